@@ -3,20 +3,25 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix pension check test test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
+	$(BIN)/python -m studies.demo.picture examples/greenhouse_coop/out/greenhouse.json
 
 plan: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.plan
+	$(BIN)/python -m studies.demo.picture examples/greenhouse_coop/out/plan.json
 
 # Runs only what is missing. MATRIX="--quick --out /tmp/matrix"
 matrix: .venv/.matrix
-	$(BIN)/python -m examples.greenhouse_coop.matrix $(MATRIX)
+	$(BIN)/python -m studies.greenhouse_matrix.matrix $(MATRIX)
 
 test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random
+
+# All tests that there are. Run it before a release: it takes more than an hour on two cores.
+test-all: test test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-clusters test-outside
 
 # The quickest of them, for each commit: under two minutes on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
@@ -28,7 +33,7 @@ check: lint
 
 # The same for the pension fund. PENSION="--quick --out /tmp/pension"
 pension: .venv/.matrix
-	$(BIN)/python -m examples.fin_base.study $(PENSION)
+	$(BIN)/python -m studies.pension.study $(PENSION)
 
 coverage: .venv/.test
 	$(BIN)/python -m pytest --cov --cov-report=term
@@ -43,8 +48,9 @@ soak: .venv/.test
 	$(BIN)/python -m benchmarks.soak --driver thread
 
 # Tests with real learners. RLlib pins an older Gymnasium than the others need, so it has its own virtual environment.
+CLIENTS ?= tests/clients
 test-clients: .venv-clients/.clients
-	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest tests/clients \
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest $(CLIENTS) \
 	    --ignore tests/clients/test_rllib.py --ignore tests/clients/test_supersuit.py
 
 test-rllib: .venv-rllib/.rllib
@@ -127,7 +133,7 @@ docs: .venv/.test
 	$(BIN)/sphinx-build --fail-on-warning --quiet docs docs/_build
 
 benchmark: .venv/.test
-	taskset -c 0 $(BIN)/python -m benchmarks.core
+	$(BIN)/python -m benchmarks.core
 
 # A marker file for each set of dependencies: make installs them again when pyproject.toml has changed.
 .venv/.%: pyproject.toml
@@ -142,13 +148,13 @@ clean:
 .PHONY: wolf-sheep
 wolf-sheep: .venv-clients/.clients
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.train
-	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.results
-	.venv-clients/bin/python -m examples.wolf_sheep.picture
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m studies.wolf_sheep.results
+	.venv-clients/bin/python -m studies.wolf_sheep.picture
 
 # The whole cooperative experiment: less than half an hour on two cores. Runs only what is missing.
 .PHONY: experiment
-EXPERIMENT := examples.greenhouse_coop.experiment
-EXPERIMENT_OUT ?= examples/greenhouse_coop/out/experiment
+EXPERIMENT := studies.greenhouse_experiment
+EXPERIMENT_OUT ?= studies/greenhouse_experiment/out
 EXPERIMENT_WORKERS ?= 2
 experiment: export OMP_NUM_THREADS = 1
 experiment: .venv-clients/.clients .venv-rllib/.rllib

@@ -14,6 +14,7 @@ MODELS = '''
 """Two walks, one of which limps."""
 
 import random
+import sys
 
 from gymnasium import spaces
 
@@ -57,6 +58,12 @@ class Boot:
 
 
 number = 3
+
+
+def __getattr__(name):
+    if name == "late":
+        1 / 0
+    raise AttributeError(f"module 'walking' has no attribute {name!r}", name=name, obj=sys.modules["walking"])
 '''
 
 
@@ -64,6 +71,7 @@ number = 3
 def beside_the_models(tmp_path, monkeypatch):
     (tmp_path / "walking.py").write_text(MODELS)
     (tmp_path / "broken_walk.py").write_text("import no_such_package_at_all\n")
+    (tmp_path / "quitting_walk.py").write_text("raise SystemExit('usage')\n")
     (tmp_path / "failing_walk.py").write_text("1 / 0\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -99,21 +107,16 @@ def test_a_simulation_with_an_error(capsys):
     assert "5 decisions" in text
 
 
-def test_reports_as_json(capsys):
+def test_reports_and_inspections_as_text_and_json(capsys):
     assert main(["check", "walking:Limping", "--episodes", "2", "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
     assert told["ok"] is False
     assert told["findings"][0]["severity"] == "error"
     assert main(["inspect", "walking:Walk", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["calls"] == "choose{10}"
-
-
-def test_inspection(capsys):
     assert main(["inspect", "walking:Walk"]) == 0
     text = capsys.readouterr().out
-    assert "walker_0" in text
-    assert "choose{10}" in text
-    assert "aec, parallel, single, joint" in text
+    assert all(part in text for part in ("walker_0", "choose{10}", "aec, parallel, single, joint"))
 
 
 def test_points_by_name(capsys):
@@ -139,6 +142,9 @@ def test_points_by_name(capsys):
         ("simenv_marl.registraton:x", "did you mean simenv_marl.registration"),
         ("broken_walk:Walk", "needs 'no_such_package_at_all'"),
         ("failing_walk:Walk", "cannot be imported: ZeroDivisionError"),
+        ("json.decoder.walking:Walk", "there is no module 'json.decoder.walking'"),
+        ("quitting_walk:Walk", "cannot be imported: SystemExit: usage"),
+        ("walking:late", "walking:late cannot be imported: ZeroDivisionError"),
         ("walking:number", "is not a simulation"),
     ],
 )
@@ -153,27 +159,33 @@ def test_what_cannot_be_looked_at(command, target, told, capsys):
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        [],
-        ["chek", "walking:Walk"],
-        ["check"],
-        ["check", "walking:Walk", "--time-limit", "never"],
-        ["wire-check", "--options", "[1]", "simulator"],
-    ],
+    ["", "chek walking:Walk", "check", "check walking:Walk --time-limit never", "wire-check --options [1] s"],
 )
 def test_wrong_arguments(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
-        main(arguments)
+        main(arguments.split())
     assert caught.value.code == 2
     assert "usage" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("option", "value"),
-    [("seed", "-1"), ("episodes", "0"), ("max-steps", "0"), ("time-limit", "0"), ("time-limit", "inf")],
+    ("command", "target", "option", "value"),
+    [
+        ("check", "walking:Walk", "seed", "-1"),
+        ("check", "walking:Walk", "episodes", "0"),
+        ("check", "walking:Walk", "max-steps", "0"),
+        ("check", "walking:Walk", "time-limit", "0"),
+        ("check", "walking:Walk", "time-limit", "inf"),
+        ("inspect", "walking:Walk", "seed", "-1"),
+        ("wire-check", "true", "seed", "-1"),
+        ("wire-check", "true", "seed", str(2**31)),
+        ("wire-check", "true", "decisions", "0"),
+        ("wire-check", "true", "timeout", "nan"),
+        ("wire-check", "true", "timeout", "inf"),
+    ],
 )
-def test_numbers_that_cannot_be_used(option, value, capsys):
-    assert main(["check", "walking:Walk", f"--{option}", value]) == 2
+def test_numbers_that_cannot_be_used(command, target, option, value, capsys):
+    assert main([command, f"--{option}", value, target]) == 2
     assert option.replace("-", "_") in capsys.readouterr().err
 
 

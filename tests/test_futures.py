@@ -7,10 +7,8 @@ import types
 
 import numpy as np
 import pytest
-from gymnasium.wrappers import TimeLimit
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from simenv_marl import aec_env, branch, joint_env, parallel_env, reseed_generators, single_env
 from simenv_marl.errors import BranchError, NotResetError, OptionValueError
@@ -67,15 +65,18 @@ def drawn(env, number):
 @pytest.mark.parametrize(("simulation", "options"), [(Reseeded, {}), (Gambling, {"global_rng": True})])
 @VIEWS
 def test_the_same_seeds_are_the_same_futures(make, points, simulation, options):
-    """By either method, and whatever has been drawn before; other seeds are other futures."""
+    """By either method and driver, and whatever has been drawn before; other seeds are other futures."""
     env = going_on(make, points, simulation, **options)
+    threaded = going_on(make, points, simulation, driver="thread", **options)
     seeds = [5, 6, 5, 2**70]
     forked, replayed = (branch(env, short, 4, method=method, seeds=seeds) for method in ("fork", "replay"))
     random.random()
     assert forked == replayed == branch(env, short, 4, seeds=np.array(seeds, object))
+    assert forked == branch(threaded, short, 4, seeds=seeds)
     assert forked[0] == forked[2]
     assert len({repr(each) for each in forked}) == 3
     assert branch(env, short, 1, seeds=[6]) == forked[1:2]
+    threaded.close()
 
 
 @METHODS
@@ -107,19 +108,6 @@ def test_neither_the_environment_nor_the_generators_of_its_user_move(make, point
         branch(env, lambda twin, number: 1 / 0, 1, method=method, seeds=[1])
     assert world() == before
     assert rest_of(env) == ahead
-
-
-@METHODS
-def test_wrappers_come_along(method):
-    def finish(twin, number):
-        assert type(twin) is type(env)
-        return short(twin.unwrapped)
-
-    for env in (TimeLimit(going_on(), 4), OrderEnforcingWrapper(going_on(aec_env))):
-        env.reset(seed=1)
-        env.step(1)
-        expected = branch(env.unwrapped, short, 2, seeds=[1, 2])
-        assert branch(env, finish, 2, method=method, seeds=[1, 2]) == expected
 
 
 @METHODS
@@ -192,14 +180,6 @@ def test_branches_of_branches_have_futures_of_their_own(method):
     assert found[0][1] != found[0][0] != found[1][0]
 
 
-@pytest.mark.parametrize("options", [{}, {"global_rng": True}])
-def test_with_threads(options):
-    env = going_on(simulation=Both if options else Reseeded, driver="thread", **options)
-    expected = branch(going_on(simulation=Both if options else Reseeded, **options), short, 2, seeds=[1, 2])
-    assert branch(env, short, 2, seeds=[1, 2]) == expected
-    env.close()
-
-
 @METHODS
 def test_decisions_of_reseed_are_the_rules(method):
     class Deciding(Reseeded):
@@ -254,13 +234,7 @@ def test_who_cannot_draw_anew_is_told_what_to_do(monkeypatch, method):
 def test_seeds_are_one_integer_for_each_branch(seeds):
     with pytest.raises(OptionValueError, match="seeds must be n = 2 non-negative integers"):
         branch(going_on(), short, 2, seeds=seeds)
-
-
-def test_no_branches_need_no_seeds():
     assert branch(going_on(), short, 0, seeds=[]) == []
-
-
-def test_without_an_episode_there_is_no_future():
     with pytest.raises(NotResetError):
         branch(single_env(lambda: Reseeded(6), Walk.choose), short, 1, seeds=[1])
 

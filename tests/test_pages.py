@@ -35,8 +35,8 @@ def can_be_installed():
 
 
 def sources(text):
-    """The files of the examples whose modules a page imports, runs or names."""
-    for name in re.findall(r"(?<![\w.])examples(?:\.\w+)+", text):
+    """The files of the examples and studies whose modules a page imports, runs or names."""
+    for name in re.findall(r"(?<![\w.])(?:examples|studies)(?:\.\w+)+", text):
         parts = name.split(".")
         paths = (ROOT.joinpath(*parts[:length]).with_suffix(".py") for length in range(len(parts), 1, -1))
         yield from [path for path in paths if path.exists()][:1]
@@ -52,7 +52,7 @@ def linked(text):
 def test_the_code_of_a_page_imports_what_can_be_installed_or_saved(page):
     text, code = code_of(page)
     saved = {path.stem for path in linked(text)}
-    assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {"examples"}
+    assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {"examples", "studies"}
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -64,7 +64,7 @@ def test_a_page_links_each_example_that_it_imports_or_runs(page):
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_says_how_to_get_what_only_the_repository_has(page):
     text, _ = code_of(page)
-    first = re.search(r"(?<![\w./])(?:benchmarks|examples)[./]\w|^make \w|`make \w", text, re.MULTILINE)
+    first = re.search(r"(?<![\w./])(?:benchmarks|examples|studies)[./]\w|^make \w|`make \w", text, re.MULTILINE)
     if first:
         up_to_there = " ".join(text[: text.find("\n\n", first.end())].split())
         assert re.search(r"[Cc]lone the repository\b.* from its root\b", up_to_there)

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -23,7 +24,7 @@ from simenv_marl.experiments import Variant
 from tests.worlds import many_registered
 from tests.worlds.many_registered import Boat, Voyage
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import calling, decision, define, play, script
+from tests.worlds.models import calling, decision, define, play
 from tests.worlds.undone import registries_put_back
 
 ROOT = Path(__file__).parent.parent
@@ -46,14 +47,42 @@ def made(identity, **options):
 # -- ids ------------------------------------------------------------------------------------------
 
 
-def test_the_ids():
+def test_there_is_an_id_for_each_point_and_one_for_all_views_of_several_agents():
     assert [*SINGLES, JOINT, COOP] == many_registered.IDS
     assert set(many_registered.IDS[:-1]) <= set(gymnasium.registry)
-    assert pettingzoo.spec("aec", COOP)
-    assert pettingzoo.spec("parallel", COOP)
+    for kind, base in (("aec", pettingzoo.AECEnv), ("parallel", pettingzoo.ParallelEnv)):
+        spec = pettingzoo.spec(kind, COOP)
+        assert isinstance(spec.entry_point, str)
+        json.dumps(spec.kwargs)
+        for identity in (COOP, spec):
+            env = pettingzoo.make(kind, identity)
+            assert isinstance(env, base)
+            assert env.possible_agents == ["helm_0", "sail_0"]
+    assert set(gymnasium.make(JOINT).action_space.spaces) == {"helm_0", "sail_0"}
+    flat = gymnasium.make(JOINT, flatten=True)
+    assert flat.action_space.shape == (2,)
+    assert flat.observation_space.shape == (4,)
 
 
-def test_a_single_view_for_each_point():
+@pytest.mark.parametrize(
+    ("options", "low", "high"),
+    [({}, -0.61, -0.39), ({"policies": {Boat.set_sail: lambda observation: np.float32([1.0])}}, 0.89, 1.11)],
+    ids=["rule", "policy"],
+)
+def test_all_other_points_run_their_rule_or_the_policy_that_is_given(options, low, high):
+    env = made(SINGLES[0], **options)
+    env.reset(seed=1)
+    env.step(np.array([1.0], np.float32))
+    assert env.simulation.boat.course == 1.0
+    envs = gymnasium.make_vec(SINGLES[0], num_envs=2, **options).unwrapped
+    envs.reset(seed=1)
+    envs.step(np.ones((2, 1), np.float32))
+    for simulation in (env.simulation, *envs.get_attr("simulation")):
+        assert low < simulation.boat.place < high
+    envs.close()
+
+
+def test_a_single_view_has_the_spaces_and_the_episodes_of_its_point():
     for identity in SINGLES:
         env = gymnasium.make(identity)
         observation, _ = env.reset(seed=1)
@@ -65,38 +94,6 @@ def test_a_single_view_for_each_point():
             decided += 1
         assert decided == 11
         env.close()
-
-
-def test_all_other_points_run_their_rule():
-    helm = made(SINGLES[0])
-    helm.reset(seed=1)
-    helm.step(np.array([1.0], np.float32))
-    assert helm.simulation.boat.course == 1.0
-    assert -0.61 < helm.simulation.boat.place < -0.39  # by the sails' own rule
-
-
-def test_the_joint_view():
-    env = gymnasium.make(JOINT)
-    assert set(env.action_space.spaces) == {"helm_0", "sail_0"}
-    env.reset(seed=1)
-    env.step(env.action_space.sample())
-    flat = gymnasium.make(JOINT, flatten=True)
-    assert flat.action_space.shape == (2,)
-    assert flat.observation_space.shape == (4,)
-    flat.reset(seed=1)
-    flat.step(flat.action_space.sample())
-
-
-def test_the_views_of_many_agents():
-    env = pettingzoo.make("aec", COOP)
-    assert isinstance(env, pettingzoo.AECEnv)
-    assert env.possible_agents == ["helm_0", "sail_0"]
-    assert len(play(env, RULE, seed=1)) == 26
-    env = pettingzoo.make("parallel", COOP)
-    assert isinstance(env, pettingzoo.ParallelEnv)
-    env.reset(seed=1)
-    while env.agents:
-        env.step(dict.fromkeys(env.agents, RULE))
 
 
 def test_options_are_given_when_it_is_made():
@@ -114,45 +111,29 @@ def test_options_are_given_when_it_is_made():
         gymnasium.make(JOINT, speed=3)
 
 
-def test_options_are_given_when_it_is_registered(register):
-    ids = register(Voyage, name="optional", max_steps=2)
-    env = made(ids[0])
-    env.reset()
-    env.step(RULE)
-    assert env.step(RULE)[2:4] == (False, True)
-    env = made(ids[0], max_steps=None)
-    env.reset()
-    assert not any(any(env.step(RULE)[2:4]) for _ in range(5))
-    env = pettingzoo.make("aec", ids[-1])
-    assert len(play(env, RULE)) == 4
-
-
-def test_versions_stand_side_by_side(register):
-    first = register(Voyage, name="versions")
-    second = register(Voyage, name="versions", version=3, max_steps=1)
-    assert first == ["versions/SteerBoat-v0", "versions/SetSail-v0", "versions/Joint-v0", "versions/coop_v0"]
-    assert second == ["versions/SteerBoat-v3", "versions/SetSail-v3", "versions/Joint-v3", "versions/coop_v3"]
+def lengths(ids, **options):
+    """How many steps a single view takes, and how many turns one of several agents does."""
     with warnings.catch_warnings():
         # Gymnasium's advice to take the latest version.
         warnings.filterwarnings("ignore", message=".*is out of date")
-        env = made(first[0])
+        env = made(ids[0], **options)
     env.reset()
-    assert not any(env.step(RULE)[2:4])
-    env = made(second[0])
-    env.reset()
-    assert env.step(RULE)[2:4] == (False, True)
-    assert len(play(pettingzoo.make("aec", first[-1]), RULE)) == 26
-    assert len(play(pettingzoo.make("aec", second[-1]), RULE)) == 3
+    steps = 1
+    while not any(env.step(RULE)[2:4]):
+        steps += 1
+    return steps, len(play(pettingzoo.make("aec", ids[-1], **options), RULE))
 
 
-def test_registering_again_replaces_and_warns_of_nothing(register):
-    """As when a notebook's cell runs again."""
-    register(Voyage, name="again", max_steps=1)
-    ids = register(Voyage, name="again")
-    env = made(ids[0])
-    env.reset()
-    assert not any(env.step(RULE)[2:4])
-    assert len(play(pettingzoo.make("aec", ids[-1]), RULE)) == 26
+def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_versions(register):
+    first = register(Voyage, name="versions", max_steps=1)
+    assert lengths(first) == (1, 3)
+    assert register(Voyage, name="versions") == first  # as when a notebook's cell runs again
+    second = register(Voyage, name="versions", version=3, max_steps=2)
+    assert first == ["versions/SteerBoat-v0", "versions/SetSail-v0", "versions/Joint-v0", "versions/coop_v0"]
+    assert second == ["versions/SteerBoat-v3", "versions/SetSail-v3", "versions/Joint-v3", "versions/coop_v3"]
+    assert lengths(first) == (12, 26)
+    assert lengths(second) == (2, 4)
+    assert lengths(second, max_steps=None) == (12, 26)
 
 
 def test_points_are_those_that_are_named(register):
@@ -178,22 +159,6 @@ def test_points_may_be_given_with_their_definitions(register):
         assert pettingzoo.make("aec", ids[-1]).action_space("sail_0") == spaces.Discrete(2)
 
 
-def test_points_may_be_functions_that_nobody_has_decorated(register):
-    definitions = beings(agent="hero_0", removed_by=())
-
-    def main(simulation):
-        simulation.log.append(Being(0).act())
-
-    ids = register(script(main), definitions, name="plain")
-    assert ids[0] == "plain/Act-v0"
-    env = made(ids[0])
-    env.reset()
-    env.step(4)
-    assert env.simulation.log == [4]
-    env.close()
-    assert Being(0).act() == "rule"
-
-
 def test_goals_may_be_registered(register):
     ant = decision(
         agent="ant_0",
@@ -208,35 +173,38 @@ def test_goals_may_be_registered(register):
     assert env.unwrapped.compute_reward(np.zeros((3, 1)), np.ones((3, 1)), [{}] * 3).tolist() == [-1, -1, -1]
 
 
-def test_entities_have_no_single_view_and_are_elsewhere(register):
+@pytest.mark.parametrize(
+    ("options", "answer"),
+    [
+        ({"possible_agents": ["being_0"]}, "rule"),
+        ({"possible_agents": {Being.act: ["being_0"]}}, "rule"),  # an option of a point that the single view lacks
+        ({"policies": {"being_0": lambda observation: 7}, "possible_agents": ["being_0"]}, 7),
+    ],
+    ids=["roster", "roster by point", "policy"],
+)
+def test_entities_have_no_single_view_and_are_in_that_of_another_point(register, options, answer):
     clerk = decision(agent="clerk_0")
-
-    def main(simulation):
-        clerk()
-        simulation.being = Being(0)
-        simulation.being.act()
-
     points = {clerk: define(agent="clerk_0"), **beings()}
-    ids = register(script(main), points, name="mixed", possible_agents=["being_0"])
+    ids = register(calling(clerk, lambda: Being(0).act()), points, name="mixed", **options)
     assert ids == ["mixed/Choose-v0", "mixed/Joint-v0", "mixed/coop_v0"]
-    assert pettingzoo.make("aec", ids[-1]).possible_agents == ["clerk_0", "being_0"]
-    assert set(made(ids[1]).action_space.spaces) == {"clerk_0", "being_0"}
-
-
-def test_a_single_view_beside_a_roster_of_entities(register):
-    """The options of all points must not keep the views of single points from being made."""
-    clerk = decision(agent="clerk_0")
-
-    def main(simulation):
-        simulation.log.append(clerk())
-        simulation.log.append(Being(0).act())
-
-    points = {clerk: define(agent="clerk_0"), **beings()}
-    ids = register(script(main), points, name="mixed", possible_agents={Being.act: ["being_0"]})
     env = made(ids[0])
     env.reset()
     env.step(4)
-    assert env.simulation.log == [4, "rule"]
+    assert env.simulation.log == [4, answer]
+    if answer == "rule":
+        assert pettingzoo.make("aec", ids[-1]).possible_agents == ["clerk_0", "being_0"]
+        assert set(made(ids[1]).action_space.spaces) == {"clerk_0", "being_0"}
+
+
+def test_points_may_be_functions_that_nobody_has_decorated(register):
+    ids = register(calling(lambda: Being(0).act()), beings(agent="hero_0", removed_by=()), name="plain")
+    assert ids[0] == "plain/Act-v0"
+    env = made(ids[0])
+    env.reset()
+    env.step(4)
+    assert env.simulation.log == [4]
+    env.close()
+    assert Being(0).act() == "rule"
 
 
 def test_policies_of_registered_simulations(register):
@@ -252,88 +220,39 @@ def test_policies_of_registered_simulations(register):
         assert 0.14 < env.simulation.boat.place < 0.36
 
 
-def test_two_points_of_one_name_have_two_ids(register):
-    class Cat:
-        @define(agent="cat_0", observation_space_mapping=lambda it: [0, 1], reward_mapping=lambda it: 0.0)
-        def move(self):
-            return 0
-
-    class Dog:
-        @define(agent="dog_0", observation_space_mapping=lambda it: [0, 2], reward_mapping=lambda it: 0.0)
-        def move(self):
-            return 0
-
-    ids = register(calling(Cat().move, Dog().move), [Cat.move, Dog.move], name="twice")
-    assert len(set(ids)) == len(ids) == 4
-    assert sorted(made(identity).reset()[0].tolist() for identity in ids[:2]) == [[0, 1], [0, 2]]
-
-
-def test_flatten_may_be_registered(register):
-    """It is an option of the joint view alone: the others are made without it."""
-    ids = register(Voyage, name="flat", flatten=True)
-    assert made("flat/Joint-v0").action_space.shape == (2,)
-    made(ids[0]).reset()
-    pettingzoo.make("parallel", ids[-1]).reset()
-
-
 @pytest.mark.parametrize("flatten", [False, True])
-def test_flatten_may_be_an_option_of_a_variant_and_of_the_call(register, flatten):
+def test_flatten_is_an_option_of_the_joint_view_alone(register, flatten):
+    """It may be one of the variant, of the registration and of the one who makes it, who comes first."""
     ids = register(Variant("flat", Voyage, options={"flatten": True}), flatten=flatten)
-    assert isinstance(made("flat/Joint-v0").action_space, spaces.Box) is flatten
+    for options, expected in (({}, flatten), ({"flatten": not flatten}, not flatten)):
+        env = made("flat/Joint-v0", **options)
+        assert isinstance(env.action_space, spaces.Box) is expected
+        check_env(env)
+        envs = gymnasium.make_vec("flat/Joint-v0", num_envs=2, **options).unwrapped
+        assert isinstance(envs.single_action_space, spaces.Box) is expected
+        envs.close()
     made(ids[0]).reset()
     pettingzoo.make("parallel", ids[-1]).reset()
 
 
-def test_names_of_points_become_camel_case(register):
-    @define(agent="ant_0")
-    def choose_2nd_route():
-        return 0
+def test_names_of_points_become_camel_case_and_are_told_apart(register):
+    """The id of the joint view is taken, names may differ in how they are written alone, and classes share names."""
+    named = {"joint": "RobotJoint", "choose_2nd_route": "Choose2ndRoute", "open_grip": None, "openGrip": None}
+    points = []
+    for number, name in enumerate([*named, "move", "move"]):
+        kind = type("Robot" if name in named else f"Legs{number}", (), {})
 
-    ids = register(calling(choose_2nd_route), choose_2nd_route, name="camels")
-    assert ids[0] == "camels/Choose2ndRoute-v0"
-    made(ids[0]).reset()
-
-
-def test_a_point_may_be_called_joint(register):
-    """The id of the joint view is taken; names that only differ in how they are written are told apart, too."""
-
-    class Robot:
-        @define(agent="joint_0", observation_space_mapping=lambda it: [0, 1], reward_mapping=lambda it: 0.0)
-        def joint(self):
+        def rule(it):
             return 0
 
-        @define(agent="grip_0", observation_space_mapping=lambda it: [0, 2], reward_mapping=lambda it: 0.0)
-        def open_grip(self):
-            return 0
-
-        @define(agent="grip_1", observation_space_mapping=lambda it: [0, 3], reward_mapping=lambda it: 0.0)
-        def openGrip(self):  # noqa: N802
-            return 0
-
-    robot = Robot()
-    points = [Robot.joint, Robot.open_grip, Robot.openGrip]
-    ids = register(calling(robot.joint, robot.open_grip, robot.openGrip), points, name="robots")
+        rule.__name__, rule.__qualname__, rule.__module__ = name, f"{kind.__name__}.{name}", __name__
+        points.append(define(agent=f"robot_{number}", observation_space_mapping=lambda it, n=number: [0, n])(rule))
+    ids = register(calling(*(partial(point, None) for point in points)), points, name="robots")
     assert ids[0] == "robots/RobotJoint-v0"
+    assert ids[1] == "robots/Choose2ndRoute-v0"
     assert "robots/Joint-v0" in ids
-    assert len(set(ids)) == len(ids) == 5
-    assert [made(identity).reset()[0].tolist() for identity in ids[:3]] == [[0, 1], [0, 2], [0, 3]]
-
-
-def test_an_entitys_policy_stands_in_the_single_view_of_another_point(register):
-    @define(agent="ant_0")
-    def choose():
-        return 0
-
-    def main(simulation):
-        choose()
-        simulation.log.append(Being(1).act())
-
-    points = {choose: define(agent="ant_0"), **beings()}
-    ids = register(script(main), points, name="entities", policies={"being_1": lambda observation: 7})
-    env = made(ids[0])
-    env.reset()
-    env.step(1)
-    assert env.simulation.log == [7]
+    assert len(set(ids)) == len(ids) == 8
+    assert [made(identity).reset()[0].tolist() for identity in ids[:6]] == [[0, number] for number in range(6)]
 
 
 @pytest.mark.parametrize(
@@ -351,7 +270,7 @@ def test_an_entitys_policy_stands_in_the_single_view_of_another_point(register):
         ({"simulation": Variant("hot summer", Voyage), "name": None}, OptionValueError),
     ],
 )
-def test_what_cannot_be_registered(register, changes, error):
+def test_what_cannot_be_registered_leaves_the_registries_as_they_were(register, changes, error):
     registries = gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry
     before = [dict(registry) for registry in registries]
     with pytest.raises(error):
@@ -393,22 +312,9 @@ def test_gymnasiums_check(identity, mode):
     check_env(made(identity, render_mode=mode))
 
 
-def test_gymnasiums_check_of_the_flattened_view():
-    check_env(made(JOINT, flatten=True))
-
-
 def test_pettingzoos_tests():
     api_test(pettingzoo.make("aec", COOP), num_cycles=20)
     parallel_api_test(pettingzoo.make("parallel", COOP), num_cycles=20)
-
-
-@pytest.mark.parametrize("identity", [SINGLES[0], JOINT])
-def test_vectors_of_gymnasium(identity):
-    envs = gymnasium.make_vec(identity, num_envs=2, vectorization_mode="sync")
-    envs.reset(seed=1)
-    for _ in range(20):
-        envs.step(envs.action_space.sample())
-    envs.close()
 
 
 # -- specs ----------------------------------------------------------------------------------------
@@ -425,14 +331,6 @@ def test_specs_can_be_written_down(identity):
     assert repr(told[0]) == repr(told[1])
     assert told[0][2][3] is True
     assert isinstance(env.spec.entry_point, str)
-
-
-def test_specs_of_pettingzoo_are_strings():
-    for kind in ("aec", "parallel"):
-        spec = pettingzoo.spec(kind, COOP)
-        assert isinstance(spec.entry_point, str)
-        json.dumps(spec.kwargs)
-        assert pettingzoo.make(kind, spec).possible_agents == ["helm_0", "sail_0"]
 
 
 def run_apart(code):
@@ -504,33 +402,6 @@ if __name__ == "__main__":
 
 
 # -- what registered views are given ---------------------------------------------------------------
-
-
-def test_policies_that_are_given_stand_in_place_of_the_rule():
-    sail = Boat.set_sail
-    env = made(SINGLES[0], policies={sail: lambda observation: np.array([1.0], np.float32)})
-    env.reset(seed=1)
-    env.step(np.array([1.0], np.float32))
-    assert 0.89 < env.simulation.boat.place < 1.11
-    envs = gymnasium.make_vec(
-        SINGLES[0], num_envs=2, policies={sail: lambda observation: np.array([1.0], np.float32)}
-    ).unwrapped
-    envs.reset(seed=1)
-    envs.step(np.ones((2, 1), np.float32))
-    assert all(0.89 < simulation.boat.place < 1.11 for simulation in envs.get_attr("simulation"))
-    envs.close()
-
-
-@pytest.mark.parametrize("flatten", [False, True])
-def test_what_is_registered_of_the_joint_view_holds_and_may_be_changed(register, flatten):
-    ids = register(Voyage, name="flat", points=Voyage.points, flatten=flatten)
-    joint = next(identity for identity in ids if "Joint" in identity)
-    for given, expected in (({}, flatten), ({"flatten": not flatten}, not flatten)):
-        space = made(joint, **given).action_space
-        assert isinstance(space, spaces.Box) is expected
-        envs = gymnasium.make_vec(joint, num_envs=2, **given).unwrapped
-        assert isinstance(envs.single_action_space, spaces.Box) is expected
-        envs.close()
 
 
 # -- what gymnasium's makers hand on --------------------------------------------------------------

@@ -64,7 +64,7 @@ def walked(seed, steps, **parameters):
     return model.place
 
 
-def test_it_is_the_plain_model_by_its_rule():
+def test_with_the_rule_throughout_it_is_the_plain_model():
     assert simulate(SteppedSimulation(Walk, 20, drift=0.1), seed=3).model.place == walked(3, 20, drift=0.1)
     env = single_env(SteppedSimulation(Walk, 20), STRIDE)
     env.reset(seed=3)
@@ -81,7 +81,7 @@ def test_it_is_the_plain_model_by_its_rule():
 
 
 @pytest.mark.parametrize("steps", [None, 1000])
-def test_the_model_ends_it(steps):
+def test_the_model_ends_the_episode_when_it_runs_no_more(steps):
     env = aec_env(SteppedSimulation(Walk, steps, far=3.0), STRIDE)
     env.reset(seed=1)
     while not env.terminations["stride_0"]:
@@ -119,7 +119,7 @@ def test_copies_and_pickles():
         assert simulate(twin, seed=2).model.place == walked(2, 5, drift=0.5)
 
 
-def test_bad_input():
+def test_models_steps_and_parameters_that_cannot_be_are_refused():
     with pytest.raises(SimulationError, match="the class of a model, not 3"):
         SteppedSimulation(3)
     for steps in (0, -1, 1.5, True, "many"):

@@ -51,6 +51,7 @@ def test_what_is_written_passes_its_own_tests(kind, tmp_path):
     assert tested.returncode == 0, tested.stdout
     checked = run(tmp_path / "water_tank", "-m", "simenv_marl", "check", "water_tank:WaterTankSimulation")
     assert checked.returncode == 0, checked.stdout + checked.stderr
+    assert "nothing to complain of" in checked.stdout
 
 
 @pytest.mark.parametrize("kind", ["simpy", "mesa"])  # plain needs Stable-Baselines3: tests/clients/test_templates.py
@@ -97,6 +98,7 @@ def test_policies_answer_one_observation_as_they_answer_many(kind):
         ("2nd", "cannot be the name of a module"),
         ("class", "cannot be the name of a module"),
         ("_", "cannot be the name of a module"),
+        ("\ufb01sh", "is 'fish' in Python, which would not find the file"),
         ("json", "is the name of another module"),
         ("pytest", "is the name of another module"),
         ("simenv_marl", "is the name of another module"),
@@ -172,22 +174,18 @@ def test_gymnasium_and_pettingzoo_accept_the_environments():
     api_test(import_module("simenv_marl.testing.templates.mesa").env(), num_cycles=500)
 
 
-@pytest.mark.parametrize("existing", ["tank.py", "test_tank.py"])
-def test_nothing_is_overwritten(existing, tmp_path, capsys):
-    (tmp_path / existing).write_text("mine")
-    (tmp_path / "other.txt").write_text("mine")
-    assert main(["new", "plain", "tank", "--folder", str(tmp_path)]) == 2
-    assert f"{existing} exists already" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([existing, "other.txt"])
-    assert (tmp_path / existing).read_text() == "mine"
-
-
-def test_a_folder_that_cannot_be_made(tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert main(["new", "plain", "tank", "--folder", str(tmp_path / "file" / "new")]) == 2
-    error = capsys.readouterr().err
-    assert "cannot be written" in error
-    assert len(error.splitlines()) == 1
+def test_nothing_is_overwritten_and_folders_may_be_out_of_reach(tmp_path, capsys):
+    for existing in ("tank.py", "test_tank.py"):
+        folder = tmp_path / existing.removesuffix(".py")
+        folder.mkdir()
+        (folder / existing).write_text("mine")
+        assert main(["new", "plain", "tank", "--folder", str(folder)]) == 2
+        assert f"{existing} exists already" in capsys.readouterr().err
+        assert [path.name for path in folder.iterdir()] == [existing]
+        assert main(["new", "plain", "tank", "--folder", str(folder / existing / "new")]) == 2
+        error = capsys.readouterr().err
+        assert "cannot be written" in error
+        assert len(error.splitlines()) == 1
 
 
 @pytest.mark.parametrize("arguments", [["new"], ["new", "plain"], ["new", "netlogo", "tank"]])

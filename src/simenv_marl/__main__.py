@@ -18,7 +18,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from .errors import OptionValueError, SimEnvError, describe_error, did_you_mean
+from .errors import OptionValueError, SimEnvError, describe_error, did_you_mean, short_repr
 from .testing.templates import KINDS, write_template
 
 
@@ -108,7 +108,7 @@ def _inspect(options: argparse.Namespace) -> Any:
         return inspect_simulation(simulation, options.points, seed=options.seed)
     except SimEnvError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise OptionValueError(f"{options.simulation} cannot be run: {describe_error(error)}") from error
 
 
@@ -124,17 +124,21 @@ def _find(text: str) -> Any:
         if not f"{name}.".startswith(f"{missing}."):
             raise OptionValueError(f"the module {name!r} needs {missing!r}, which is not installed") from error
         parent, _, last = missing.rpartition(".")
-        folders = importlib.import_module(parent).__path__ if parent else [os.getcwd()]
+        folders = getattr(importlib.import_module(parent), "__path__", [parent]) if parent else [os.getcwd()]
         modules = [module.name for module in pkgutil.iter_modules(folders)]
         hint = did_you_mean(last, modules, f"{parent}." if parent else "")
         raise OptionValueError(f"there is no module {missing!r}{hint} (looked for in {folders[0]})") from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise OptionValueError(f"the module {name!r} cannot be imported: {describe_error(error)}") from error
     try:
         return attrgetter(path)(module)
     except AttributeError as error:
         hint = did_you_mean(error.name, dir(error.obj))
-        raise OptionValueError(f"{getattr(error.obj, '__name__', error.obj)} has no {error.name!r}{hint}") from None
+        raise OptionValueError(
+            f"{getattr(error.obj, '__name__', short_repr(error.obj))} has no {error.name!r}{hint}"
+        ) from None
+    except Exception as error:
+        raise OptionValueError(f"{text} cannot be imported: {describe_error(error)}") from error
 
 
 if __name__ == "__main__":

@@ -2,24 +2,22 @@
 
 ``make_step`` makes a ``Definition``. Applied to a function, the definition gives a *decision function*. It looks and
 behaves like the function, whose body is the *rule*. But if the calling simulation runs in an environment, it asks the
-environment for its decision. A ``DecisionPoint`` is what is asked: one for every rule, with any number of definitions.
+environment for its decision. One function is one decision point, its hook, with any number of definitions.
 """
 
-import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
 from types import FunctionType
 from typing import Any, Final
-from weakref import WeakValueDictionary
 
 import numpy as np
 from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, short_repr
-from .hooks.hook import Hook, hook_of, made_with, unbind
+from .hooks.hook import Hook, hook_of, hooks, made_with, unbind
 from .hooks.places import permanent_hook
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
@@ -61,7 +59,8 @@ class Definition:
         Raises:
             DefinitionError: The definition cannot work.
         """
-        _check(self)
+        for problem in _problems(self):
+            raise DefinitionError(f"make_step: {problem}")
         answers = _answers(self.action_space_mapping)
         if answers is not None:
             object.__setattr__(self, "action_space_mapping", dict(answers).__getitem__)
@@ -89,10 +88,8 @@ class Definition:
             PatchError: ``function`` is none of these.
         """
         hook, binding = permanent_hook(function)
-        point = point_for(hook)
-        wrapper = hook.make_wrapper(self)
-        point.definition = self
-        _REGISTRY[point.name] = point
+        wrapper = point_for(hook).make_wrapper(self)
+        hook.definition = self
         return wrapper if binding is None else binding(wrapper)
 
 
@@ -159,56 +156,54 @@ def make_step(
     return Definition(**locals())  # which checks them
 
 
-def _check(definition: Definition) -> None:
-    """Check the parts of a definition, one by one and together."""
-    for name in ("observation_space", "action_space", "goal_space"):
-        space = getattr(definition, name)
-        if not isinstance(space, spaces.Space) and (name != "goal_space" or space is not None):
-            raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {short_repr(space)}")
-    required = ("observation_space_mapping", "reward_mapping")
-    goal = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
-    for name in (*required, "apply", "choices", "action_mask_mapping", *goal[1:]):
-        function = getattr(definition, name)
-        if not callable(function) and (name in required or function is not None):
-            raise DefinitionError(f"make_step: {name} must be callable, not {short_repr(function)}")
-    for name in ("action_space_mapping", "rule_action_mapping"):
-        mapping = getattr(definition, name)
-        if mapping is not None and not callable(mapping) and not isinstance(mapping, Mapping):
-            raise DefinitionError(f"make_step: {name} must be a callable or a dict, not {short_repr(mapping)}")
-    agent = definition.agent
-    if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
-        raise DefinitionError(f"make_step: agent must be a name or a callable, not {short_repr(agent)}")
+_GOAL: Final = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
+
+_REQUIRED: Final = ("observation_space", "observation_space_mapping", "action_space", "reward_mapping")
+
+
+def _problems(definition: Definition) -> Iterator[str]:
+    """Yield what is wrong with the parts of a definition, one by one and together."""
+    for name, part in vars(definition).items():
+        if name == "removed_by" or (part is None and name not in _REQUIRED):
+            continue
+        fits, kind = callable(part), "callable"
+        if name.endswith("_space"):
+            fits, kind = isinstance(part, spaces.Space), "a gymnasium space"
+        elif name == "agent":
+            fits, kind = fits or (isinstance(part, str) and part != ""), "a name or a callable"
+        elif name in ("action_space_mapping", "rule_action_mapping"):
+            fits, kind = fits or isinstance(part, Mapping), "a callable or a dict"
+        if not fits:
+            yield f"{name} must be {kind}, not {short_repr(part)}"
     given = [name for name in ("action_space_mapping", "apply", "choices") if getattr(definition, name) is not None]
     if len(given) != 1 and given != ["apply", "choices"]:
-        raise DefinitionError(
-            "make_step: give one of action_space_mapping, apply and choices (or both apply and choices), to say what an"
-            f" action decides; given: {', '.join(given) or 'none'}"
+        yield (
+            "give one of action_space_mapping, apply and choices (or both apply and choices), to say what an action"
+            f" decides; given: {', '.join(given) or 'none'}"
         )
-    space, mask = definition.action_space, definition.action_mask_mapping
-    if mask is not None and not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        raise DefinitionError(
-            f"make_step: action_mask_mapping needs a Discrete or MultiDiscrete action_space, not {space}"
-        )
+    space, has_mask = definition.action_space, definition.action_mask_mapping is not None
+    if has_mask and not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        yield f"action_mask_mapping needs a Discrete or MultiDiscrete action_space, not {space}"
     if definition.choices is not None:
         if not isinstance(space, spaces.Discrete) or space.start != 0:
-            raise DefinitionError(f"make_step: choices needs a Discrete action_space that starts at 0, not {space}")
-        if mask is not None:
-            raise DefinitionError("make_step: choices makes the mask itself; leave action_mask_mapping out")
-    missing = [name for name in goal if getattr(definition, name) is None]
-    if 0 < len(missing) < len(goal):
-        raise DefinitionError(f"make_step: a goal needs all of its parts; missing: {', '.join(missing)}")
+            yield f"choices needs a Discrete action_space that starts at 0, not {space}"
+        if has_mask:
+            yield "choices makes the mask itself; leave action_mask_mapping out"
+    missing = [name for name in _GOAL if getattr(definition, name) is None]
+    if 0 < len(missing) < len(_GOAL):
+        yield f"a goal needs all of its parts; missing: {', '.join(missing)}"
     answers = _answers(definition.action_space_mapping)
     if answers is None:
         return
     if not isinstance(space, spaces.Discrete):
-        raise DefinitionError(f"make_step: a dict as action_space_mapping needs a Discrete action_space, not {space}")
-    actions = range(int(space.start), int(space.start + space.n))
+        yield f"a dict as action_space_mapping needs a Discrete action_space, not {space}"
+    actions = range(int(space.start), int(space.start + space.n))  # type: ignore[attr-defined]
     absent = [action for action in actions if action not in answers]
     surplus = [action for action in answers if action not in actions]
     if absent or surplus:
-        raise DefinitionError(
-            f"make_step: the dict action_space_mapping must have just the actions of {space};"
-            f" missing: {absent}, not in the space: {surplus}"
+        yield (
+            f"the dict action_space_mapping must have just the actions of {space}; missing: {absent}, not in the space:"
+            f" {surplus}"
         )
 
 
@@ -235,96 +230,67 @@ def inverse(definition: Definition) -> dict[Any, Any] | None:
 BY_NAME: Final = "simenv_marl_point"
 """The attribute with the name of a function that a simulation names itself and that is not in a module."""
 
-_REGISTRY: "WeakValueDictionary[str, DecisionPoint]" = WeakValueDictionary()
-"""The decorated points, by dotted name. Weak, so that a model can be garbage-collected with its points."""
+DecisionPoint = Hook
+"""A function of a model that decides something, under any definition: the hook of that function."""
 
 
-class DecisionPoint:
-    """A function of a model that decides something, under any definition.
-
-    Attributes:
-        hook: The hook of the function.
-        name: The dotted name, ``package.module.Class.function``.
-        rule: The undecorated function, which decides where no environment or policy does.
-        definition: The latest definition, which the bare name means; None for a point that was named from outside the
-            model and is a decision point for some environments only.
-        removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
-    """
-
-    __slots__ = ("__weakref__", "definition", "hook", "name", "removed_by", "rule")
-
-    def __init__(self, hook: Hook) -> None:
-        self.hook, self.name, self.rule = hook, hook.name, hook.function
-        self.definition: Definition | None = None
-        self.removed_by: dict[Any, Mapped | None] = {}
-
-    def __repr__(self) -> str:
-        return f"<DecisionPoint {self.name}>"
-
-    def __reduce__(self) -> Any:
-        return point_for, (self.hook,), self.definition
-
-    def __setstate__(self, definition: Definition) -> None:
-        """Set the definition after unpickling, unless the point has one of this process."""
-        if self.definition is None:
-            self.definition = definition
-            _REGISTRY.setdefault(self.name, self)
-
-    @property
-    def letters(self) -> str:
-        """The letters of the function's name in lower case, for the default name of its agent."""
-        return re.sub("[^a-z]", "", self.name.rpartition(".")[2].lower()) or "agent"
-
-
-def point_for(hook: Hook) -> "DecisionPoint":
-    """Return the decision point of a hook, which may be new.
+def point_for(hook: Hook) -> DecisionPoint:
+    """Return a hook as a decision point.
 
     Raises:
         PatchError: The hook's function is not written in Python.
     """
     if not isinstance(hook.function, FunctionType):
         raise PatchError(f"{hook.name} cannot be a decision point: it is not a function written in Python")
-    if hook.point is None:
-        hook.point = DecisionPoint(hook)
-    point: DecisionPoint = hook.point
-    return point
+    return hook
 
 
-def point_of(function: Any) -> "tuple[DecisionPoint, Definition | None] | None":
+def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
     """Return the point of a decision function, also as an attribute of a class, and its definition; or None."""
     hook = hook_of(function)
-    if hook is None:
-        return None
-    definition: Definition | None = made_with(unbind(function))
-    if definition is None and hook.point is None:
-        return None
-    return point_for(hook), definition
+    return None if hook is None else (hook, made_with(unbind(function)))
 
 
-def registered(name: str) -> "DecisionPoint | None":
-    """Return the decorated decision point with that dotted name."""
-    return _REGISTRY.get(name)
+def registered() -> dict[str, DecisionPoint]:
+    """Return the decorated points, by dotted name. Nothing keeps them, so that a model is collected with its points."""
+    return {hook.name: hook for hook in hooks() if hook.definition is not None}
 
 
 def decision_points() -> list[str]:
-    """Return the dotted names of all decorated decision points, in the order of decoration."""
-    return list(_REGISTRY)
+    """Return the dotted names of all decorated decision points, in the order in which they were first wrapped."""
+    return list(registered())
 
 
 # -- differences ----------------------------------------------------------------------------------
 
 
-class Difference:
-    """A mapping that returns the change of another mapping's value. Made by ``difference``."""
+class difference:  # noqa: N801 - it is used like a function
+    """A mapping that returns the change of ``function(*arguments)``.
+
+    The change is the difference from its value at the last call for the same agent in the same episode; it is 0.0 at
+    the first call, and wherever the mapping is not called for an environment. It can be used as a mapping, or be called
+    in one. It replaces the global variable that a reward such as "water used since the last decision" would need
+    (paper, supplement S2).
+    """
 
     def __init__(self, function: Mapped) -> None:
+        """Make the mapping.
+
+        Args:
+            function: A callable of the decision call's arguments that returns a number.
+
+        Raises:
+            DefinitionError: ``function`` is not callable.
+        """
+        if not callable(function):
+            raise DefinitionError(f"difference: {short_repr(function)} is not callable")
         if not DIFFERENCES:  # one is enough
             DIFFERENCES.append(getattr(function, "__qualname__", None) or short_repr(function))
         self._function = function
         update_wrapper(self, function)
 
     def __reduce__(self) -> Any:
-        return Difference, (self._function,)  # which notes, in another process too, that there are differences
+        return difference, (self._function,)  # which notes, in another process too, that there are differences
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Return the change of the function's value for these arguments."""
@@ -336,24 +302,3 @@ class Difference:
         before = memory.get(self, value)
         memory[self] = copy(value) if isinstance(value, np.ndarray) else value  # an array may change in place
         return value - before
-
-
-def difference(function: Mapped) -> Difference:
-    """Make a mapping that returns the change of ``function(*arguments)``.
-
-    The change is the difference from its value at the last call for the same agent in the same episode; it is 0.0 at
-    the first call. The result can be used as a mapping, or be called in one. It replaces the global variable that a
-    reward such as "water used since the last decision" would need (paper, supplement S2).
-
-    Args:
-        function: A callable of the decision call's arguments that returns a number.
-
-    Returns:
-        The mapping. It returns 0.0 when it is not called for an environment's mapping.
-
-    Raises:
-        DefinitionError: ``function`` is not callable.
-    """
-    if not callable(function):
-        raise DefinitionError(f"difference: {short_repr(function)} is not callable")
-    return Difference(function)

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from types import FunctionType, MappingProxyType, MethodType
 from typing import Any, Final, TypeVar, cast
 
 from .decision import decision_points
 from .errors import HandlerError, PatchError, UnknownTargetError, name_of, short_repr
-from .hooks.handlers import TRACE, Call, ChangedArgs, ChangedResult, Handler, Installation, Target
-from .hooks.hook import Hook, hook_of
+from .hooks.handlers import CALLS, TRACE, Call, ChangedArgs, ChangedResult, Handler, Installation, recorder
+from .hooks.hook import Hook, hook_of, hooks
 from .hooks.places import (
-    Purpose,
     find_hook,
     hook_at,
     is_importable,
@@ -55,7 +55,7 @@ _FUNCTIONS: Final = (staticmethod, classmethod, FunctionType, MethodType)
 
 def exposed_functions() -> list[str]:
     """Return the names of all targets that are exposed to plugins or have handlers."""
-    return sorted({target.name for target in Target.all.values() if target.exposed or target.slot})
+    return sorted({target.name for target in hooks() if target.exposed or target.slot})
 
 
 def attached_handlers(env: Any = None) -> list[Entry]:
@@ -70,11 +70,11 @@ def attached_handlers(env: Any = None) -> list[Entry]:
     if env is not None:
         entries: list[Entry] = env.unwrapped.plugins
         return entries
-    targets = sorted(Target.all.values(), key=lambda target: target.name)
-    return [(handler.function, target.name, handler.position) for target in targets for handler in _general(target)]
+    found = sorted(hooks(), key=lambda target: target.name)
+    return [(handler.function, target.name, handler.position) for target in found for handler in _general(target)]
 
 
-def _general(target: Target) -> list[Handler]:
+def _general(target: Hook) -> list[Handler]:
     """Return the handlers of a target that users have attached for the whole process."""
     return [handler for handler in target.handlers if handler.owner is None and handler.position is not TRACE]
 
@@ -99,23 +99,19 @@ def expose_to_plugins(function_or_iterable: Thing) -> Thing:
     Raises:
         PatchError: It is neither of these, or a method that is bound to one object.
     """
-    with LOCK:
-        return cast("Thing", _expose(function_or_iterable))
-
-
-def _expose(thing: Any) -> Any:
+    thing: Any = function_or_iterable
     if _proxied(thing) is not None:
-        return thing
+        return function_or_iterable
     if isinstance(thing, _FUNCTIONS):
-        function, binding = split_binding(thing)
-        known = hook_of(function)
-        again = known is not None and known.permanent  # decorated or exposed already
-        hook, _ = permanent_hook(thing)
-        hook.exposed = True
-        if again and isinstance(thing, (staticmethod, classmethod)):
-            return thing
-        wrapper = function if again else hook.make_wrapper()
-        return wrapper if binding is None else binding(wrapper)
+        wrapper, binding = split_binding(thing)
+        known = hook_of(wrapper)
+        if known is None or not known.permanent:  # else it is decorated or exposed already
+            known, _ = permanent_hook(thing)
+            wrapper = known.make_wrapper()
+        known.exposed = True
+        if isinstance(thing, (staticmethod, classmethod)) and thing.__func__ is wrapper:
+            return function_or_iterable
+        return cast("Thing", wrapper if binding is None else binding(wrapper))
     if isinstance(thing, type):
         raise PatchError(
             f"the class {name_of(thing)} cannot be exposed to plugins: expose one of its functions, such as __init__ or"
@@ -124,45 +120,37 @@ def _expose(thing: Any) -> Any:
     if isinstance(thing, Iterable) or (hasattr(type(thing), "__getitem__") and hasattr(type(thing), "__len__")):
         from .hooks.iterables import expose  # its dependency imports asyncio, which slows down decisions
 
-        return expose(thing)
+        return cast("Thing", expose(thing))
     if callable(thing):
         hook = Hook(thing, f"{getattr(thing, '__module__', None) or '?'}.{name_of(thing)}")
         hook.exposed = True
-        return hook.make_wrapper()
+        return cast("Thing", hook.make_wrapper())
     raise PatchError(f"{short_repr(thing)} cannot be exposed to plugins: it is neither a function nor an iterable")
 
 
-def _proxied(thing: Any) -> Target | None:
+def _proxied(thing: Any) -> Hook | None:
     """Return the target of an exposed iterable; None for anything else."""
     return thing._self_target if hasattr(type(thing), "_self_next") else None
 
 
-_TARGET: Final = Purpose(
-    "target of handlers",
-    UnknownTargetError,
-    exposed_functions,
-    "name a Python function that it calls, or that calls it, or use expose_to_plugins for an iterable",
-)
-
-
-def _find_target(target: Any) -> Target:
+def _find_target(target: Any) -> Hook:
     """Find the target for handlers: a function, an exposed iterable, or the dotted name of one of these."""
     if isinstance(target, str):
         try:
-            owner, attribute = resolve(target, _TARGET)
+            owner, attribute = resolve(target, UnknownTargetError)
         except (UnknownTargetError, PatchError):
-            named = [other for other in Target.all.values() if other.name == target and other.exposed]
+            named = [other for other in hooks() if other.name == target and other.exposed]
             if not named:
                 raise
             return named[-1]  # exposed inside a function, under the latest's name
-        return _proxied(raw_attribute(owner, attribute)) or hook_at(target, owner, attribute, _TARGET)
+        return _proxied(raw_attribute(owner, attribute)) or hook_at(target, owner, attribute, UnknownTargetError)
     found = _proxied(target)
     if found is None and not isinstance(target, _FUNCTIONS):
         raise PatchError(
             f"no handlers can be attached to {short_repr(target)}: pass what expose_to_plugins returns for it, or the"
             " dotted name of a function"
         )
-    return found or find_hook(target, _TARGET)
+    return found or find_hook(target, UnknownTargetError)
 
 
 # -- handlers -------------------------------------------------------------------------------------
@@ -189,7 +177,7 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
     """
     with LOCK:
         made = _make_handler((handler, target, position))
-        made.target.install(made)
+        made.target.install(None, made)
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
@@ -214,7 +202,7 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
             at = ", ".join(sorted({h.position for h in present})) or "nowhere"
             raise HandlerError(f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}")
         for removed in chosen if handler is None else chosen[-1:]:
-            found.uninstall(removed)
+            found.uninstall(None, removed)
 
 
 @contextmanager
@@ -229,7 +217,7 @@ def handlers(*entries: Entry) -> Iterator[None]:
     """
     with LOCK:
         made = [_make_handler(entry) for entry in entries]
-    installation = Installation(made)
+    installation = Installation([(handler.target, handler) for handler in made])
     try:
         yield
     finally:
@@ -237,12 +225,12 @@ def handlers(*entries: Entry) -> Iterator[None]:
 
 
 @contextmanager
-def trace(*targets: Any) -> Iterator[list[Call]]:
+def trace(*functions: Any) -> Iterator[list[Call]]:
     """Record the calls of a model's functions, in the order in which they begin.
 
     Args:
-        *targets: The functions, as ``attach_handler`` takes them. Without arguments: all functions that are exposed or
-            have handlers, and all decorated decision points.
+        *functions: The functions, as ``attach_handler`` takes them. If none is given: all functions that are exposed
+            or have handlers, and all decorated decision points.
 
     Returns:
         A context manager whose value is the list of calls. An entry has the attributes ``target``, ``arguments`` and
@@ -252,11 +240,12 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
         SimEnvError: As ``attach_handler``.
     """
     calls: list[Call] = []
+    record = partial(recorder, calls)
     with LOCK:
-        found = [_find_target(target) for target in targets] if targets else list(Target.all.values())
-        hooks = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
+        found = [_find_target(target) for target in functions] if functions else hooks()
+        traced = [target for target in dict.fromkeys(found) if CALLS[0] in target.positions]
     installation = Installation(
-        [Handler(calls.append, hook, TRACE) for hook in hooks if targets or hook.permanent or hook.slot]
+        [(hook, Handler(record, hook, TRACE)) for hook in traced if functions or hook.permanent or hook.slot]
     )
     try:
         yield calls
@@ -264,7 +253,7 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
         installation.uninstall()
 
 
-def _make_handler(entry: Any, named: Mapping[str, Target] = MappingProxyType({}), owner: Any = None) -> Handler:
+def _make_handler(entry: Any, named: Mapping[str, Hook] = MappingProxyType({}), owner: Any = None) -> Handler:
     """Return a handler, checked to fit its target; ``named`` has names that take precedence over importable names."""
     if not isinstance(entry, (tuple, list)) or len(entry) != 3:
         raise HandlerError(f"handlers are given as (handler, target, position), not {short_repr(entry)}")
@@ -276,53 +265,23 @@ def _make_handler(entry: Any, named: Mapping[str, Target] = MappingProxyType({})
 class Plugins:
     """The handlers of the environments of one plan, attached while one of these is in use.
 
-    It is also the key under which targets know them, and an ``Evaluation``: agents keep the memory of differences.
+    It is also the key under which targets know them, and an entry in ``EVALUATING``; agents have the memory.
     """
 
     memory: dict[Any, Any] | None = None
 
-    def __init__(self, entries: Iterable[Any], named: Mapping[str, Target] = MappingProxyType({})) -> None:
+    def __init__(self, entries: Iterable[Any], named: Mapping[str, Hook] = MappingProxyType({})) -> None:
         """Find the targets, and check that the handlers fit; ``named`` has the names that the simulation defines."""
-        self._given, self._users = list(entries), set[object]()
+        given = list(entries)
         with LOCK:
-            self._handlers = [_make_handler(entry, named, self) for entry in self._given]
-
-    def install(self, user: object) -> None:
-        """Attach the handlers until every user has called ``uninstall``."""
-        with LOCK:
-            self._users.add(user)
-            for handler in self._handlers:
-                handler.target.install(handler)
-
-    def uninstall(self, user: object) -> None:
-        """Undo ``install``, also where it failed half-way."""
-        with LOCK:
-            self._users.discard(user)
-            for handler in reversed(self._handlers) if not self._users else ():
-                handler.target.uninstall(handler)
+            self.handlers = [_make_handler(entry, named, self) for entry in given]
+        self.hooks = list(dict.fromkeys(handler.target for handler in self.handlers))
+        self.entries: list[Entry] = [(own.function, own.target.name, own.position) for own in self.handlers]
+        # With the given target where its name would not lead to it in another process.
+        pairs = zip(self.entries, given, strict=True)
+        self.portable: list[Entry] = [entry if is_importable(entry[1]) else own for entry, own in pairs]
 
     @property
     def plugins(self) -> Plugins:
         """This object: its handlers take part in evaluations for its environment."""
         return self
-
-    @property
-    def entries(self) -> list[Entry]:
-        """Tuples of the handler, the dotted name of its target, and its position."""
-        return [(handler.function, handler.target.name, handler.position) for handler in self._handlers]
-
-    @property
-    def portable(self) -> list[Entry]:
-        """The same as ``entries``, but with the given target where its name would not lead to it in another process."""
-        pairs = zip(self.entries, self._given, strict=True)
-        return [entry if is_importable(entry[1]) else given for entry, given in pairs]
-
-    @property
-    def stale(self) -> bool:
-        """Whether something else has replaced a target while nothing was set there."""
-        return any(handler.target.stale for handler in self._handlers)
-
-    @property
-    def hooks(self) -> Iterable[Hook]:
-        """The hooks of functions that have handlers."""
-        return dict.fromkeys(handler.target for handler in self._handlers if isinstance(handler.target, Hook))

@@ -14,10 +14,9 @@ from .core.plan import Plan
 from .core.points import Points
 from .envs import vector_env, view_class
 from .errors import OptionValueError, UnknownPointError, short_repr
-from .simulation import RULE
 
-_RECIPES: dict[str, tuple[Any, Any, dict[str, Any], list[str]]] = {}
-"""What ``register_simulation`` was given, and the names of the active decision points, by name and version."""
+_RECIPES: dict[str, tuple[Any, Any, dict[str, Any]]] = {}
+"""The simulation, the points and the options that ``register_simulation`` was given, by name and version."""
 
 
 def register_simulation(
@@ -54,9 +53,12 @@ def register_simulation(
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
     plan = Plan(simulation, points, options)
     recipe = f"{name}-v{version}"
-    _RECIPES[recipe] = simulation, points, dict(options), [point.point.name for point in plan.active]
-    named = [point.point.name for point in plan.active if point.agent is not None or plan.one_agent is not None]
-    views = {title: {"view": "single", "point": point} for point, title in zip(named, _titles(named), strict=True)}
+    _RECIPES[recipe] = simulation, points, dict(options)
+    named = [point for point in plan.active if point.agent or plan.one_agent]
+    views: dict[str, dict[str, Any]] = {}
+    for title, point in zip(_titles([point.point.name for point in named]), named, strict=True):
+        no_roster = {} if point.agent is None else {"possible_agents": None, "undeclared": "error"}
+        views[title] = {"view": "single", "agent": point.agent or plan.one_agent, **no_roster}
     entry, vector_entry = f"{__name__}:make_view", f"{__name__}:make_vector_view"
     where = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
     made: list[str] = []
@@ -92,13 +94,13 @@ def _camel(point: str, parts: int) -> str:
 # -- entry points ---------------------------------------------------------------------------------
 
 
-def make_view(recipe: str, module: str, view: str, point: str | None = None, **options: Any) -> Any:
+def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
     """Make an environment of a registered simulation.
 
     Gymnasium reads render modes from the metadata of a class, which an entry point for many simulations lacks.
     Therefore this applies the wrapper by which Gymnasium supplies a render mode that the simulation lacks.
     """
-    simulation, points, options = _recall(recipe, module, view, point, options)
+    simulation, points, options = _recall(recipe, module, view, options)
     mode = options.pop("render_mode", None)
     plan = Plan(simulation, points, options)
     modes = plan.render_modes
@@ -112,15 +114,15 @@ def make_view(recipe: str, module: str, view: str, point: str | None = None, **o
     return env if wrapper is None else wrapper(env)
 
 
-def make_vector_view(recipe: str, module: str, view: str, point: str | None = None, **options: Any) -> Any:
+def make_vector_view(recipe: str, module: str, view: str, **options: Any) -> Any:
     """Make a vector environment. ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``."""
-    simulation, points, options = _recall(recipe, module, view, point, options)
+    simulation, points, options = _recall(recipe, module, view, options)
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
     options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
     return vector_env(simulation, points, view=view, **options)
 
 
-def _recall(recipe: str, module: str, view: str, point: str | None, options: Any) -> tuple[Any, Any, dict[str, Any]]:
+def _recall(recipe: str, module: str, view: str, options: Any) -> tuple[Any, Any, dict[str, Any]]:
     """Return the simulation and the points of a recipe, and its options for a view."""
     if recipe not in _RECIPES and module != "__main__":
         importlib.import_module(module)  # as in a process that has only the spec
@@ -129,13 +131,6 @@ def _recall(recipe: str, module: str, view: str, point: str | None, options: Any
             f"no simulation is registered as {recipe!r} in this process; import the module that registers it, or"
             ' make the environment by "module:id"'
         )
-    simulation, points, registered, active = _RECIPES[recipe]
+    simulation, points, registered = _RECIPES[recipe]
     for_view = {} if view == "joint" else {"flatten": False}  # an option of the joint view alone
-    merged = {**registered, **for_view, **options}
-    if point is not None:
-        rules = {other: RULE for other in active if other != point}
-        merged["policies"] = rules | dict(merged.get("policies") or {})
-        if merged.get("agent") is None:
-            merged.pop("possible_agents", None)
-            merged.pop("undeclared", None)
-    return simulation, points, merged
+    return simulation, points, {**registered, **for_view, **options}

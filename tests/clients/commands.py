@@ -33,6 +33,6 @@ def python(*arguments: object, **environment: str) -> str:
     return done.stdout
 
 
-def example(name: str, *arguments: object, **environment: str) -> str:
-    """Run a module of the examples as the Makefile does; otherwise like ``python``."""
-    return python("-m", f"examples.{name}", *arguments, **environment)
+def module(name: str, *arguments: object, **environment: str) -> str:
+    """Run a module of the repository as the Makefile does; otherwise like ``python``."""
+    return python("-m", name, *arguments, **environment)

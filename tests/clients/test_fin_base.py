@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import pytest
 import torch
 from examples.fin_base.env import FundSim
 
@@ -11,12 +10,6 @@ from simenv_marl import evaluate
 from .page import blocks
 
 UNSEEN = range(2_000_000, 2_000_128)
-
-
-@pytest.fixture(autouse=True)
-def _the_same_at_every_run():
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
 
 
 def welfare_gained(learner, agents):

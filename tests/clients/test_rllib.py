@@ -9,7 +9,6 @@ os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 import numpy as np
 import pytest
 import ray
-import torch
 from examples.greenhouse_coop.env import parallel_env as parallel_greenhouse
 from examples.greenhouse_coop.env import raw_env as aec_greenhouse
 from examples.greenhouse_coop.env import watering_env
@@ -28,6 +27,7 @@ from simenv_marl.envs import pad_agents
 
 from . import commands
 from .page import DOCS, blocks
+from .returns import parallel_return, single_return
 
 HELD_OUT = range(10_000, 10_010)
 GREENHOUSES = {
@@ -51,9 +51,7 @@ def _ray():
 
 
 @pytest.fixture(autouse=True)
-def _the_same_at_every_run():
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
+def _also_without_torch():
     random.seed(0)
     np.random.seed(0)
 
@@ -130,16 +128,10 @@ def in_the_greenhouse(policies):
     return gained / len(HELD_OUT)
 
 
-def in_the_hive(policy, seeds=range(10_000, 10_040)):
-    """The nectar that bees bring home in the model's own loop when a policy decides for each."""
-    brought = 0.0
-    for seed in seeds:
-        env = parallel_env(HiveSim, points(DEFINITION), possible_agents=BEES)
-        observations, _ = env.reset(seed=seed)
-        while env.agents:
-            observations, rewards, _, _, _ = env.step({agent: policy(observations[agent]) for agent in env.agents})
-            brought += sum(rewards.values())
-    return brought / len(seeds)
+def in_the_hive(policy):
+    """The nectar that bees bring home when a policy decides for each."""
+    env = parallel_env(HiveSim, points(DEFINITION), possible_agents=BEES)
+    return parallel_return(env, lambda agent, observation, info: policy(observation), range(10_000, 10_040))
 
 
 TAKE_OUT = """
@@ -216,16 +208,7 @@ def test_training_a_single_agent(policy_of):
 
     def worth():
         policy = policy_of(algorithm.get_module())
-        days = []
-        for seed in HELD_OUT:
-            env = watering_env()
-            observation, _ = env.reset(seed=seed)
-            over, gained = False, 0.0
-            while not over:
-                observation, reward, terminated, truncated, _ = env.step(policy(observation))
-                over, gained = terminated or truncated, gained + reward
-            days.append(gained)
-        return np.mean(days)
+        return single_return(watering_env(), lambda observation, info: policy(observation), HELD_OUT)
 
     before = worth()
     for _ in range(6):

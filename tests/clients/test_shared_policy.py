@@ -1,19 +1,13 @@
 """TorchRL: one policy for all sheep of Mesa's model, learnt from the episodes that ``collect_episodes`` returns."""
 
-import csv
-import json
+from functools import partial
 
 import numpy as np
-import pytest
 import torch
-from examples.wolf_sheep import picture, results, train
-from examples.wolf_sheep.env import MOVE, TICKS, Meadow, sheep_points
+from examples.wolf_sheep import train
+from examples.wolf_sheep.env import MOVE, Meadow, sheep_points
 
 from simenv_marl.data import collect_episodes
-
-from . import commands
-
-torch.set_num_threads(1)
 
 SMALL = {"width": 10, "height": 10, "initial_sheep": 30, "initial_wolves": 12}
 
@@ -96,46 +90,10 @@ def test_sheep_learn_to_live_longer():
     """Of the default meadow, on seeds that nobody was trained on: more turns for each sheep than before."""
 
     def turns(policy):
-        found = results.play(policy, 2, range(train.HELD_OUT, train.HELD_OUT + 8), ticks=40, only_with_sheep=True)
+        meadow, seeds = partial(Meadow, 40, only_with_sheep=True), range(train.HELD_OUT, train.HELD_OUT + 8)
+        found = collect_episodes(meadow, {MOVE: policy}, points=sheep_points(2), seeds=seeds)[MOVE]
         return len(found) / len(found.starts)
 
     herd, _ = train.train(2, 0, decisions=50_000, each=8_000, ticks=40)
     before = turns(train.Herd(2, 0).explore)
     assert turns(herd.decide) > 1.5 * before
-
-
-def test_lives_are_told_by_kaplan_and_meier():
-    lengths = np.array([1, 1, 2, 3, 3])
-    died = np.array([True, False, True, True, False])
-    told = results.lives(lengths, died, 5)
-    assert told[:4].tolist() == pytest.approx([1, 4 / 5, 4 / 5 * 2 / 3, 4 / 5 * 2 / 3 * 1 / 2])
-    assert np.isnan(told[4:]).all()
-
-
-def test_by_hand_one_stays_away_from_wolves():
-    played = {
-        name: results.play(policy, 2, range(6), ticks=15)
-        for name, policy in (("hand", results.by_hand), ("random", results.at_random(0)))
-    }
-    eaten = {name: ((found.terminations).sum() / len(found)) for name, found in played.items()}
-    assert eaten["hand"] < 0.7 * eaten["random"]
-
-
-def test_from_training_to_the_pictures(tmp_path):
-    curves, path = tmp_path / "shared-policy-training.csv", tmp_path / "shared-policy.json"
-    options = "--seeds", 2, "--decisions", 1, "--ticks", 5
-    commands.example("wolf_sheep.train", *options, "--out", tmp_path, "--curves", curves)
-    with curves.open(newline="") as file:
-        course = list(csv.DictReader(file))
-    assert {(row["sight"], row["seed"]) for row in course} == {(s, n) for s in "12" for n in "01"}
-    commands.example("wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
-    compared = json.loads(path.read_text())
-    assert list(compared["results"]) == list(picture.STYLES)
-    rule = compared["results"]["the model's rule"]
-    assert rule["numbers"]["sheep"]["50"][0] == 100
-    assert len(rule["numbers"]["wolves"]["25"]) == TICKS + 1
-    assert len(compared["results"]["trained, one step of sight"]["survived"]) == 2
-    told = commands.example("wolf_sheep.picture", "--figures", tmp_path)
-    assert (tmp_path / "shared-policy.png").stat().st_size > 10_000
-    assert (tmp_path / "shared-policy-training.png").stat().st_size > 10_000
-    assert told.count("\n") == 2 + len(picture.STYLES)

@@ -226,21 +226,12 @@ def story_of(envs, number):
 
 @pytest.mark.parametrize("processes", [0, 2])
 def test_environments_of_many_hands(processes):
-    ours, theirs = (story_of(vectors_of(env, processes), 6) for env in (hands(parallel_env), HandsEnv()))
-    assert alike(ours, theirs)
-
-
-@pytest.mark.parametrize("processes", [0, 2])
-def test_environments_that_were_reset_before_they_are_copied(processes):
-    """As PettingZoo's tutorial does it."""
-
-    def begun():
-        env = hands(parallel_env)
-        env.reset(seed=7)
-        return env
-
-    ours, theirs = (story_of(vectors_of(env, processes), 6) for env in (begun(), hands(parallel_env)))
-    assert alike(ours, theirs)
+    """Also of one that was reset before it is copied, as PettingZoo's tutorial does it."""
+    begun = hands(parallel_env)
+    begun.reset(seed=7)
+    theirs = story_of(vectors_of(HandsEnv(), processes), 6)
+    for env in (hands(parallel_env), begun):
+        assert alike(story_of(vectors_of(env, processes), 6), theirs)
 
 
 @pytest.mark.parametrize("wrapper", [pad_agents, suit["black_death_v3"]])
@@ -255,13 +246,22 @@ def test_environments_in_which_agents_are_born_and_die(wrapper):
     assert ends >= 3
 
 
-@pytest.mark.parametrize("multiprocessing", [False, True])
-def test_many_single_views(multiprocessing):
-    ours, theirs = (suit["gym_vec_env_v0"](env, 2, multiprocessing) for env in (dial_env(), DialEnv()))
-    actions = np.full((2, 2), 0.5, np.float32)
-    assert alike(*([each.reset(seed=1), *(each.step(actions) for _ in range(9))] for each in (ours, theirs)))
-    for each in (ours, theirs):
-        each.close()
+@pytest.mark.parametrize(
+    ("wrapper", "options", "reset"),
+    [
+        ("gym_vec_env_v0", {"multiprocessing": False}, {"seed": 1}),
+        ("gym_vec_env_v0", {"multiprocessing": True}, {"seed": 1}),
+        ("stable_baselines3_vec_env_v0", {}, {}),
+    ],
+    ids=["vector", "processes", "stable-baselines3"],
+)
+def test_many_single_views(wrapper, options, reset):
+    actions, told = np.full((2, 2), 0.5, np.float32), []
+    for env in (dial_env(), DialEnv()):
+        envs = suit[wrapper](env, 2, **options)
+        told.append([envs.reset(**reset), *(envs.step(actions) for _ in range(9))])
+        envs.close()
+    assert alike(*told)
 
 
 def test_many_environments_of_turns():
@@ -300,13 +300,6 @@ def test_one_policy_of_stable_baselines3_for_all_agents():
     model.learn(10_000)
     after = parallel_return(tested, greedy)
     assert after > parallel_return(tested, untrained) + 5
-
-
-def test_many_single_views_for_stable_baselines3():
-    ours, theirs = (suit["stable_baselines3_vec_env_v0"](env, 2) for env in (dial_env(), DialEnv()))
-    assert alike(*([each.reset(), *(each.step(np.full((2, 2), 0.5)) for _ in range(9))] for each in (ours, theirs)))
-    for each in (ours, theirs):
-        each.close()
 
 
 def test_what_options_say_in_place_of_wrappers():

@@ -60,19 +60,6 @@ def greedy(algorithm):
     return act
 
 
-def test_two_agents_that_need_each_other():
-    np.random.seed(0)
-    space = spaces.Discrete(4)
-    algorithm = MultiAgentOffPolicyAlgorithm(
-        algorithms=[learner(space, 4), learner(space, 4)], env=PettingZooEnv(aec_env(ShopSim))
-    )
-    before = aec_return(aec_env(ShopSim), greedy(algorithm))
-    train(algorithm, collector_of(algorithm, lambda: PettingZooEnv(aec_env(ShopSim))), 2400)
-    after = aec_return(aec_env(ShopSim), greedy(algorithm))
-    assert after > before + 5
-    assert after > 18  # of 30
-
-
 def test_masks_in_observations():
     """It draws no masked action, not even to explore: that would be an error."""
     bench = make_step(

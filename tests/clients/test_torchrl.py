@@ -18,12 +18,6 @@ VIEWS = {"parallel": parallel_env, "aec": aec_env}
 EVERY_VIEW = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
 
 
-@pytest.fixture(autouse=True)
-def _the_same_at_every_run():
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-
-
 # -- its wrappers and its checker -----------------------------------------------------------------
 
 

@@ -21,7 +21,6 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.data import collect_episodes
-from simenv_marl.errors import ReentrancyError
 
 BOOK = f"{__name__}.Shop.book"
 LOG = []
@@ -228,15 +227,6 @@ def test_the_state_comes_before_it(books) -> None:
     assert of("close") == [1]
 
 
-def test_what_it_uses_belongs_to_the_stack_on_which_it_was_made(books) -> None:
-    # sqlite refuses to close a connection in a thread that has not opened it.
-    env = single_env(Shop, books)
-    env.reset(seed=1)
-    env.step(3)
-    env.close()
-    assert of("close") == [1]
-
-
 def test_branches_end_without_it(books) -> None:
     env = single_env(Shop, books, driver="greenlet")
     env.reset(seed=1)
@@ -244,27 +234,6 @@ def test_branches_end_without_it(books) -> None:
     assert results == [0, 0]
     assert of("close") == []
     env.close()
-
-
-@pytest.mark.parametrize("use", ["step", "reset", "close"])
-def test_the_environment_cannot_be_used_from_inside(books, use) -> None:
-    caught = []
-
-    class Meddling(Shop):
-        def close(self):
-            try:
-                getattr(env, use)(*((1,) if use == "step" else ()))
-            except Exception as error:
-                caught.append(type(error))
-            super().close()
-
-    env = single_env(Meddling, books)
-    env.reset(seed=1)
-    env.close()
-    assert of("close") == [1]
-    assert len(caught) == 1
-    if use != "step":
-        assert issubclass(caught[0], ReentrancyError)
 
 
 @pytest.mark.filterwarnings("ignore:unclosed database", "ignore::pytest.PytestUnraisableExceptionWarning")

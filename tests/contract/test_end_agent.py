@@ -13,7 +13,8 @@ from simenv_marl import (
     simulate,
     single_env,
 )
-from simenv_marl.errors import AgentError
+from simenv_marl.errors import AgentError, UnknownAgentError
+from tests.worlds.models import play
 
 MOVE = f"{__name__}.Seat.move"
 
@@ -57,18 +58,19 @@ def points(**changes):
     return {MOVE: make_step(**given | changes)}
 
 
-def told(env, action=2):
-    env.reset()
-    seen = []
-    for agent in env.agent_iter():
-        observation, reward, terminated, truncated, _ = env.last()
-        seen.append((agent, observation.item(), reward, terminated))
-        env.step(None if terminated or truncated else action)
-    return seen
+def told(env):
+    turns = play(env, 2)
+    return [(turn.agent, turn.observation.item(), turn.reward, turn.terminated) for turn in turns]
 
 
-def test_it_is_rewarded_and_observed_for_the_last_time_and_leaves() -> None:
-    assert told(aec_env(Table, points())) == [
+def test_the_agent_is_rewarded_and_observed_for_the_last_time_and_leaves() -> None:
+    class Named(Table):
+        def end_agent(self, name):
+            self.said = name
+            super().end_agent(name=name)
+
+    env = aec_env(Named, points())
+    assert told(env) == [
         ("seat_0", 0, 0, False),
         ("seat_1", 0, 0, False),
         ("seat_2", 0, 0, False),
@@ -80,46 +82,50 @@ def test_it_is_rewarded_and_observed_for_the_last_time_and_leaves() -> None:
         ("seat_0", 6, 6, True),
         ("seat_2", 6, 6, True),
     ]
-
-
-def test_in_rounds_it_ends_in_the_round_in_which_it_is_out() -> None:
-    env = parallel_env(Table, points(), possible_agents=[f"seat_{number}" for number in range(3)])
-    env.reset()
-    _, rewards, terminations, _, _ = env.step(dict.fromkeys(env.agents, 3))
-    assert rewards == {"seat_0": 3, "seat_1": 3, "seat_2": 3}
-    assert terminations == {"seat_0": False, "seat_1": True, "seat_2": False}
-    assert env.agents == ["seat_0", "seat_2"]
-
-
-def test_the_single_view_ends_with_its_agent() -> None:
-    env = single_env(Table, points(), agent="seat_1")
-    env.reset()
-    assert env.step(4)[1:4] == (4.0, True, False)
-
-
-def test_by_keyword_and_through_a_method_of_its_own() -> None:
-    class Named(Table):
-        def end_agent(self, name):
-            self.said = name
-            super().end_agent(name=name)
-
-    env = aec_env(Named, points())
-    assert [agent for agent, *_, terminated in told(env) if terminated] == ["seat_1", "seat_0", "seat_2"]
-    assert env.unwrapped.simulation.said == "seat_1"
+    assert env.simulation.said == "seat_1"
 
 
 @pytest.mark.parametrize("out", ["seat_7", None, 3])
-def test_what_is_no_live_agent_is_left_alone(out) -> None:
+def test_names_of_no_live_agent_are_left_alone(out) -> None:
     class Other(Table):
         pass
 
     Other.out = out
-    assert [agent for agent, *_, terminated in told(aec_env(Other, points())) if terminated] == [
-        "seat_0", "seat_1", "seat_2",
-    ]  # fmt: skip
+    ends = [agent for agent, *_, terminated in told(aec_env(Other, points())) if terminated]
+    assert ends == ["seat_0", "seat_1", "seat_2"]
 
 
-def test_outside_an_environment_it_does_nothing() -> None:
+@pytest.mark.parametrize("early", [False, True])
+def test_in_rounds_an_agent_ends_in_the_round_in_which_it_is_out_or_else_in_the_first(early) -> None:
+    class Early(Table):
+        def run(self):
+            self.end_agent(self.out)
+            self.seats = self.seats[::2]
+            super().run()
+
+    env = parallel_env(Early if early else Table, points(), possible_agents=[f"seat_{number}" for number in range(3)])
+    env.reset()
+    _, rewards, terminations, _, _ = env.step(dict.fromkeys(env.agents, 3))
+    assert rewards == {"seat_0": 3, "seat_1": 0 if early else 3, "seat_2": 3}
+    assert terminations == {"seat_0": False, "seat_1": True, "seat_2": False}
+    assert env.agents == ["seat_0", "seat_2"]
+    assert set(env.step(dict.fromkeys(env.agents, 3))[0]) == {"seat_0", "seat_2"}
+    with pytest.raises(UnknownAgentError, match="seat_1"):
+        env.step({"seat_1": 3})
+
+
+def test_the_single_view_ends_with_its_agent() -> None:
+    class Alone(Table):
+        def run(self):
+            self.seats[0].points += self.seats[0].move()
+            self.end_agent("one")
+
+    for env in (single_env(Table, points(), agent="seat_1"), single_env(Alone, points(agent="one"))):
+        env.reset()
+        assert env.step(4)[1:4] == (4.0, True, False)
+
+
+def test_outside_an_environment_end_agent_does_nothing() -> None:
     table = Table()
     table.reset()
     table.run()
@@ -133,7 +139,7 @@ def test_outside_an_environment_it_does_nothing() -> None:
     assert [seat.points for seat in table.seats] == [3, 3]
 
 
-def test_to_decide_after_it_is_an_error() -> None:
+def test_an_agent_that_decides_after_its_end_is_an_error() -> None:
     class Undead(Table):
         def run(self):
             self.end_agent("seat_0")
@@ -150,16 +156,3 @@ def test_to_decide_after_it_is_an_error() -> None:
     env.step(None)
     with pytest.raises(AgentError, match="after its end"):
         env.step(RULE)
-
-
-def test_an_agent_with_a_name_of_its_own_can_end_so() -> None:
-    class Alone(Table):
-        out = "one"
-
-        def run(self):
-            self.seats[0].move()
-            self.end_agent("one")
-
-    env = single_env(Alone, points(agent="one"))
-    env.reset()
-    assert env.step(1)[2:4] == (True, False)

@@ -6,18 +6,16 @@ import signal
 import subprocess
 import sys
 import warnings
-import weakref
 from contextlib import suppress
 from textwrap import dedent
 
 import pytest
 from benchmarks import soak
 
-from simenv_marl import aec_env, joint_env, parallel_env, single_env
+from simenv_marl import single_env
 from simenv_marl.core.options import Options
 from tests.worlds.models import decision, define, script
 
-VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
 SECONDS = 60
 """What a process may take at most: far more than it needs, so that only one that hangs is ended."""
 
@@ -45,11 +43,6 @@ def process(code):
     )  # fmt: skip
 
 
-def stepped(env, view):
-    """Take a step of an environment of ``choose_0``."""
-    return env.step({"choose_0": 3} if view in (parallel_env, joint_env) else 3)
-
-
 # -- many episodes --------------------------------------------------------------------------------
 
 
@@ -59,39 +52,11 @@ def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
     before = soak.figures()
     soak.play(driver(), 1500, draw)
     after = soak.figures()
-    for name in ("threads", "greenlets", "descriptors"):
-        assert after[name] <= before[name], name
-    assert after["objects"] <= before["objects"] + 100
+    for name in ("threads", "greenlets", "descriptors", "objects"):
+        assert after[name] <= before[name] + soak.GROWTH.get(name, 0), name
 
 
 # -- environments ---------------------------------------------------------------------------------
-
-
-@VIEWS
-def test_environments_that_refer_to_themselves_are_collected_though_closing_failed(view):
-    class Model:
-        def reset(self):
-            pass
-
-        def run(self):
-            try:
-                decide()
-            finally:
-                raise ZeroDivisionError
-
-        def expected_calls(self, point):
-            return [()]
-
-    decide = decision()
-    env = view(Model, decide)
-    env.reset()
-    env.unwrapped.simulation.env = env
-    with pytest.raises(ZeroDivisionError):
-        env.close()
-    gone = weakref.ref(env.unwrapped)
-    del env
-    gc.collect()
-    assert gone() is None
 
 
 class Patched:
@@ -151,56 +116,6 @@ def test_an_exit_in_a_group_is_an_exit_and_what_is_with_it_is_an_error():
 # -- processes ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("where", ["here", "daemon", "threads"])
-@pytest.mark.parametrize("state", ["suspended", "failed", "closed", "nested"])
-def test_a_process_ends_though_a_hundred_environments_are_open(where, state):
-    result = process(f"""
-        decide = decision()
-        state = {state!r}
-        def main(simulation):
-            if state == "nested":
-                simulation.inner = single_env(calling(decide, decide), decide)
-                simulation.inner.reset()
-            decide()
-            decide()
-            if state == "failed":
-                raise ZeroDivisionError
-        envs = []
-        def use(number):
-            for _ in range(number):
-                env = random.choice([single_env, aec_env])(script(main), decide)
-                envs.append(env)
-                env.reset()
-                env.step(1)
-                try:
-                    if state == "failed":
-                        env.step(1)
-                except ZeroDivisionError:
-                    pass
-                if state == "closed":
-                    env.close()
-        where, done = {where!r}, threading.Semaphore(0)
-        def stay(number):
-            use(number)
-            done.release()
-            threading.Event().wait()
-        if where == "here":
-            use(100)
-        elif where == "daemon":
-            for _ in range(4):
-                threading.Thread(target=stay, args=(25,), daemon=True).start()
-            for _ in range(4):
-                done.acquire()
-        else:
-            for _ in range(4):
-                thread = threading.Thread(target=use, args=(25,))
-                thread.start()
-                thread.join()
-        print(len(envs))
-    """)
-    assert (result.returncode, result.stdout, result.stderr) == (0, "100\n", "")
-
-
 def test_a_model_may_end_the_process():
     code = """
         def main(simulation):
@@ -217,54 +132,6 @@ def test_a_model_may_end_the_process():
     said = process(code.replace("END", "raise KeyboardInterrupt"))
     assert "KeyboardInterrupt" in said.stderr
     assert "went on" not in said.stdout
-
-
-@needs_signals
-@pytest.mark.parametrize("where", ["rule", "mapping", "reset"])
-def test_ctrl_c_in_mid_step_surfaces_and_the_next_episode_is_as_ever(where):
-    result = process(f"""
-        import simenv_marl.core.threads
-        simenv_marl.core.threads.SECONDS_TO_UNWIND = 0.2
-        where, armed = {where!r}, [True]
-        def linger(place):
-            if place == where and armed and armed.pop():
-                signal.setitimer(signal.ITIMER_REAL, 0.05)
-                until = time.monotonic() + 50
-                while time.monotonic() < until:
-                    time.sleep(0.001)
-                print("nobody came")
-        signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
-        def rule():
-            linger("rule")
-            return 0
-        def observe():
-            linger("mapping")
-            return [0, 0]
-        class Model:
-            def reset(self):
-                linger("reset")
-                self.log = []
-            def run(self):
-                try:
-                    for _ in range(3):
-                        self.log.append(decide())
-                finally:
-                    self.log.append("unwound")
-        decide = decision(rule, observation_space_mapping=observe)
-        env = aec_env(Model, decide)
-        try:
-            env.reset()
-            env.step(RULE)
-        except KeyboardInterrupt:
-            print("interrupted")
-        for _ in range(2):
-            env.reset()
-            for _ in range(3):
-                env.step(RULE)
-            print(env.unwrapped.simulation.log)
-    """)
-    log = "[0, 0, 0, 'unwound']\n"
-    assert (result.stdout, result.stderr) == ("interrupted\n" + 2 * log, "")
 
 
 @needs_signals

@@ -1,6 +1,5 @@
 """What the views tell beside observations: goals, masks, the time, the state and pictures."""
 
-import math
 import warnings
 
 import gymnasium
@@ -8,8 +7,6 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import api_test
-from pettingzoo.test.render_test import render_test
 from pettingzoo.utils import wrappers
 
 from simenv_marl import (
@@ -31,10 +28,9 @@ from simenv_marl.errors import (
     ViewError,
 )
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import calling, decision, define, play, rewards_of, script
+from tests.worlds.models import calling, decision, define, play
 
-VIEWS = {"aec": aec_env, "parallel": parallel_env, "single": single_env, "joint": joint_env}
-EVERY_VIEW = pytest.mark.parametrize("make", VIEWS.values(), ids=VIEWS.keys())
+EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 
 
 # -- goals ----------------------------------------------------------------------------------------
@@ -84,30 +80,26 @@ def goals(**changes):
     return {Walker.walk: define(**GOAL | changes)}
 
 
-def test_observations_of_goals():
+def test_goal_based_observations_are_dicts_of_the_users_own():
     env = single_env(Walk, goals())
     assert isinstance(env.observation_space, spaces.Dict)
     assert set(env.observation_space.spaces) == {"observation", "achieved_goal", "desired_goal"}
     assert env.observation_space["achieved_goal"] == env.observation_space["desired_goal"] == GOAL["goal_space"]
-    observation, _ = env.reset(seed=3)
-    assert observation in env.observation_space
-    assert observation["desired_goal"].tolist() == env.simulation.walker.goal.tolist()
+    first, info = env.reset(seed=3)
+    assert info == {}
+    assert first in env.observation_space
+    goal = env.simulation.walker.goal.tolist()
+    assert first["desired_goal"].tolist() == goal
+    first["desired_goal"][:] = first["achieved_goal"][:] = 9
     observation, reward, *_ = env.step(np.array([0.5, -1], np.float32))
     assert observation["achieved_goal"].tolist() == [0.5, -1]
+    assert observation["desired_goal"].tolist() == env.simulation.walker.goal.tolist() == goal
     assert observation["observation"].tolist() == [0.5, -1, 1]
     assert observation["achieved_goal"].dtype == np.float32
-    assert type(reward) is float
-
-
-def test_goals_are_the_users_own():
-    env = single_env(Walk, goals())
-    first, _ = env.reset(seed=3)
-    first["desired_goal"][:] = 9
-    first["achieved_goal"][:] = 9
-    assert env.simulation.walker.place.tolist() == [0, 0]
-    second, *_ = env.step(np.zeros(2, np.float32))
-    assert second["desired_goal"].tolist() == env.simulation.walker.goal.tolist()
     assert first["achieved_goal"].tolist() == [9, 9]
+    assert type(reward) is float
+    with pytest.raises(ViewError, match="masks need a Discrete or MultiDiscrete"):
+        env.action_masks()
 
 
 def test_rewards_are_computed_anew_for_other_goals():
@@ -130,34 +122,29 @@ def test_rewards_are_computed_anew_for_other_goals():
         assert one == reward == batched
 
 
-def test_goals_as_stable_baselines_checks_them():
-    env = single_env(Walk, goals())
-    observation, _ = env.reset(seed=1)
-    observation, reward, _, _, info = env.step(env.action_space.sample())
-    achieved, desired = np.array(observation["achieved_goal"]), np.array(observation["desired_goal"])
-    assert env.compute_reward(achieved, desired, info) == reward
-    rewards = env.compute_reward(np.array([achieved] * 2), np.array([desired] * 2), np.array([info] * 2))
-    assert rewards.shape == (2,)
-    assert rewards[0] == reward
-
-
-def test_gymnasiums_check_of_goals():
+def test_gymnasiums_check_of_goals_passes():
     check_env(single_env(Walk, goals()), skip_render_check=True)
     check_env(generate_env(Walk, goals())(), skip_render_check=True)
     check_env(single_env(Walk, goals(goal_space=spaces.Box(-20, 20, (2,), np.float64))), skip_render_check=True)
 
 
-def test_goals_need_all_of_their_parts():
-    for part in ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward"):
-        with pytest.raises(DefinitionError, match=part):
-            goals(**{part: None})
-    with pytest.raises(DefinitionError, match="must be a gymnasium space"):
-        goals(goal_space=(2,))
-    with pytest.raises(DefinitionError, match="compute_reward must be callable"):
-        goals(compute_reward=3)
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"goal_space": None}, "goal_space"),
+        ({"achieved_goal_mapping": None}, "achieved_goal_mapping"),
+        ({"desired_goal_mapping": None}, "desired_goal_mapping"),
+        ({"compute_reward": None}, "compute_reward"),
+        ({"goal_space": (2,)}, "must be a gymnasium space"),
+        ({"compute_reward": 3}, "compute_reward must be callable"),
+    ],
+)
+def test_goals_need_all_of_their_parts(changes, match):
+    with pytest.raises(DefinitionError, match=match):
+        goals(**changes)
 
 
-def test_goals_that_do_not_fit_their_space():
+def test_goals_are_in_their_space():
     env = single_env(Walk, goals(achieved_goal_mapping=lambda walker, pace: [1, 2, 3]))
     with pytest.raises(ObservationError, match="its space Box"):
         env.reset()
@@ -172,64 +159,36 @@ def test_other_views_observe_no_goals(make):
         assert env.observation_space("walker_0") == GOAL["observation_space"]
 
 
-def test_goals_and_masks():
-    """A mask in the observation stays where it belongs."""
+@pytest.mark.parametrize("seen", [True, False])
+def test_masks_stay_where_they_belong_beside_goals(seen):
     space = spaces.Dict({"place": spaces.Box(-20, 20, (2,), np.float32), "action_mask": spaces.MultiBinary(3)})
     changes = {
-        "observation_space": space,
-        "observation_space_mapping": lambda walker, pace: {"place": walker.place},
         "action_space": spaces.Discrete(3),
         "action_space_mapping": lambda action: np.array([action - 1.0, 0]),
         "action_mask_mapping": lambda walker, pace: [1, 0, 1],
     }
+    if seen:
+        changes |= {
+            "observation_space": space,
+            "observation_space_mapping": lambda walker, pace: {"place": walker.place},
+        }
     env = single_env(Walk, goals(**changes))
     observation, info = env.reset()
     assert observation in env.observation_space
     assert info["action_mask"].tolist() == [1, 0, 1]
-    assert observation["observation"]["action_mask"].tolist() == [1, 0, 1]
+    if seen:
+        assert observation["observation"]["action_mask"].tolist() == [1, 0, 1]
     with pytest.raises(InvalidActionError, match="is masked"):
         env.step(1)
-
-
-def test_goals_and_masks_in_infos():
-    changes = {
-        "action_space": spaces.Discrete(3),
-        "action_space_mapping": lambda action: np.array([action - 1.0, 0]),
-        "action_mask_mapping": lambda walker, pace: [1, 0, 1],
-    }
-    env = single_env(Walk, goals(**changes))
-    _, info = env.reset()
-    assert info["action_mask"].tolist() == [1, 0, 1]
     observation, *_ = env.step(2)
     assert observation["achieved_goal"].tolist() == [1, 0]
-
-
-def test_goals_within_gymnasiums_wrappers():
-    env = gymnasium.wrappers.FlattenObservation(single_env(Walk, goals()))
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (7,)
-    vector = gymnasium.vector.SyncVectorEnv([lambda: single_env(Walk, goals())] * 2)
-    observations, _ = vector.reset(seed=0)
-    assert observations["achieved_goal"].shape == (2, 2)
-    vector.close()
-
-
-def test_with_rule_throughout_goals_change_nothing():
-    plain = Walk()
-    plain.reset(4)
-    plain.run()
-    env = single_env(Walk, goals())
-    env.reset(seed=4)
-    while not any(env.step(RULE)[2:4]):
-        pass
-    assert env.simulation.walker.place.tolist() == plain.walker.place.tolist()
 
 
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def test_masks_on_request():
-    """The method that sb3-contrib's MaskablePPO calls before each step, through whatever wrappers there are."""
+def test_masks_on_request_pass_through_wrappers():
+    """The method that sb3-contrib's MaskablePPO calls before each step."""
     legal = iter([[1, 0], [0, 1], [1, 1]])
     ant = decision(agent="ant_0", action_space=spaces.Discrete(2), action_mask_mapping=lambda: next(legal))
     env = gymnasium.wrappers.RecordEpisodeStatistics(single_env(calling(ant, ant), ant))
@@ -245,103 +204,84 @@ def test_masks_on_request():
     assert masks().tolist() == [True, True]
 
 
+PARTS = spaces.MultiDiscrete([2, 3])
+
+
 @pytest.mark.parametrize(
-    ("space", "number"), [(spaces.Discrete(3, start=2), 3), (spaces.MultiDiscrete([2, 3]), 5)], ids=str
+    ("changes", "expected"),
+    [
+        ({"action_space": spaces.Discrete(3, start=2)}, [True] * 3),
+        ({"action_space": PARTS}, [True] * 5),
+        ({"action_space": spaces.Discrete(4), "choices": lambda: "ab"}, [True, True, False, False]),
+        (
+            {"action_space": PARTS, "action_mask_mapping": lambda: ([1, 0], [0, 1, 1])},
+            [True, False, False, True, True],
+        ),
+    ],
+    ids=["all of one", "all of several", "choices", "several parts"],
 )
-def test_masks_on_request_where_everything_is_legal(space, number):
-    ant = decision(agent="ant_0", action_space=space)
+def test_masks_on_request_are_flat(changes, expected):
+    ant = decision(agent="ant_0", **changes)
     env = single_env(calling(ant), ant)
     env.reset()
-    assert env.action_masks().tolist() == [True] * number
-
-
-def test_masks_on_request_of_choices_and_of_several_parts():
-    ant = decision(agent="ant_0", choices=lambda: "ab", action_space=spaces.Discrete(4))
-    env = single_env(calling(ant), ant)
-    env.reset()
-    assert env.action_masks().tolist() == [True, True, False, False]
-    ant = decision(
-        agent="ant_0",
-        action_space=spaces.MultiDiscrete([2, 3]),
-        action_mask_mapping=lambda: ([1, 0], [0, 1, 1]),
-    )
-    env = single_env(calling(ant), ant)
-    env.reset()
-    assert env.action_masks().tolist() == [True, False, False, True, True]
-
-
-def test_continuous_actions_have_no_masks():
-    env = single_env(Walk, goals())
-    env.reset()
-    with pytest.raises(ViewError, match="masks need a Discrete or MultiDiscrete"):
-        env.action_masks()
-
-
-def masks(**changes):
-    return {"action_mask_mapping": lambda *_: [1] * 4 + [0] * 6, **changes}
+    assert env.action_masks().tolist() == expected
 
 
 @EVERY_VIEW
-def test_masks_in_every_view(make):
-    ant = decision(agent="ant_0", **masks())
+@pytest.mark.parametrize(
+    ("changes", "mask", "illegal", "legal", "log"),
+    [
+        ({"action_mask_mapping": lambda: [1] * 4 + [0] * 6}, [1] * 4 + [0] * 6, [4, 9], [3, 0], [3, 0]),
+        ({"choices": lambda: "ab", "action_space": spaces.Discrete(3)}, [1, 1, 0], [2], [1, 0], ["b", "a"]),
+        (
+            {
+                "action_space": PARTS,
+                "action_space_mapping": lambda action: action.tolist(),
+                "action_mask_mapping": lambda: ([1, 0], [0, 1, 1]),
+            },
+            [[1, 0], [0, 1, 1]],
+            [np.array([1, 1]), np.array([0, 0])],
+            [np.array([0, 2]), np.array([0, 1])],
+            [[0, 2], [0, 1]],
+        ),
+    ],
+    ids=["a mask", "choices", "a mask of several parts"],
+)
+def test_masked_actions_are_illegal_in_every_view(make, changes, mask, illegal, legal, log):
+    ant = decision(agent="ant_0", **changes)
     env = make(calling(ant, ant), ant)
     result = env.reset(seed=1)
     told = {aec_env: lambda: env.infos["ant_0"], joint_env: lambda: {"action_mask": result[1]["action_mask"]["ant_0"]}}
     told |= {parallel_env: lambda: result[1]["ant_0"], single_env: lambda: result[1]}
-    mask = told[make]()["action_mask"]
-    assert mask.tolist() == [1] * 4 + [0] * 6
-    assert mask.dtype == np.int8
+    given = told[make]()["action_mask"]
+    parts = given if isinstance(given, tuple) else (given,)
+    assert [part.tolist() for part in parts] == (mask if isinstance(given, tuple) else [mask])
+    assert {part.dtype for part in parts} == {np.dtype(np.int8)}
+    for part in parts:
+        part[:] = 1  # the user's own
     together = make in (parallel_env, joint_env)
-    with pytest.raises(InvalidActionError, match="is masked"):
-        env.step({"ant_0": 4} if together else 4)
-    mask[:] = 1  # the user's own
-    with pytest.raises(InvalidActionError, match="is masked"):
-        env.step({"ant_0": 4} if together else 4)
-    env.step({"ant_0": 3} if together else 3)
-    assert env.simulation.log == [3]
+    for action in illegal:
+        with pytest.raises(InvalidActionError, match="is masked"):
+            env.step({"ant_0": action} if together else action)
+    assert env.simulation.log == []
+    for action in legal:
+        env.step({"ant_0": action} if together else action)
+    assert env.simulation.log == log
 
 
-@EVERY_VIEW
-def test_choices_in_every_view(make):
-    lists = iter([["a", "b"], ["c"]])
-    ant = decision(agent="ant_0", choices=lambda: offered[-1], action_space=spaces.Discrete(3))
-    offered = []
-
-    def main(simulation):
-        for choices in lists:
-            offered.append(choices)
-            simulation.log.append(ant())
-
-    env = make(script(main), ant)
-    env.reset()
-    together = make in (parallel_env, joint_env)
-    with pytest.raises(InvalidActionError, match="is masked"):
-        env.step({"ant_0": 2} if together else 2)
-    env.step({"ant_0": 1} if together else 1)
-    assert env.simulation.log == ["b"]
-    with pytest.raises(InvalidActionError, match="is masked"):
-        env.step({"ant_0": 1} if together else 1)
-    env.step({"ant_0": 0} if together else 0)
-    assert env.simulation.log == ["b", "c"]
-
-
-def test_masks_of_several_parts():
-    space = spaces.MultiDiscrete([2, 3])
+def test_a_mask_that_the_model_itself_observes_is_no_mask_of_its_decisions():
+    seen = {"observation_space": spaces.Dict({"action_mask": spaces.MultiBinary(2)})}
     ant = decision(
         agent="ant_0",
-        action_space=space,
-        action_space_mapping=lambda action: action.tolist(),
-        action_mask_mapping=lambda: ([1, 0], [0, 1, 1]),
+        action_space=spaces.Discrete(2),
+        observation_space_mapping=lambda: {"action_mask": [0, 1]},
+        **seen,
     )
-    env = parallel_env(calling(ant, ant), ant)
-    _, infos = env.reset()
-    mask = infos["ant_0"]["action_mask"]
-    assert [part.tolist() for part in mask] == [[1, 0], [0, 1, 1]]
-    assert space.contains(space.sample(mask))
-    with pytest.raises(InvalidActionError, match="is masked"):
-        env.step({"ant_0": np.array([1, 1])})
-    env.step({"ant_0": np.array([0, 2])})
-    assert env.simulation.log == [[0, 2]]
+    env = single_env(calling(ant), ant)
+    observation, info = env.reset()
+    assert observation["action_mask"].tolist() == [0, 1]
+    assert info == {}
+    env.step(0)
 
 
 def announcing(main):
@@ -366,15 +306,6 @@ def one_after_the_other(simulation):
         simulation.clock = number * number
         simulation.log.append(being.act())
     simulation.clock = 100
-
-
-@pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_masks_of_those_who_are_announced(make):
-    env = make(announcing(one_after_the_other), beings(**masks()))
-    result = env.reset()
-    infos = env.infos if make is aec_env else result[1]
-    for number in range(3):
-        assert infos[f"being_{number}"]["action_mask"].tolist() == [1] * 4 + [0] * 6
 
 
 # -- time -----------------------------------------------------------------------------------------
@@ -413,34 +344,21 @@ def test_the_time_and_what_has_gone_by_since_the_agents_decision_before():
     assert {type(value) for turn in turns for value in turn.info.values()} == {float}
 
 
-def test_the_time_of_the_single_view():
+@pytest.mark.parametrize("make", [single_env, joint_env])
+def test_the_time_of_views_of_one_agent_is_that_of_its_steps(make):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = single_env(lambda: Clock((np.int64(1), ant), (2, bee), (3, ant), end=4), ant)
-    assert env.reset()[1] == {"time": 1.0, "elapsed": 0.0}
-    assert env.step(1)[-1] == {"time": 3.0, "elapsed": 2.0}
-    assert env.step(RULE)[-1] == {"time": 4.0, "elapsed": 1.0}
+    env = make(lambda: Clock((np.int64(1), ant), (2, bee), (3, ant), end=4), ant)
 
+    def told(action):
+        *_, info = env.reset() if action is None else env.step(action)
+        return info["time"], info["elapsed"]
 
-def test_an_action_that_is_refused_takes_no_time():
-    ant = decision(agent="ant_0")
-    env = single_env(lambda: Clock((1, ant), (3, ant), end=4), ant)
-    env.reset()
-    with pytest.raises(InvalidActionError, match="is not in its action space"):
-        env.step(10)
-    assert env.step(1)[-1] == {"time": 3.0, "elapsed": 2.0}
-
-
-def test_a_semi_markov_discount():
-    """What the docs say the time is for: rewards of long decisions count for longer."""
-    ant = decision(agent="ant_0", reward_mapping=lambda: 1.0)
-    env = single_env(lambda: Clock((0, ant), (1, ant), (4, ant), end=6), ant)
-    env.reset()
-    discount, total, over = 1.0, 0.0, False
-    while not over:
-        _, reward, over, _, info = env.step(1)
-        discount *= 0.5 ** info["elapsed"]
-        total += discount * reward
-    assert total == 0.5**1 + 0.5**4 + 0.5**6
+    for _ in range(2):
+        assert told(None) == (1.0, 0.0)
+        with pytest.raises(InvalidActionError, match="is not in its action space"):
+            told({"ant_0": 10} if make is joint_env else 10)  # takes no time
+        assert told({"ant_0": 1} if make is joint_env else 1) == (3.0, 2.0)
+        assert told(RULE) == (4.0, 1.0)
 
 
 def test_the_time_of_the_dead():
@@ -460,7 +378,7 @@ def test_the_time_of_the_dead():
     assert times(turns, "being_1") == [(3, 0), (8, 5), (8, 0)]
 
 
-def test_the_time_in_turns():
+def test_the_time_of_rounds_that_are_turns():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
     _, infos = env.reset()
@@ -478,14 +396,19 @@ def test_the_time_in_turns():
     ]
 
 
-def test_the_time_of_rounds_in_which_all_are_known():
-    env = parallel_env(announcing(one_after_the_other), beings())
-    _, infos = env.reset()
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_announced_agents_have_masks_and_times(make):
+    env = make(announcing(one_after_the_other), beings(action_mask_mapping=lambda being: [1] * 4 + [0] * 6))
+    result = env.reset()
+    infos = env.infos if make is aec_env else result[1]
+    for number in range(3):
+        assert infos[f"being_{number}"]["action_mask"].tolist() == [1] * 4 + [0] * 6
     assert {(info["time"], info["elapsed"]) for info in infos.values()} == {(0.0, 0.0)}
-    *_, infos = env.step(dict.fromkeys(env.agents, 1))
-    assert {info["time"] for info in infos.values()} == {9.0}
-    assert infos["being_0"]["elapsed"] == 9.0
-    assert all(0 < info["elapsed"] <= 9 for info in infos.values())
+    if make is parallel_env:
+        *_, infos = env.step(dict.fromkeys(env.agents, 1))
+        assert {info["time"] for info in infos.values()} == {9.0}
+        assert infos["being_0"]["elapsed"] == 9.0
+        assert all(0 < info["elapsed"] <= 9 for info in infos.values())
 
 
 def test_time_has_gone_by_for_those_who_act_as_soon_as_they_are_seen():
@@ -498,36 +421,17 @@ def test_time_has_gone_by_for_those_who_act_as_soon_as_they_are_seen():
     assert infos["bee_0"]["elapsed"] > 0  # since 5, when it decided, or since 0, when its action was chosen
 
 
-def test_the_time_of_the_joint_view():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = joint_env(lambda: Clock((0, ant), (5, bee), (7, ant), end=9), [ant, bee])
-    _, info = env.reset()
-    assert info["time"] == 0.0
-    assert env.step({"ant_0": 1, "bee_0": 1})[-1]["time"] == 7.0
-
-
-def test_policies_know_the_time():
-    ant, seen = decision(agent="ant_0"), []
-    simulate(lambda: Clock((1, ant), (3, ant), end=4), {ant: lambda observation, info: seen.append(dict(info)) or 1})
-    assert [info["time"] for info in seen] == [1.0, 3.0]
-
-
 @pytest.mark.parametrize("action", [1, RULE])
-def test_policies_know_how_much_time_has_gone_by(action):
+def test_policies_know_the_time_and_how_much_has_gone_by(action):
     """Since the decision before, whether the policy has taken that or left it to the rule."""
     ant, seen = decision(agent="ant_0"), []
 
     def policy(observation, info):
-        seen.append(info["elapsed"])
+        seen.append((info["time"], info["elapsed"]))
         return action
 
     simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy})
-    assert seen == [0.0, 2.0, 4.0]
-
-
-def test_without_a_clock_there_is_no_time():
-    ant = decision(agent="ant_0")
-    assert single_env(calling(ant), ant).reset()[1] == {}
+    assert seen == [(1.0, 0.0), (3.0, 2.0), (7.0, 4.0)]
 
 
 # -- the state ------------------------------------------------------------------------------------
@@ -552,8 +456,8 @@ class Counted:
 
 
 @EVERY_VIEW
-def test_the_state_is_a_copy_of_the_simulations(make):
-    ant = decision(agent="ant_0")
+def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
+    ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
     env = make(lambda: Counted(ant), ant)
     env.reset()
     state = env.state()
@@ -565,45 +469,38 @@ def test_the_state_is_a_copy_of_the_simulations(make):
     state[:] = 9
     assert env.simulation.numbers.tolist() == [1, 4]
     assert env.state_space is None
-
-
-@EVERY_VIEW
-def test_the_state_is_in_its_space(make):
-    ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
     env = make(lambda: Counted(ant), ant, state_space=space)
     assert env.state_space == space
     env.reset()
-    state = env.state()
-    assert state.dtype == np.float32
-    assert state in env.state_space
+    assert env.state().dtype == np.float32
+    assert env.state() in env.state_space
 
 
-def test_states_that_cannot_be():
-    ant = decision(agent="ant_0")
+def test_states_that_cannot_be_are_refused():
+    ant, being = decision(agent="ant_0"), announcing(one_after_the_other)
     env = parallel_env(lambda: Counted(ant), ant, state_space=spaces.Box(-9, 9, (3,), np.float32))
     env.reset()
     with pytest.raises(ObservationError, match="the observation has shape"):
         env.state()
-    with pytest.raises(OptionValueError, match="must be a gymnasium space"):
-        aec_env(lambda: Counted(ant), ant, state_space=3)
+    for space in (3, "rewards"):
+        with pytest.raises(OptionValueError, match="must be a gymnasium space"):
+            aec_env(lambda: Counted(ant), ant, state_space=space)
     env = parallel_env(calling(ant), ant)
     env.reset()
     with pytest.raises(NotImplementedError):
         env.state()
-
-
-def seeing(number):
-    """What is observed: a pair, or one of three."""
-    return {
-        "agent": ("ant_0", "bee_0")[number],
-        "observation_space": (spaces.Box(0, 9, (2,), np.float32), spaces.Discrete(3))[number],
-        "observation_space_mapping": (lambda: [1, 2], lambda: 2)[number],
-    }
+    for space in (spaces.Sequence(spaces.Discrete(3)), spaces.Graph(spaces.Discrete(3), None)):
+        ant = decision(agent="ant_0", observation_space=space)
+        with pytest.raises(ViewError, match="flattened"):
+            _ = aec_env(calling(ant), ant, state_space="observations").state_space
+    with pytest.raises(ViewError, match="possible_agents"):
+        parallel_env(being, beings(), state_space="observations")
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_the_state_may_be_what_all_observe(make):
-    ant, bee = decision(**seeing(0)), decision(**seeing(1))
+    ant = decision(agent="ant_0", observation_space=spaces.Box(0, 9, (2,), np.float32))
+    bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 2)
     env = make(calling(ant, bee), [ant, bee], state_space="observations")
     assert (env.state_space.low.tolist(), env.state_space.high.tolist()) == ([0] * 5, [9, 9, 1, 1, 1])
     assert env.state_space is env.state_space
@@ -618,26 +515,11 @@ def test_the_state_may_be_what_all_observe(make):
     while env.agents:
         env.step(RULE)
     assert env.state().tolist() == [1, 2, 0, 0, 1]
-
-
-@pytest.mark.parametrize("make", [single_env, joint_env])
-def test_the_state_may_be_what_one_observes(make):
-    ant = decision(**seeing(0))
-    env = make(calling(ant), ant, state_space="observations")
-    env.reset()
-    assert env.state().tolist() == [1, 2]
-    assert env.state() in env.state_space
-
-
-def test_states_of_observations_that_cannot_be():
-    for space in (spaces.Sequence(spaces.Discrete(3)), spaces.Graph(spaces.Discrete(3), None)):
-        ant = decision(agent="ant_0", observation_space=space)
-        with pytest.raises(ViewError, match="flattened"):
-            _ = aec_env(calling(ant), ant, state_space="observations").state_space
-    with pytest.raises(ViewError, match="possible_agents"):
-        parallel_env(announcing(one_after_the_other), beings(), state_space="observations")
-    with pytest.raises(OptionValueError, match="must be a gymnasium space"):
-        aec_env(calling(ant), ant, state_space="rewards")
+    for view in (single_env, joint_env):
+        env = view(calling(ant), ant, state_space="observations")
+        env.reset()
+        assert env.state().tolist() == [1, 2]
+        assert env.state() in env.state_space
 
 
 # -- pictures -------------------------------------------------------------------------------------
@@ -661,13 +543,14 @@ def painted(make=aec_env, **options):
 
 
 @EVERY_VIEW
-def test_rendering(make):
+def test_the_simulation_renders_in_its_modes(make, capsys):
+    step = {"ant_0": 4} if make in (parallel_env, joint_env) else 4
     env = painted(make, render_mode="ansi")
     assert env.render_mode == "ansi"
     assert env.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
     env.reset()
     assert env.render() == "now 0"
-    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    env.step(step)
     assert env.render() == "now 4"
     env = painted(make, render_mode="rgb_array")
     env.reset()
@@ -675,21 +558,13 @@ def test_rendering(make):
     assert picture.shape == (4, 6, 3)
     assert picture.dtype == np.uint8
     env.close()
-
-
-@EVERY_VIEW
-def test_rendering_for_people(make, capsys):
     env = painted(make, render_mode="human")
     env.reset()
     assert capsys.readouterr().out == "now 0\n"
-    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    env.step(step)
     assert capsys.readouterr().out == "now 4\n"
     assert env.render() is None
     assert capsys.readouterr().out == "now 4\n"
-
-
-@EVERY_VIEW
-def test_rendering_that_cannot_be(make):
     with pytest.raises(OptionValueError, match="is not one of the simulation's"):
         painted(make, render_mode="video")
     ant = decision(agent="ant_0")
@@ -701,7 +576,7 @@ def test_rendering_that_cannot_be(make):
         assert env.render() is None
 
 
-def test_what_is_rendered_runs_the_rule():
+def test_decision_functions_called_while_rendering_run_their_rule():
     ant = decision(agent="ant_0")
 
     class Curious(Painted):
@@ -715,7 +590,12 @@ def test_what_is_rendered_runs_the_rule():
 
 
 @pytest.mark.parametrize("make", [single_env, joint_env])
-def test_gymnasium_collects_pictures(make):
+def test_gymnasium_checks_and_collects_pictures(make):
+    for mode in ("ansi", "rgb_array"):
+        with warnings.catch_warnings():
+            # Other render modes can be tested on registered environments alone.
+            warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes")
+            check_env(painted(make, render_mode=mode))
     env = gymnasium.wrappers.RenderCollection(painted(make, render_mode="rgb_array"))
     env.reset()
     for _ in range(2):
@@ -723,40 +603,7 @@ def test_gymnasium_collects_pictures(make):
     assert [frame.max() for frame in env.render()] == [0, 4, 8]
 
 
-@pytest.mark.parametrize("make", [single_env, joint_env])
-@pytest.mark.parametrize("mode", ["ansi", "rgb_array", None])
-def test_gymnasiums_check_with_pictures(make, mode):
-    with warnings.catch_warnings():
-        # Other render modes can be tested on registered environments alone.
-        warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes")
-        check_env(painted(make, render_mode=mode), skip_render_check=mode is None)
-
-
-def test_pettingzoo_renders(capsys):
-    with warnings.catch_warnings():
-        # PettingZoo's test renders pictures in one mode after the other.
-        warnings.filterwarnings("ignore", message=".*")
-        render_test(lambda render_mode: painted(render_mode=render_mode))
+def test_pettingzoo_captures_what_is_printed(capsys):
     env = wrappers.CaptureStdoutWrapper(painted(render_mode="human"))
     env.reset()
     assert env.render() == "now 0\n"
-    api_test(painted(render_mode="ansi"), num_cycles=5)
-    capsys.readouterr()
-
-
-# -- all of it ------------------------------------------------------------------------------------
-
-
-def test_rewards_and_infos_of_a_simulation_that_tells_everything():
-    class Everything(Painted):
-        def time(self):
-            return float(self.numbers[0])
-
-        def expected_calls(self, point):
-            return [()]
-
-    ant = decision(agent="ant_0", reward_mapping=lambda: 2.0, **masks())
-    turns = play(aec_env(lambda: Everything(ant), ant, render_mode="ansi"), 3)
-    assert rewards_of(turns, "ant_0") == [2.0, 2.0, 2.0]
-    assert all(math.isfinite(turn.info["time"]) and "action_mask" in turn.info for turn in turns)
-    assert [turn.info["elapsed"] for turn in turns] == [0.0, 1.0, 1.0, 0.0]

@@ -92,7 +92,7 @@ def test_the_views_agree_in_decisions_rewards_and_outcome(design, seed, options)
 
 @given(designs, seeds)
 @settings(max_examples=100)
-def test_policies_for_the_others_are_as_good_as_their_user(design, seed):
+def test_policies_for_the_others_decide_as_their_user_would(design, seed):
     everybody = made(aec_env, design)
     _, totals = played(everybody, seed)
     others = {name: advised for name in POINTS if name not in PLAN}

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from hypothesis import given, settings
 
-from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, joint_env, parallel_env, vector_env
+from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, vector_env
 from simenv_marl.errors import (
     AgentError,
     EpisodeOverError,
@@ -35,8 +35,8 @@ BOX = {"action_space": spaces.Box(0, 1, (1,), np.float32), "action_space_mapping
 
 
 def test_spaces_are_dicts_keyed_by_agent():
-    ant, bee = points()
-    env = joint_env(calling(ant, bee), [ant, bee])
+    ant, bee, cat = points(3)
+    env = joint_env(calling(ant, cat, bee), [ant, bee, cat], policies={"cat_0": lambda observation: 7})
     assert env.action_space == spaces.Dict({"ant_0": spaces.Discrete(10), "bee_0": spaces.Discrete(10)})
     assert list(env.observation_space.spaces) == ["ant_0", "bee_0"]
     observation, info = env.reset(seed=1)
@@ -44,67 +44,60 @@ def test_spaces_are_dicts_keyed_by_agent():
     assert observation["ant_0"].tolist() == [1, 2]
     assert observation["bee_0"].tolist() == [0, 0]
     assert info == {"deciding": "ant_0", "acted": {"ant_0": False, "bee_0": False}}
+    env.step({"ant_0": 1, "bee_0": 2})
+    assert env.simulation.log == [1, 7, 2]
 
 
-def test_a_step_is_a_round():
+@pytest.mark.parametrize("max_steps", [None, 2])
+def test_a_step_is_a_round(max_steps):
     ant, bee = points(reward_mapping=lambda: 1.5)
-    env = joint_env(calling(ant, bee, ant, bee), [ant, bee])
-    env.reset()
-    observation, reward, terminated, truncated, info = env.step({"bee_0": 2, "ant_0": 1})
-    assert env.simulation.log == [1, 2]
-    assert observation in env.observation_space
-    assert (reward, terminated, truncated) == (3.0, False, False)
-    assert type(reward) is float
-    assert type(terminated) is type(truncated) is bool
-    assert info == {"deciding": "ant_0", "acted": {"ant_0": True, "bee_0": True}}
-    *_, terminated, truncated, info = env.step({"ant_0": 3, "bee_0": 4})
-    assert env.simulation.log == [1, 2, 3, 4]
-    assert (terminated, truncated) == (True, False)
-    assert info["deciding"] == ""
-    with pytest.raises(EpisodeOverError, match="begin the next one"):
-        env.step({"ant_0": 3, "bee_0": 4})
-
-
-def test_a_round_ends_where_an_action_was_used_already():
-    ant, bee = points()
-    env = joint_env(calling(ant, ant, bee), [ant, bee])
-    env.reset()
-    *_, info = env.step({"ant_0": 1, "bee_0": 2})
-    assert env.simulation.log == [1]
-    assert info == {"deciding": "ant_0", "acted": {"ant_0": True, "bee_0": False}}
-    *_, terminated, _, info = env.step({"ant_0": 3, "bee_0": 4})
-    assert env.simulation.log == [1, 3, 4]
-    assert terminated
+    calls = [ant, bee] * (2 if max_steps is None else 9)
+    env = joint_env(calling(*calls), [ant, bee], max_steps=max_steps)
+    for _ in range(2):
+        env.reset()
+        observation, reward, terminated, truncated, info = env.step({"bee_0": 2, "ant_0": 1})
+        assert env.simulation.log == [1, 2]
+        assert observation in env.observation_space
+        assert (reward, terminated, truncated) == (3.0, False, False)
+        assert type(reward) is float
+        assert type(terminated) is type(truncated) is bool
+        assert info == {"deciding": "ant_0", "acted": {"ant_0": True, "bee_0": True}}
+        *_, terminated, truncated, info = env.step({"ant_0": 3, "bee_0": 4})
+        assert env.simulation.log == [1, 2, 3, 4]
+        assert (terminated, truncated) == (max_steps is None, max_steps is not None)
+        assert info["deciding"] == ""
+        with pytest.raises(EpisodeOverError, match="begin the next one"):
+            env.step({"ant_0": 3, "bee_0": 4})
 
 
 @pytest.mark.parametrize(
-    "action",
+    ("action", "match"),
     [
-        {"ant_0": 1},
-        {"bee_0": 1},
-        {},
-        {"ant_0": 1, "bee_0": 1, "cat_0": 1},
-        {"ant_0": 1, "cat_0": 1},
-        {"ant_0": 1, 2: 1},
-        {"ant_0": 10, "bee_0": 1},
-        {"ant_0": 1, "bee_0": 10},
-        {"ant_0": 1, "bee_0": None},
-        None,
-        3,
-        [1, 1],
-        (1, 1),
-        np.array([1, 1]),
-        "ant_0",
+        ({"ant_0": 1}, "ant_0, bee_0; given: ['ant_0']"),
+        ({"bee_0": 1}, "ant_0, bee_0; given: ['bee_0']"),
+        ({}, "given: []"),
+        ({"ant_0": 1, "bee_0": 1, "cat_0": 1}, "cat_0"),
+        ({"ant_0": 1, "cat_0": 1}, "cat_0"),
+        ({"ant_0": 1, 2: 1}, "2"),
+        ({"ant_0": 10, "bee_0": 1}, "ant_0"),
+        ({"ant_0": 1, "bee_0": 10}, "bee_0"),
+        ({"ant_0": 1, "bee_0": None}, "bee_0"),
+        (None, "given: None"),
+        (3, "given: 3"),
+        ([1, 1], "given: [1, 1]"),
+        ((1, 1), "given: (1, 1)"),
+        (np.array([1, 1]), "given: array([1, 1])"),
+        ("ant_0", "given: 'ant_0'"),
     ],
     ids=repr,
 )
-def test_what_is_refused_moves_nothing(action):
+def test_actions_that_are_refused_move_nothing(action, match):
     paid = []
     ant, bee = points(reward_mapping=lambda: paid.append(0) or 1.0)
     env = joint_env(calling(ant, bee), [ant, bee])
     env.reset()
     del paid[:]
-    with pytest.raises(InvalidActionError):
+    with pytest.raises(InvalidActionError, match=re.escape(match)):
         env.step(action)
     assert env.simulation.log == []
     assert paid == []
@@ -112,16 +105,19 @@ def test_what_is_refused_moves_nothing(action):
     assert env.simulation.log == [1, 2]
 
 
-def test_rule_for_all_and_for_some():
-    ant, bee = points()
-    env = joint_env(calling(ant, bee, ant, bee), [ant, bee])
+@pytest.mark.parametrize("flatten", [False, True])
+def test_rule_may_answer_for_all_and_for_some(flatten):
+    ant, bee = points(**BOX)
+    env = joint_env(calling(ant, bee, ant, bee), [ant, bee], flatten=flatten)
     env.reset()
     env.step(RULE)
-    env.step({"ant_0": RULE, "bee_0": 4})
-    assert env.simulation.log == ["rule", "rule", "rule", 4]
+    assert env.simulation.log == ["rule", "rule"]
+    if not flatten:
+        env.step({"ant_0": RULE, "bee_0": [0.5]})
+        assert env.simulation.log[2:] == ["rule", 0.5]
 
 
-def test_masks_and_choices():
+def test_masks_and_choices_are_those_of_the_pending_decision():
     ant = decision(agent="ant_0", action_mask_mapping=lambda: [1] * 3 + [0] * 7)
     bee = decision(agent="bee_0", choices=lambda: ["x", "y"], action_space=spaces.Discrete(3))
     cat = decision(agent="cat_0")
@@ -140,43 +136,6 @@ def test_masks_and_choices():
     assert env.simulation.log == [2, "y", 0, 2]
     assert info["deciding"] == "bee_0"
     assert info["acted"] == {"ant_0": True, "bee_0": False, "cat_0": False}
-
-
-def test_policies_answer_for_whom_they_name():
-    ant, bee = points()
-    env = joint_env(calling(ant, bee, ant), [ant, bee], policies={"bee_0": lambda observation: 7})
-    assert list(env.action_space.spaces) == ["ant_0"]
-    env.reset()
-    env.step({"ant_0": 1})
-    assert env.simulation.log == [1, 7]
-
-
-def test_max_steps_counts_rounds():
-    ant, bee = points(reward_mapping=lambda: 1.0)
-    env = joint_env(calling(*[ant, bee] * 9), [ant, bee], max_steps=2)
-    for _ in range(2):
-        env.reset()
-        assert env.step({"ant_0": 1, "bee_0": 2})[1:4] == (2.0, False, False)
-        *told, info = env.step({"ant_0": 1, "bee_0": 2})
-        assert told[1:] == [2.0, False, True]
-        assert info["deciding"] == ""
-        with pytest.raises(EpisodeOverError, match="begin the next one"):
-            env.step({"ant_0": 1, "bee_0": 2})
-        assert env.simulation.log == [1, 2, 1, 2]
-
-
-def test_what_is_returned_is_the_users_own():
-    kept = np.array([1.0, 2.0])
-    ant, bee = points(observation_space_mapping=lambda: kept, action_mask_mapping=lambda: [1] * 10)
-    env = joint_env(calling(*[ant, bee] * 3), [ant, bee])
-    first, info = env.reset()
-    first["ant_0"][:] = 9
-    info["action_mask"]["ant_0"][:] = 0
-    second, *_, other = env.step({"ant_0": 1, "bee_0": 2})
-    assert kept.tolist() == [1, 2]
-    assert second["ant_0"].tolist() == [1, 2]
-    assert second["ant_0"] is not second["bee_0"]
-    assert other["action_mask"]["ant_0"].tolist() == [1] * 10
 
 
 # -- who is there ---------------------------------------------------------------------------------
@@ -206,41 +165,41 @@ class AnnouncingPack(Pack):
 NAMES = ["being_0", "being_1", "being_2"]
 
 
-def test_the_roster_is_declared():
-    env = joint_env(Pack, beings(), possible_agents=[*NAMES, "being_3"])
-    assert set(env.action_space.spaces) == {*NAMES, "being_3"}
+@pytest.mark.parametrize(
+    ("pack", "options", "names"),
+    [(Pack, {"possible_agents": [*NAMES, "being_3"]}, [*NAMES, "being_3"]), (AnnouncingPack, {}, NAMES)],
+    ids=["declared", "announced"],
+)
+def test_the_roster_is_declared_or_asked_of_the_simulation(pack, options, names):
+    env = joint_env(pack, beings(), **options)
+    assert sorted(env.action_space.spaces) == names
     observation, _ = env.reset()
     assert observation in env.observation_space
-    assert observation["being_3"].tolist() == [0, 0]
+    assert {name: part.tolist() for name, part in observation.items() if name not in NAMES[:1]} == {
+        name: [int(name[-1]) if pack is AnnouncingPack else 0, 0] for name in names[1:]
+    }
 
 
-def test_the_roster_is_asked_for():
-    env = joint_env(AnnouncingPack, beings())
-    assert sorted(env.action_space.spaces) == NAMES
-    observation, _ = env.reset()
-    assert sorted(observation) == NAMES
-
-
-def test_who_joins_after_all_is_refused_or_follows_its_rule():
+@pytest.mark.parametrize("undeclared", ["error", "rule"])
+def test_agents_that_join_after_all_are_refused_or_follow_their_rule(undeclared):
     class Growing(AnnouncingPack):
         def run(self):
             super().run()
             self.log.append(Being(9).act())
 
-    env = joint_env(Growing, beings())
+    env = joint_env(Growing, beings(), undeclared=undeclared)
     env.reset()
     for _ in range(3):
         env.step(dict.fromkeys(NAMES, 1))
-    with pytest.raises(AgentError, match="being_9"):
-        env.step(dict.fromkeys(NAMES, 1))
-    env = joint_env(Growing, beings(), undeclared="rule")
-    env.reset()
-    while not env.step(dict.fromkeys(NAMES, 1))[2]:
-        pass
-    assert env.simulation.log[-1] == "rule"
+    if undeclared == "rule":
+        assert env.step(dict.fromkeys(NAMES, 1))[2]
+        assert env.simulation.log[-1] == "rule"
+    else:
+        with pytest.raises(AgentError, match="being_9"):
+            env.step(dict.fromkeys(NAMES, 1))
 
 
-def test_the_dead_are_observed_as_they_ended_and_not_rewarded():
+def test_the_dead_are_observed_as_they_ended_and_neither_act_nor_are_paid():
     env = joint_env(AnnouncingPack, beings())
     env.reset()
     action = dict.fromkeys(NAMES, 1)
@@ -250,48 +209,14 @@ def test_the_dead_are_observed_as_they_ended_and_not_rewarded():
     assert reward == 2.0 + 3.0 + 2.0
     assert not terminated
     assert info["acted"] == dict.fromkeys(NAMES, True)
-    observation, reward, *_ = env.step(action)
-    assert observation["being_0"].tolist() == [0, 2]
-    assert reward == 4.0 + 3.0
-    assert env.simulation.log[6:] == [(1, 1), (2, 1)]
-    assert env.step(action)[2]
-
-
-def test_the_dead_have_not_acted():
-    env = joint_env(AnnouncingPack, beings())
-    env.reset()
-    for _ in range(2):
-        env.step(dict.fromkeys(NAMES, 1))
-    *_, info = env.step(dict.fromkeys(NAMES, 1))
-    assert info["acted"] == {"being_0": False, "being_1": True, "being_2": True}
-
-
-def test_actions_of_the_dead_are_asked_for_and_not_used():
-    env = joint_env(AnnouncingPack, beings())
-    env.reset()
-    for _ in range(2):
-        env.step(dict.fromkeys(NAMES, 1))
     with pytest.raises(InvalidActionError, match="being_0"):
         env.step({"being_1": 1, "being_2": 1})
-    env.step(env.action_space.sample())
-    env.step({"being_0": RULE, "being_1": 1, "being_2": 1})
-
-
-def test_all_may_die_before_the_simulation_ends():
-    class Doom(Pack):
-        def run(self):
-            for being in self.beings:
-                being.act()
-            for being in self.beings:
-                being.health = 10
-                being.leave()
-            return TRUNCATED
-
-    env = joint_env(Doom, beings(), possible_agents=NAMES)
-    env.reset()
-    _, reward, terminated, truncated, _ = env.step(dict.fromkeys(NAMES, 1))
-    assert reward == 30.0
-    assert terminated or truncated
+    observation, reward, _, _, info = env.step(action | {"being_0": RULE})
+    assert observation["being_0"].tolist() == [0, 2]
+    assert reward == 4.0 + 3.0
+    assert info["acted"] == {"being_0": False, "being_1": True, "being_2": True}
+    assert env.simulation.log[6:] == [(1, 1), (2, 1)]
+    assert env.step(action)[2]
 
 
 def test_a_roster_that_is_not_known_is_refused():
@@ -313,23 +238,13 @@ def test_a_roster_that_is_not_known_is_refused():
         joint_env(Announced, beings())
 
 
-def test_one_simulation_alone_is_used():
-    made = []
+def test_asking_for_the_roster_leaves_nothing_behind():
+    made, ended = [], []
 
-    class Counted(AnnouncingPack):
+    class Ending(AnnouncingPack):
         def __init__(self):
             made.append(self)
 
-    env = joint_env(Counted, beings())
-    env.reset()
-    env.close()
-    assert env.simulation in made
-
-
-def test_asking_for_the_roster_leaves_nothing_behind():
-    ended = []
-
-    class Ending(AnnouncingPack):
         def run(self):
             try:
                 super().run()
@@ -342,13 +257,14 @@ def test_asking_for_the_roster_leaves_nothing_behind():
     assert ended == [0]
     env.close()
     assert ended == [0, 0]
+    assert env.simulation in made
 
 
 # -- flattened ------------------------------------------------------------------------------------
 
 
 def test_flattened_spaces_are_boxes():
-    ant, bee = (
+    functions = [
         decision(
             agent=f"{name}_0",
             observation_space=spaces.Box(-size, size, (size,), np.float32),
@@ -356,19 +272,19 @@ def test_flattened_spaces_are_boxes():
             action_space=spaces.Box(0, size, (size,), np.float32),
             action_space_mapping=lambda action: action.tolist(),
         )
-        for name, size in (("ant", 1), ("bee", 2))
-    )
-    env = joint_env(calling(ant, bee, ant), [ant, bee], flatten=True)
-    assert env.action_space == spaces.Box(np.zeros(3, np.float32), np.array([1, 2, 2], np.float32))
-    assert env.observation_space == spaces.Box(np.array([-1, -2, -2], np.float32), np.array([1, 2, 2], np.float32))
+        for name, size in (("ant", 2), ("bee", 3), ("cat", 1))
+    ]
+    env = joint_env(calling(*functions, functions[0]), functions, flatten=True)
+    high = np.array([2, 2, 3, 3, 3, 1], np.float32)
+    assert env.action_space == spaces.Box(np.zeros(6, np.float32), high)
+    assert env.observation_space == spaces.Box(-high, high)
     observation, info = env.reset()
-    assert observation.tolist() == [0.5, 0, 0]
+    assert observation.tolist() == [1, 1, 0, 0, 0, 0]
     assert observation.dtype == np.float32
-    observation, *_, info = env.step(np.array([0.5, 1.5, 2], np.float32))
-    assert observation.tolist() == [0.5, 1, 1]
-    assert env.simulation.log == [[0.5], [1.5, 2.0]]
-    assert info["acted"] == {"ant_0": True, "bee_0": True}
-    assert info["deciding"] == "ant_0"
+    observation, *_, info = env.step(np.array([0, 1, 0.5, 1.5, 2.5, 0.25], np.float32))
+    assert observation.tolist() == [1, 1, 1.5, 1.5, 1.5, 0.5]
+    assert env.simulation.log == [[0, 1], [0.5, 1.5, 2.5], [0.25]]
+    assert info == {"deciding": "ant_0", "acted": dict.fromkeys(["ant_0", "bee_0", "cat_0"], True)}
 
 
 @pytest.mark.parametrize(
@@ -384,129 +300,84 @@ def test_flattened_spaces_are_boxes():
         0.5,
         {"ant_0": [0.5], "bee_0": [0.5]},
     ],
+    ids=repr,
 )
-def test_what_is_refused_of_a_flattened_action(action):
-    ant, bee = points(**BOX)
+def test_flattened_actions_that_are_refused_move_nothing(action):
+    seen = []
+    ant, bee = points(**BOX | {"action_space_mapping": seen.append})
     env = joint_env(calling(ant, bee), [ant, bee], flatten=True)
     env.reset()
     with pytest.raises(InvalidActionError):
         env.step(action)
-    assert env.simulation.log == []
-    env.step(np.array([0.25, 0.5]))
-    assert env.simulation.log == [0.25, 0.5]
-
-
-def test_rule_for_all_of_a_flattened_view():
-    ant, bee = points(**BOX)
-    env = joint_env(calling(ant, bee), [ant, bee], flatten=True)
-    env.reset()
-    env.step(RULE)
-    assert env.simulation.log == ["rule", "rule"]
-
-
-def test_a_flattened_action_is_not_kept():
-    seen = []
-    ant, bee = points(action_space=spaces.Box(0, 1, (1,), np.float32), action_space_mapping=seen.append)
-    env = joint_env(calling(ant, bee), [ant, bee], flatten=True)
-    env.reset()
-    action = np.array([0.25, 0.5], np.float32)
+    assert env.simulation.log == seen == []
+    action = np.array([0.25, 0.5])
     env.step(action)
-    action[:] = 0
+    action[:] = 0  # the user's own
     assert [part.tolist() for part in seen] == [[0.25], [0.5]]
 
 
 def discrete():
-    """Two decisions: one of two or three from 5 on, and one of two of which the first is not legal, with three."""
-    ant = decision(agent="ant_0", action_space=spaces.Discrete(2, start=5))
-    bee = decision(
-        agent="bee_0",
+    """Three decisions: one of two of which the first is not legal, with three; one of two from 5 on; one of two."""
+    ant = decision(
+        agent="ant_0",
         action_space=spaces.MultiDiscrete([2, 3]),
         action_space_mapping=lambda action: action.tolist(),
         action_mask_mapping=lambda: ([0, 1], [1, 1, 1]),
     )
-    return ant, bee
+    return [ant, decision(agent="bee_0", action_space=spaces.Discrete(2, start=5)), decision(agent="cat_0")]
 
 
-def test_flattened_actions_of_discrete_spaces():
-    ant, bee = discrete()
-    env = joint_env(calling(ant, bee, ant), [ant, bee], flatten=True)
-    assert env.action_space == spaces.MultiDiscrete([2, 2, 3], start=[5, 0, 0])
-    observation, _ = env.reset()
-    assert observation.tolist() == [1, 2, 0, 0]
-    *_, info = env.step(np.array([6, 1, 2]))
-    assert env.simulation.log == [6, [1, 2]]
-    assert info["acted"] == {"ant_0": True, "bee_0": True}
-
-
-@pytest.mark.parametrize("action", [[6, 1, 2], np.array([6.0, 1, 2]), np.array([4, 1, 2]), np.array([6, 1]), 6])
-def test_what_is_refused_of_flattened_actions_of_discrete_spaces(action):
-    ant, bee = discrete()
-    env = joint_env(calling(ant, bee), [ant, bee], flatten=True)
-    env.reset()
-    with pytest.raises(InvalidActionError):
-        env.step(action)
-    assert env.simulation.log == []
-
-
-def test_flattened_actions_of_discrete_spaces_side_by_side():
-    ant, bee = discrete()
-    envs = vector_env(calling(ant, bee, ant, bee), [ant, bee], num_envs=2, flatten=True)
-    envs.reset()
-    envs.step(np.array([[5, 1, 2], [6, 1, 0]]))
-    assert [simulation.log for simulation in envs.get_attr("simulation")] == [[5, [1, 2]], [6, [1, 0]]]
-    with pytest.raises(InvalidActionError, match="sub-environment 1"):
-        envs.step(np.array([[5, 1, 2], [7, 1, 0]]))
-    envs.close()
-
-
-def test_flattened_masks():
-    ant, bee = discrete()
-    env = joint_env(calling(ant, bee, ant, bee), [ant, bee], flatten=True)
+def test_flattened_discrete_spaces_have_one_mask():
+    functions = discrete()
+    env = joint_env(calling(*functions * 2), functions, flatten=True)
+    assert env.action_space == spaces.MultiDiscrete([2, 3, 2, 10], start=[0, 0, 5, 0])
     with pytest.raises(NotResetError, match="no episode yet"):
         env.action_masks()
-    env.reset()
-    env.step(np.array([6, 1, 2]))
+    observation, _ = env.reset()
+    assert observation.tolist() == [1, 2, 0, 0, 0, 0]
+    for refused in ([1, 2, 6, 9], np.array([1.0, 2, 6, 9]), np.array([1, 2, 4, 9]), np.array([1, 2, 6]), 6):
+        with pytest.raises(InvalidActionError):
+            env.step(refused)
+    assert env.simulation.log == []
+    *_, info = env.step(np.array([1, 2, 6, 9]))
+    assert env.simulation.log == [[1, 2], 6, 9]
+    assert info["acted"] == dict.fromkeys(["ant_0", "bee_0", "cat_0"], True)
     masks = env.action_masks()
     assert masks.dtype == np.bool_
-    assert masks.tolist() == [True, True, False, True, True, True, True]
+    assert masks.tolist() == [False, True] + [True] * 15
     masks[:] = False
     assert env.action_masks().any()
-
-
-def test_joint_actions_that_have_no_masks():
-    ant, bee = discrete()
-    env = joint_env(calling(ant, bee), [ant, bee])
+    env = joint_env(calling(*functions), functions)
     env.reset()
     with pytest.raises(ViewError, match="flatten"):
         env.action_masks()
+    envs = vector_env(calling(*functions * 2), functions, num_envs=2, flatten=True)
+    envs.reset()
+    envs.step(np.array([[1, 2, 5, 3], [1, 0, 6, 9]]))
+    assert [simulation.log for simulation in envs.get_attr("simulation")] == [[[1, 2], 5, 3], [[1, 0], 6, 9]]
+    with pytest.raises(InvalidActionError, match="sub-environment 1"):
+        envs.step(np.array([[1, 2, 5, 3], [1, 0, 7, 9]]))
+    envs.close()
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("of_ant", "of_bee", "match"),
     [
-        {"action_space": spaces.MultiDiscrete([[2, 2]])},
-        {**BOX, "observation_space": spaces.Box(0, 1, (2, 2), np.float32)},
-        {**BOX, "observation_space": spaces.Discrete(3)},
-        {"action_space": spaces.Box(0, 1, (), np.float32)},
+        ({"action_space": spaces.MultiDiscrete([[2, 2]])}, {}, "needs one-dimensional Box"),
+        ({**BOX, "observation_space": spaces.Box(0, 1, (2, 2), np.float32)}, BOX, "needs one-dimensional Box"),
+        ({**BOX, "observation_space": spaces.Discrete(3)}, BOX, "needs one-dimensional Box"),
+        ({"action_space": spaces.Box(0, 1, (), np.float32)}, BOX, "needs one-dimensional Box"),
+        ({}, BOX, "all continuous or all discrete"),
     ],
+    ids=["matrix of numbers", "matrix", "number", "scalar", "partly discrete"],
 )
-def test_what_cannot_be_flattened(changes):
-    ant, bee = points(**changes)
-    with pytest.raises(ViewError, match="needs one-dimensional Box"):
+def test_some_spaces_cannot_be_flattened(of_ant, of_bee, match):
+    ant, bee = decision(agent="ant_0", **of_ant), decision(agent="bee_0", **of_bee)
+    with pytest.raises(ViewError, match=match):
         joint_env(calling(ant, bee), [ant, bee], flatten=True)
-
-
-def test_what_is_partly_discrete_cannot_be_flattened():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **BOX)
-    with pytest.raises(ViewError, match="all continuous or all discrete"):
-        joint_env(calling(ant, bee), [ant, bee], flatten=True)
-
-
-@pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_flatten_is_the_joint_views_alone(make):
-    ant, bee = points(**BOX)
-    with pytest.raises(UnknownOptionError, match="an option of the joint view only"):
-        make(calling(ant, bee), [ant, bee], flatten=True)
+    for make in (aec_env, parallel_env):
+        with pytest.raises(UnknownOptionError, match="an option of the joint view only"):
+            make(calling(ant, bee), [ant, bee], flatten=True)
 
 
 # -- colonies -------------------------------------------------------------------------------------
@@ -549,128 +420,52 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
 # -- Gymnasium's check ----------------------------------------------------------------------------
 
 
-def boxes(**options):
-    ant, bee = points(**BOX)
-    return joint_env(calling(*[ant, bee] * 20), [ant, bee], **options)
+SEEN_MASKS = {
+    "observation_space": spaces.Dict(
+        {"observation": spaces.Box(0, 1, (1,), np.float32), "action_mask": spaces.MultiBinary(10)}
+    ),
+    "observation_space_mapping": lambda: {"observation": [0.5]},
+    "action_mask_mapping": lambda: [1] * 10,
+}
 
 
 JOINTS = {
     "dicts": lambda: joint_env(calling(*(pair := points()) * 20), list(pair)),
-    "flattened": lambda: boxes(flatten=True),
-    "boxes": boxes,
-    "irregular": lambda: irregular(),
+    "boxes": lambda: joint_env(calling(*(pair := points(**BOX)) * 20), list(pair)),
     "deaths": lambda: joint_env(AnnouncingPack, beings()),
     "a roster": lambda: joint_env(Pack, beings(), possible_agents=[*NAMES, "being_3"]),
-    "limited": lambda: boxes(flatten=True, max_steps=2),
-    "a class": lambda: generate_env(calling(*(pair := points(**BOX)) * 20), pair, view="joint", flatten=True)(),
-    "masks in observations": lambda: masked(),
+    "flattened": lambda: generate_env(calling(*(pair := points(**BOX)) * 20), pair, view="joint", flatten=True)(),
+    "masks in observations": lambda: joint_env(calling(*(pair := points(**SEEN_MASKS)) * 20), list(pair)),
 }
 
 
-def irregular():
-    ant, bee, cat = points(3)
-    return joint_env(calling(*[ant, ant, bee, cat, bee] * 5), [ant, bee, cat])
-
-
-def masked():
-    space = spaces.Dict({"observation": spaces.Box(0, 1, (1,), np.float32), "action_mask": spaces.MultiBinary(10)})
-    ant, bee = points(
-        observation_space=space,
-        observation_space_mapping=lambda: {"observation": [0.5]},
-        action_mask_mapping=lambda: [1] * 10,
-    )
-    return joint_env(calling(*[ant, bee] * 20), [ant, bee])
-
-
 @pytest.mark.parametrize("make", JOINTS.values(), ids=JOINTS.keys())
-def test_gymnasiums_check(make):
-    check_env(make(), skip_render_check=True)
-
-
-def test_seeds_seed_the_space():
-    env = boxes(flatten=True)
-    env.reset(seed=4)
-    drawn = [env.action_space.sample() for _ in range(5)]
-    env.reset(seed=4)
-    assert data_equivalence([env.action_space.sample() for _ in range(5)], drawn)
-    env.reset(seed=5)
-    assert not data_equivalence([env.action_space.sample() for _ in range(5)], drawn)
-
-
-def test_of_one_agent_the_joint_view_is_the_single_view():
-    ant = decision(agent="ant_0", reward_mapping=lambda: 1.0)
-    env = joint_env(calling(ant, ant), ant)
-    env.reset()
-    assert env.step({"ant_0": 3})[1:4] == (1.0, False, False)
-    assert env.step({"ant_0": 4})[1:4] == (1.0, True, False)
-
-
-# -- each agent's part is its own ------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("parts", "action", "expected"),
-    [
-        (
-            [spaces.Box(-9, 9, (length,), np.float64) for length in (2, 3, 1)],
-            [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
-            [[1, 2], [3, 4, 5], [6]],
-        ),
-        (
-            [spaces.MultiDiscrete([4, 4, 4]), spaces.Discrete(3, start=5), spaces.MultiDiscrete([2, 2])],
-            [1, 2, 3, 6, 0, 1],
-            [[1, 2, 3], 6, [0, 1]],
-        ),
-    ],
-    ids=["boxes", "numbers"],
-)
-def test_each_agent_gets_its_part_of_a_flat_action_whatever_its_length(parts, action, expected):
-    functions = [
-        decision(agent=f"{name}_0", action_space=part, action_space_mapping=lambda given: np.array(given).tolist())
-        for name, part in zip(("ant", "bee", "cat"), parts, strict=True)
-    ]
-    env = joint_env(calling(*functions), functions, flatten=True)
-    env.reset()
-    assert env.action_space.shape == (6,)
-    env.step(np.array(action))
-    assert env.simulation.log == expected
-
-
-def test_the_time_of_an_episode_begins_with_its_reset():
-    ant, bee = points()
-
-    class Timed:
-        def reset(self, seed=None):
-            self.now = 0.0
-
-        def run(self):
-            for _ in range(2):
-                ant()
-                bee()
-                self.now += 5.0
-
-        def time(self):
-            return self.now
-
-    env = joint_env(Timed, [ant, bee])
-    for _ in range(2):
-        _, info = env.reset()
-        assert (info["time"], info["elapsed"]) == (0.0, 0.0)
-        *_, info = env.step(RULE)
-        assert (info["time"], info["elapsed"]) == (5.0, 5.0)
+def test_gymnasiums_check_passes(make):
+    env = make()
+    check_env(env, skip_render_check=True)
+    drawn = []
+    for seed in (4, 4, 5):
+        env.reset(seed=seed)
+        drawn.append([env.action_space.sample() for _ in range(5)])
+    assert data_equivalence(drawn[0], drawn[1])
+    assert not data_equivalence(drawn[0], drawn[2])
 
 
 @pytest.mark.parametrize("flatten", [False, True])
-def test_what_is_told_can_be_changed_by_its_user(flatten):
-    ant, bee = points()
+def test_what_is_returned_is_the_users_own(flatten):
+    kept = np.array([1.0, 2.0])
+    ant, bee = points(observation_space_mapping=lambda: kept, action_mask_mapping=lambda: [1] * 10)
     env = joint_env(calling(ant, bee, bee, bee), [ant, bee], flatten=flatten)
     action = np.array([1, 1]) if flatten else {"ant_0": 1, "bee_0": 1}
-    told = [env.reset()[0], *(env.step(action)[0] for _ in range(2))]
-    for observation in told:
+    told = [env.reset(), *(env.step(action) for _ in range(2))]
+    for observation, *_, info in told:
+        info["action_mask"]["ant_0"][:] = 0
         for part in [observation] if flatten else observation.values():
             part += 100
-    again = env.step(action)[0]
+    again, *_, info = env.step(action)
+    assert kept.tolist() == [1, 2]
     assert (again.tolist() if flatten else again["ant_0"].tolist() + again["bee_0"].tolist()) == [1, 2, 1, 2]
+    assert info["action_mask"]["ant_0"].tolist() == [1] * 10
 
 
 def test_its_spaces_are_its_own():
@@ -687,11 +482,3 @@ def test_its_spaces_are_its_own():
     for name in ("observation_space", "action_space"):
         parts = [getattr(env, name)[agent] for env in (one, other) for agent in ("ant_0", "bee_0")]
         assert len({id(part) for part in parts}) == 4
-
-
-def test_an_action_that_lacks_an_agent_names_those_that_are_given():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = joint_env(calling(ant, bee), [ant, bee])
-    env.reset()
-    with pytest.raises(InvalidActionError, match=re.escape("ant_0, bee_0; given: ['bee_0']")):
-        env.step({"bee_0": 1})

@@ -102,35 +102,32 @@ def test_nothing_of_the_kit_is_left_out():
     assert tests == MET | NOT_MET
 
 
-def test_turns(world):
+def test_turns_and_rounds_pass_its_tests(world):
     kit.api_test(maker(world, aec_env)(), num_cycles=60)
     kit.seed_test(maker(world, aec_env), num_cycles=30)
-
-
-def test_rounds(world):
     kit.parallel_api_test(maker(world, parallel_env)(), num_cycles=60)
     kit.parallel_seed_test(maker(world, parallel_env), num_cycles=30)
 
 
-def test_pictures(world):
+def test_pictures_are_rendered(world):
     kit.render_test(maker(world, aec_env))
     assert kit.collect_render_results(maker(world, aec_env, render_mode="ansi")()) == ["a picture"] * 5
 
 
-def test_any_number_of_episodes(world, monkeypatch):
+def test_the_benchmark_plays_any_number_of_episodes(world, monkeypatch):
     clock = SimpleNamespace(time=count().__next__)  # it goes by how often it is looked at, and not by the seconds
     monkeypatch.setattr(sys.modules["pettingzoo.test.performance_benchmark"], "time", clock)
     kit.performance_benchmark(maker(world, aec_env)())
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_states(name):
+def test_states_pass_its_test(name):
     make = partial(maker, WORLDS[name], state_space="observations")
     kit.state_test(make(aec_env)(), make(parallel_env)())
 
 
 @pytest.mark.parametrize("name", [name for name in DECLARED if "colony" not in name])
-def test_numbers_of_rounds(name):
+def test_episodes_have_as_many_rounds_as_max_steps(name):
     """The creatures of a colony decide once a round, twice or never, and so have no such number."""
     simulation, points, options = WORLDS[name]
 
@@ -148,7 +145,7 @@ def test_one_agent_after_many_resets():
     kit.bombardment_test(aec_env(Greenhouse, WATERING), cycles=20)
 
 
-def test_observations_that_are_pictures(tmp_path, monkeypatch, capsys):
+def test_observations_that_are_pictures_are_saved(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (point,) = WATERING
     seen = make_step(
@@ -172,7 +169,7 @@ class Wrapped(wrappers.BaseParallelWrapper):
     """A wrapper that changes nothing."""
 
 
-def test_wrapped(world):
+def test_wrapped_environments_pass_its_tests(world):
     for wrapper in (wrappers.BaseWrapper, wrappers.OrderEnforcingWrapper):
         kit.api_test(wrapper(maker(world, aec_env)()), num_cycles=30)
     kit.parallel_api_test(Wrapped(maker(world, parallel_env)()), num_cycles=30)
@@ -187,19 +184,15 @@ def length_in_rounds(env, seed):
     return rounds
 
 
-def length_in_turns(env, seed):
-    return len(play(env, seed=seed))
-
-
 @pytest.mark.parametrize(
     ("view", "wrapper", "length"),
     [
         (parallel_env, wrappers.MultiEpisodeParallelEnv, length_in_rounds),
-        (aec_env, wrappers.MultiEpisodeEnv, length_in_turns),
+        (aec_env, wrappers.MultiEpisodeEnv, lambda env, seed: len(play(env, seed=seed))),
     ],
     ids=["rounds", "turns"],
 )
-def test_many_episodes_as_one(world, view, wrapper, length):
+def test_wrappers_make_one_of_many_episodes(world, view, wrapper, length):
     make = maker(world, view)
     episodes = [length(make(), seed) for seed in (1, 2, 3)]
     assert length(wrapper(make(), num_episodes=3), 1) == sum(episodes)

@@ -1,13 +1,9 @@
 """Agents that are entities: their names, rosters, births and deaths, in the AEC view."""
 
 import gc
-import warnings
-import weakref
 from collections import Counter
 
-import numpy as np
 import pytest
-from gymnasium import spaces
 from hypothesis import given, settings
 from pettingzoo.test import api_test, seed_test
 
@@ -16,8 +12,6 @@ from simenv_marl import (
     TRUNCATED,
     SimEnvError,
     aec_env,
-    difference,
-    joint_env,
     parallel_env,
     single_env,
 )
@@ -32,7 +26,6 @@ from simenv_marl.errors import (
 )
 from tests.worlds.many_worlds import (
     HERE,
-    NAMES_OF_THE_VILLAGE,
     AnnouncedHunt,
     Announcing,
     Answered,
@@ -42,7 +35,6 @@ from tests.worlds.many_worlds import (
     Other,
     Played,
     Village,
-    advised,
     answer,
     banish,
     being_of,
@@ -112,23 +104,17 @@ def test_an_agent_for_each_entity_joins_when_it_first_decides():
     env = aec_env(living(2, 0, 2), beings(removed_by=()))
     env.reset()
     assert env.agents == ["being_2"]
+    assert not hasattr(env, "possible_agents")
+    with pytest.raises(AttributeError):
+        _ = env.max_num_agents
     env.step(1)
     assert env.agents == ["being_2", "being_0"]
     assert set(env.rewards) == set(env.terminations) == set(env.truncations) == set(env.infos) == set(env.agents)
     assert decisions(play(env, 1)) == ["being_2", "being_0", "being_2"]
 
 
-def test_without_a_roster_there_are_no_possible_agents():
-    env = aec_env(living(0), beings())
-    assert not hasattr(env, "possible_agents")
-    env.reset()
-    assert not hasattr(env, "possible_agents")
-    with pytest.raises(AttributeError):
-        _ = env.max_num_agents
-
-
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_spaces_of_all_possible_agents(make):
+def test_spaces_of_all_possible_agents_are_dicts(make):
     """Some learners ask for all at once, as the attributes of PettingZoo's base classes have it."""
     env = make(living(0, 1), beings(), possible_agents=["being_0", "being_1"])
     assert list(env.observation_spaces) == list(env.action_spaces) == env.possible_agents
@@ -140,46 +126,16 @@ def test_spaces_of_all_possible_agents(make):
     assert not hasattr(without, "action_spaces")
 
 
-def test_nobody_is_named_and_the_rule_decides():
+def test_where_nobody_is_named_the_rule_decides():
     env = aec_env(living(0, 1, 2), beings(agent=lambda being: None if being.number == 1 else being_of(being)))
     assert decisions(play(env, 7)) == ["being_0", "being_2"]
     assert env.simulation.log == [7, "rule", 7]
-
-
-@pytest.mark.parametrize("name", [0, 1.5, b"being", ("being", 0), ["being_0"], True])
-def test_what_is_no_name_is_an_error_that_ends_the_episode(name):
-    env = aec_env(living(0, 1), beings(agent=lambda being: name if being.number else "being_0"))
+    env = aec_env(living(0), beings(agent=lambda being: ""))  # a name as any other
     env.reset()
-    with pytest.raises(AgentError, match=r"Being\.act"):
-        env.step(1)
-    with pytest.raises(EpisodeOverError, match="begin the next one"):
-        env.step(1)
-    env.reset()
-    assert env.agent_selection == "being_0"
-
-
-def test_an_empty_name_is_a_name_or_refused_but_never_silently_the_rule():
-    env = aec_env(living(0), beings(agent=lambda being: ""))
-    try:
-        env.reset()
-    except SimEnvError:
-        return
     assert env.agents == [""]
 
 
-def test_one_name_at_two_points_is_an_error():
-    def main(simulation):
-        Being(0).act()
-        Other(0).act()
-
-    env = aec_env(script(main), beings() | others(agent=lambda other: f"being_{other.number}"))
-    env.reset()
-    with pytest.raises(AgentError, match=r"being_0.*Being\.act.*Other\.act"):
-        env.step(1)
-    assert env.agents == []
-
-
-def test_an_entity_is_not_told_from_another_of_the_same_name():
+def test_entities_of_one_name_are_one_agent():
     """The name is the agent: a model may replace the object behind it."""
 
     def main(simulation):
@@ -193,13 +149,11 @@ def test_an_entity_is_not_told_from_another_of_the_same_name():
     assert len({turn.agent for turn in turns}) == 1
 
 
-def test_spaces_of_those_who_join_late():
+def test_spaces_of_those_who_join_late_are_their_own_and_seeded():
     env = aec_env(living(0, 1), beings())
     env.reset(seed=3)
     with pytest.raises(UnknownAgentError, match="there is no agent"):
         env.action_space("being_1")
-    with pytest.raises(LookupError, match="there is no agent"):
-        env.observation_space("nobody")
     env.step(1)
     space = env.action_space("being_1")
     assert space is env.action_space("being_1")
@@ -236,72 +190,40 @@ def test_declared_agents_are_there_from_the_start():
     assert env.possible_agents == NAMES
 
 
-def test_what_is_not_known_is_zero_clipped_into_the_space():
-    space = spaces.Dict(
-        {
-            "box": spaces.Box(np.array([1, -5], np.float32), np.array([2, -3], np.float32)),
-            "number": spaces.Discrete(3, start=4),
-            "bits": spaces.MultiBinary(2),
-            "pair": spaces.Tuple((spaces.MultiDiscrete([3, 3], start=[1, 0]), spaces.Box(0, 255, (1,), np.uint8))),
-        }
-    )
-    told = {"box": [1, -3], "number": 4, "bits": [0, 1], "pair": ([1, 0], [7])}
-    env = aec_env(
-        living(0),
-        beings(observation_space=space, observation_space_mapping=lambda being: told),
-        possible_agents=NAMES[:2],
-    )
-    env.reset()
-    blank = env.observe("being_1")
-    assert blank in space
-    assert blank["box"].tolist() == [1, -3]
-    assert blank["number"] == 4
-    assert blank["pair"][0].tolist() == [1, 0]
-    assert env.observe("being_1")["box"] is not blank["box"]
-
-
-def test_a_roster_by_point():
-    def main(simulation):
-        Other(0).act()
-        Being(1).act()
-
-    rosters = {Being.act: ["being_1", "being_0"], f"{HERE}.Other.act": ("other_0",)}
-    env = aec_env(script(main), beings() | others(), possible_agents=rosters)
-    assert sorted(env.possible_agents) == ["being_0", "being_1", "other_0"]
-    assert decisions(play(env, 1)) == ["other_0", "being_1"]
-
-
-def test_a_roster_beside_agents_with_names_of_their_own():
+def test_a_roster_is_declared_by_point_where_there_are_several():
     clerk = decision()
 
     def main(simulation):
+        Other(0).act()
         Being(1).act()
         clerk()
 
-    points = {clerk: define(agent="clerk_0"), **beings()}
-    env = aec_env(script(main), points, possible_agents=["being_0", "being_1"])
-    assert sorted(env.possible_agents) == ["being_0", "being_1", "clerk_0"]
-    assert decisions(play(env, 1)) == ["being_1", "clerk_0"]
-
-
-def test_a_list_is_not_enough_for_two_points():
+    points = {clerk: define(agent="clerk_0"), **beings(), **others()}
+    rosters = {Being.act: ["being_1", "being_0"], f"{HERE}.Other.act": ("other_0",)}
+    env = aec_env(script(main), points, possible_agents=rosters)
+    assert sorted(env.possible_agents) == ["being_0", "being_1", "clerk_0", "other_0"]
+    assert decisions(play(env, 1)) == ["other_0", "being_1", "clerk_0"]
     with pytest.raises(OptionValueError, match="possible_agents must be a dict"):
         aec_env(living(0), beings() | others(), possible_agents=["being_0", "other_0"])
+    env = aec_env(living(1), {clerk: define(agent="clerk_0"), **beings()}, possible_agents=["being_0", "being_1"])
+    assert sorted(env.possible_agents) == ["being_0", "being_1", "clerk_0"]
 
 
 @pytest.mark.parametrize(
-    ("roster", "error"),
+    ("options", "error", "match"),
     [
-        (["being_0", "being_0"], AgentError),
-        ([0], AgentError),
-        ("being_0", SimEnvError),
-        ({Other.act: ["other_0"]}, OptionValueError),
-        ({f"{HERE}.Being.leave": ["being_0"]}, OptionValueError),
+        ({"possible_agents": ["being_0", "being_0"]}, AgentError, "being_0"),
+        ({"possible_agents": [0]}, AgentError, "0"),
+        ({"possible_agents": "being_0"}, SimEnvError, "being_0"),
+        ({"possible_agents": {Other.act: ["other_0"]}}, OptionValueError, "Other.act"),
+        ({"possible_agents": {f"{HERE}.Being.leave": ["being_0"]}}, OptionValueError, "Being.leave"),
+        ({"possible_agents": NAMES, "undeclared": "ignore"}, OptionValueError, "undeclared"),
     ],
+    ids=["twice", "a number", "a string", "a point that is not used", "no point", "undeclared"],
 )
-def test_rosters_that_cannot_be(roster, error):
-    with pytest.raises(error):
-        aec_env(living(0), beings(), possible_agents=roster)
+def test_rosters_that_cannot_be_are_refused(options, error, match):
+    with pytest.raises(error, match=match):
+        aec_env(living(0), beings(), **options)
 
 
 def test_an_undeclared_agent_is_an_error_that_ends_the_episode():
@@ -310,10 +232,10 @@ def test_an_undeclared_agent_is_an_error_that_ends_the_episode():
     with pytest.raises(AgentError, match=r"being_5.*possible_agents"):
         env.step(1)
     assert env.agents == []
-    with pytest.raises(EpisodeOverError, match="begin the next one"):
-        env.step(1)
     env.reset()
     assert sorted(env.agents) == NAMES
+    with pytest.raises(AgentError, match="is not declared"):
+        aec_env(knowing(act_in_order, 0, 3), beings(), possible_agents=NAMES).reset()
 
 
 def test_an_undeclared_agent_may_follow_its_rule():
@@ -322,38 +244,29 @@ def test_an_undeclared_agent_may_follow_its_rule():
     assert decisions(turns) == ["being_0", "being_1"]
     assert {turn.agent for turn in turns} == set(NAMES)
     assert env.simulation.log == ["rule", 7, "rule", 7]
-
-
-def test_undeclared_is_error_or_rule():
-    with pytest.raises(OptionValueError, match="undeclared"):
-        aec_env(living(0), beings(), possible_agents=NAMES, undeclared="ignore")
-
-
-def test_nobody_who_is_declared_decides():
-    env = aec_env(living(5), beings(), possible_agents=NAMES, undeclared="rule")
     with pytest.raises(NoDecisionError, match="without a decision"):
-        env.reset()
+        aec_env(living(5), beings(), possible_agents=NAMES, undeclared="rule").reset()
 
 
-def test_a_policy_answers_for_one_entity():
+@pytest.mark.parametrize("roster", [None, NAMES[:2]])
+def test_a_policy_answers_for_one_entity_even_when_that_is_removed(roster):
     observed = []
 
     def policy(observation, info):
         observed.append(observation.tolist())
         return 3
 
-    env = aec_env(living(0, 1, 0), beings(), policies={"being_0": policy})
-    turns = play(env, 7)
-    assert {turn.agent for turn in turns} == {"being_1"}
-    assert env.simulation.log == [3, 7, 3]
+    def main(simulation):
+        one, two = Being(0), Being(1)
+        simulation.log += [one.act(), two.act(), one.act()]
+        one.leave()
+        simulation.log.append(two.act())
+
+    env = aec_env(script(main), beings(), policies={"being_0": policy}, possible_agents=roster)
+    assert getattr(env, "possible_agents", None) == (roster and ["being_1"])
+    assert [turn.agent for turn in play(env, 7)] == ["being_1"] * 3
+    assert env.simulation.log == [3, 7, 3, 7]
     assert observed == [[0, 0], [0, 0]]
-
-
-def test_a_policy_answers_for_one_of_a_roster():
-    env = aec_env(living(0, 1), beings(), possible_agents=NAMES[:2], policies={"being_0": lambda observation: 3})
-    assert env.possible_agents == ["being_1"]
-    assert {turn.agent for turn in play(env, 7)} == {"being_1"}
-    assert env.simulation.log == [3, 7]
 
 
 # -- who is expected ------------------------------------------------------------------------------
@@ -366,104 +279,62 @@ def act_in_order(simulation):
 
 
 def test_announced_agents_join_and_are_observed_before_their_first_decision():
-    env = aec_env(knowing(act_in_order, 1, 2), beings())
+    paid = []
+    definition = beings(reward_mapping=lambda being: paid.append(being.number) or 0.0)
+    env = aec_env(knowing(act_in_order, 0, 1, 2, 2, 0), definition)
     env.reset()
     assert env.simulation.asked
     assert set(env.simulation.asked) == {f"{HERE}.Being.act"}
     assert env.agents == ["being_0", "being_1", "being_2"]
+    assert env.last()[0].tolist() == [0, 1]
     assert env.observe("being_1").tolist() == [1, 0]
     assert env.agent_selection == "being_0"
+    assert paid == [0]  # to be announced asks for no reward
+    env.step(1)
+    assert env.last()[0].tolist() == [1, 1]  # observed anew
+    assert paid == [0, 1]
     turns = play(env, 1)
     assert decisions(turns) == ["being_0", "being_1", "being_2", "being_3"]
     assert [turn.agent for turn in turns if turn.terminated] == ["being_0", "being_1", "being_2", "being_3"]
 
 
-def test_to_be_announced_asks_for_no_reward():
-    paid = []
-    definition = beings(reward_mapping=lambda being: paid.append(being.number) or 0.0)
-    env = aec_env(knowing(act_in_order, 0, 1, 2), definition)
+@pytest.mark.parametrize(
+    ("announced", "changes", "options", "agents", "log"),
+    [
+        ([], {}, {}, [0], [1, 1, 1, 1]),
+        ([0, 1, 2], {"agent": lambda being: f"being_{being.number}" if being.number != 1 else None}, {}, [0, 2],
+         [1, "rule", 1, 1]),
+        ([0, 1, 2], {}, {"policies": {"being_1": lambda observation: 5}}, [0, 2], [1, 5, 1, 1]),
+        ([0, 3], {}, {"possible_agents": NAMES, "undeclared": "rule"}, [0, 1, 2], [1, 1, 1, "rule"]),
+    ],
+    ids=["nobody", "nobody's agent", "a policy's agent", "an undeclared agent"],
+)  # fmt: skip
+def test_those_who_are_announced_join_if_their_decisions_are_the_users(announced, changes, options, agents, log):
+    env = aec_env(knowing(act_in_order, *announced), beings(**changes), **options)
     env.reset()
-    assert paid == [0]
-    env.step(1)
-    assert paid == [0, 1]
+    assert env.agents == [f"being_{number}" for number in agents]
+    play(env, 1, reset=False)
+    assert env.simulation.log == log
 
 
-def test_the_decision_of_one_who_was_announced_is_observed_anew():
-    env = aec_env(knowing(act_in_order, 1), beings())
-    env.reset()
-    env.step(1)
-    assert env.last()[0].tolist() == [1, 1]
-
-
-def test_who_is_announced_twice_or_decides_already_joins_once():
-    env = aec_env(knowing(act_in_order, 0, 1, 1, 0), beings())
-    env.reset()
-    assert env.agents == ["being_0", "being_1"]
-    assert env.last()[0].tolist() == [0, 1]
-
-
-def test_nobody_may_be_announced():
-    env = aec_env(knowing(act_in_order), beings())
-    env.reset()
-    assert env.agents == ["being_0"]
-
-
-def test_an_announced_agent_that_never_decides_ends_with_the_episode():
+def test_announced_agents_that_never_decide_end_with_the_episode_or_when_they_are_removed():
     def main(simulation):
-        simulation.beings[0].act()
+        zero, one, two, _ = simulation.beings
+        zero.act()
+        two.health = 8
+        two.leave()
+        one.act()
 
-    turns = play(aec_env(knowing(main, 0, 3), beings()), 1)
+    turns = play(aec_env(knowing(main, 1, 2, 3), beings()), 1)
     assert [(turn.agent, turn.terminated, turn.reward) for turn in turns] == [
         ("being_0", False, 0.0),
+        ("being_2", True, 0.0),
+        ("being_1", False, 0.0),
         ("being_0", True, 0.0),
+        ("being_1", True, 0.0),
         ("being_3", True, 0.0),
     ]
-
-
-def test_to_announce_an_undeclared_agent_is_to_let_it_decide():
-    with pytest.raises(AgentError, match="is not declared"):
-        aec_env(knowing(act_in_order, 0, 3), beings(), possible_agents=NAMES).reset()
-    env = aec_env(knowing(act_in_order, 0, 3), beings(), possible_agents=NAMES, undeclared="rule")
-    assert {turn.agent for turn in play(env, 1)} == set(NAMES)
-    assert env.simulation.log == [1, 1, 1, "rule"]
-
-
-def test_who_is_nobodys_agent_may_be_announced():
-    definition = beings(agent=lambda being: None if being.number == 1 else being_of(being))
-    env = aec_env(knowing(act_in_order, 0, 1, 2), definition)
-    env.reset()
-    assert env.agents == ["being_0", "being_2"]
-
-
-def test_agents_of_policies_may_be_announced():
-    env = aec_env(knowing(act_in_order, 0, 1, 2), beings(), policies={"being_1": lambda observation: 5})
-    assert {turn.agent for turn in play(env, 1)} == {"being_0", "being_2", "being_3"}
-    assert env.simulation.log == [1, 5, 1, 1]
-
-
-def test_points_with_an_agent_of_their_own_may_be_announced():
-    clerk = define(agent="clerk_0", observation_space_mapping=lambda number: [number, 0], reward_mapping=lambda n: 0.0)
-
-    @clerk
-    def work(number):
-        return number
-
-    class Office:
-        def reset(self):
-            pass
-
-        def run(self):
-            Being(0).act()
-            work(4)
-
-        def expected_calls(self, point):
-            return [(7,)] if point.endswith("work") else []
-
-    env = aec_env(Office, {work: clerk, **beings()})
-    env.reset()
-    assert env.observe("clerk_0").tolist() == [7, 0]
-    env.step(1)
-    assert env.last()[0].tolist() == [4, 0]
+    assert turns[1].observation.tolist() == [2, 8]
 
 
 def test_decision_functions_that_are_called_to_foresee_run_their_rule():
@@ -476,17 +347,6 @@ def test_decision_functions_that_are_called_to_foresee_run_their_rule():
     env.reset()
     assert set(env.simulation.log) == {"rule"}
     assert env.agents == ["being_0", "being_1"]
-
-
-def test_an_error_in_foreseeing_surfaces():
-    class Blind(Knowing):
-        def expected_calls(self, point):
-            raise ZeroDivisionError
-
-    env = aec_env(lambda: Blind(act_in_order, announced=()), beings())
-    with pytest.raises(ZeroDivisionError):
-        env.reset()
-    assert env.agents == []
 
 
 # -- deaths ---------------------------------------------------------------------------------------
@@ -521,32 +381,9 @@ def test_a_removed_agent_is_rewarded_and_observed_while_it_is_whole():
     assert [turn.agent for turn in play(env, reset=False)] == ["being_1"]
 
 
-def test_an_agent_ends_once():
-    calls = []
-
-    def main(simulation):
-        one = Being(0)
-        one.act()
-        one.leave()
-        one.whole = True
-        one.leave()
-        simulation.being = Being(1)
-        simulation.being.act()
-
-    env = aec_env(script(main), beings(reward_mapping=lambda being: calls.append(being.number) or 1.0))
-    turns = play(env, 1)
-    assert [(turn.agent, turn.terminated) for turn in turns] == [
-        ("being_0", False),
-        ("being_0", True),
-        ("being_1", False),
-        ("being_1", True),
-    ]
-    assert calls == [0, 0, 1, 1]
-
-
 @pytest.mark.parametrize("action", [3, RULE])
-def test_removed_in_mid_decision(action):
-    """By ``apply`` or by the rule: the decision of the agent that ends is still carried out."""
+def test_the_decision_in_which_an_agent_is_removed_is_still_carried_out(action):
+    """By ``apply`` or by the rule."""
 
     def apply(action, being):
         being.health = 10 * action
@@ -563,195 +400,77 @@ def test_removed_in_mid_decision(action):
         simulation.log.append(Mortal(0).act())
         simulation.log.append(Mortal(1).act())
 
-    definition = beings(apply=apply)[Being.act]
-    env = aec_env(script(main), {Mortal.act: definition})
+    points = {Mortal.act: beings(apply=apply)[Being.act]}
+    answered = ["rule" if action is RULE else "applied"]
+    env = aec_env(script(main), points)
     env.reset()
     env.step(action)
-    assert env.simulation.log == ["rule" if action is RULE else "applied"]
+    assert env.simulation.log == answered
     assert env.agent_selection == "being_0"
     observation, reward, terminated, *_ = env.last()
     assert (observation.tolist(), reward, terminated) == ([0, 30], 30.0, True)
     env.step(None)
     assert env.agent_selection == "being_1"
-
-
-def test_several_are_removed_at_once():
-    def main(simulation):
-        crowd = [Being(number) for number in range(5)]
-        for being in crowd:
-            being.health = being.number
-            being.act()
-        for number in (3, 0, 2):
-            crowd[number].leave()
-        crowd[1].act()
-        crowd[4].leave()
-        crowd[1].leave()
-
-    env = aec_env(script(main), beings())
-    turns = play(env, 1)
-    assert [turn.agent for turn in turns] == [
-        *(f"being_{number}" for number in range(5)),
-        "being_3",
-        "being_0",
-        "being_2",
-        "being_1",
-        "being_4",
-        "being_1",
-    ]
-    ends = {turn.agent: (turn.reward, turn.terminated) for turn in turns if turn.terminated}
-    assert ends == {f"being_{number}": (float(number), True) for number in range(5)}
-
-
-def test_rewards_are_those_of_the_latest_step():
-    """Every reward stands in ``rewards`` for one step, and in what ``last`` says until the agent's next step."""
-
-    def main(simulation):
-        one, two, three = simulation.beings = [Being(number) for number in range(3)]
-        for being in (one, two, three):
-            being.health = 10 + being.number
-            being.act()
-        one.leave()
-        two.leave()
-        three.act()
-
-    env = aec_env(script(main), beings())
+    env = parallel_env(script(main), points)
     env.reset()
-    env.step(1)
-    env.step(1)
-    assert set(env.rewards.values()) == {0.0}
-    env.step(1)
-    assert env.rewards == {"being_0": 10.0, "being_1": 11.0, "being_2": 12.0}
-    env.step(None)
-    assert env.rewards == {"being_1": 0.0, "being_2": 0.0}
-    assert env.last()[1] == 11.0
-    env.step(None)
-    assert env.last()[1] == 12.0
-    env.step(1)
-    assert env.rewards == {"being_2": 12.0}
-    env.step(None)
-    assert env.agents == []
+    observations, rewards, terminations, _, infos = env.step({"being_0": action})
+    assert env.simulation.log == answered
+    assert (observations["being_0"].tolist(), rewards) == ([0, 30], {"being_0": 30.0, "being_1": 0.0})
+    assert terminations == {"being_0": True, "being_1": False}
+    assert infos["being_0"]["acted"] is True
 
 
-def test_who_was_declared_and_is_removed_before_it_decides():
+def test_removals_of_those_who_have_not_decided_or_are_no_agents():
     def main(simulation):
+        Being(3).leave()
         Being(0).act()
         Being(2).leave()
+        Being(2).leave()
+        Being(9).leave()
+        Other(0).leave()
         Being(1).act()
 
-    env = aec_env(script(main), beings(), possible_agents=NAMES)
+    env = aec_env(script(main), beings(), possible_agents=[*NAMES, "being_3"])
+    env.reset()
+    assert not any(env.truncations.values())
     turns = play(env, 1)
-    assert [(turn.agent, turn.terminated) for turn in turns] == [
+    assert [(turn.agent, turn.terminated) for turn in turns if turn.agent != "being_3"] == [
         ("being_0", False),
         ("being_2", True),
         ("being_1", False),
         ("being_0", True),
         ("being_1", True),
     ]
-    assert turns[1].reward == 0.0
-    assert turns[1].observation.tolist() == [0, 0]
+    assert [turn.terminated for turn in turns if turn.agent == "being_3"] in ([], [True])
+    being_2 = next(turn for turn in turns if turn.agent == "being_2")
+    assert (being_2.reward, being_2.observation.tolist()) == (0.0, [0, 0])
 
 
-def test_who_was_announced_and_is_removed_before_it_decides():
-    def main(simulation):
-        zero, one, two, _ = simulation.beings
-        zero.act()
-        two.health = 8
-        two.leave()
-        one.act()
-
-    turns = play(aec_env(knowing(main, 1, 2), beings()), 1)
-    assert [turn.agent for turn in turns] == ["being_0", "being_2", "being_1", "being_0", "being_1"]
-    assert (turns[1].reward, turns[1].observation.tolist()) == (0.0, [2, 8])
-
-
-def test_who_is_removed_before_the_first_decision():
-    def main(simulation):
-        Being(1).leave()
-        Being(0).act()
-
-    env = aec_env(script(main), beings(), possible_agents=NAMES[:2])
-    env.reset()
-    assert not any(env.truncations.values())
-    turns = play(env, 1)
-    assert decisions(turns) == ["being_0"]
-    ended = [turn.agent for turn in turns if turn.terminated]
-    assert ended in (["being_1", "being_0"], ["being_0"])
-
-
-def test_who_was_never_an_agent_may_be_removed():
-    def main(simulation):
-        Being(0).act()
-        Being(9).leave()
-        Other(0).leave()
-        Being(0).act()
-
-    turns = play(aec_env(script(main), beings()), 1)
-    assert [turn.agent for turn in turns] == ["being_0"] * 3
-
-
-@pytest.mark.parametrize("roster", [None, NAMES])
-def test_a_revived_agent_is_an_error_that_ends_the_episode(roster):
+@pytest.mark.parametrize("roster", [None, NAMES], ids=["no roster", "a roster"])
+@pytest.mark.parametrize("view", [aec_env, parallel_env])
+@pytest.mark.parametrize("agent", [being_of, "being_0"], ids=["by entity", "one name"])
+def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(roster, view, agent):
     def main(simulation):
         one = Being(0)
         one.act()
         one.leave()
-        one.whole = True
-        one.act()
+        again = simulation.again = one if simulation.seed % 2 else Being(0)
+        again.whole = True
+        again.act()
         simulation.log.append("decided")
 
-    env = aec_env(script(main), beings(), possible_agents=roster)
+    env = view(script(main), beings(agent=agent), possible_agents=roster if callable(agent) else None)
+    for seed in (11, 12):
+        env.reset(seed=seed)
+        with pytest.raises(AgentError, match=r"being_0.*after its end") as caught:
+            env.step({"being_0": 1} if view is parallel_env else 1)
+        assert f"seed {seed}" in notes(caught.value)
+        assert env.simulation.log == []
+        assert env.agents == []
+        with pytest.raises(EpisodeOverError, match="begin the next one"):
+            env.step({} if view is parallel_env else 1)
     env.reset()
-    with pytest.raises(AgentError, match=r"being_0.*after its end"):
-        env.step(1)
-    assert env.simulation.log == []
-    assert env.agents == []
-    with pytest.raises(EpisodeOverError, match="begin the next one"):
-        env.step(1)
-    env.reset()
-    assert env.agent_selection == "being_0"
-
-
-def test_a_namesake_of_a_removed_agent_is_an_error_too():
-    env = aec_env(leaving(1, 0), beings())
-    env.reset()
-    env.step(1)
-    env.step(None)
-    with pytest.raises(AgentError, match="after its end"):
-        env.step(1)
-
-
-def test_an_end_does_not_outlast_its_episode():
-    env = aec_env(leaving(1), beings())
-    assert [turn.agent for turn in play(env, 1)] == [turn.agent for turn in play(env, 1)]
-
-
-def test_all_are_removed_and_the_simulation_goes_on():
-    def main(simulation):
-        for number in range(2):
-            being = Being(number)
-            being.act()
-            being.leave()
-        simulation.log.append("on and on")
-
-    turns = play(env := aec_env(script(main), beings()), 1)
-    assert [turn.agent for turn in turns] == ["being_0", "being_0", "being_1", "being_1"]
-    assert env.simulation.log == ["on and on"]
-    assert env.agents == []
-
-
-def test_the_ends_of_the_removed_and_of_the_others_are_told_apart():
-    def main(simulation):
-        first, second = Being(0), Being(1)
-        first.act()
-        second.act()
-        first.leave()
-        return TRUNCATED
-
-    turns = play(aec_env(script(main), beings()), 1)
-    assert {turn.agent: (turn.terminated, turn.truncated) for turn in turns[2:]} == {
-        "being_0": (True, False),
-        "being_1": (False, True),
-    }
+    assert "being_0" in env.agents
 
 
 def test_a_removal_in_the_last_step():
@@ -799,36 +518,17 @@ def test_several_entities_under_one_name_are_warned_of_once(view):
     """Nothing was said of agents, and so they are taken to be one, whose rewards and differences mix."""
 
     def main(simulation):
+        simulation.crowd = [Being(number) for number in range(simulation.seed)]
         for being in simulation.crowd * 2:
             being.act()
 
-    class Model:
-        def reset(self):
-            self.crowd = [Being(number) for number in range(size)]
-
-        def run(self):
-            main(self)
-
-    def play_through(env):
-        env.reset()
-        if view is aec_env:
-            play(env, 1)
-        elif view is single_env:
-            while not env.step(1)[2]:
-                pass
-        else:
-            while env.agents:
-                env.step(dict.fromkeys(env.agents, 1))
-
-    size = 1
-    env = view(Model, {Being.act: define()})
-    play_through(env)
-    play_through(env)  # another one in each episode is the one of that episode
-    size = 2
+    env = view(script(main), {Being.act: define()})
+    follow_the_rule(env, 1)
+    follow_the_rule(env, 1)  # another one in each episode is the one of that episode
     with pytest.warns(UserWarning, match=r"several objects decide at .*Being\.act as one agent, 'act_0'.*agent="):
-        play_through(env)
-    play_through(env)
-    play_through(view(Model, {Being.act: define(agent="all_of_them")}))
+        follow_the_rule(env, 2)
+    follow_the_rule(env, 2)
+    follow_the_rule(view(script(main), {Being.act: define(agent="all_of_them")}), 2)
 
 
 class Bound:
@@ -875,48 +575,30 @@ def test_a_bare_name_means_who_the_entity_was_where_it_is_named_no_more(kind):
     env.reset()
     gone = []
     while env.agents:
-        *_, terminations, _, _ = env.step(dict.fromkeys(env.agents, 1))
-        gone += [agent for agent, over in terminations.items() if over]
+        gone += [agent for agent, over in env.step(RULE)[2].items() if over]
     assert gone[:2] == ["being_1", "being_7"]
     assert sorted(gone) == ["being_0", "being_1", "being_2", "being_7"]
 
 
-def test_a_bare_name_that_can_never_mean_an_agent_is_warned_of():
-    """A method of something else is called on that, and not on an entity."""
-    with pytest.warns(UserWarning, match=r"leave.*not on a Being.*ends no agent.*callable"):
-        env = aec_env(script(lambda simulation: Being(0).act()), beings(removed_by=f"{HERE}.Other.leave"))
-    assert len(play(env, 1)) == 2
-
-
 def test_a_callable_names_who_is_removed():
     def main(simulation):
-        crowd = [Being(number) for number in range(3)]
+        crowd = [Being(number) for number in range(4)]
         for being in crowd:
             being.act()
         banish("the woods", crowd[1])
         banish("nowhere", crowd[2])
+        crowd[3].leave()
         banish(place="the woods", being=crowd[0])
         crowd[2].whole = True
         crowd[2].act()
 
-    removed_by = {f"{HERE}.banish": lambda place, being: being_of(being) if place == "the woods" else None}
+    removed_by = {
+        f"{HERE}.Being.leave": None,
+        f"{HERE}.banish": lambda place, being: being_of(being) if place == "the woods" else None,
+    }
     turns = play(aec_env(script(main), beings(removed_by=removed_by)), 1)
-    assert [turn.agent for turn in turns if turn.terminated] == ["being_1", "being_0", "being_2"]
+    assert [turn.agent for turn in turns if turn.terminated] == ["being_1", "being_3", "being_0", "being_2"]
     assert decisions(turns)[-1] == "being_2"
-
-
-def test_several_functions_remove():
-    def main(simulation):
-        crowd = [Being(number) for number in range(3)]
-        for being in crowd:
-            being.act()
-        banish("the woods", crowd[1])
-        crowd[0].leave()
-        crowd[2].act()
-
-    removed_by = {f"{HERE}.Being.leave": None, f"{HERE}.banish": lambda place, being: being_of(being)}
-    turns = play(aec_env(script(main), beings(removed_by=removed_by)), 1)
-    assert [turn.agent for turn in turns[3:]] == ["being_1", "being_0", "being_2", "being_2"]
 
 
 class Leaver:
@@ -939,21 +621,6 @@ class Young(Leaver):
 
 class Old(Leaver):
     pass
-
-
-def test_the_last_observation_is_of_the_last_arguments():
-    class Walker:
-        def walk(self, place):
-            return "rule"
-
-    def main(simulation):
-        simulation.walker = Walker()
-        simulation.walker.walk(1)
-        simulation.walker.walk(2)
-
-    point = define(agent=lambda walker, place: "walker_0", observation_space_mapping=lambda walker, place: [place, 0])
-    turns = play(aec_env(script(main), {Walker.walk: point}), 1)
-    assert [turn.observation[0] for turn in turns] == [1, 2, 2]
 
 
 def test_one_removal_ends_the_agents_of_several_points():
@@ -990,67 +657,25 @@ def test_a_removal_that_is_inherited_ends_agents_of_its_subclasses_alone():
     assert [(turn.agent, turn.terminated) for turn in turns] == [("young_1", 0), ("young_1", 0), ("young_1", 1)]
 
 
-def test_agents_of_one_name_end_as_well():
-    """In the single view, the episode is over then; the simulation still runs to its end."""
-
-    def main(simulation):
-        one = Being(0)
-        one.act()
-        one.health = 4
-        one.leave()
-        simulation.log.append("on and on")
-        return TRUNCATED
-
-    definition = beings(agent="hero_0")
-    env = single_env(script(main), definition)
-    env.reset()
-    observation, reward, terminated, truncated, _ = env.step(1)
-    assert (observation.tolist(), reward, terminated, truncated) == ([0, 4], 4.0, True, False)
-    assert env.simulation.log == ["on and on"]
-    with pytest.raises(EpisodeOverError, match="begin the next one"):
-        env.step(1)
-
-
-@pytest.mark.parametrize("view", [aec_env, parallel_env])
-def test_an_agent_of_one_name_is_not_revived_either(view):
-    def main(simulation):
-        simulation.beings = one, two = Being(0), Being(1)
-        for _ in range(3):
-            one.act()
-        one.leave()
-        two.act()
-
-    env = view(script(main), beings(agent="hero_0"))
-    env.reset()
-    for _ in range(2):
-        env.step({"hero_0": 1} if view is parallel_env else 1)
-    with pytest.raises(AgentError, match="hero_0"):
-        env.step({"hero_0": 1} if view is parallel_env else 1)
-    assert env.agents == []
-
-
 @pytest.mark.parametrize(
-    ("removed_by", "error"),
+    ("removed_by", "error", "match"),
     [
-        ("tests.worlds.many_worlds.Being.vanish", UnknownPointError),
-        ("nowhere.Being.leave", UnknownPointError),
-        (["tests.worlds.many_worlds.Being.leave", "nowhere"], UnknownPointError),
-        ("tests.worlds.many_worlds.Being.act", DefinitionError),
+        ("tests.worlds.many_worlds.Being.vanish", UnknownPointError, "vanish"),
+        ("nowhere.Being.leave", UnknownPointError, "nowhere"),
+        (["tests.worlds.many_worlds.Being.leave", "nowhere"], UnknownPointError, "nowhere"),
+        ("tests.worlds.many_worlds.Being.act", DefinitionError, "Being.act"),
+        ({f"{HERE}.banish": "being_0"}, DefinitionError, "removed_by must be a dict from dotted names"),
+        ({3: None}, DefinitionError, "removed_by must be a dict from dotted names"),
+        ([3], DefinitionError, "removed_by must be a dict from dotted names"),
     ],
 )
-def test_removals_that_cannot_be(removed_by, error):
-    with pytest.raises(error):
+def test_removals_that_cannot_be_are_refused(removed_by, error, match):
+    with pytest.raises(error, match=match):
         aec_env(living(0), beings(removed_by=removed_by))
     assert Being(0).act() == "rule"
 
 
-@pytest.mark.parametrize("removed_by", [{f"{HERE}.banish": "being_0"}, {3: None}, [3]])
-def test_removals_that_are_not_even_defined(removed_by):
-    with pytest.raises(DefinitionError, match="removed_by must be a dict from dotted names"):
-        beings(removed_by=removed_by)
-
-
-def test_removals_are_what_they_were_for_everybody_else():
+def test_everybody_else_removes_as_ever():
     leave, act = vars(Being)["leave"], vars(Being)["act"]
     env = aec_env(leaving(1), beings())
     env.reset()
@@ -1064,6 +689,22 @@ def test_removals_are_what_they_were_for_everybody_else():
     assert vars(Being)["act"] is act
 
 
+def test_the_single_view_is_over_when_its_agent_is_removed_though_the_simulation_runs_on():
+    def main(simulation):
+        one = Being(0)
+        one.act()
+        one.health = 4
+        one.leave()
+        simulation.log.append("on and on")
+        return TRUNCATED
+
+    env = single_env(script(main), beings(agent="hero_0"))
+    env.reset()
+    observation, reward, terminated, truncated, _ = env.step(1)
+    assert (observation.tolist(), reward, terminated, truncated) == ([0, 4], 4.0, True, False)
+    assert env.simulation.log == ["on and on"]
+
+
 def test_points_that_were_named_while_another_environment_was_open():
     """What ``Being.act`` is then stands for it as well, even when that environment is gone."""
     first = aec_env(living(0), beings())
@@ -1075,18 +716,6 @@ def test_points_that_were_named_while_another_environment_was_open():
     env = aec_env(living(0, 1), named)
     assert decisions(play(env, 1)) == ["being_0", "being_1"]
     assert env.simulation.log == [1, 1]
-
-
-def test_an_error_in_a_last_reward_surfaces():
-    changes = {"reward_mapping": lambda being: 1.0 + being.health, "observation_space_mapping": lambda being: [0, 0]}
-    env = aec_env(leaving(1, before=lambda being: setattr(being, "health", None)), beings(**changes))
-    env.reset()
-    with pytest.raises(TypeError) as caught:
-        env.step(1)
-    assert "being_0" in notes(caught.value)
-    assert env.agents == []
-    env.reset()
-    assert env.agent_selection == "being_0"
 
 
 @pytest.mark.parametrize("ends", ["return", "remove"])
@@ -1110,6 +739,9 @@ def test_an_error_in_a_last_reward_says_whose_it_was(ends):
         env.step(1)
     assert "being_0" in notes(caught.value)
     assert "seed 19" in notes(caught.value)
+    assert env.agents == []
+    env.reset()
+    assert env.agent_selection == "being_0"
 
 
 def test_an_error_after_a_removal_says_after_whose_decision_it_was():
@@ -1129,75 +761,7 @@ def test_an_error_after_a_removal_says_after_whose_decision_it_was():
     assert "being_0" not in notes(caught.value)
 
 
-def test_policies_agents_are_removed_without_a_word():
-    def main(simulation):
-        one, two = Being(0), Being(1)
-        one.act()
-        two.act()
-        one.leave()
-        two.act()
-
-    turns = play(aec_env(script(main), beings(), policies={"being_0": lambda observation: 3}), 1)
-    assert [turn.agent for turn in turns] == ["being_1"] * 3
-
-
 # -- who keeps whom alive -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("announced", [False, True])
-def test_the_environment_keeps_nobody_alive(announced):
-    class Town:
-        def reset(self):
-            self.beings = [Being(number) for number in range(3)]
-            self.seen = [weakref.ref(being) for being in self.beings]
-            self.log = []
-
-        def run(self):
-            for number in range(3):
-                self.beings[number].act()
-            del self.beings[0]
-            gc.collect()
-            self.log.append([seen() is not None for seen in self.seen])
-            self.beings[0].act()
-
-        if announced:
-
-            def expected_calls(self, point):
-                return [(being,) for being in self.beings]
-
-    env = aec_env(Town, beings(removed_by=()))
-    turns = play(env, 1)
-    assert env.simulation.log == [[False, True, True]]
-    last = next(turn for turn in turns if turn.terminated and turn.agent == "being_0")
-    assert last.reward == 0.0
-    assert last.observation.tolist() == [0, 0]
-
-
-def test_a_set_of_weak_references_is_as_it_would_be():
-    """As Mesa keeps its agents: whoever is held by nobody else decides no more."""
-
-    class Herd:
-        def reset(self, seed=None):
-            self.beings, self.weakly, self.log = [Being(n) for n in range(4)], weakref.WeakSet(), []
-            self.weakly.update(self.beings)
-
-        def run(self):
-            for number in (0, 2):
-                for being in sorted(self.weakly, key=being_of):
-                    self.log.append((being.number, being.act()))
-                    del being
-                self.beings[number].leave()
-                self.beings[number] = None
-            self.log.append(sorted(being.number for being in self.weakly))
-
-    plain = Herd()
-    plain.reset()
-    plain.run()
-    assert plain.log[-1] == [1, 3]
-    env = aec_env(Herd, beings())
-    turns = play(env)
-    assert env.simulation.log == plain.log
-    assert len([turn for turn in turns if turn.terminated]) == 4
 
 
 @pytest.mark.parametrize("simulation", [Hunt, AnnouncedHunt])
@@ -1208,14 +772,7 @@ def test_choices_keep_nobody_alive(make, simulation):
     plain.reset()
     plain.run()
     assert (0, 2, "rule") not in plain.log
-    env = make(simulation, hunters())
-    if make is aec_env:
-        play(env)
-    else:
-        env.reset()
-        while env.agents:
-            env.step(dict.fromkeys(env.agents, RULE))
-    assert env.simulation.log == plain.log
+    assert follow_the_rule(make(simulation, hunters())).log == plain.log
 
 
 # -- everything at once ---------------------------------------------------------------------------
@@ -1265,8 +822,7 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
             assert result.decisions == plain.decisions
             assert env.simulation.trace == plain.trace
             assert env.simulation.random.getstate() == plain.random.getstate()
-            decided = {agent: result.totals[agent] for agent in plain.first}
-            assert decided == plain.totals
+            assert {agent: result.totals[agent] for agent in plain.first} == plain.totals
             assert all(total == 0.0 for agent, total in result.totals.items() if agent not in plain.first)
             died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}
             for agent, ended in result.ends.items():
@@ -1274,80 +830,20 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
             assert set(result.ends) >= set(plain.first)
 
 
-@given(designs, seeds)
-@settings(max_examples=60)
-def test_observations_tell_what_is_needed(design, seed):
-    """The answers follow from the observations alone, if these are those of the moment."""
-    plain = Answered(design, seed)
-    env = colony(aec_env, design, Announcing)
-    result = played(env, lambda agent, number, observation: advised(observation, seed), seed)
-    assert result.decisions == plain.decisions
-    assert env.simulation.trace == plain.trace
-
-
-@given(designs, seeds)
-@settings(max_examples=60)
-def test_with_rule_throughout_a_colony_is_the_plain_run(design, seed):
-    plain = Colony(design)
-    plain.reset(seed)
-    plain.run()
-    for view, roster in ((aec_env, False), (parallel_env, False), (joint_env, True)):
-        for simulation in (Colony, Announcing):
-            found = follow_the_rule(colony(view, design, simulation, roster=roster), seed)
-            assert found.trace == plain.trace
-            assert found.random.getstate() == plain.random.getstate()
-
-
 # -- PettingZoo's tests ---------------------------------------------------------------------------
 
 
-def village(**options):
-    return aec_env(Village, colony_points(overseen=True), **options)
+def test_pettingzoos_tests_pass_with_births_and_deaths():
+    def village(**options):
+        return aec_env(Village, colony_points(overseen=True), **options)
 
-
-def test_api_with_births_and_deaths():
     with pytest.warns(UserWarning, match="possible_agents") as caught:
         api_test(village(), num_cycles=100)
     assert len(caught) == 1
-
-
-def test_seeds_with_births_and_deaths():
     seed_test(village, num_cycles=100)
 
 
-def test_api_with_a_roster():
-    with warnings.catch_warnings():
-        # Those that are never born are observed as zeros.
-        warnings.filterwarnings("ignore", message="Observation numpy array is all zeros")
-        api_test(village(possible_agents=NAMES_OF_THE_VILLAGE), num_cycles=100)
-    seed_test(lambda: village(possible_agents=NAMES_OF_THE_VILLAGE), num_cycles=100)
-
-
 # -- rewards --------------------------------------------------------------------------------------
-
-
-def test_differences_are_kept_by_agent():
-    def main(simulation):
-        one, two = Being(0), Being(1)
-        for health in (3, 10):
-            for being in (one, two):
-                being.health = health * (being.number + 1)
-                being.act()
-        two.health = 100
-        two.leave()
-        one.act()
-
-    env = aec_env(script(main), beings(reward_mapping=difference(lambda being: being.health)))
-    turns = play(env, 1)
-    assert [(turn.agent, turn.reward) for turn in turns] == [
-        ("being_0", 0.0),
-        ("being_1", 0.0),
-        ("being_0", 7.0),
-        ("being_1", 14.0),
-        ("being_1", 80.0),
-        ("being_0", 0.0),
-        ("being_0", 0.0),
-    ]
 
 
 def test_at_the_end_those_leave_first_who_have_decided():

@@ -124,7 +124,7 @@ def test_each_kind_of_mapping_gets_the_simulation() -> None:
     assert log == [("market", "low")] * 2 + [("market", "high")] * 4
 
 
-def test_each_environment_gets_its_own() -> None:
+def test_mappings_of_each_environment_get_its_own_simulation() -> None:
     envs = [aec_env(Market(title), points()) for title in ("here", "there")]
     for env in envs:
         env.reset(seed=1)
@@ -134,7 +134,7 @@ def test_each_environment_gets_its_own() -> None:
     assert [env.unwrapped.simulation.log for env in envs] == [[("here", "low")], [("there", "low")]]
 
 
-def test_the_action_space_mapping_gets_it_and_so_do_masks_and_actions_of_the_rule() -> None:
+def test_mappings_of_actions_masks_and_the_rule_get_the_simulation() -> None:
     changes = {
         "choices": None,
         "apply": None,
@@ -153,7 +153,7 @@ def test_the_action_space_mapping_gets_it_and_so_do_masks_and_actions_of_the_rul
     assert env.last()[-1]["rule_action"] == 1
 
 
-def test_a_difference_gets_it() -> None:
+def test_the_mapping_of_a_difference_gets_the_simulation() -> None:
     def sold(dealer, offers, *, _simulation):
         return len(_simulation.log)
 
@@ -161,7 +161,7 @@ def test_a_difference_gets_it() -> None:
     assert [reward for agent, _, reward, _ in told if agent == "market_0"] == [0, 2, 2, 2]
 
 
-def test_goals_get_it() -> None:
+def test_mappings_of_goals_get_the_simulation() -> None:
     def reached(dealer, offers, *, _simulation):
         return [_simulation.day]
 
@@ -182,7 +182,7 @@ def test_goals_get_it() -> None:
     }  # fmt: skip
 
 
-def test_every_view_and_runner_has_it() -> None:
+def test_mappings_get_the_simulation_in_every_view_and_runner() -> None:
     roster = {"possible_agents": ["market_0", "market_1"]}
     parallel = parallel_env(Market, points(), **roster)
     assert parallel.reset(seed=2)[0]["market_1"].tolist() == [0, 2]
@@ -202,7 +202,7 @@ def test_every_view_and_runner_has_it() -> None:
     assert made.observations[:, 1].tolist() == [0] * 6 + [1] * 6 + [2] * 6
 
 
-def test_copies_have_their_own() -> None:
+def test_mappings_of_a_copy_get_its_own_simulation() -> None:
     env = aec_env(Market, points())
     env.reset()
     env.close()
@@ -211,7 +211,7 @@ def test_copies_have_their_own() -> None:
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 2])
-def test_nothing_is_kept_alive(episodes) -> None:
+def test_mappings_keep_no_simulation_alive(episodes) -> None:
     env = aec_env(Market, points())
     for _ in range(episodes):
         env.reset(seed=1)
@@ -222,7 +222,7 @@ def test_nothing_is_kept_alive(episodes) -> None:
     assert simulation() is None
 
 
-def test_a_parameter_that_may_be_passed_by_position_is_none_of_it() -> None:
+def test_a_parameter_that_may_be_passed_by_position_does_not_ask_for_the_simulation() -> None:
     env = aec_env(
         Market, points(reward_mapping=lambda dealer, offers, _simulation=None: float(_simulation is not None))
     )
@@ -230,7 +230,7 @@ def test_a_parameter_that_may_be_passed_by_position_is_none_of_it() -> None:
     assert {reward for _, _, reward, _ in told} == {0.0}
 
 
-def test_a_wrapper_may_give_it_by_itself() -> None:
+def test_a_wrapper_may_give_another_simulation_by_itself() -> None:
     @functools.wraps(pay)
     def given(dealer, offers):
         return pay(dealer, offers, _simulation=types.SimpleNamespace(log=[1, 2, 3]))

@@ -5,7 +5,6 @@ They are made and run in other ways since Mesa 3.5, which is nobody's business b
 
 import gc
 import warnings
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -28,8 +27,7 @@ from simenv_marl import (
     parallel_env,
     simulate,
 )
-from simenv_marl.errors import AgentError
-from tests.worlds.models import play
+from tests.worlds.models import follow_the_rule
 
 EXAMPLES = "mesa.examples.advanced"
 UNTOUCHED = [
@@ -230,24 +228,6 @@ def plain_run(simulation, seed):
     return simulation
 
 
-def in_turns(env, seed):
-    env.reset(seed=seed)
-    for agent in env.agent_iter():
-        env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
-
-
-def in_rounds(env, seed):
-    """Plays it; returns the number of rounds and of actions that were dropped."""
-    env.reset(seed=seed)
-    rounds = dropped = 0
-    while env.agents:
-        actions = dict.fromkeys(env.agents, RULE)
-        *_, infos = env.step(actions)
-        rounds += 1
-        dropped += sum(not infos[agent]["acted"] for agent in actions)
-    return rounds, dropped
-
-
 def all_alike(states, others):
     """Whether two runs are the same; says where they differ first."""
     assert len(states) == len(others)
@@ -258,104 +238,66 @@ def all_alike(states, others):
 
 
 @pytest.mark.parametrize("seed", [5, 11])
-@pytest.mark.parametrize("simulation", [Pasture, AnnouncedPasture])
-def test_wolves_and_sheep_with_rule_throughout_are_the_plain_run(simulation, seed):
-    plain = plain_run(simulation, seed)
+def test_wolves_and_sheep_with_rule_throughout_are_the_plain_run(seed):
+    plain = plain_run(Pasture, seed)
     assert len({tuple(state[-1]) for state in plain.states}) > 20  # it is a lively run
-    env = aec_env(simulation, herd())
-    in_turns(env, seed)
-    assert all_alike(env.simulation.states, plain.states)
-    env.close()
-    env = parallel_env(simulation, herd())
-    rounds, dropped = in_rounds(env, seed)
-    assert all_alike(env.simulation.states, plain.states)
-    if simulation is AnnouncedPasture:
-        assert (rounds, dropped) == (Pasture.ticks, 0)
-    else:
-        assert rounds > Pasture.ticks  # each birth needs a return
-    env.close()
+    assert all_alike(simulate(Pasture, points=herd(), seed=seed).states, plain.states)
+    for simulation in (Pasture, AnnouncedPasture):
+        assert all_alike(follow_the_rule(aec_env(simulation, herd()), seed).states, plain.states)
+        env = parallel_env(simulation, herd())
+        rounds, dropped = in_rounds(env, seed)
+        assert all_alike(env.simulation.states, plain.states)
+        if simulation is AnnouncedPasture:
+            assert (rounds, dropped) == (Pasture.ticks, 0)
+        else:
+            assert rounds > Pasture.ticks  # each birth needs a return
+
+
+def in_rounds(env, seed):
+    """Let the rule decide throughout; return the number of rounds and of actions that were dropped."""
+    env.reset(seed=seed)
+    rounds = dropped = 0
+    while env.agents:
+        actions = dict.fromkeys(env.agents, RULE)
+        *_, infos = env.step(actions)
+        rounds += 1
+        dropped += sum(not infos[agent]["acted"] for agent in actions)
+    return rounds, dropped
 
 
 @pytest.mark.parametrize("order", PdGrid.activation_regimes)
-def test_prisoners_with_rule_throughout_are_the_plain_run(order):
-    class Ordered(Prison):
-        pass
-
-    class AnnouncedOrdered(AnnouncedPrison):
-        pass
-
-    Ordered.order = AnnouncedOrdered.order = order
-    plain = plain_run(Ordered, 3)
-    for simulation in (Ordered, AnnouncedOrdered):
-        env = aec_env(simulation, prisoners())
-        in_turns(env, 3)
+def test_prisoners_with_rule_throughout_are_the_plain_run(order, monkeypatch):
+    monkeypatch.setattr(Prison, "order", order)
+    plain = plain_run(Prison, 3)
+    assert all_alike(simulate(Prison, points=prisoners(), seed=3).states, plain.states)
+    assert all_alike(follow_the_rule(aec_env(Prison, prisoners()), 3).states, plain.states)
+    for simulation, options in ((AnnouncedPrison, {}), (Prison, {"possible_agents": roster(20)})):
+        env = parallel_env(simulation, prisoners(), **options)
+        assert in_rounds(env, 3) == (Prison.ticks, 0)
         assert all_alike(env.simulation.states, plain.states)
-        env = parallel_env(simulation, prisoners())
-        rounds, dropped = in_rounds(env, 3)
-        assert all_alike(env.simulation.states, plain.states)
-        if simulation is AnnouncedOrdered:
-            assert (rounds, dropped) == (Prison.ticks, 0)
-    env = parallel_env(Ordered, prisoners(), possible_agents=roster(20))
-    assert in_rounds(env, 3) == (Prison.ticks, 0)
-    assert all_alike(env.simulation.states, plain.states)
-
-
-def test_one_joint_agent_for_400_prisoners():
-    plain = plain_run(AnnouncedPrison, 3)
     env = joint_env(AnnouncedPrison, prisoners())
     assert set(env.action_space.spaces) == set(roster(20))
     env.reset(seed=3)
-    rounds, total = 0, 0.0
-    over = False
-    while not over:
-        _, reward, terminated, truncated, info = env.step(RULE)
-        rounds, total, over = rounds + 1, total + reward, terminated or truncated
-        assert all(info["acted"].values())
-    assert (rounds, terminated, truncated) == (Prison.ticks, False, True)
+    told = [env.step(RULE) for _ in range(Prison.ticks)]
+    assert [step[2:4] for step in told] == [(False, False)] * (Prison.ticks - 1) + [(False, True)]
+    assert all(all(info["acted"].values()) for *_, info in told)
     assert all_alike(env.simulation.states, plain.states)
     # Each prisoner is paid what it has won since it was known, which is since the beginning.
-    assert total == pytest.approx(sum(score for *_, score, _ in plain.states[-1][0]))
-
-
-def test_simulate_without_policies_is_the_plain_run():
-    simulation = simulate(Pasture, points=herd(), seed=5)
-    assert all_alike(simulation.states, plain_run(Pasture, 5).states)
-    simulation = simulate(Prison, points=prisoners(), seed=5)
-    assert all_alike(simulation.states, plain_run(Prison, 5).states)
+    won = sum(score for *_, score, _ in plain.states[-1][0])
+    assert sum(step[1] for step in told) == pytest.approx(won)
 
 
 def test_the_models_are_as_they_were():
     env = aec_env(Meadow, herd())
     env.reset(seed=5)
     beside = plain_run(Meadow, 5)  # while the environment stands in mid-episode
-    in_turns(env, 5)
+    follow_the_rule(env, 5)
     assert all_alike(env.simulation.states, beside.states)
     env.close()
     del env
     gc.collect()
     for owner, name, function in UNTOUCHED:
         assert vars(owner)[name] is function
-
-
-def test_side_by_side_they_do_not_touch_each_other():
-    plain = [plain_run(Meadow, 5), plain_run(Meadow, 6), plain_run(Cell, 5), plain_run(Meadow, 7)]
-    envs = [
-        aec_env(Meadow, herd()),
-        parallel_env(AnnouncedMeadow, herd()),
-        parallel_env(Cell, prisoners()),
-        aec_env(AnnouncedMeadow, {name: definition for name, definition in herd().items() if ".Wolf." in name}),
-    ]
-    for env, seed in zip(envs, (5, 6, 5, 7), strict=True):
-        env.reset(seed=seed)
-    while any(env.agents for env in envs):
-        for env in envs:
-            if env.agents and hasattr(env, "agent_selection"):
-                agent = env.agent_selection
-                env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
-            elif env.agents:
-                env.step(RULE)
-    for env, simulation in zip(envs, plain, strict=True):
-        assert all_alike(env.simulation.states, simulation.states)
 
 
 # -- births and deaths ----------------------------------------------------------------------------
@@ -368,25 +310,6 @@ def names(state):
 
 def number_of(agent):
     return int(agent.partition("_")[2])
-
-
-def test_everybody_who_dies_terminates_once_and_the_others_are_truncated():
-    env = aec_env(Pasture, herd())
-    turns = play(env, seed=5)
-    states = env.simulation.states
-    ends = [turn for turn in turns if turn.terminated or turn.truncated]
-    assert max(Counter(turn.agent for turn in ends).values()) == 1
-    survivors = names(states[-1])
-    assert {number_of(turn.agent) for turn in ends if turn.truncated} <= survivors
-    dead = {number_of(turn.agent) for turn in ends if turn.terminated}
-    assert not dead & survivors
-    decided = {turn.agent for turn in turns}
-    assert {turn.agent for turn in ends} == decided
-    assert len(dead) > 20
-    assert len(decided) > 200  # 150 there were first
-    # After its end nobody is heard of again.
-    last = {turn.agent: place for place, turn in enumerate(turns)}
-    assert all(turns[last[turn.agent]] is turn for turn in ends)
 
 
 def test_deaths_in_rounds():
@@ -420,13 +343,6 @@ def test_deaths_in_rounds():
     assert all(observation[0] >= -1 for observation in ended.values())
 
 
-def test_the_time_of_the_pasture():
-    turns = play(aec_env(Meadow, herd()), seed=5)
-    for turn in turns:
-        assert turn.info["elapsed"] in (0.0, 1.0)
-    assert {turn.info["time"] for turn in turns} == set(map(float, range(1, Meadow.ticks + 1)))
-
-
 def test_the_environment_keeps_no_animal():
     """The model counts on whoever is removed being gone."""
     env = aec_env(Pasture, herd())
@@ -445,101 +361,29 @@ def test_the_environment_keeps_no_animal():
     env.close()
 
 
-def test_actions_are_carried_out():
-    """Everybody goes where it is sent, in turns and in rounds alike."""
-
-    def where_to(agent, tick):
-        return (number_of(agent) + tick) % 4
-
-    def move(action, animal):
-        went.append((animal.unique_id, action))
-        go(action, animal)
-
-    went = []
-    env = aec_env(AnnouncedMeadow, herd(apply=move))
-    env.reset(seed=5)
-    for agent in env.agent_iter():
-        ended = env.terminations[agent] or env.truncations[agent]
-        env.step(None if ended else where_to(agent, env.simulation.model.steps))
-    in_turn, went = went, []
-    states = env.simulation.states
-    env = parallel_env(AnnouncedMeadow, herd(apply=move))
-    env.reset(seed=5)
-    while env.agents:
-        env.step({agent: where_to(agent, env.simulation.model.steps) for agent in env.agents})
-    assert len(in_turn) > 100
-    assert in_turn == went
-    assert all_alike(env.simulation.states, states)
-    wolves = simulate(
-        AnnouncedMeadow,
-        {f"{EXAMPLES}.wolf_sheep.agents.Wolf.move": lambda observation: 0},
-        points=herd(),
-        seed=5,
-    )
-    assert len(wolves.states) == Meadow.ticks + 1
-    assert wolves.states[-1] != states[-1]
-
-
-def test_a_roster_of_those_who_are_there_first():
-    first = [f"sheep_{number}" for number in range(1, 15)] + [f"wolf_{number}" for number in range(15, 21)]
-    by_point = {
-        name: [agent for agent in first if agent.startswith(kind)]
-        for kind, name in zip(("wolf", "sheep"), herd(), strict=True)
-    }
-    env = aec_env(Meadow, herd(), possible_agents=by_point, undeclared="rule")
-    assert sorted(env.possible_agents) == sorted(first)
-    turns = play(env, seed=5)
-    assert {turn.agent for turn in turns} == set(first)
-    assert all_alike(env.simulation.states, plain_run(Meadow, 5).states)
-    env = aec_env(Meadow, herd(), possible_agents=by_point)
-    with pytest.raises(AgentError, match="not declared"):
-        play(env, seed=5)
-
-
-def test_without_removals_the_dead_end_with_the_episode():
-    env = aec_env(Meadow, herd(removed_by=()))
-    turns = play(env, seed=5)
-    assert all_alike(env.simulation.states, plain_run(Meadow, 5).states)
-    assert not any(turn.terminated for turn in turns)
-    assert {turn.agent for turn in turns if turn.truncated} == {turn.agent for turn in turns}
-
-
 # -- PettingZoo's and Gymnasium's tests -----------------------------------------------------------
 
 UNKNOWN_ROSTER = r"This environment does not have possible_agents defined\."
 
 
-def test_api_of_wolves_and_sheep():
-    for simulation in (Meadow, AnnouncedMeadow):
-        with pytest.warns(UserWarning, match=UNKNOWN_ROSTER) as caught:
-            api_test(aec_env(simulation, herd()), num_cycles=20)
-        assert len(caught) == 1
+@pytest.mark.parametrize("simulation", [Meadow, AnnouncedMeadow])
+def test_pettingzoos_tests_of_wolves_and_sheep(simulation):
+    with pytest.warns(UserWarning, match=UNKNOWN_ROSTER) as caught:
+        api_test(aec_env(simulation, herd()), num_cycles=20)
+    assert len(caught) == 1
+    seed_test(lambda: aec_env(simulation, herd()), num_cycles=20)
+    parallel_seed_test(lambda: parallel_env(simulation, herd()), num_cycles=20)
+    with warnings.catch_warnings():
+        # Of every environment without a roster, and at the end of each of its episodes.
+        warnings.filterwarnings("ignore", message=UNKNOWN_ROSTER)
+        warnings.filterwarnings("ignore", message="No agents present")
+        parallel_api_test(parallel_env(simulation, herd()), num_cycles=50)
 
 
-def test_seeds_of_wolves_and_sheep():
-    for simulation in (Meadow, AnnouncedMeadow):
-        seed_test(lambda simulation=simulation: aec_env(simulation, herd()), num_cycles=20)
-        parallel_seed_test(lambda simulation=simulation: parallel_env(simulation, herd()), num_cycles=20)
-
-
-def test_parallel_api_of_wolves_and_sheep():
-    for simulation in (Meadow, AnnouncedMeadow):
-        with warnings.catch_warnings():
-            # Of every environment without a roster, and at the end of each of its episodes.
-            warnings.filterwarnings("ignore", message=UNKNOWN_ROSTER)
-            warnings.filterwarnings("ignore", message="No agents present")
-            parallel_api_test(parallel_env(simulation, herd()), num_cycles=50)
-
-
-def test_api_of_prisoners():
-    api_test(aec_env(Prison, prisoners(), possible_agents=roster(20)), num_cycles=2)
-    seed_test(lambda: aec_env(Prison, prisoners(), possible_agents=roster(20)), num_cycles=2)
-
-
-def test_parallel_api_of_prisoners():
-    parallel_api_test(parallel_env(AnnouncedPrison, prisoners(), possible_agents=roster(20)), num_cycles=20)
-    parallel_seed_test(lambda: parallel_env(Prison, prisoners(), possible_agents=roster(20)), num_cycles=20)
-
-
-def test_gymnasiums_check_of_joint_prisoners():
+def test_pettingzoos_and_gymnasiums_tests_of_prisoners():
+    named = {"possible_agents": roster(5)}
+    api_test(aec_env(Cell, prisoners(), **named), num_cycles=2)
+    seed_test(lambda: aec_env(Cell, prisoners(), **named), num_cycles=2)
+    parallel_api_test(parallel_env(Cell, prisoners(), **named), num_cycles=20)
+    parallel_seed_test(lambda: parallel_env(Cell, prisoners(), **named), num_cycles=20)
     check_env(joint_env(Cell, prisoners()), skip_render_check=True)

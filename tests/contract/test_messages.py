@@ -203,6 +203,7 @@ def test_names_of_agents_may_have_lone_surrogates():
 # -- errors -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("_collected")
 def test_an_error_without_looks_is_no_obstacle_to_the_first_one():
     """It is raised while the simulation is unwound for another."""
 

@@ -36,8 +36,10 @@ from simenv_marl.errors import (
     UnknownPointError,
     ViewError,
 )
+from tests.worlds.counters import same
 
 NAMES = ("player_red", "player_blue")
+RED = {"agent": "player_red"}
 PLACE = f"{__name__}.Player"
 
 
@@ -145,15 +147,10 @@ def test_one_named_agent_is_asked_and_all_others_are_left_to_their_rule() -> Non
         env.step(0)
 
 
-def test_the_others_are_left_to_policies_by_agent_or_by_point() -> None:
-    for policies in ({"player_blue": lambda observation: 0}, {f"{PLACE}.move": lambda observation: 0}):
-        env = single_env(Game, MOVE, agent="player_red", policies=policies) if "player_blue" in policies else None
-        if env is None:  # of a point all of whose agents a policy answers, none is left
-            with pytest.raises(UnknownPointError):
-                single_env(Game, MOVE, agent="player_red", policies=policies)
-            continue
-        episode(env)
-        assert [move for name, move in env.simulation.log if name == "player_blue"] == [1] * 6
+def test_the_others_are_left_to_policies_by_agent() -> None:
+    env = single_env(Game, MOVE, agent="player_red", policies={"player_blue": lambda observation: 0})
+    episode(env)
+    assert [move for name, move in env.simulation.log if name == "player_blue"] == [1] * 6
 
 
 def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
@@ -162,10 +159,6 @@ def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
     while not env.step(0)[2]:
         pass
     assert env.simulation.log == [(5, 1), (5, 1)]
-    with pytest.raises(ViewError, match="agent="):
-        single_env(Casino, NAMED)
-    with pytest.raises(AgentError, match="mover, better"):
-        single_env(Casino, NAMED, agent="mvoer")
 
 
 def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
@@ -183,33 +176,43 @@ def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
     assert env.simulation.log == [(6, 2), (5, 2)]
 
 
-def test_without_a_name_the_error_tells_of_the_option() -> None:
-    with pytest.raises(ViewError, match="agent="):
-        single_env(Game, MOVE)
-
-
 def test_an_agent_that_never_decides_is_an_error_that_lists_who_did() -> None:
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
 
 
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
-def test_it_is_an_option_of_the_single_view_alone(make) -> None:
-    with pytest.raises(UnknownOptionError, match="single view"):
-        make(Game, MOVE, agent="player_red")
+@pytest.mark.parametrize(
+    ("make", "simulation", "points", "options", "error", "match"),
+    [
+        (single_env, Game, MOVE, {}, ViewError, "agent="),
+        (single_env, Casino, NAMED, {}, ViewError, "agent="),
+        (single_env, Casino, NAMED, {"agent": "mvoer"}, AgentError, "mover, better"),
+        *((single_env, Game, MOVE, {"agent": agent}, OptionValueError, "agent") for agent in ("", 3, ("player_red",))),
+        *(
+            (make, Game, MOVE, {"agent": "player_red"}, UnknownOptionError, "single view")
+            for make in (aec_env, parallel_env, joint_env)
+        ),
+        (
+            lambda game, points, **options: simulate(game, points=points, **options),
+            Game,
+            MOVE,
+            {"agent": "player_red"},
+            UnknownOptionError,
+            "single_env",
+        ),
+        (single_env, Game, MOVE, RED | {"policies": {"player_red": RULE}}, OptionValueError, "policies"),
+        # Of a point all of whose agents a policy answers, none is left.
+        (single_env, Game, MOVE, RED | {"policies": {f"{PLACE}.move": RULE}}, UnknownPointError, "no decision point"),
+    ],
+)
+def test_only_the_single_view_takes_an_agent_and_needs_one_of_many(
+    make, simulation, points, options, error, match
+) -> None:
+    with pytest.raises(error, match=match):
+        make(simulation, points, **options)
 
 
-def test_nothing_else_takes_it() -> None:
-    with pytest.raises(UnknownOptionError, match="single_env"):
-        simulate(Game, points=MOVE, agent="player_red")
-    for wrong in ("", 3, ("player_red",)):
-        with pytest.raises(OptionValueError, match="agent"):
-            single_env(Game, MOVE, agent=wrong)
-    with pytest.raises(OptionValueError, match="policies"):
-        single_env(Game, MOVE, agent="player_red", policies={"player_red": RULE})
-
-
-def test_all_that_makes_single_views_takes_it() -> None:
+def test_all_that_makes_single_views_takes_the_name_of_the_agent() -> None:
     alone = episode(single_env(Game, MOVE, agent="player_blue"))
     made = generate_env(Game, MOVE, agent="player_blue")
     assert episode(made()) == alone
@@ -223,7 +226,7 @@ def test_all_that_makes_single_views_takes_it() -> None:
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_the_vector_view_is_of_single_views_of_it(workers) -> None:
+def test_the_vector_view_of_one_agent_is_many_single_views(workers) -> None:
     env = vector_env(Game, MOVE, agent="player_red", num_envs=2, workers=workers, context="fork" if workers else None)
     env.reset(seed=3)
     single, _ = episode(single_env(Game, MOVE, agent="player_red"))
@@ -336,13 +339,18 @@ def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
     parallel.reset(seed=0)
     assert parallel.agents == list(NAMES)
     assert parallel.step(dict.fromkeys(NAMES, 0))[2] == dict.fromkeys(NAMES, True)
-    vector = vector_env(Forced, MOVE, agent="player_red", skip_forced=True, num_envs=2)
-    vector.reset(seed=0)
-    for ended in (True, False, True):
-        _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
-        assert terminations.tolist() == [ended] * 2
-        assert rewards.tolist() == [3.0 * ended] * 2
-    vector.close()
+    actions = np.zeros(2, np.int64)
+    for options, action, reward in (
+        (RED, actions, 3.0),
+        ({"view": "joint", "possible_agents": list(NAMES)}, dict.fromkeys(NAMES, actions), 4.0),
+    ):
+        vector = vector_env(Forced, MOVE, skip_forced=True, num_envs=2, **options)
+        vector.reset(seed=0)
+        for ended in (True, False, True):
+            _, rewards, terminations, *_ = vector.step(action)
+            assert terminations.tolist() == [ended] * 2
+            assert rewards.tolist() == [reward * ended] * 2
+        vector.close()
 
 
 def test_an_episode_without_any_decision_still_is_an_error() -> None:
@@ -373,64 +381,69 @@ def flown(make, space, action, **options):
     return taken[0]
 
 
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
-def test_actions_outside_a_box_are_clipped(make) -> None:
-    taken = flown(make, BOX, np.array([-7.5, 1e30]), clip_actions=True)
-    assert taken.dtype == np.float32
-    assert taken.tolist() == [-1.0, np.float32(1e30)]
-    with pytest.raises(InvalidActionError):
-        flown(make, BOX, np.array([-7.5, 1.0]))
+ONE, HALF = spaces.Box(-1, 1, (1,), np.float32), spaces.Box(0.25, 0.5, (1,), np.float32)
+WHOLE = spaces.Box(0, 5, (1,), np.int8)
+CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 1)]))
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
-@pytest.mark.parametrize("wrong", [np.array([np.nan, 0.0]), np.array([5.0]), np.array(["a", "b"]), None, [[1, 2]]])
-def test_what_is_no_action_is_refused_all_the_same(make, wrong) -> None:
+@pytest.mark.parametrize(
+    ("space", "action", "expected"),
+    [
+        (BOX, np.array([-7.5, 1e30]), np.float32([-1.0, 1e30])),
+        (ONE, 3.5, 1.0),
+        (ONE, -2, -1),
+        (HALF, 7, 0.5),
+        (HALF, 0, 0.25),
+        (WHOLE, np.array([300]), np.int8([5])),
+        (
+            CAR,
+            {"gas": [9.5, -9], "gear": (2, np.float32([7]))},
+            {"gas": np.float32([1, 0]), "gear": (2, np.float32([1]))},
+        ),
+    ],
+)
+def test_actions_outside_a_box_are_clipped(make, space, action, expected) -> None:
+    taken = flown(make, space, action, clip_actions=True)
+    assert same(taken, expected) or (type(taken) is float and taken == expected)
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+@pytest.mark.parametrize(
+    ("space", "wrong"),
+    [
+        *((BOX, wrong) for wrong in (np.array([np.nan, 0.0]), np.array([5.0]), np.array(["a", "b"]), None, [[1, 2]])),
+        (WHOLE, np.array([2.5])),
+        (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
+    ],
+)
+def test_what_is_no_action_is_refused_all_the_same(make, space, wrong) -> None:
     with pytest.raises(InvalidActionError):
-        flown(make, BOX, wrong, clip_actions=True)
+        flown(make, space, wrong, clip_actions=True)
 
 
-def test_numbers_for_a_box_of_one_reach_the_mapping_as_such() -> None:
-    one = spaces.Box(-1, 1, (1,), np.float32)
-    assert flown(single_env, one, 3.5, clip_actions=True) == 1.0
-    assert type(flown(single_env, one, 3.5, clip_actions=True)) is float
-    assert flown(single_env, one, -2, clip_actions=True) == -1
-    half = spaces.Box(0.25, 0.5, (1,), np.float32)
-    assert flown(single_env, half, 7, clip_actions=True) == 0.5
-    assert flown(single_env, half, 0, clip_actions=True) == 0.25
-    whole = spaces.Box(0, 5, (1,), np.int8)
-    assert flown(single_env, whole, np.array([300]), clip_actions=True).tolist() == [5]
+def test_without_the_option_nothing_is_clipped() -> None:
     with pytest.raises(InvalidActionError):
-        flown(single_env, whole, np.array([2.5]), clip_actions=True)
-
-
-def test_boxes_within_other_spaces_are_clipped_and_nothing_else() -> None:
-    space = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 1)]))
-    action = {"gas": [9.5, -9], "gear": (2, np.float32([7]))}
-    taken = flown(single_env, space, action, clip_actions=True)
-    assert taken["gas"].tolist() == [1, 0]
-    assert taken["gear"][1].tolist() == [1]
-    with pytest.raises(InvalidActionError):
-        flown(single_env, space, {**action, "gear": (3, np.float32([7]))}, clip_actions=True)
+        flown(single_env, BOX, np.array([-7.5, 1.0]))
 
 
 @given(st.lists(st.floats(width=32), min_size=2, max_size=2))
 def test_the_vector_view_clips_as_the_single_view_does(numbers) -> None:
     action = np.array(numbers, np.float32)
-    vector = definition(
-        action_space=BOX, choices=None, action_space_mapping=lambda action: tuple(action), agent="pilot"
+    taken = []
+    made = definition(
+        action_space=BOX, choices=None, action_space_mapping=lambda action: taken.append(action) or 0, agent="pilot"
     )
-    env = vector_env(Game, {f"{PLACE}.move": vector}, num_envs=2, clip_actions=True)
+    env = vector_env(Game, {f"{PLACE}.move": made}, num_envs=2, clip_actions=True)
     env.reset(seed=0)
-    try:
-        env.step(np.stack([action, np.zeros(2, np.float32)]))
-        taken = [sub.simulation.log[0][1] for sub in env.envs]
-    except (InvalidActionError, TypeError) as error:
-        taken = type(error)
-    env.close()
     if np.isnan(action).any():
-        assert taken is InvalidActionError
+        with pytest.raises(InvalidActionError):
+            env.step(np.stack([np.zeros(2, np.float32), action]))
+        assert taken == []
     else:
-        assert taken is TypeError  # the model adds what it was given to a number
+        env.step(np.stack([np.zeros(2, np.float32), action]))
+        assert same(taken, [np.zeros(2, np.float32), flown(single_env, BOX, action, clip_actions=True)])
+    env.close()
 
 
 # -- forced moves and ends ------------------------------------------------------------------------
@@ -519,15 +532,6 @@ def test_the_single_view_of_an_agent_that_ends_during_the_reset() -> None:
     vector.reset(seed=1)
     assert vector.step(np.zeros(2, np.int64))[1:3] == (pytest.approx([3.0, 3.0]), pytest.approx([True, True]))
     vector.close()
-
-
-def test_joint_vectors_take_episodes_of_forced_moves_alone() -> None:
-    roster = {"possible_agents": list(NAMES), "skip_forced": True}
-    env = vector_env(Forced, MOVE, view="joint", num_envs=2, **roster)
-    env.reset(seed=1)
-    for ended in (True, False, True):
-        assert env.step(dict.fromkeys(NAMES, np.zeros(2, np.int64)))[2].tolist() == [ended] * 2
-    env.close()
 
 
 def test_elapsed_time_adds_up_as_rewards_do() -> None:

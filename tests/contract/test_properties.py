@@ -1,16 +1,14 @@
 """Random simulations under random use, compared with what was computed without the library."""
 
-import gc
 from dataclasses import replace
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, rule
 
 from simenv_marl import RULE, aec_env, parallel_env, single_env
-from simenv_marl.errors import EpisodeOverError, InvalidActionError, ResetNeededError
+from simenv_marl.errors import EpisodeOverError, ResetNeededError
 from tests.worlds.models import follow_the_rule, notes
 from tests.worlds.worlds import (
     Design,
@@ -69,9 +67,6 @@ def turns_of(env: Any, seed: int, given_answers: list[Any]) -> Any:
         ended = terminated or truncated
         yield agent, observation.tolist(), reward, terminated, truncated, sorted(info)
         env.step(None if ended else legal(next(given_answers), info))
-
-
-# -- one episode ----------------------------------------------------------------------------------
 
 
 @given(designs(), seeds, answers)
@@ -164,23 +159,6 @@ def test_the_single_view_tells_the_same(design, seed, given_answers):
     single.close()
 
 
-# -- many episodes --------------------------------------------------------------------------------
-
-
-@given(designs(), st.lists(st.tuples(seeds, answers, st.integers(0, 20), st.booleans()), max_size=4), seeds, answers)
-@settings(max_examples=100)
-def test_an_episode_replays_whatever_happened_before(design, disturbances, seed, given_answers):
-    fresh = list(turns_of(made(design), seed, given_answers))
-    env = made(design)
-    for other_seed, others, steps, close in disturbances:
-        for _, _ in zip(turns_of(env, other_seed, others), range(steps), strict=False):
-            pass
-        if close:
-            env.close()
-    assert list(turns_of(env, seed, given_answers)) == fresh
-    assert list(turns_of(env, seed, given_answers)) == fresh
-
-
 @given(designs(), st.integers(1, 60), seeds, answers)
 @settings(max_examples=150)
 def test_an_error_anywhere_surfaces_and_the_next_episode_is_as_ever(design, fuse, seed, given_answers):
@@ -203,118 +181,3 @@ def test_an_error_anywhere_surfaces_and_the_next_episode_is_as_ever(design, fuse
             env.step(0)
     world.fuse = None
     assert list(turns_of(env, seed, given_answers)) == fresh
-
-
-@given(st.lists(st.tuples(designs(), seeds, answers), min_size=2, max_size=4), st.booleans(), st.randoms())
-@settings(max_examples=100)
-def test_interleaved_is_as_separate(specifications, same_design, rng):
-    if same_design:
-        specifications = [(specifications[0][0], *rest) for _, *rest in specifications]
-    separate = [list(turns_of(made(design), *others)) for design, *others in specifications]
-    shared = {}  # environments of one design share its decision points
-    episodes = []
-    for design, *others in specifications:
-        points = shared.setdefault(id(design), points_of(design))
-        episodes.append(turns_of(made(design, points=points), *others))
-    together = [[] for _ in episodes]
-    running = list(range(len(episodes)))
-    while running:
-        number = rng.choice(running)
-        try:
-            together[number].append(next(episodes[number]))
-        except StopIteration:
-            running.remove(number)
-    assert together == separate
-
-
-class Use(RuleBasedStateMachine):
-    """Environments of one design, used in any way; each must stand where its reference stands."""
-
-    environments = Bundle("environments")
-
-    @initialize(design=designs())
-    def begin(self, design):
-        self.design, self.points = design, points_of(design)
-        self.states: dict[int, tuple[int, list[Any]] | None] = {}
-        self.alive: dict[int, Any] = {}
-
-    @rule(target=environments)
-    def make(self):
-        number = len(self.states)
-        self.alive[number] = made(self.design, points=self.points)
-        self.states[number] = None
-        return number
-
-    @rule(number=environments, seed=seeds)
-    def reset(self, number, seed):
-        self.alive[number].reset(seed=seed)
-        self.states[number] = (seed, [])
-
-    def pending(self, number):
-        state = self.states[number]
-        return state is not None and Reference(self.design, *state).ends is None
-
-    @rule(number=environments, answer=st.integers(0, 9) | st.just(RULE))
-    def step(self, number, answer):
-        env = self.alive[number]
-        if self.pending(number):
-            self.states[number][1].append(answer)
-            env.step(legal(answer, env.infos[env.agent_selection]))
-        elif not env.agents:
-            with pytest.raises(ResetNeededError, match="call reset"):
-                env.step(1)
-
-    @rule(number=environments, action=st.sampled_from([-1, 10, None, "1", 0.5, [1]]))
-    def step_illegally(self, number, action):
-        if self.pending(number):
-            with pytest.raises(InvalidActionError, match="is not in its action space"):
-                self.alive[number].step(action)
-
-    @rule(number=environments)
-    def deface(self, number):
-        if self.pending(number):
-            observation, *_, info = self.alive[number].last()
-            observation[:] = -1
-            for mask in info.values():
-                mask[:] = mask
-
-    @rule(number=environments)
-    def close(self, number):
-        self.alive[number].close()
-        self.states[number] = None
-
-    @rule(number=consumes(environments))
-    def drop(self, number):
-        trace = getattr(self.alive[number].unwrapped.simulation, "trace", None)
-        suspended = self.pending(number)
-        del self.alive[number], self.states[number]
-        self.states[number] = None
-        if suspended:
-            assert trace[-1] == "over"
-
-    @rule(seed=seeds)
-    def run_the_plain_model(self, seed):
-        open_ended = Design(self.design.kinds, self.design.program)
-        plain = World(open_ended, self.points)
-        plain.reset(seed)
-        plain.run()
-        everybody = Design(self.design.kinds, self.design.program, rules=frozenset(range(len(self.design.kinds))))
-        assert plain.trace == [*Reference(everybody, seed, []).trace, "over"]
-
-    @invariant()
-    def all_stand_where_they_should(self):
-        for number, env in getattr(self, "alive", {}).items():
-            state = self.states[number]
-            if state is None:
-                continue
-            reference = Reference(self.design, *state)
-            if reference.ends is None or env.agents:
-                agrees(env, reference)
-
-    def teardown(self):
-        self.alive = {}
-        gc.collect()
-
-
-Use.TestCase.settings = settings(max_examples=60, stateful_step_count=30)
-TestUse = Use.TestCase

@@ -1,13 +1,12 @@
 """An environment that is used from inside itself says so, in every view, whatever is asked or runs just then."""
 
-import signal
 from contextlib import ExitStack
 
 import numpy as np
 import pytest
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env, vector_env
-from simenv_marl.errors import ReentrancyError
+from simenv_marl.errors import NotResetError, ReentrancyError
 from simenv_marl.plugins import handlers
 from tests.worlds.models import decision, script
 
@@ -24,24 +23,8 @@ VIEWS = {
 }
 PLACES = [
     *["action_space_mapping", "observation_space_mapping", "reward_mapping", "action_mask_mapping", "choices", "apply"],
-    *["agent", "rule", "policy", "before", "instead", "after", "plugin", "time", "expected_calls"],
+    *["agent", "rule", "policy", "before", "instead", "after", "plugin", "time", "expected_calls", "reset"],
 ]
-
-
-@pytest.fixture(autouse=True)
-def _never_a_hang():
-    if not hasattr(signal, "alarm"):
-        yield
-        return
-
-    def give_up(*_):
-        raise TimeoutError
-
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(120)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
 
 
 class World:
@@ -50,7 +33,7 @@ class World:
     def __init__(self, view, place, method):
         make, self.action = VIEWS[view]
         self.place, self.method = place, method
-        self.armed, self.catch, self.raised = False, True, []
+        self.armed, self.resetting, self.catch, self.raised = False, False, True, []
         self.made = []
         self.undo = ExitStack()
 
@@ -68,11 +51,14 @@ class World:
 
         def main(simulation):
             for _ in range(3):
-                simulation.log.append(ant())
                 bee()
+                simulation.log.append(ant())
 
         def simulation():
             made = script(main)()
+            if place == "reset":
+                reset = made.reset
+                made.reset = lambda seed=None: (reset(seed), self.at("reset", None))
             if place == "time":
                 made.time = lambda: self.at("time", 0.0)
             if place == "expected_calls":
@@ -113,8 +99,9 @@ class World:
             self.armed = False
             try:
                 self.step() if self.method == "step" else getattr(self.env, self.method)()
-            except ReentrancyError as error:
-                self.raised.append("was used from" in str(error))
+            except (ReentrancyError, NotResetError) as error:
+                said = type(error) is ReentrancyError and (self.resetting or "was used from" in str(error))
+                self.raised.append(said or (self.resetting and self.method == "step"))
                 if not self.catch:
                     raise
             else:
@@ -150,29 +137,36 @@ METHODS = pytest.mark.parametrize("method", ["step", "reset", "close"])
 @EVERYWHERE
 @METHODS
 def test_an_environment_that_is_used_from_inside_itself_says_so_and_goes_on(view, place, method):
+    if place == "reset":
+        return
     world = World(view, place, method)
     with world.undo:
-        for _ in range(2):
+        for world.catch in (True, True, False, False):
             world.env.reset(seed=1)
             world.armed = True
-            world.play()
+            if world.catch:
+                world.play()
+                assert all(log == [1, 1, 1] for log in world.logs)
+            else:
+                with pytest.raises(ReentrancyError, match="was used from"):
+                    world.play()
             assert not world.armed
-            assert all(log == [1, 1, 1] for log in world.logs)
-        assert world.raised == [True, True]
+        assert world.raised == [True] * 4
+        world.env.reset(seed=1)
+        world.play()
+        assert all(log == [1, 1, 1] for log in world.logs)
 
 
 @EVERYWHERE
 @METHODS
-def test_where_that_is_not_caught_it_ends_the_step_and_the_next_reset_works(view, place, method):
+def test_an_environment_that_is_used_from_inside_its_own_reset_says_so_and_goes_on(view, place, method):
     world = World(view, place, method)
-    world.catch = False
     with world.undo:
-        for _ in range(2):
-            world.env.reset(seed=1)
-            world.armed = True
-            with pytest.raises(ReentrancyError, match="was used from"):
-                world.play()
-        assert world.raised == [True, True]
+        world.armed = world.resetting = True
         world.env.reset(seed=1)
+        world.resetting = False
+        assert world.raised == [True] * (not world.armed)
+        assert not (world.armed and place in ("reset", "rule", "observation_space_mapping", "policy"))
+        world.armed = False
         world.play()
         assert all(log == [1, 1, 1] for log in world.logs)

@@ -1,20 +1,17 @@
 """Section 5.10 of the contract, and models that switch stacks of their own: SimPy, generators, greenlets, asyncio."""
 
 import asyncio
-import contextvars
 import decimal
 import gc
 import logging
 import random
 import subprocess
 import sys
-import warnings
 from textwrap import dedent
 
 import greenlet
 import pytest
 import simpy
-from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, generate_env, single_env
 from tests.worlds.models import Script, calling, decision, decisions, define, play, rewards_of, script, stacks
@@ -77,17 +74,6 @@ def test_some_may_run_their_rule_and_others_be_decided():
     assert [env.unwrapped.simulation.account.money for env in envs] == [plain.account.money] * 3
 
 
-def test_the_plain_model_runs_between_steps_as_ever():
-    env = single_env(Banking, Account.spend)
-    env.reset(seed=1)
-    plain, again = Banking(), Banking()
-    for simulation in (plain, again):
-        simulation.reset(3)
-        simulation.run()
-        env.step(1)
-    assert plain.account.spent == again.account.spent
-
-
 # -- nested ---------------------------------------------------------------------------------------
 
 
@@ -119,23 +105,6 @@ def test_a_rule_may_run_an_environment_of_its_own(action, also_outer):
     assert env.unwrapped.simulation.log == [expected, 9 if also_outer else "inner rule", expected]
 
 
-def test_an_inner_environment_may_stay_suspended_while_the_outer_one_is():
-    inner = inner_env()
-
-    def rule():
-        if not hasattr(inner, "begun"):
-            inner.begun = True
-            inner.reset()
-            return "reset"
-        return inner.step(len(inner.unwrapped.simulation.log))[2]
-
-    outer = decision(rule, agent="outer_0")
-    env = aec_env(calling(*[outer] * 4), outer)
-    play(env, RULE)
-    assert env.unwrapped.simulation.log == ["reset", False, False, True]
-    assert inner.unwrapped.simulation.log == [0, 1, 2]
-
-
 def test_an_inner_environment_may_be_stepped_from_inside_and_from_outside_in_turn():
     inner = single_env(calling(*[INNER] * 6), INNER)
     outer = decision(lambda: inner.step(1)[2], agent="outer_0")
@@ -149,22 +118,6 @@ def test_an_inner_environment_may_be_stepped_from_inside_and_from_outside_in_tur
     inner.reset()
     inner.step(3)
     inner.close()
-
-
-def test_an_inner_environment_may_be_made_reset_and_closed_inside():
-    def rule():
-        inner = inner_env()
-        inner.reset()
-        inner.step(5)
-        log = list(inner.unwrapped.simulation.log)
-        inner.close()
-        return log, INNER()
-
-    outer = decision(rule, agent="outer_0")
-    env = aec_env(calling(outer, outer), [outer, INNER])
-    turns = play(env, {"outer_0": RULE, "inner_0": 9})
-    assert decisions(turns) == ["outer_0", "inner_0"] * 2
-    assert env.unwrapped.simulation.log == [([5], 9)] * 2
 
 
 @pytest.mark.parametrize("source", ["class", "factory", "generate_env"])
@@ -429,27 +382,7 @@ def test_simpy_models_unwind(how, number):
     assert stacks(before) == before
 
 
-# -- generators and greenlets of the model --------------------------------------------------------
-
-
-def test_decisions_inside_generators_of_the_model():
-    decide = decision(lambda: 1)
-
-    def producer():
-        total = 0
-        while total < 5:
-            total += decide()
-            yield total
-
-    def main(simulation):
-        for total in producer():
-            simulation.log.append((total, decide()))
-
-    env = single_env(script(main), decide)
-    env.reset()
-    for action in (2, 5, 3, 7):
-        env.step(action)
-    assert env.unwrapped.simulation.log == [(2, 5), (5, 7)]
+# -- greenlets of the model ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("how", ["end", "close", "collect"])
@@ -579,59 +512,6 @@ def test_models_that_use_asyncio_run_side_by_side(view):
 
 
 @pytest.mark.usefixtures("_no_loop_stays_behind")
-def test_the_user_may_run_an_event_loop_between_steps_of_a_model_that_uses_one():
-    async def use(env):
-        await asyncio.sleep(0)
-        return asyncio.get_running_loop() is not None
-
-    env = single_env(office(), Office.rounds)
-    env.reset()
-    while True:
-        assert asyncio.run(use(env))
-        if env.step(RULE)[2]:
-            break
-    with pytest.raises(RuntimeError):
-        asyncio.get_running_loop()
-    env.reset()
-    env.close()
-    with pytest.raises(RuntimeError):
-        asyncio.get_running_loop()
-
-
-@pytest.mark.usefixtures("_no_loop_stays_behind")
-def test_the_user_may_step_a_model_that_uses_asyncio_from_another_event_loop_each_time():
-    async def step(env):
-        loop = asyncio.get_running_loop()
-        ended = env.step(RULE)[2]
-        assert asyncio.get_running_loop() is loop
-        await asyncio.sleep(0)
-        return ended
-
-    env = single_env(office(), Office.rounds)
-    env.reset()
-    assert [asyncio.run(step(env)) for _ in range(3)] == [False] * 3
-    assert env.step(RULE)[2]
-    with pytest.raises(RuntimeError):
-        asyncio.get_running_loop()
-
-
-def test_the_user_may_use_plain_models_inside_an_event_loop():
-    decide = decision()
-
-    async def use(number):
-        env = single_env(calling(*[decide] * 3), decide)
-        env.reset()
-        while not env.step(number)[2]:
-            await asyncio.sleep(0)
-        return env.unwrapped.simulation.log
-
-    async def gather():
-        return await asyncio.gather(*[use(number) for number in range(3)])
-
-    assert asyncio.run(gather()) == [[0] * 3, [1] * 3, [2] * 3]
-
-
-@pytest.mark.usefixtures("_no_loop_stays_behind")
 def test_models_may_be_the_first_to_import_asyncio():
     code = """
         import sys
@@ -661,48 +541,7 @@ def test_models_may_be_the_first_to_import_asyncio():
     assert (result.returncode, result.stdout) == (0, "[1, 2]\n"), result.stderr
 
 
-@pytest.mark.parametrize("number", [2, 30])
-@pytest.mark.parametrize("how", ["close", "reset"])
-def test_models_that_use_asyncio_unwind(number, how):
-    env = single_env(office(number), Office.rounds)
-    env.reset()
-    env.step(1)
-    getattr(env, how)()
-    env.close()
-    # The first clerk, who has got its decision, may come to its end; nobody else got one.
-    assert {number for number, *_ in env.unwrapped.simulation.log} <= {0}
-    with pytest.raises(RuntimeError):
-        asyncio.get_running_loop()
-    with pytest.raises(RuntimeError):
-        asyncio.get_event_loop_policy().get_event_loop()
-
-
 # -- state of the interpreter ---------------------------------------------------------------------
-
-
-def test_context_variables_of_the_user_are_seen_and_those_of_the_model_are_its_own():
-    variable = contextvars.ContextVar("variable", default="nobody's")
-    seen = []
-
-    def main(simulation):
-        for number in range(3):
-            seen.append(variable.get())
-            variable.set(f"the model's {number}")
-            decide()
-
-    decide = decision()
-    env = single_env(script(main), decide)
-    token = variable.set("the user's")
-    try:
-        env.reset()
-        env.step(1)
-        assert variable.get() == "the user's"
-    finally:
-        variable.reset(token)
-    env.step(1)
-    env.step(1)
-    assert seen == ["the user's", "the model's 0", "the model's 1"]
-    assert variable.get() == "nobody's"
 
 
 def test_decimal_contexts_and_handled_errors_do_not_leak():
@@ -745,31 +584,3 @@ def test_models_may_recurse_as_deeply_as_without_an_environment():
     env.step(1)
     env.step(2)
     assert env.unwrapped.simulation.log == [1, 2]
-
-
-def test_many_environments_may_be_suspended_at_once():
-    decide = decision(observation_space=spaces.Discrete(1000), observation_space_mapping=lambda: 1)
-    env_class = generate_env(calling(*[decide] * 3), decide)
-    envs = [env_class() for _ in range(300)]
-    for env in envs:
-        env.reset()
-    for step in range(3):
-        for number, env in enumerate(envs):
-            assert env.step((number + step) % 10)[2] == (step == 2)
-    assert all(
-        env.unwrapped.simulation.log == [(number + step) % 10 for step in range(3)] for number, env in enumerate(envs)
-    )
-
-
-@pytest.mark.usefixtures("_no_loop_stays_behind")
-def test_nothing_warns():
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        for source, points in ((office(), [Office.rounds]), (Shopping, [Shop.pause]), (Banking, [Account.earn])):
-            env = aec_env(source, points)
-            play(env, 1, seed=0)
-            env.reset(seed=1)  # of others, a banker might never earn
-            env.close()
-            del env
-        gc.collect()
-    assert [str(warning.message) for warning in caught] == []

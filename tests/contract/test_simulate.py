@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 
-from simenv_marl import RULE, TRUNCATED, aec_env, difference, simulate, simulate_many
+from simenv_marl import RULE, aec_env, difference, simulate, simulate_many
 from simenv_marl.errors import (
     AgentError,
     InvalidActionError,
@@ -35,32 +35,36 @@ from tests.worlds.many_worlds import (
 from tests.worlds.models import calling, decision, decisions, notes, play, script
 
 
-def test_without_policies_it_is_the_plain_run():
+def test_without_policies_it_is_the_plain_run_of_a_copy():
     ant = decision(agent="ant_0")
-    simulation = simulate(calling(ant, ant))
-    assert simulation.log == ["rule", "rule"]
-    simulation = simulate(calling(ant, ant), points=ant)
-    assert simulation.log == ["rule", "rule"]
-    simulation = simulate(calling(ant, ant), {}, points=[ant])
-    assert simulation.log == ["rule", "rule"]
+    for arguments in ({}, {"points": ant}, {"policies": {}, "points": [ant]}):
+        given_simulation = calling(ant, ant)()
+        simulation = simulate(given_simulation, **arguments)
+        assert simulation is not given_simulation
+        assert simulation.log == ["rule", "rule"]
+        assert not hasattr(given_simulation, "log")
 
 
-def test_policies_by_agent_and_by_point():
-    ant, bee, cat = (decision(agent=f"{name}_0") for name in ("ant", "bee", "cat"))
-    source = calling(ant, bee, cat, ant)
-    policies = {"ant_0": lambda observation: 1, bee: lambda observation, info: 2}
-    assert simulate(source, policies, points=[ant, bee, cat]).log == [1, 2, "rule", 1]
-    assert simulate(source, policies | {"cat_0": RULE}, points=[ant, bee, cat]).log == [1, 2, "rule", 1]
+@pytest.mark.parametrize("key", [Being.act, f"{HERE}.Being.act", "being_0"], ids=["function", "dotted", "agent"])
+@pytest.mark.parametrize("own", [False, True], ids=["given", "own"])
+def test_a_policy_names_points_and_agents_as_the_simulation_knows_them(key, own):
+    def make():
+        simulation = script(lambda simulation: simulation.log.append(Being(0).act()))()
+        simulation.points = beings() if own else ()
+        return simulation
+
+    plain = vars(Being)["act"]
+    points = None if own else beings()
+    assert simulate(make, {key: lambda observation: 2}, points=points).log == [2]
+    assert vars(Being)["act"] is plain
+    with pytest.raises(ZeroDivisionError):
+        simulate(make, {key: lambda observation: 1 // 0}, points=points)
+    assert vars(Being)["act"] is plain
 
 
-def test_a_policy_names_its_point_by_itself():
+def test_a_policy_names_a_point_that_is_not_listed():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     assert simulate(calling(ant, bee), {bee: lambda observation: 2}, points=ant).log == ["rule", 2]
-    name = f"{Being.__module__}.Being.act"
-    plain = vars(Being)["act"]
-    source = script(lambda simulation: simulation.log.append(Being(3).act()))
-    assert simulate(source, {name: lambda observation: 2}, points=beings()).log == [2]
-    assert vars(Being)["act"] is plain
 
 
 def test_policies_see_what_agents_see():
@@ -80,88 +84,50 @@ def test_policies_see_what_agents_see():
     assert seen == [([0], [0, 1] + [0] * 8), ([1], [0, 1] + [0] * 8)]
 
 
-def test_seeds():
-    class Seeded:
-        def reset(self, seed):
-            self.seed = seed
-
-        def run(self):
-            pass
-
-    assert simulate(Seeded, seed=7).seed == 7
-    assert simulate(Seeded, seed=np.int64(7)).seed == 7
-    drawn = {simulate(Seeded).seed for _ in range(5)}
-    assert len(drawn) > 1
+def test_a_seed_is_handed_on_or_drawn():
+    ant = decision(agent="ant_0")
+    assert simulate(calling(ant), seed=7).seed == 7
+    drawn = {simulate(calling(ant)).seed for _ in range(5)} | {simulate(calling(ant), seed=np.int64(7)).seed}
+    assert len(drawn) > 2
     assert all(type(seed) is int for seed in drawn)
-    with pytest.raises(OptionValueError, match="seed must be a non-negative"):
-        simulate(Seeded, seed=-1)
 
 
-def test_what_is_simulated_is_returned():
-    ant = decision(agent="ant_0")
-    given_simulation = calling(ant)()
-    simulation = simulate(given_simulation, {ant: lambda observation: 1})
-    assert simulation is not given_simulation  # it is copied
-    assert simulation.log == [1]
-    assert not hasattr(given_simulation, "log")
-    assert simulate(type("Simulation", (), {"reset": lambda self: None, "run": lambda self: TRUNCATED})) is not None
+ANT, BROKEN = decision(agent="ant_0"), decision(agent="broken_0", observation_space_mapping=lambda: [1, 2, 3])
 
 
-def test_simulations_of_their_own_points():
-    ant = decision(agent="ant_0")
-
-    class Own:
-        points = (ant,)
-
-        def reset(self):
-            self.log = []
-
-        def run(self):
-            self.log.append(ant())
-
-    assert simulate(Own).log == ["rule"]
-    assert simulate(Own, {"ant_0": lambda observation: 3}).log == [3]
-
-
-def test_errors_surface():
-    ant = decision(agent="ant_0")
-    with pytest.raises(InvalidActionError, match="is not in its action space") as caught:
-        simulate(calling(ant), {ant: lambda observation: 10}, seed=13)
+@pytest.mark.parametrize(
+    ("source", "arguments", "error", "match"),
+    [
+        (calling(ANT), {"policies": {ANT: lambda observation: 10}}, InvalidActionError, "is not in its action space"),
+        (calling(ANT), {"policies": {ANT: lambda observation: 1 // 0}}, ZeroDivisionError, "division"),
+        (script(lambda simulation: ANT() // 0), {"policies": {ANT: lambda observation: 4}}, ZeroDivisionError, "div"),
+        (calling(BROKEN), {"policies": {BROKEN: lambda observation: 1}}, ObservationError, "its space Box"),
+    ],
+    ids=["action", "policy", "model", "observation"],
+)
+def test_errors_tell_the_seed(source, arguments, error, match):
+    with pytest.raises(error, match=match) as caught:
+        simulate(source, seed=13, **arguments)
     assert "seed 13" in notes(caught.value)
-    with pytest.raises(ZeroDivisionError):
-        simulate(calling(ant), {ant: lambda observation: 1 // 0})
-    with pytest.raises(ZeroDivisionError) as caught:
-        simulate(script(lambda simulation: ant() // 0), {ant: lambda observation: 4}, seed=13)
-    assert "seed 13" in notes(caught.value)
-    broken = decision(agent="broken_0", observation_space_mapping=lambda: [1, 2, 3])
-    with pytest.raises(ObservationError, match="its space Box"):
-        simulate(calling(broken), {broken: lambda observation: 1})
-    with pytest.raises(UnknownOptionError, match="there is no option"):
-        simulate(calling(ant), {ant: lambda observation: 1}, speed=3)
-    with pytest.raises(UnknownPointError, match="known are ant"):
-        simulate(calling(ant), {"nobody": lambda observation: 1}, points=ant)
-    with pytest.raises(OptionValueError, match="must be a callable"):
-        simulate(calling(ant), {ant: 3})
-    with pytest.raises(SimulationError, match="is not a simulation"):
-        simulate(3)
 
 
-def test_an_error_unwinds_and_puts_back_what_was_patched():
-    ended, plain = [], vars(Being)["act"]
+@pytest.mark.parametrize(
+    ("arguments", "error", "match"),
+    [
+        ({"speed": 3}, UnknownOptionError, "there is no option"),
+        ({"policies": {"nobody": lambda observation: 1}}, UnknownPointError, "known are ant"),
+        ({"policies": {ANT: 3}}, OptionValueError, "must be a callable"),
+        ({"simulation": 3}, SimulationError, "is not a simulation"),
+        ({"seed": -1}, OptionValueError, "seed must be a non-negative"),
+    ],
+    ids=["option", "policy of nobody", "no policy", "no simulation", "seed"],
+)
+def test_arguments_that_cannot_be(arguments, error, match):
+    with pytest.raises(error, match=match):
+        simulate(**{"simulation": calling(ANT), "points": ANT} | arguments)
 
-    def main(simulation):
-        try:
-            Being(0).act()
-        finally:
-            ended.append(True)
 
-    with pytest.raises(ZeroDivisionError):
-        simulate(script(main), {"being_0": lambda observation: 1 // 0}, points=beings())
-    assert ended == [True]
-    assert vars(Being)["act"] is plain
-
-
-def test_one_name_at_two_points_is_an_error_here_too():
+def test_one_name_at_two_points_is_an_error():
     definitions = beings() | others(agent=lambda other: f"being_{other.number}")
 
     def main(simulation):
@@ -170,16 +136,6 @@ def test_one_name_at_two_points_is_an_error_here_too():
 
     with pytest.raises(AgentError, match="has one decision point"):
         simulate(script(main), {"being_0": lambda observation: 1}, points=definitions)
-
-
-def test_simulations_within_policies():
-    """A policy may look ahead by a simulation of its own."""
-    ant = decision(agent="ant_0")
-
-    def policy(observation):
-        return len(simulate(calling(ant, ant, ant), points=ant).log)
-
-    assert simulate(calling(ant, ant), {ant: policy}).log == [3, 3]
 
 
 def test_differences_in_what_policies_observe():
@@ -192,22 +148,22 @@ def test_differences_in_what_policies_observe():
     assert simulate(calling(ant, ant, ant), {ant: lambda observation: int(observation[0])}).log == [0, 7, 7]
 
 
+def test_simulations_within_policies():
+    """A policy may look ahead by a simulation of its own."""
+    ant = decision(agent="ant_0")
+
+    def policy(observation):
+        return len(simulate(calling(ant, ant, ant), points=ant).log)
+
+    assert simulate(calling(ant, ant), {ant: policy}).log == [3, 3]
+
+
 def test_no_reward_is_asked_for():
     paid = []
     ant = decision(agent="ant_0", reward_mapping=lambda: paid.append(0) or 0.0)
     simulate(calling(ant, ant), {ant: lambda observation: 1})
     simulate_many(calling(ant, ant), {ant: lambda observations: [1] * 3}, seeds=range(3))
     assert paid == []
-
-
-def test_it_is_the_run_of_the_environment_with_the_same_policies():
-    ant = decision(agent="ant_0", observation_space_mapping=lambda: [1, 3])
-    bee = decision(agent="bee_0")
-    source = calling(ant, bee, bee, ant)
-    policies = {"ant_0": lambda observation: int(observation[1]), "bee_0": lambda observation: 7}
-    env = aec_env(source, [ant, bee])
-    play(env, lambda agent, env: policies[agent](env.last()[0]))
-    assert simulate(source, policies, points=[ant, bee]).log == env.simulation.log == [3, 7, 7, 3]
 
 
 @given(designs, seeds)
@@ -230,7 +186,7 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
 
 @given(designs, seeds)
 @settings(max_examples=20)
-def test_some_by_their_policies_and_the_rest_by_their_rule(design, seed):
+def test_some_agents_decide_by_their_policies_and_the_rest_by_their_rule(design, seed):
     chosen = {"creature_0", "creature_2"}
     plain = Answered(design, seed, lambda seed, agent, number: 3 if agent in chosen else RULE)
     points = {Creature.act: colony_points(overseen=False)[Creature.act]}
@@ -246,45 +202,26 @@ def test_some_by_their_policies_and_the_rest_by_their_rule(design, seed):
 # -- who answers for whom -------------------------------------------------------------------------
 
 
-def test_whoever_is_named_is_answered_by_what_is_named_for_it():
-    """An agent's own policy comes before that of its point, and so before its point's rule."""
-
-    def main(simulation):
-        for number in (0, 1):
-            simulation.log.append(Being(number).act())
-
-    own = {"being_1": lambda observation: 5}
-    assert simulate(script(main), {Being.act: lambda observation: 3} | own, points=beings()).log == [3, 5]
-    assert simulate(script(main), {Being.act: RULE} | own, points=beings()).log == ["rule", 5]
-    assert simulate(script(main), {Being.act: lambda observation: 3, "being_1": RULE}, points=beings()).log == [
-        3,
-        "rule",
-    ]
-    ant = decision(agent="ant_0")
-    assert simulate(calling(ant), {ant: RULE, "ant_0": lambda observation: 5}, points=ant).log == [5]
-    assert simulate(calling(ant), {ant: lambda observation: 3, "ant_0": RULE}, points=ant).log == ["rule"]
-
-
-def test_agents_of_policies_are_no_agents_of_the_environment_whatever_else_is_named():
+@pytest.mark.parametrize(
+    ("of_point", "of_agent", "expected"),
+    [
+        (lambda observation: 3, lambda observation: 5, [3, 5]),
+        (RULE, lambda observation: 5, ["rule", 5]),
+        (lambda observation: 3, RULE, [3, "rule"]),
+    ],
+    ids=["both", "rule of the point", "rule of the agent"],
+)
+def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent, expected):
+    source = script(lambda simulation: simulation.log.extend(Being(number).act() for number in (0, 1)))
+    assert simulate(source, {Being.act: of_point, "being_1": of_agent}, points=beings()).log == expected
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    policies = {ant: RULE, "ant_0": lambda observation: 5}
+    policies = {ant: of_point, "ant_0": of_agent}
+    assert simulate(calling(ant), policies, points=ant).log == expected[1:]
     env = aec_env(calling(ant, bee), [ant, bee], policies=policies)
     assert env.possible_agents == ["bee_0"]
     env.reset()
     env.step(1)
-    assert env.simulation.log == [5, 1]
-
-
-@pytest.mark.parametrize("key", [Being.act, f"{HERE}.Being.act", "being_0"])
-def test_simulations_of_their_own_definitions(key):
-    """Definitions that only the simulation itself knows are found, by whatever name a policy is given."""
-
-    def make():
-        simulation = script(lambda simulation: simulation.log.append(Being(0).act()))()
-        simulation.points = beings()
-        return simulation
-
-    assert simulate(make, {key: lambda observation: 3}).log == [3]
+    assert env.simulation.log == [expected[1], 1]
 
 
 @pytest.mark.parametrize("action", [1, RULE])

@@ -11,6 +11,7 @@ import pytest
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.errors import ClosedError, InvalidActionError, ReentrancyError
+from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, alive, calling, decision, notes, script, stacks, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
@@ -194,6 +195,8 @@ def test_environments_are_collected_and_take_everything_along(view, how):
         env.close()
     armed.clear()
     references = [weakref.ref(env), weakref.ref(env.unwrapped), weakref.ref(env.unwrapped.simulation)]
+    if how == "closing failed":
+        env.unwrapped.simulation.env = env
     del env
     gc.collect()
     assert [reference() for reference in references] == [None, None, None]
@@ -371,12 +374,6 @@ def test_models_that_resist_a_little_are_unwound(view, trigger, main):
         assert stacks(before) == before
 
 
-def stubborn(simulation):
-    while True:
-        with suppress(BaseException):
-            simulation.log.append(decide())
-
-
 @VIEWS
 @pytest.mark.parametrize("trigger", ["close", "reset"])
 def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger):
@@ -390,37 +387,36 @@ def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger
     env = view(script(refuse), decide)
     env.reset()
     env.step(1)
-    log = env.unwrapped.simulation.log
-    with pytest.warns(ResourceWarning, match="Script"):
+    refusing = env.unwrapped.simulation
+    with pytest.warns(ResourceWarning, match="Script refuses to end") as caught:
         getattr(env, trigger)()
-    assert log == [1]  # none of its decisions was answered
+    assert caught[0].filename == __file__
+    assert refusing.log == [1]  # none of its decisions was answered
     if trigger == "close":
         with pytest.raises(ClosedError, match="call reset"):
             env.step(1)
         env.reset()
+    assert env.unwrapped.simulation is not refusing
     env.step(2)
-    assert env.unwrapped.simulation.log == [2]
+    assert (refusing.log, env.unwrapped.simulation.log) == ([1], [2])
     stop[0] = True
     env.step(3)
 
 
 @VIEWS
 def test_a_model_that_refuses_to_unwind_when_it_is_collected_is_given_up_with_a_warning(view):
-    env = view(script(stubborn), decide)
+    def refuse(simulation):
+        while True:
+            with suppress(BaseException):
+                decide()
+
+    env = view(script(refuse), decide)
     env.reset()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         del env
         gc.collect()
     assert [warning.category for warning in caught] == [ResourceWarning]
-
-
-def test_the_warning_points_at_the_users_line():
-    env = single_env(script(stubborn), decide)
-    env.reset()
-    with pytest.warns(ResourceWarning) as caught:
-        env.close()
-    assert caught[0].filename == __file__
 
 
 def test_errors_while_a_collected_simulation_unwinds_are_not_lost():
@@ -442,26 +438,16 @@ def test_errors_while_a_collected_simulation_unwinds_are_not_lost():
 # -- threads --------------------------------------------------------------------------------------
 
 
-def test_an_environment_whose_thread_has_ended_can_be_dropped():
+def test_an_environment_whose_thread_has_ended_can_be_reset_or_dropped():
     env = single_env(unwinding(decide, []), decide)
-    thread = threading.Thread(target=env.reset)
-    thread.start()
-    thread.join()
+    in_a_thread(env.reset)
+    env.reset()
+    assert env.step(1)[2]
+    in_a_thread(env.reset)
     reference = weakref.ref(env)
-    del env, thread
+    del env
     gc.collect()
     assert reference() is None
-
-
-def test_an_environment_whose_thread_has_ended_can_be_reset():
-    env = single_env(calling(decide, decide), decide)
-    thread = threading.Thread(target=env.reset)
-    thread.start()
-    thread.join()
-    env.reset()
-    env.step(1)
-    assert env.unwrapped.simulation.log == [1]
-    env.close()
 
 
 @pytest.mark.greenlet("threads of their own unwind at once, wherever their environment is dropped")
@@ -478,9 +464,7 @@ def test_an_environment_that_is_dropped_in_another_thread_unwinds_in_its_own():
 
     held = [single_env(script(main), decide)]
     held[0].reset()
-    thread = threading.Thread(target=held.clear)
-    thread.start()
-    thread.join()
+    in_a_thread(held.clear)
     gc.collect()
     greenlet.greenlet(lambda: None).switch()  # whatever switches next
     assert log == [threading.get_ident(), "nobody was asked"]
@@ -492,23 +476,11 @@ def test_an_environment_that_is_dropped_in_another_thread_unwinds_in_its_own():
     assert env.unwrapped.simulation.log == [1]
 
 
-def test_refusals_are_not_errors_of_the_next_episode():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
-        env = single_env(script(stubborn), decide)
-        for _ in range(3):
-            env.reset()
-            env.step(1)
-        env.close()
-        with pytest.raises(ClosedError, match="call reset"):
-            env.step(1)
-
-
 # -- from inside ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
-@pytest.mark.parametrize("where", ["stop", "finally"])
+@pytest.mark.parametrize("where", ["stop", "finally", "close"])
 @pytest.mark.parametrize("use", ["close", "reset", "step"])
 def test_an_environment_that_is_used_while_it_unwinds_its_simulation_says_so(view, where, use):
     action = {"choose_0": 1} if view in (parallel_env, joint_env) else 1
@@ -516,6 +488,10 @@ def test_an_environment_that_is_used_while_it_unwinds_its_simulation_says_so(vie
     class Model(Script):
         def stop(self):
             if where == "stop":
+                use_it()
+
+        def close(self):
+            if where == "close":
                 use_it()
 
     def main(simulation):

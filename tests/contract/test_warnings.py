@@ -22,8 +22,8 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.core import rng
-from simenv_marl.errors import ObservationError, UnknownPointError
-from tests.worlds.models import calling, decision, define, script
+from simenv_marl.errors import UnknownPointError
+from tests.worlds.models import calling, decision, script
 
 DRAWS = "draws from the global generator"
 ABSENT = "did not appear in the episode"
@@ -76,7 +76,12 @@ def play(env, draw=lambda: None):
 
 @pytest.mark.parametrize(
     ("draw", "name"),
-    [(random.random, "random"), (np.random.random, "numpy.random"), (lambda: random.shuffle([1, 2, 3]), "random")],
+    [
+        (random.random, "random"),
+        (np.random.random, "numpy.random"),
+        (lambda: random.shuffle([1, 2, 3]), "random"),
+        (lambda: (random.random(), np.random.random()), "random and numpy.random"),
+    ],
 )
 @pytest.mark.parametrize("in_reset", [False, True])
 @ALONE
@@ -89,12 +94,6 @@ def test_a_simulation_that_draws_is_warned_of_once(heard, draw, name, in_reset) 
     assert f"of {name}," in message
     assert "global_rng=True" in message
     assert "Gambler" in message
-
-
-@ALONE
-def test_both_generators_are_named(heard) -> None:
-    play(single_env(gambler(lambda: (random.random(), np.random.random())), decide))
-    assert "random and numpy.random" in heard(DRAWS)[0]
 
 
 @pytest.mark.parametrize("run", [
@@ -311,51 +310,3 @@ def test_turns_are_no_standstill(heard) -> None:
         # Two rounds of three leave the pending agent out.
         env.step({("one", "two")[number // 3 % 2]: 1} if number % 3 == 0 else {})
     assert heard("stands still") == []
-
-
-# -- observations that are no numbers -------------------------------------------------------------
-
-
-@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("make", [aec_env, single_env, parallel_env, joint_env])
-def test_what_is_not_finite_in_a_bounded_space_is_refused_at_the_reset(make, wrong) -> None:
-    blind = define(agent="blind", observation_space_mapping=lambda: [1.0, wrong])(lambda: 0)
-    env = make(calling(blind, blind), blind)
-    with pytest.raises(ObservationError, match="not finite"):
-        env.reset()
-    with pytest.raises(ObservationError, match="not finite"):
-        env.reset()
-
-
-@pytest.mark.parametrize(
-    ("space", "seen"),
-    [
-        (spaces.Box(-np.inf, np.inf, (2,), np.float64), [np.nan, np.inf]),
-        (spaces.Box(np.array([0, -np.inf]), np.array([1, 1]), dtype=np.float64), [1.0, -np.inf]),
-        (spaces.Dict(a=spaces.Box(-np.inf, np.inf, (1,))), {"a": [np.inf]}),
-    ],
-)
-def test_where_a_space_has_no_bounds_it_may_be_anything(space, seen) -> None:
-    free = define(agent="free", observation_space=space, observation_space_mapping=lambda: seen)(lambda: 0)
-    env = single_env(calling(free, free), free)
-    env.reset()
-    env.step(1)
-
-
-@pytest.mark.parametrize(
-    ("space", "seen"),
-    [
-        (spaces.Box(np.array([0, -np.inf]), np.array([1, 1]), dtype=np.float64), [np.nan, 0]),
-        (spaces.Dict(a=spaces.Discrete(2), b=spaces.Tuple([spaces.Box(0, 1, (1,))])), {"a": 1, "b": ([np.nan],)}),
-    ],
-)
-def test_the_parts_of_a_space_are_looked_at_one_by_one(space, seen) -> None:
-    blind = define(agent="blind", observation_space=space, observation_space_mapping=lambda: seen)(lambda: 0)
-    with pytest.raises(ObservationError, match="not finite"):
-        single_env(calling(blind), blind).reset()
-
-
-def test_batched_policies_do_not_see_it_either() -> None:
-    blind = define(agent="blind", observation_space_mapping=lambda: [np.nan, 0.0])(lambda: 0)
-    with pytest.raises(ObservationError, match="not finite"):
-        simulate_many(calling(blind), {"blind": lambda observations: [0]}, seeds=[0], points=blind)

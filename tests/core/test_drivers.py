@@ -34,32 +34,47 @@ def _nobody_is_running_afterwards():
 # -- several at once ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("outer", ["greenlet", "thread"])
-@pytest.mark.parametrize("inner", ["greenlet", "thread"])
-def test_environments_run_inside_each_others_simulations(outer, inner):
-    decide, deeper = decision(agent="outer_0"), decision(agent="inner_0")
+@DRIVERS
+@pytest.mark.parametrize("inside", ["greenlet", "thread"])
+def test_environments_run_inside_each_others_simulations(driver, inside):
+    """Each decides for itself alone, and the mappings of the inner one are not the outer one's."""
+    seen = []
+
+    def spy(value):
+        seen.append(outer())
+        return value
+
+    outer = decision(agent="outer_0")
+    inner = decision(
+        agent="inner_0",
+        observation_space_mapping=lambda: spy([0, 0]),
+        reward_mapping=lambda: spy(0.0),
+        action_space_mapping=spy,
+    )
 
     def main(simulation):
-        env = single_env(calling(deeper, deeper), deeper, driver=inner)
+        env = single_env(calling(inner, inner), inner, driver=inside)
         env.reset()
         for _ in range(2):
-            number = decide()
+            number = outer()
             simulation.log.append((number, env.step(number)[2]))
         simulation.log.append(env.simulation.log)
-        simulation.log.append(deeper())
+        simulation.log.append(inner())
+        env.close()
+        simulation.log.append(outer())
 
-    env = single_env(script(main), decide, driver=outer)
+    env = single_env(script(main), outer, driver=driver)
     env.reset()
-    env.step(1)
-    env.step(2)
-    assert env.simulation.log == [(1, False), (2, True), [1, 2], "rule"]
+    assert [env.step(number)[2] for number in (1, 2, 3)] == [False, False, True]
+    assert env.simulation.log == [(1, False), (2, True), [1, 2], "rule", 3]
+    assert set(seen) == {"rule"}
     env.reset()
     env.close()
 
 
 @DRIVERS
 def test_unrelated_threads_run_their_rule_while_a_simulation_is_moving(driver):
-    asked, answered, pool = threading.Event(), threading.Event(), ThreadPoolExecutor(1)
+    asked, answered = threading.Event(), threading.Event()
     said = []
 
     def unrelated():
@@ -80,7 +95,6 @@ def test_unrelated_threads_run_their_rule_while_a_simulation_is_moving(driver):
     thread.start()
     env.step(1)
     thread.join()
-    pool.shutdown()
     assert said == ["rule"]
     env.close()
 
@@ -89,51 +103,33 @@ def test_unrelated_threads_run_their_rule_while_a_simulation_is_moving(driver):
 
 
 def by_thread(function):
-    """In a thread of its own: what it has returned, or what it has raised."""
-    with suppress(Exception):
+    """In a thread of its own: what it has returned there, or that it was refused."""
+    with suppress(WrongThreadError):
         return in_a_thread(function)
     return "refused"
 
 
-def by_grandchild(function):
-    return by_thread(lambda: by_thread(function))
-
-
-def by_timer(function):
-    said = []
-
-    def run():
-        said.append("refused")
-        with suppress(WrongThreadError):
-            said[0] = function()
-
-    timer = threading.Timer(0, run)
-    timer.start()
-    timer.join()
-    return said[0]
-
-
 def by_pool(function):
-    with ThreadPoolExecutor(1) as pool, suppress(WrongThreadError):
+    with ThreadPoolExecutor(1) as pool:
         return pool.submit(function).result()
-    return "refused"
 
 
-def by_asyncio(function):
-    with suppress(WrongThreadError):
-        return asyncio.run(asyncio.to_thread(function))
-    return "refused"
-
-
-WAYS = pytest.mark.parametrize("way", [by_thread, by_grandchild, by_timer, by_pool, by_asyncio])
+WAYS = [
+    in_a_thread,
+    lambda function: in_a_thread(lambda: in_a_thread(function)),
+    by_pool,
+    lambda function: asyncio.run(asyncio.to_thread(function)),
+]
 
 
 @DRIVERS
-@WAYS
+@pytest.mark.parametrize("way", WAYS, ids=["thread", "grandchild", "pool", "asyncio"])
 def test_decisions_in_threads_of_the_model_are_refused_and_the_next_step_says_so(driver, way):
     def main(simulation):
         simulation.log.append(decide())
-        simulation.log.append(way(decide))
+        with suppress(WrongThreadError):
+            simulation.log.append(way(decide))
+        simulation.log.append("refused")
         simulation.log.append(decide())
 
     decide = decision()
@@ -151,36 +147,28 @@ def test_decisions_in_threads_of_the_model_are_refused_and_the_next_step_says_so
 
 
 @DRIVERS
-def test_an_error_of_a_refused_thread_that_the_model_passes_on_is_raised_once(driver):
-    def main(simulation):
-        decide()
-        with ThreadPoolExecutor(1) as pool:
-            pool.submit(decide).result()
+def test_a_refusal_is_raised_once_or_told_of_by_another_error(driver):
+    def passed_on():
+        return by_pool(decide)
 
-    decide = decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset()
-    with pytest.raises(WrongThreadError, match="in a thread that the simulation has started") as caught:
-        env.step(1)
-    assert "main" in culprits(caught.value)
-    assert notes(caught.value).count("\n") == 0
-    env.reset()
-    env.close()
-
-
-@DRIVERS
-def test_another_error_of_the_model_tells_of_the_refusal_too(driver):
-    def main(simulation):
-        decide()
+    def followed_by_another():
         by_thread(decide)
         raise KeyError("nobody has put it there")
 
     decide = decision()
-    env = single_env(script(main), decide, driver=driver)
+    env = single_env(calling(decide, passed_on), decide, driver=driver)
+    env.reset()
+    with pytest.raises(WrongThreadError, match="in a thread that the simulation has started") as caught:
+        env.step(1)
+    assert "passed_on" in culprits(caught.value)
+    assert notes(caught.value).count("\n") == 0
+    env.close()
+    env = single_env(calling(decide, followed_by_another), decide, driver=driver)
     env.reset()
     with pytest.raises(KeyError) as caught:
         env.step(1)
     assert "a decision was refused" in notes(caught.value)
+    env.close()
 
 
 @DRIVERS
@@ -371,31 +359,6 @@ def test_a_process_that_is_forked_in_mid_episode_goes_on_twice_with_greenlets():
 
 
 @needs_fork
-def test_a_decision_in_a_process_that_the_model_has_forked_is_refused():
-    said = run("""
-        from simenv_marl.errors import WrongThreadError
-        decide = decision()
-        def main(simulation):
-            simulation.log.append(decide())
-            child = os.fork()
-            if child == 0:
-                try:
-                    decide()
-                except WrongThreadError as error:
-                    print("a process that the simulation has forked" in str(error), flush=True)
-                os._exit(0)
-            assert os.waitpid(child, 0)[1] == 0
-            simulation.log.append(decide())
-        env = single_env(script(main), decide)
-        env.reset()
-        env.step(1)
-        assert env.step(2)[2]
-        print(env.simulation.log, flush=True)
-    """)
-    assert said == "True\n[1, 2]\n"
-
-
-@needs_fork
 def test_a_process_that_is_forked_in_mid_episode_has_to_reset_with_threads():
     said = run("""
         decide = decision()
@@ -420,29 +383,6 @@ def test_a_process_that_is_forked_in_mid_episode_has_to_reset_with_threads():
         print("parent", env.simulation.log)
     """)
     assert said == "child [4, 5]\nparent [1, 3]\n"
-
-
-@needs_fork
-def test_a_model_in_a_thread_that_forks_cannot_decide_in_the_child():
-    said = run("""
-        decide = decision()
-        def main(simulation):
-            simulation.log.append(decide())
-            def child():
-                try:
-                    decide()
-                except WrongThreadError as error:
-                    assert "forked" in str(error)
-                    print("refused", flush=True)
-            in_a_child(child)
-            simulation.log.append(decide())
-        env = single_env(script(main), decide, driver="thread")
-        env.reset()
-        env.step(1)
-        assert env.step(2)[2]
-        print(env.simulation.log)
-    """)
-    assert said == "refused\n[1, 2]\n"
 
 
 @needs_fork
@@ -500,42 +440,54 @@ def test_a_fork_while_other_threads_are_moving_leaves_nothing_of_them_in_the_chi
 
 
 @DRIVERS
-@pytest.mark.parametrize("where", ["suspended", "several", "over", "closed", "inside", "in a thread", "moving"])
+@pytest.mark.parametrize(
+    "where", ["suspended", "a hundred", "failed", "over", "closed", "inside", "in a thread", "in daemons", "moving"]
+)
 def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
     said = run(f"""
         where = {where!r}
         decide = decision()
-        inside = threading.Event()
+        ready, never = threading.Event(), threading.Event()
         def main(simulation):
             try:
                 if where == "inside":
-                    simulation.inner = single_env(script(leaf), decide, driver={driver!r})
+                    simulation.inner = single_env(script(main_inside), decide, driver={driver!r})
                     simulation.inner.reset()
                 decide()
                 if where == "moving":
-                    inside.set()
-                    threading.Event().wait()
+                    ready.set()
+                    never.wait()
+                if where == "failed":
+                    raise ZeroDivisionError
                 decide()
             finally:
                 print("unwound", flush=True)
-        def leaf(simulation):
+        def main_inside(simulation):
             try:
                 decide()
             finally:
                 print("unwound", flush=True)
-        envs = [single_env(script(main), decide, driver={driver!r}) for _ in range(3 if where == "several" else 1)]
+        number = 100 if where == "a hundred" else 1
+        views = (single_env, aec_env)
+        envs = [views[number % 2](script(main), decide, driver={driver!r}) for number in range(number)]
         def use():
             for env in envs:
                 env.reset()
-                if where in ("over", "moving"):
-                    env.step(1)
+                if where in ("over", "moving", "failed"):
+                    try:
+                        env.step(1)
+                    except ZeroDivisionError:
+                        pass
                 if where == "over":
                     env.step(1)
                 if where == "closed":
                     env.close()
-        if where == "moving":
+            if where == "in daemons":
+                ready.set()
+                never.wait()
+        if where in ("moving", "in daemons"):
             threading.Thread(target=use, daemon=True).start()
-            inside.wait()
+            ready.wait()
         elif where == "in a thread":
             user = threading.Thread(target=use)
             user.start()
@@ -543,6 +495,6 @@ def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
         else:
             use()
     """)
-    # What is moving when the process ends, or was on a greenlet of a thread that has ended, is not unwound.
-    never = where == "moving" or (where == "in a thread" and driver == "greenlet")
-    assert said == "unwound\n" * (0 if never else {"several": 3, "inside": 2}.get(where, 1))
+    # What is moving when the process ends, or was on a greenlet of another thread, is not unwound.
+    never = where == "moving" or (where in ("in a thread", "in daemons") and driver == "greenlet")
+    assert said == "unwound\n" * (0 if never else {"a hundred": 100, "inside": 2}.get(where, 1))

@@ -86,22 +86,6 @@ NOTHING = (None, (None, None), 0)
 
 @DRIVERS
 @pytest.mark.parametrize("first", [False, True], ids=["from the first decision on", "later"])
-def test_hooks_and_tracking_are_the_users_between_steps_and_the_models_again_afterwards(driver, first):
-    decide = decision()
-    env = single_env(tracking(decide, first), decide, driver=driver)
-    for _ in range(2):
-        env.reset()
-        seen = [around()]
-        while not env.step(1)[2]:
-            seen.append(around())
-        assert {*seen, around()} == {NOTHING}
-        check_tracked(env, NOTHING)
-    env.reset()
-    env.close()
-
-
-@DRIVERS
-@pytest.mark.parametrize("first", [False, True], ids=["from the first decision on", "later"])
 def test_hooks_and_tracking_of_a_user_without_a_loop_stay_what_they_are(driver, first):
     def hook(generator):
         """What takes note of asynchronous generators."""
@@ -127,7 +111,7 @@ def test_hooks_and_tracking_of_a_user_without_a_loop_stay_what_they_are(driver, 
 @pytest.mark.parametrize("first", [False, True], ids=["from the first decision on", "later"])
 @pytest.mark.parametrize("inside", [0, 1, 2, 5])
 def test_hooks_and_tracking_of_a_user_with_a_loop_are_those_of_that_loop(driver, first, inside):
-    """The episode begins inside a loop of the user's, or outside, and goes on in the other."""
+    """The episode begins inside a loop of the user's, or outside, and goes on in the other; or it is outside all."""
 
     async def act(move):
         mine = around()
@@ -142,11 +126,13 @@ def test_hooks_and_tracking_of_a_user_with_a_loop_are_those_of_that_loop(driver,
     decide = decision()
     env = single_env(tracking(decide, first), decide, driver=driver)
     moves = [env.reset, *[move] * (4 + first)]
-    for number, moved in enumerate(moves):
-        ended = asyncio.run(act(moved)) if (number < inside) == (inside % 2 == 0) else moved()
-        assert around() == NOTHING
-    assert ended
-    check_tracked(env, NOTHING)
+    for _ in range(2):
+        for number, moved in enumerate(moves):
+            ended = asyncio.run(act(moved)) if (number < inside) == (inside % 2 == 0) else moved()
+            assert around() == NOTHING
+        assert ended
+        check_tracked(env, NOTHING)
+    env.reset()
     env.close()
 
 

@@ -173,7 +173,13 @@ def test_workers_that_were_forked_before_the_model_runs_have_the_rule(kind, driv
 
 @pytest.mark.parametrize(
     ("way", "driver"),
-    [("directly", "thread"), ("in_a_thread", "thread"), ("in_a_thread", "greenlet"), ("in_a_greenlet", "thread")],
+    [
+        ("directly", "greenlet"),
+        ("directly", "thread"),
+        ("in_a_thread", "thread"),
+        ("in_a_thread", "greenlet"),
+        ("in_a_greenlet", "thread"),
+    ],
 )
 def test_a_plain_fork_without_the_user_is_refused_as_well(way, driver):
     said = run(

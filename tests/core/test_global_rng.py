@@ -11,7 +11,7 @@ import pytest
 from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.core import context
 from simenv_marl.errors import OptionValueError, WrongThreadError
-from tests.worlds.models import decision, define, play
+from tests.worlds.models import define, play
 
 
 class Casino:
@@ -54,7 +54,7 @@ def world():
 @pytest.fixture(params=["copied as bytes", "by their own functions"])
 def _states(request, monkeypatch):
     if request.param == "by their own functions":
-        monkeypatch.setattr(context, "GAUSS_AT", 0)
+        monkeypatch.setattr(context, "IS_COPIED", False)
 
 
 @pytest.fixture(autouse=True)
@@ -79,7 +79,7 @@ def plain(seed):
 
 
 def test_here_states_are_copied_as_bytes():
-    assert context.GAUSS_AT
+    assert context.IS_COPIED
 
 
 @pytest.mark.usefixtures("_states")
@@ -108,7 +108,8 @@ def test_an_environment_draws_as_the_plain_run_with_its_seed(make, driver):
 @pytest.mark.usefixtures("_states")
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 def test_interleaved_environments_are_as_reproducible_as_alone(driver):
-    def run(env, seed):
+    def run(seed):
+        env = aec_env(Casino, POINTS, global_rng=True, driver=driver)
         env.reset(seed=seed)
         seen = []
         for _ in range(6):
@@ -117,13 +118,8 @@ def test_interleaved_environments_are_as_reproducible_as_alone(driver):
             yield
         yield seen, list(env.simulation.log)
 
-    def alone(seed):
-        *_, found = run(aec_env(Casino, POINTS, global_rng=True, driver=driver), seed)
-        return found
-
-    expected = [alone(seed) for seed in (1, 2, 1)]
-    runs = [run(aec_env(Casino, POINTS, global_rng=True, driver=driver), seed) for seed in (1, 2, 1)]
-    found = []
+    expected = [list(run(seed))[-1] for seed in (1, 2, 1)]
+    runs = [run(seed) for seed in (1, 2, 1)]
     for steps in range(7):
         found = [next(each) for each in runs]
         np.random.seed(steps)  # the user draws as well
@@ -131,47 +127,28 @@ def test_interleaved_environments_are_as_reproducible_as_alone(driver):
     assert expected[0] == expected[2] != expected[1]
 
 
-def test_an_episode_without_a_seed_is_that_of_the_seed_that_it_drew():
-    env = aec_env(Casino, POINTS, global_rng=True)
-    play(env)
-    assert env.simulation.log[:4] == plain(env.simulation.seed)[:4]
-    assert env.provenance()["options"] == {"global_rng": True}
-
-
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 def test_without_it_generators_are_everybodys():
-    random.seed(5)
     env = aec_env(Casino, POINTS)
     env.reset(seed=7)
     random.seed(5)
     env.step(RULE)
-    first = env.simulation.log[-1]
     random.seed(5)
     env.step(RULE)
     assert env.simulation.log[-1] != plain(7)[-1]
-    assert first is not None
-
-
-def test_simulate_leaves_its_users_generators_alone():
-    before = world()
-    seen = simulate(Casino, {BET: lambda observation: int(observation[0])}, points=POINTS, seed=3, global_rng=True)
-    assert world() == before
-    again = simulate(Casino, {BET: lambda observation: int(observation[0])}, points=POINTS, seed=3, global_rng=True)
-    assert seen.log == again.log
+    env = aec_env(Casino, POINTS, global_rng=True)
+    play(env)
+    assert env.simulation.log[:4] == plain(env.simulation.seed)[:4]  # of the seed that it drew
+    assert env.provenance()["options"] == {"global_rng": True}
+    with pytest.raises(OptionValueError, match="global_rng"):
+        aec_env(Casino, POINTS, global_rng=1)
 
 
 def test_errors_give_the_generators_back():
     before = world()
-    ant = decision(agent="ant_0", observation_space_mapping=lambda: 1 / 0)
-
-    class Broken(Casino):
-        def run(self):
-            random.random()
-            ant()
-
-    env = aec_env(Broken, ant, global_rng=True)
+    broken = define(agent="player_0", observation_space_mapping=lambda casino, card: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        env.reset(seed=1)
+        aec_env(Casino, {BET: broken}, global_rng=True).reset(seed=1)
     assert world() == before
     env = aec_env(Casino, POINTS, global_rng=True)
     env.reset(seed=1)
@@ -182,21 +159,32 @@ def test_errors_give_the_generators_back():
     assert world() == before
 
 
-def test_models_that_seed_the_generators_themselves():
+def test_simulate_leaves_generators_alone_also_those_that_a_model_seeds_and_of_an_environment_within():
     class Seeding(Casino):
         def run(self):
             random.seed(1)
             np.random.seed(1)
-            self.log.append(self.bet(0))
+            self.log = [self.bet(0)]
 
-    before = world()
-    logs = []
-    for seed in (1, 2):
-        env = aec_env(Seeding, POINTS, global_rng=True)
-        play(env, RULE, seed=seed)
-        logs.append(env.simulation.log[-1])
+    def draw(observation):
+        return int(observation[0])
+
+    def use_another(observation):
+        inner.step(RULE)
+        return draw(observation)
+
+    before, inner = world(), aec_env(Casino, POINTS, global_rng=True)
+    inner.reset(seed=2)
+    inner.step(RULE)
+    alone, logs = inner.simulation.log[:7], []
+    for kind, seed, policy in ((Casino, 3, draw), (Casino, 3, use_another), (Seeding, 1, draw), (Seeding, 2, draw)):
+        inner.reset(seed=2)
+        logs.append(simulate(kind, {BET: policy}, points=POINTS, seed=seed, global_rng=True).log)
+        assert world() == before
+        if policy is use_another:
+            assert inner.simulation.log[:7] == alone
     assert logs[0] == logs[1]
-    assert world() == before
+    assert logs[2] == logs[3]
 
 
 @pytest.mark.usefixtures("_states")
@@ -212,24 +200,6 @@ def test_other_bit_generators_of_the_user_stay():
     finally:
         np.random.set_bit_generator(ours)
     assert env.simulation.log == plain(7)
-
-
-def test_one_environment_inside_another():
-    inner = aec_env(Casino, POINTS, global_rng=True)
-    inner.reset(seed=2)
-    inner.step(RULE)
-    inner.step(RULE)
-    expected = list(inner.simulation.log)
-
-    def policy(observation):
-        inner.step(RULE)
-        return int(observation[0])
-
-    without = simulate(Casino, {BET: lambda observation: int(observation[0])}, points=POINTS, seed=3, global_rng=True)
-    inner.reset(seed=2)
-    outer = simulate(Casino, {BET: policy}, points=POINTS, seed=3, global_rng=True)
-    assert outer.log == without.log
-    assert inner.simulation.log[: len(expected)] == expected
 
 
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
@@ -272,11 +242,6 @@ def test_two_at_work_at_once_in_two_threads_are_refused():
     random.setstate(before[0])
 
 
-def test_only_true_and_false():
-    with pytest.raises(OptionValueError, match="global_rng"):
-        aec_env(Casino, POINTS, global_rng=1)
-
-
 def test_without_the_memory_layout_that_is_expected_the_portable_way_is_taken():
     code = """
 import _random, sys
@@ -289,10 +254,10 @@ before = np.random.get_state(legacy=False)["state"]["pos"]
 import ctypes
 ctypes.string_at = lambda *args: b""
 import simenv_marl.core.context as generators
-print(generators.GAUSS_AT, np.random.get_state(legacy=False)["state"]["pos"] == before)
+print(generators.IS_COPIED, np.random.get_state(legacy=False)["state"]["pos"] == before)
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    assert ran.stdout.split() == ["0", "True"], ran.stderr
+    assert ran.stdout.split() == ["False", "True"], ran.stderr
 
 
 @pytest.mark.usefixtures("_states")

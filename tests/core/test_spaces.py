@@ -317,6 +317,39 @@ def test_integers_never_wrap_around():
     assert check([10, 0]).dtype == np.uint8
 
 
+@pytest.mark.parametrize("pair", [tuple, list])
+def test_parts_of_actions_are_checked_like_actions(pair):
+    given = {"pair": pair([np.int8(6), {"bits": np.array([1, 0, 1], np.int8)}]), "box": [0.5, 1]}
+    found = action_check(TREE)(given)
+    assert same(found, {"box": np.array([0.5, 1]), "pair": (6, {"bits": np.array([1, 0, 1])})})
+    assert found["box"].dtype == np.float32
+    assert (type(found["pair"]), type(found["pair"][0])) == (tuple, int)
+    assert found["pair"][1]["bits"] is not given["pair"][1]["bits"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"box": [0.5, np.nan]},
+        {"box": None},
+        {"pear": 3},
+        {"pair": (6,)},
+        {"pair": {0: 6, 1: {"bits": np.zeros(3, np.int8)}}},
+        {"pair": (6, {"bits": np.zeros(2, np.int8)})},
+        {"pair": (6, {"bats": np.zeros(3, np.int8)})},
+        {"pair": (6, None)},
+    ],
+    ids=str,
+)
+def test_an_action_with_an_illegal_part_is_illegal(change):
+    action = {"pair": (6, {"bits": np.zeros(3, np.int8)}), "box": [0.5, 1]}
+    for clips in (False, True):
+        check = action_check(TREE, clips=clips)
+        assert check(action) is not ILLEGAL
+        assert check({**action, **change}) is ILLEGAL
+    assert action_check(TREE)(3) is ILLEGAL
+
+
 def test_other_spaces_are_asked_themselves():
     check, given = action_check(DIALS), np.array([1, 6])
     found = check(given)

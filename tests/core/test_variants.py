@@ -9,9 +9,7 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-from examples.greenhouse_coop import variants
-from examples.greenhouse_coop.env import GreenhouseSim, parallel_env
-from examples.greenhouse_coop.model import Greenhouse
+from studies.greenhouse_matrix import variants
 
 from simenv_marl import (
     RULE,
@@ -83,8 +81,9 @@ def test_a_variant_serves_wherever_a_simulation_is_asked_for():
     env = single_env(DEAR)
     env.reset()
     assert env.step(RULE)[2:4] == (False, False)
-    env = joint_env(LARGE)
-    assert set(env.action_space.spaces) == {"sower_0", "reaper_0"}
+    assert set(joint_env(LARGE).action_space.spaces) == {"sower_0", "reaper_0"}
+    assert simulate(Variant("instance", Farm(1), points=POINTS)).log == [("wheat", 1)]
+    assert simulate(Variant("factory", lambda fields: Farm(fields), parameters={"fields": 1})).log == [("wheat", 1)]
     assert Farm().sow(0) == "wheat"  # and the model is what it was
 
 
@@ -130,32 +129,23 @@ def test_registered_by_their_name():
             register_simulation(Farm, POINTS)
 
 
-def test_simulations_and_factories_of_every_kind():
-    assert simulate(Variant("instance", Farm(1), points=POINTS)).log == [("wheat", 1)]
-    assert simulate(Variant("factory", lambda fields: Farm(fields), parameters={"fields": 1})).log == [("wheat", 1)]
-
-
 # -- values ---------------------------------------------------------------------------------------
 
 
-def test_variants_are_frozen():
+def test_variants_are_frozen_and_can_be_pickled():
     with pytest.raises(FrozenInstanceError):
         LARGE.name = "larger"
     with pytest.raises(TypeError):
         LARGE.parameters["fields"] = 5
     given = {"fields": 1}
-    variant = Variant("small", Farm, parameters=given)
+    variant = Variant("small", Farm, parameters=given, plugins=[(dearer, HARVEST, "after")], points=[SOW])
     given["fields"] = 7
-    assert simulate(variant).log == [("wheat", 1)]
-
-
-def test_variants_can_be_pickled():
-    variant = Variant("small", Farm, parameters={"fields": 1}, plugins=[(dearer, HARVEST, "after")], points=[SOW])
     again = pickle.loads(pickle.dumps(variant))
     assert (again.name, again.simulation, dict(again.parameters), again.plugins, again.points) == (
         ("small", Farm, {"fields": 1}, ((dearer, HARVEST, "after"),), [SOW])
     )
-    assert simulate(again, points=POINTS).log == [("wheat", 10)]
+    for each in (variant, again):
+        assert simulate(each, points=POINTS).log == [("wheat", 10)]
 
 
 @pytest.mark.parametrize(
@@ -229,47 +219,6 @@ def test_what_json_does_not_know_is_named():
 
 
 # -- the greenhouse -------------------------------------------------------------------------------
-
-
-def test_a_decision_within_a_plugin_is_an_agents_like_any_other():
-    """The ventilator that arrives by a plugin lives through the same days as the one that is named from outside."""
-    rng = np.random.default_rng(4)
-    named, plugged = parallel_env(), generate_env(variants.VENTILATED, view="parallel")()
-    observations = [env.reset(seed=2)[0] for env in (named, plugged)]
-    assert named.possible_agents == sorted(plugged.possible_agents, reverse=True)
-    while named.agents:
-        actions = {agent: rng.random(1).astype(np.float32) * 0.5 for agent in named.agents}
-        results = [env.step(actions) for env in (named, plugged)]
-        observations = [result[0] for result in results]
-        for agent in actions:
-            assert observations[0][agent].tolist() == observations[1][agent].tolist()
-        assert results[0][1] == results[1][1]
-    assert not plugged.agents
-    assert named.simulation.greenhouse.day == plugged.simulation.greenhouse.day
-
-
-def test_the_papers_air_exchange():
-    """Humidity moves towards that outside, the faster the warmer it is; nobody else's does."""
-    env, other = single_env(variants.WARM_EXCHANGE), single_env(variants.BASE)
-    for each in (env, other):
-        each.reset(seed=1)
-    house = env.simulation.greenhouse
-    assert house.humidity != other.simulation.greenhouse.humidity
-    with_handler, without = Greenhouse(1), Greenhouse(1)
-    with_handler.temp = without.temp = 35
-    with_handler.humidity = without.humidity = 0.9
-    variants.new_air_exchange(with_handler)
-    without.update_air_exchange()
-    assert with_handler.humidity == pytest.approx(0.6)
-    assert without.humidity == pytest.approx(0.84)
-
-
-def test_with_rules_throughout_the_second_agent_changes_nothing():
-    plain = GreenhouseSim()
-    plain.reset(seed=5)
-    plain.run()
-    ran = simulate(variants.VENTILATED, seed=5)
-    assert [plant.health for plant in ran.greenhouse.pots] == [plant.health for plant in plain.greenhouse.pots]
 
 
 def test_the_variants_page_prints(capsys):

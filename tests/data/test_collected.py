@@ -8,14 +8,14 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, TRUNCATED, aec_env, difference
+from simenv_marl import RULE, aec_env
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
 from tests.contract.test_simulate_many import by_row
 from tests.worlds import worlds
 from tests.worlds.many_worlds import Announcing, Being, Colony, Other, beings, colony_points, designs, others
-from tests.worlds.models import Script, calling, decision, notes, play, script
+from tests.worlds.models import Script, calling, decision, play, script
 
 some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=6)
 sizes = st.integers(1, 8)
@@ -171,41 +171,23 @@ def test_agents_under_their_own_keys():
     assert found[Being.act].observations.tolist() == [[0, 0]] * 4
 
 
-def test_nobody_else_is_an_agent():
-    asked = []
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0)
-    found = collect_episodes(calling(ant, bee, ant), {"ant_0": ones}, points=[ant, bee], seeds=[1])
-    assert found["ant_0"].turns.tolist() == [0, 1]
-    assert asked == []
-
-
-def test_differences_count_for_each_agent():
-    levels = iter(range(0, 1000, 7))
-    ant = decision(agent="ant_0", reward_mapping=difference(lambda: next(levels)))
-    found = collect_episodes(calling(ant, ant, ant), {ant: ones}, seeds=[1])
-    assert found[ant].rewards.tolist() == [7.0, 7.0, 7.0]
-
-
-def test_ends():
-    ant = decision(agent="ant_0")
-    found = collect_episodes(calling(ant, ant), {ant: ones}, seeds=range(2))[ant]
-    assert found.terminations.tolist() == [False, True] * 2
-    assert not found.truncations.any()
-    found = collect_episodes(calling(ant, ant, ends=TRUNCATED), {ant: ones}, seeds=range(2))[ant]
-    assert found.truncations.tolist() == [False, True] * 2
-    assert not found.terminations.any()
-    found = collect_episodes(calling(ant, ant, ant), {ant: ones}, seeds=range(2), max_steps=2)[ant]
-    assert found.truncations.tolist() == [False, True] * 2
-
-
 # -- what arrays there are ------------------------------------------------------------------------
 
 
-def test_shapes_and_dtypes():
-    class Timed(Script):
-        def time(self):
-            return len(self.log) * 2
+class Timed(Script):
+    def time(self):
+        return len(self.log) * 2
 
+
+def with_infos(observations, infos):
+    assert [info["time"] for info in infos] in ([0, 0, 0], [2, 2, 2])
+    for info in infos:
+        del info["time"]
+    return ones(observations)
+
+
+@pytest.mark.parametrize("policy", [ones, with_infos])
+def test_shapes_and_dtypes(policy):
     def main(simulation):
         simulation.log += [ant()]
         simulation.log += [ant()]
@@ -216,28 +198,21 @@ def test_shapes_and_dtypes():
         observation_space_mapping=lambda: np.ones((2, 3)),
         action_mask_mapping=lambda: [0, 1] + [0] * 8,
     )
-    found = collect_episodes(lambda: Timed(main), {ant: ones}, seeds=range(3))[ant]
+    found = collect_episodes(lambda: Timed(main), {ant: policy}, seeds=range(3))[ant]
+    rows = {
+        np.float64: "rewards times elapsed",
+        np.bool_: "terminations truncations by_rule",
+        np.int64: "actions episodes agents steps turns",
+    }
+    trajectories = {np.int64: "starts lengths last_turns", np.float64: "returns"}
     shapes = {
         "observations": ((6, 2, 3), np.float32),
         "next_observations": ((6, 2, 3), np.float32),
         "last_observations": ((3, 2, 3), np.float32),
-        "actions": ((6,), np.int64),
-        "rewards": ((6,), np.float64),
-        "terminations": ((6,), np.bool_),
-        "truncations": ((6,), np.bool_),
         "action_masks": ((6, 10), np.int8),
-        "times": ((6,), np.float64),
-        "elapsed": ((6,), np.float64),
-        "episodes": ((6,), np.int64),
-        "agents": ((6,), np.int64),
-        "steps": ((6,), np.int64),
-        "turns": ((6,), np.int64),
-        "by_rule": ((6,), np.bool_),
-        "starts": ((3,), np.int64),
-        "lengths": ((3,), np.int64),
-        "last_turns": ((3,), np.int64),
-        "returns": ((3,), np.float64),
     }
+    for size, names in ((6, rows), (3, trajectories)):
+        shapes |= {name: ((size,), dtype) for dtype, several in names.items() for name in several.split()}
     for name, (shape, dtype) in shapes.items():
         array = getattr(found, name)
         assert (array.shape, array.dtype) == (shape, dtype), name
@@ -247,31 +222,14 @@ def test_shapes_and_dtypes():
     assert "6 decisions" in repr(found)
 
 
-def test_times_are_kept_where_a_policy_takes_the_infos():
-    class Timed(Script):
-        def time(self):
-            return len(self.log) * 2
-
-    def asked(observations, infos):
-        assert [info.pop("time") for info in infos] in ([0, 0, 0], [2, 2, 2])
-        return ones(observations)
-
-    ant = decision(agent="ant_0")
-    main = lambda simulation: simulation.log.extend(ant() for _ in range(2))  # noqa: E731
-    found = collect_episodes(lambda: Timed(main), {ant: asked}, seeds=range(3))[ant]
-    assert found.times.tolist() == [0, 2] * 3
-
-
 def test_policies_can_tell_decisions_apart():
     ant = decision(agent="ant_0")
     bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 1)
 
     def policy(observations, infos, identities):
         assert len(observations) == len(infos) == len(identities)
-        return [RULE] * len(identities), {
-            "seeds": [seed for seed, _ in identities],
-            "turns": [t for _, t in identities],
-        }
+        seeds, turns = zip(*identities, strict=True)
+        return [RULE] * len(identities), {"seeds": seeds, "turns": turns}
 
     def optional(observations, infos, identities=None):
         assert identities is None
@@ -311,7 +269,7 @@ def test_composite_spaces():
     assert found.by_rule.tolist() == [False, True, True, True]
 
 
-def test_masks_of_several_parts():
+def test_masks_of_several_parts_and_scalars_for_boxes_of_one_element():
     ant = decision(
         agent="ant_0",
         action_space=spaces.MultiDiscrete([2, 3]),
@@ -321,9 +279,6 @@ def test_masks_of_several_parts():
     assert found.action_masks[0].tolist() == [[0, 1]] * 2
     assert found.action_masks[1].tolist() == [[1, 0, 0]] * 2
     assert found.actions.tolist() == [[1, 0]] * 2
-
-
-def test_scalars_for_boxes_of_one_element():
     ant = decision(agent="ant_0", action_space=spaces.Box(0, 9, (1,), np.float32))
     found = collect_episodes(calling(ant), {ant: lambda observations: np.array([0.5, 1.5])}, seeds=range(2))[ant]
     assert found.actions.tolist() == [[0.5], [1.5]]
@@ -381,18 +336,16 @@ def test_extras_may_be_tensors_and_buffers_that_are_used_again():
     assert found.extras["tensors"].dtype == np.float32
 
 
-@pytest.mark.parametrize("values", [[1.0], 1.0, [1.0, 2.0, 3.0]])
-def test_extras_that_do_not_fit(values):
+@pytest.mark.parametrize(
+    ("second", "match"),
+    [({"values": [1.0]}, "2 decisions"), ({"values": 1.0}, "2 decisions"), ({"values": [1.0] * 3}, "2 decisions"),
+     (None, "values"), ({"others": [1.0, 2.0]}, "values")],
+)  # fmt: skip
+def test_extras_that_do_not_fit(second, match):
     ant = decision(agent="ant_0")
-    with pytest.raises(OptionValueError, match="2 decisions"):
-        collect_episodes(calling(ant), {ant: lambda observations: ([1, 1], {"values": values})}, seeds=range(2))
-
-
-def test_extras_that_are_not_always_there():
-    ant = decision(agent="ant_0")
-    answers = iter([([1], {"values": [0.5]}), [1]])
-    with pytest.raises(OptionValueError, match="values"):
-        collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=[1])
+    answers = iter([([1, 1], {"values": [0.5, 1.5]}), [1, 1] if second is None else ([1, 1], second)])
+    with pytest.raises(OptionValueError, match=match):
+        collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2))
 
 
 def test_episodes_in_which_nobody_decides():
@@ -419,21 +372,16 @@ def test_what_is_collected_of_each_simulation():
         for _ in range(simulation.seed):  # the last seeds are the first to end
             ant()
 
-    found = collect_episodes(
-        script(main),
-        {ant: ones, bee: ones},
-        points=[ant, bee],
-        seeds=[4, 0, 2],
-        collect=lambda simulation: simulation.seed,
-    )
-    assert found[ant].collected == (4, 0, 2)
-    assert found[bee].collected == (4, 0, 2)  # who has never decided
-    assert collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1])[ant].collected is None
-    with pytest.raises(OptionValueError, match="collect"):
-        collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1], collect=3)
-    for wrong in ({"batch_size": 0}, {"batch_size": 1.5}, {"workers": 1.5}):
+    def found(**options):
+        given = {"points": [ant, bee], "seeds": [4, 0, 2], **options}
+        return collect_episodes(script(main), {ant: ones, bee: ones}, **given)
+
+    collected = found(collect=lambda simulation: simulation.seed)
+    assert collected[ant].collected == collected[bee].collected == (4, 0, 2)  # also of whom has never decided
+    assert found()[ant].collected is None
+    for wrong in ({"collect": 3}, {"batch_size": 0}, {"batch_size": 1.5}, {"workers": 1.5}):
         with pytest.raises(OptionValueError, match=next(iter(wrong))):
-            collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1], **wrong)
+            found(**wrong)
 
 
 def test_one_name_at_points_whose_spaces_differ():
@@ -450,41 +398,21 @@ def test_one_name_at_points_whose_spaces_differ():
         collect_episodes(script(main), {"being_0": ones}, points=definitions, seeds=range(2))
 
 
-def test_variants_own_policies_answer_for_no_agents():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+def test_whom_no_policy_of_the_call_decides_for_is_no_agent():
+    asked = []
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0)
     variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: lambda observation: 5})
     found = collect_episodes(variant, {ant: ones}, seeds=range(2))
     assert list(found) == [ant]
     assert found[ant].turns.tolist() == [0, 0]
+    found = collect_episodes(calling(ant, bee, ant), {"ant_0": ones}, points=[ant, bee], seeds=[1])
+    assert found["ant_0"].turns.tolist() == [0, 1]
+    assert asked == []
 
 
-def test_errors_unwind_all_and_say_of_which_seed():
-    ended = []
-
-    def main(simulation):
-        try:
-            for _ in range(simulation.seed):
-                ant()
-        finally:
-            ended.append(simulation.seed)
-
-    def paid():
-        paid.number += 1
-        return 1.0 if paid.number < 8 else float("nan")
-
-    paid.number = 0
-    ant = decision(agent="ant_0", reward_mapping=paid)
-    with pytest.raises(ValueError, match="not finite") as caught:
-        collect_episodes(script(main), {ant: ones}, seeds=[7, 8, 9])
-    assert "seed" in notes(caught.value)
-    assert sorted(ended) == [7, 8, 9]
-
-
-@pytest.mark.parametrize("policies", [None, [1], {"nobody": ones}])
+@pytest.mark.parametrize("policies", [[1], {"nobody": ones}])
 def test_policies_that_cannot_be(policies):
     ant = decision(agent="ant_0")
-    if policies is None:
-        assert collect_episodes(calling(ant), {}, points=ant, seeds=[1]) == {}
-        return
+    assert collect_episodes(calling(ant), {}, points=ant, seeds=[1]) == {}
     with pytest.raises((OptionValueError, UnknownPointError), match=r"policies|nobody"):
         collect_episodes(calling(ant), policies, points=ant, seeds=[1])

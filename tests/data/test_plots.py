@@ -38,8 +38,8 @@ def clocked(main):
     return lambda: Clocked(main)
 
 
-def herd(number, steps, *, dying=()):
-    """A simulation in which beings act in turns; some are banished after their first step."""
+def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **definition):
+    """What was collected of beings that act in turns; some are banished after their first step."""
 
     def main(simulation):
         simulation.crowd = [Being(place) for place in range(number)]
@@ -51,7 +51,15 @@ def herd(number, steps, *, dying=()):
                 simulation.crowd.remove(being)
         return TRUNCATED
 
-    return script(main)
+    policies = key if isinstance(key, dict) else {key: policy}
+    return collect_episodes(script(main), policies, points=beings(**definition), seeds=seeds)
+
+
+def asked(*functions, answers=None, seeds=(1,), **options):
+    """What was collected of decisions that are made one after the other, by answers or always by one."""
+    given = iter([]) if answers is None else iter(answers)
+    policy = lambda seen: next(given, ones(seen))  # noqa: E731
+    return collect_episodes(calling(*functions), dict.fromkeys(functions, policy), seeds=seeds, **options)
 
 
 def of(axes, kind):
@@ -97,28 +105,37 @@ def test_charts_show_each_action_and_each_reward():
 
 def test_the_clock_is_what_runs_from_left_to_right():
     def main(simulation):
+        simulation.log.append(Being(0).act())  # whom the model has let go of lives to the end
+        keeper = Being(1)
         for _ in range(3):
-            simulation.log.append(ant())
+            simulation.log.append(keeper.act())
 
-    ant = decision(agent="ant_0")
     bee = decision(agent="bee_0")  # who never decides, and so tells no time
-    policies = {ant: lambda seen: [1], bee: lambda seen: [1]}
-    figure = plot_timeline(collect_episodes(clocked(main), policies, seeds=[1]))
-    assert dots(figure.axes[0]) == [([[0, 1], [10, 1], [20, 1]], True)]
-    assert figure.axes[-1].get_xlabel() == "time"
-    (ending,) = figure.axes[0].lines[1:]
-    assert (ending.get_xdata()[0], ending.get_marker()) == (30, "x")
+    points = beings() | {bee: None}
+    found = collect_episodes(clocked(main), {Being.act: ones, bee: ones}, points=points, seeds=[1])
+    first, _, second, paid = plot_timeline(found).axes
+    assert dots(first) == [([[0, 1]], True)]
+    assert dots(second) == [([[10, 1], [20, 1], [30, 1]], True)]
+    assert paid.get_xlabel() == "time"
+    assert not first.patches
+    assert [(patch.get_x(), patch.get_width()) for patch in second.patches] == [(0, 10)]
+    for axes in (first, second):
+        (ending,) = axes.lines[1:]
+        assert (ending.get_xdata()[0], ending.get_marker()) == (40, "x")
 
 
-def test_what_the_rule_has_decided_is_told_apart():
-    ant = decision(agent="ant_0")
-    answers = iter([[1], RULE, [3]])
-    figure = plot_timeline(collect_episodes(calling(ant, ant, ant), {ant: lambda seen: next(answers)}, seeds=[1]))
-    by_policy, by_rule = dots(figure.axes[0])
+@pytest.mark.parametrize("known", [False, True])
+def test_what_the_rule_has_decided_is_told_apart(known):
+    names = {**dict(enumerate("abcdefghi")), 9: "rule"} if known else int
+    ant = decision(agent="ant_0", action_space_mapping=names)
+    found = asked(ant, ant, ant, answers=[[1], RULE, [3]])
+    by_policy, by_rule = dots(plot_timeline(found).axes[0])
     assert by_policy == ([[0, 1], [2, 3]], True)
-    assert [place for place, _ in by_rule[0]] == [1]
-    assert not by_rule[1]
-    assert texts(figure.axes[0]) == ["policy", "rule", "terminated"]
+    assert ([place for place, _ in by_rule[0]], by_rule[1]) == ([1], False)
+    assert by_rule[0] == [[1, 9]] or not known
+    assert texts(plot_timeline(found).axes[0]) == ["policy", "rule", "terminated"]
+    assert plot_timeline(found)._repr_png_().startswith(b"\x89PNG")  # for notebooks
+    assert dots(plot_timeline(found[ant]).axes[0]) == [by_policy, by_rule]
 
 
 def test_actions_have_names():
@@ -139,58 +156,31 @@ def test_actions_have_names():
 def test_actions_of_several_parts_have_a_chart_for_each_part():
     space = spaces.Dict(how=spaces.Box(0, 1, (2,), np.float32), what=spaces.Discrete(3), say=spaces.Text(9))
     ant = decision(agent="ant_0", action_space=space)
-
-    def policy(seen):
-        return [{"how": np.array([0.5, 0.25], np.float32), "what": 2, "say": "hello"}] * len(seen)
-
-    figure = plot_timeline(collect_episodes(calling(ant, ant), {ant: policy}, seeds=[1]))
-    by_name = {axes.get_ylabel(): axes for axes in figure.axes}
+    answer = {"how": np.array([0.5, 0.25], np.float32), "what": 2, "say": "hello"}
+    by_name = {axes.get_ylabel(): axes for axes in plot_timeline(asked(ant, ant, answers=[[answer]] * 2)).axes}
     assert set(by_name) == {"how", "what", "say", "reward"}
     assert dots(by_name["how"]) == [([[0, 0.5], [1, 0.5]], True), ([[0, 0.25], [1, 0.25]], True)]
     assert dots(by_name["what"]) == [([[0, 2], [1, 2]], True)]
     assert [tick.get_text() for tick in by_name["say"].get_yticklabels()] == ["hello"]
     assert {"how[0]", "how[1]"} <= set(texts(by_name["how"]))
-
-
-def test_parts_of_tuples_are_counted():
     space = spaces.Tuple([spaces.Discrete(3), spaces.Dict(far=spaces.Box(0, 9, (1,), np.float32))])
     ant = decision(agent="ant_0", action_space=space)
-    answer = (2, {"far": np.array([0.5], np.float32)})
-    figure = plot_timeline(collect_episodes(calling(ant), {ant: lambda seen: [answer]}, seeds=[1]))
+    figure = plot_timeline(asked(ant, answers=[[(2, {"far": np.array([0.5], np.float32)})]]))
     assert [axes.get_ylabel() for axes in figure.axes] == ["[0]", "[1]['far']", "reward"]
     assert [dots(axes) for axes in figure.axes[:2]] == [[([[0, 2]], True)], [([[0, 0.5]], True)]]
-
-
-def test_one_decision_alone_can_be_drawn():
-    ant = decision(agent="ant_0", action_space=spaces.Box(0, 1, (1,)))
-    figure = plot_timeline(collect_episodes(calling(ant), {ant: lambda seen: [[0.5]]}, seeds=[1]))
-    assert dots(figure.axes[0]) == [([[0, 0.5]], True)]
-    low, high = figure.axes[0].get_ylim()
+    low, high = figure.axes[1].get_ylim()
     assert low < 0.5 < high
     figure.canvas.draw()
 
 
 def test_where_nobody_lives_is_shaded():
-    figure = plot_timeline(collect_episodes(herd(3, 2, dying=[1]), {Being.act: ones}, points=beings(), seeds=[1]))
-    first, _, second, _, third, _ = figure.axes
+    first, _, second, _, third, _ = plot_timeline(herd(3, 2, dying=[1])).axes
     # being_1, which has made the second of five decisions, goes after the third.
     assert [patch.get_x() for patch in second.patches] == [0, 3]
     assert [patch.get_x() for patch in third.patches] == [0]
     assert not first.patches
     assert [line.get_marker() for line in second.lines[1:]] == ["x"]
     assert [line.get_marker() for line in third.lines[1:]] == ["|"]
-
-
-def test_whom_the_model_has_let_go_of_lives_to_the_end():
-    def main(simulation):
-        simulation.log.append(Being(0).act())
-        keeper = Being(1)
-        for _ in range(3):
-            simulation.log.append(keeper.act())
-
-    figure = plot_timeline(collect_episodes(clocked(main), {Being.act: ones}, points=beings(), seeds=[1]))
-    assert not figure.axes[0].patches
-    assert [(patch.get_x(), patch.get_width()) for patch in figure.axes[2].patches] == [(0, 10)]
 
 
 # -- many agents ----------------------------------------------------------------------------------
@@ -205,7 +195,7 @@ def drawn(axes):
 
 
 def test_many_agents_have_a_row_each():
-    found = collect_episodes(herd(200, 3, dying=range(0, 200, 2)), {Being.act: ones}, points=beings(), seeds=[5])
+    found = herd(200, 3, dying=range(0, 200, 2))
     figure = plot_timeline(found)
     actions, rewards = figure.axes[:2]
     figure.canvas.draw()
@@ -223,32 +213,20 @@ def test_many_agents_have_a_row_each():
     assert (dashes.get_marker(), len(dashes.get_xdata())) == ("|", 100)
 
 
-def test_rows_are_coloured_by_the_action():
-    found = collect_episodes(
-        herd(8, 1), {Being.act: lambda seen: [3, *[0] * 7][: len(seen)]}, points=beings(), seeds=[5]
-    )
-    figure = plot_timeline(found, action_names=["stay", "1", "2", "go"])
-    actions = figure.axes[0]
+@pytest.mark.parametrize("key", [Being.act, f"{Being.__module__}.Being.act"])
+def test_rows_are_coloured_by_the_action(key):
+    found = herd(8, 1, key=key, policy=lambda seen: [3, *[0] * 7][: len(seen)])
+    actions = plot_timeline(found, action_names=["stay", "1", "2", "go"]).axes[0]
     colours = [tuple(colour) for colour in of(actions, PolyCollection)[-1].get_facecolor()]
     assert set(colours) <= {to_rgba(COLOURS[0]), to_rgba(COLOURS[3])}
     assert "go" in texts(actions)
-
-
-def test_one_dimensional_actions_have_a_scale():
-    space = spaces.Box(0, 9, (1,), np.float32)
-    policy = lambda seen: (seen[:, :1] / 2).astype(np.float32)  # noqa: E731
-    points = beings(action_space=space, observation_space_mapping=lambda being: [being.number, 0])
-    found = collect_episodes(herd(10, 2), {Being.act: policy}, points=points, seeds=[5])
-    scale = of(plot_timeline(found).axes[0], PolyCollection)[-1]
-    assert scale.get_array().tolist() == [number / 2 for number in range(10) for _ in range(2)]
-    assert scale.get_clim() == (0, 4.5)
+    assert actions.get_title(loc="left") == "Being.act, 8 agents: action"
 
 
 def test_rows_of_actions_with_components_are_coloured_by_one():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), far=spaces.Discrete(5))
-    points = beings(action_space=space)
     answer = {"how": np.array([1, 2], np.float32), "far": 4}
-    found = collect_episodes(herd(8, 1), {Being.act: lambda seen: [answer] * len(seen)}, points=points, seeds=[5])
+    found = herd(8, 1, policy=lambda seen: [answer] * len(seen), action_space=space)
 
     def values(component):
         return set(of(plot_timeline(found, component=component).axes[0], PolyCollection)[-1].get_array().tolist())
@@ -263,35 +241,18 @@ def test_rows_of_actions_with_components_are_coloured_by_one():
 
 def test_what_only_the_rule_knows_is_grey():
     answers = iter([RULE])
-    policy = lambda seen: next(answers, [2] * len(seen))  # noqa: E731
-    found = collect_episodes(herd(8, 1), {Being.act: policy}, points=beings(), seeds=[5, 6])
+    found = herd(8, 1, policy=lambda seen: next(answers, [2] * len(seen)), seeds=(5, 6))
     assert found[Being.act].by_rule.any()
     of_each = [plot_timeline(found, episode).axes[0] for episode in (0, 1)]
-    greys = [
-        to_hex(cells.get_facecolor()[0]) == UNKNOWN.lower()
-        for axes in of_each
-        for cells in of(axes, PolyCollection)
-        if len(cells.get_facecolor())
-    ]
-    assert any(greys)
+    cells = [cells.get_facecolor() for axes in of_each for cells in of(axes, PolyCollection)]
+    assert any(to_hex(colours[0]) == UNKNOWN.lower() for colours in cells if len(colours))
     assert any("by rule, action unknown" in texts(axes.figure.axes[1]) for axes in of_each)
-
-
-def test_policies_are_called_by_the_last_of_their_dotted_names():
-    for key in (Being.act, f"{Being.__module__}.Being.act"):
-        found = collect_episodes(herd(8, 1), {key: ones}, points=beings(), seeds=[5])
-        assert plot_timeline(found).axes[0].get_title(loc="left") == "Being.act, 8 agents: action"
-
-
-def test_nobody_but_the_rule_can_be_drawn():
-    found = collect_episodes(herd(8, 2), {Being.act: lambda seen: RULE}, points=beings(), seeds=[5])
-    plot_timeline(found).canvas.draw()
+    plot_timeline(herd(8, 2, policy=lambda seen: RULE)).canvas.draw()  # by nobody but the rule
 
 
 def test_policies_have_panels_of_their_own_unless_they_are_many():
     def collected(number):
-        names = [f"being_{place}" for place in range(number)]
-        return collect_episodes(herd(number, 2), dict.fromkeys(names, ones), points=beings(), seeds=[5])
+        return herd(number, 2, key={f"being_{place}": ones for place in range(number)})
 
     assert len(plot_timeline(collected(4)).axes) == 8
     many = plot_timeline(collected(30))
@@ -300,14 +261,20 @@ def test_policies_have_panels_of_their_own_unless_they_are_many():
     assert texts(many.axes[0]) == ["1"]
 
 
-def test_policies_with_too_many_different_actions_share_a_scale():
-    names = [f"being_{place}" for place in range(30)]
-    policies = {name: lambda seen, own=place: [own] * len(seen) for place, name in enumerate(names)}
-    points = beings(action_space=spaces.Discrete(40))
-    found = collect_episodes(herd(30, 1), policies, points=points, seeds=[5])
-    scale = of(plot_timeline(found).axes[0], PolyCollection)[-1]
-    assert scale.get_array().tolist() == list(range(30))
-    assert scale.get_clim() == (0, 29)
+def test_numbers_and_too_many_different_actions_share_a_scale():
+    policies = {f"being_{place}": lambda seen, own=place: [own] * len(seen) for place in range(30)}
+    many = herd(30, 1, key=policies, action_space=spaces.Discrete(40))
+    numbers = herd(
+        10,
+        2,
+        policy=lambda seen: (seen[:, :1] / 2).astype(np.float32),
+        action_space=spaces.Box(0, 9, (1,), np.float32),
+        observation_space_mapping=lambda being: [being.number, 0],
+    )
+    for found, values, most in ((many, list(range(30)), 29), (numbers, np.repeat(np.arange(10) / 2, 2).tolist(), 4.5)):
+        scale = of(plot_timeline(found).axes[0], PolyCollection)[-1]
+        assert scale.get_array().tolist() == values
+        assert scale.get_clim() == (0, most)
 
 
 def test_decisions_of_the_same_time_share_it():
@@ -328,7 +295,7 @@ def test_decisions_of_the_same_time_share_it():
 
 
 def test_some_agents_can_be_chosen():
-    found = collect_episodes(herd(50, 3), {Being.act: ones}, points=beings(), seeds=[5])
+    found = herd(50, 3)
     figure = plot_timeline(found, agents=["being_7", "being_3"])
     assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == ["being_7  (Being.act)", "being_3  (Being.act)"]
     with pytest.raises(UnknownAgentError, match="being_50"):
@@ -337,38 +304,25 @@ def test_some_agents_can_be_chosen():
         plot_timeline(found, agents="being_7")
 
 
-def test_what_is_under_one_key_can_be_drawn():
-    ant = decision(agent="ant_0")
-    found = collect_episodes(calling(ant, ant), {ant: ones}, seeds=[1])
-    assert dots(plot_timeline(found[ant]).axes[0]) == dots(plot_timeline(found).axes[0])
-
-
 def test_episodes_are_counted_from_either_end():
     ant = decision(agent="ant_0")
-    found = collect_episodes(calling(ant, ant), {ant: ones}, seeds=[7, 8, 9])
+    found = asked(ant, ant, seeds=[7, 8, 9])
     assert plot_timeline(found, np.int64(1)).get_suptitle() == "Episode 1, seed 8"
     assert plot_timeline(found, -1).get_suptitle() == "Episode 2, seed 9"
-
-
-@pytest.mark.parametrize("episode", [2, -3, 1.0, None])
-def test_episodes_that_do_not_exist(episode):
-    ant = decision(agent="ant_0")
-    found = collect_episodes(calling(ant), {ant: ones}, seeds=[7, 8])
-    with pytest.raises(OptionValueError, match="episode"):
-        plot_timeline(found, episode)
+    for episode in (3, -4, 1.0, None):
+        with pytest.raises(OptionValueError, match="episode"):
+            plot_timeline(found, episode)
 
 
 def test_episodes_in_which_nobody_decides():
-    ant = decision(agent="ant_0")
-
-    def main(simulation):
-        if simulation.seed == 1:
-            ant()
-
-    found = collect_episodes(script(main), {ant: ones}, seeds=[0, 1])
+    ant = decision(agent="ant_0", reward_mapping=lambda: 3.0)
+    main = lambda simulation: ant() if simulation.seed else None  # noqa: E731
+    found = collect_episodes(script(main), {ant: ones}, seeds=[0, 1, 2])
     with pytest.raises(OptionValueError, match=r"episode 0 \(seed 0\)"):
         plot_timeline(found, 0)
     plot_timeline(found, 1)
+    for per in ("policy", "agent", "team"):
+        assert [values for _, values in rows_of(plot_returns(found, per=per))] == [[3, 3]]
     with pytest.raises(OptionValueError, match="no agent has decided"):
         plot_returns(collect_episodes(script(main), {ant: ones}, seeds=[0]))
 
@@ -382,7 +336,7 @@ def test_what_cannot_be_drawn(wrong):
 
 
 def test_pictures_are_drawn_where_they_are_asked_for():
-    found = collect_episodes(herd(8, 2), {Being.act: ones}, points=beings(), seeds=[5])
+    found = herd(8, 2)
     whole = Figure(figsize=(20, 8), layout="constrained")
     left, right = whole.subfigures(1, 2)
     assert plot_timeline(found, figure=left) is left
@@ -395,16 +349,9 @@ def test_pictures_are_drawn_where_they_are_asked_for():
     assert whole.get_size_inches().tolist() == [20, 8]
 
 
-def test_notebooks_are_given_an_image():
-    ant = decision(agent="ant_0")
-    figure = plot_timeline(collect_episodes(calling(ant), {ant: ones}, seeds=[7]))
-    assert figure._repr_png_().startswith(b"\x89PNG")
-
-
 @pytest.mark.parametrize("draw", [plot_timeline, plot_returns])
 def test_without_matplotlib_the_extra_is_named(monkeypatch, draw):
-    ant = decision(agent="ant_0")
-    found = collect_episodes(calling(ant), {ant: ones}, seeds=[7])
+    found = asked(decision(agent="ant_0"))
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[plots\]"):
         draw(found)
@@ -439,17 +386,23 @@ def rows_of(figure):
     return [(labels[place], values) for place, values in zip(means, points, strict=True)]
 
 
-def test_a_point_is_the_mean_of_the_agents_of_an_episode():
-    assert rows_of(plot_returns(paid_by_seed(3))) == [("Being.act", [4, 6, 14])]
-
-
-def test_a_point_is_what_an_agent_has_got():
-    rows = rows_of(plot_returns(paid_by_seed(2), per="agent"))
-    assert rows == [("being_0", [2, 4, 12]), ("being_1", [4, 6, 14])]
-
-
-def test_a_point_is_what_a_team_has_got():
-    assert [values for _, values in rows_of(plot_returns(paid_by_seed(3), per="team"))] == [[12, 18, 42]]
+@pytest.mark.parametrize(
+    ("per", "rows"),
+    [
+        ("policy", [("Being.act", [3, 5, 13])]),
+        ("agent", [("being_0", [2, 4, 12]), ("being_1", [4, 6, 14])]),
+        ("team", [("Being.act", [6, 10, 26])]),
+    ],
+)
+def test_a_point_is_the_mean_of_the_agents_or_of_one_or_the_sum(per, rows):
+    found = rows_of(plot_returns(paid_by_seed(2), per=per))
+    assert [values for _, values in found] == [values for _, values in rows]
+    assert found == rows or per == "team"
+    intervals = [plot_returns(paid_by_seed(3)).axes[0].texts[0].get_text() for _ in range(2)]
+    assert intervals == ["8  [4, 14]"] * 2  # the same each time
+    ant, bee = (decision(agent=name, reward_mapping=lambda paid=paid: paid) for name, paid in (("a", 1.0), ("b", 10.0)))
+    found = collect_episodes(calling(ant, bee, ant), {ant: ones, bee: ones}, seeds=[3, 4])
+    assert [values for _, values in rows_of(plot_returns(found, per="team"))] == [[12, 12]]
 
 
 def test_several_collections_stand_side_by_side():
@@ -463,34 +416,8 @@ def test_several_collections_stand_side_by_side():
     assert rows_of(plot_returns(several, per="team")) == [("once", [12, 18, 42]), ("twice", [18, 30, 78])]
 
 
-def test_agents_of_policies_that_share_an_episode_are_one_team():
-    ant, bee = (decision(agent=name, reward_mapping=lambda paid=paid: paid) for name, paid in (("a", 1.0), ("b", 10.0)))
-    found = collect_episodes(calling(ant, bee, ant), {ant: ones, bee: ones}, seeds=[3, 4])
-    assert [values for _, values in rows_of(plot_returns(found, per="team"))] == [[12, 12]]
-
-
-def test_episodes_without_a_decision_have_no_point():
-    ant = decision(agent="ant_0", reward_mapping=lambda: 3.0)
-
-    def main(simulation):
-        if simulation.seed:
-            ant()
-
-    found = collect_episodes(script(main), {ant: ones}, seeds=[0, 1, 2])
-    for per in ("policy", "agent", "team"):
-        assert [values for _, values in rows_of(plot_returns(found, per=per))] == [[3, 3]]
-
-
-def test_the_interval_of_the_mean_is_always_the_same():
-    def interval():
-        (axes,) = plot_returns(paid_by_seed(3)).axes
-        return axes.texts[0].get_text()
-
-    assert interval() == interval() == "8  [4, 14]"
-
-
 def test_hundreds_of_agents_are_too_many_rows():
-    many = collect_episodes(herd(100, 1), {Being.act: ones}, points=beings(), seeds=[5])
+    many = herd(100, 1)
     with pytest.raises(OptionValueError, match="100 rows"):
         plot_returns(many, per="agent")
     plot_returns(many)
@@ -498,16 +425,11 @@ def test_hundreds_of_agents_are_too_many_rows():
         plot_returns(many, per="wolf")
 
 
-def test_what_the_rule_has_decided_is_shown_where_it_is_known():
-    ant = decision(agent="ant_0", action_space_mapping={**dict(enumerate("abcdefghi")), 9: "rule"})
-    answers = iter([[1], RULE, [3]])
-    found = collect_episodes(calling(ant, ant, ant), {ant: lambda seen: next(answers)}, seeds=[1])
-    assert dots(plot_timeline(found).axes[0]) == [([[0, 1], [2, 3]], True), ([[1, 9]], False)]
-    points = beings(action_space_mapping={**dict(enumerate("abcdefghi")), 9: "rule"})
+def test_cells_of_the_rule_are_lower():
     policy = lambda seen: [RULE if number == 3 else 4 for number in seen[:, 0]]  # noqa: E731
-    actions = plot_timeline(collect_episodes(herd(8, 2), {Being.act: policy}, points=points, seeds=[5])).axes[0]
-    cells = of(actions, PolyCollection)[-1]
+    found = herd(8, 2, policy=policy, action_space_mapping={**dict(enumerate("abcdefghi")), 9: "rule"})
+    actions = plot_timeline(found).axes[0]
     assert texts(actions) == ["4", "9"]
-    heights = [round(path.get_extents().height, 3) for path in cells.get_paths()]
+    heights = [round(path.get_extents().height, 3) for path in of(actions, PolyCollection)[-1].get_paths()]
     assert [height for height in heights if height != heights[0]] == [heights[6]] * 2
     assert heights[6] < heights[0] / 2

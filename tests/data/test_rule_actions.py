@@ -27,15 +27,10 @@ from tests.worlds.models import calling, decision, notes, play, script
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
 
-def counting(start: int = 1) -> Any:
+def counting() -> Any:
     """A rule that decides 10, 20, 30, ..."""
-    tens = {"now": 10 * (start - 1)}
-
-    def choose(step: int = 10) -> int:
-        tens["now"] += step
-        return tens["now"]
-
-    return choose
+    tens = iter(range(10, 100, 10))
+    return lambda: next(tens)
 
 
 def four(function: Any) -> Any:
@@ -47,38 +42,30 @@ def four(function: Any) -> Any:
     return script(main)
 
 
-def single(function: Any, **options: Any) -> Any:
+# -- infos ------------------------------------------------------------------------------------------
+
+
+def begun(function: Any, **options: Any) -> Any:
     env = single_env(four(function), function, **options)
     env.reset(seed=0)
     return env
 
 
-# -- infos ------------------------------------------------------------------------------------------
-
-
+@pytest.mark.parametrize(
+    ("mapping", "told"),
+    [
+        (lambda tens: tens // 10, [1, None, 2, 3]),
+        ({10: 4, 20: 5, 30: 6}, [4, None, 5, 6]),
+        (lambda tens: None if tens == 20 else 1, [1, None, None, 1]),
+    ],
+    ids=["callable", "dict", "none"],
+)
 @DRIVERS
-def test_the_next_info_tells_the_rules_action_and_only_that_of_the_latest_decision(driver):
-    env = single(decision(counting(), rule_action_mapping=lambda tens: tens // 10), driver=driver)
-    assert [env.step(action)[4] for action in (RULE, 7, RULE, RULE)] == [
-        {"rule_action": 1},
-        {},
-        {"rule_action": 2},
-        {"rule_action": 3},
-    ]
+def test_the_next_info_tells_the_rules_action_and_only_that_of_the_latest_decision(mapping, told, driver):
+    env = begun(decision(counting(), rule_action_mapping=mapping), driver=driver)
+    expected = [{} if action is None else {"rule_action": action} for action in told]
+    assert [env.step(action)[4] for action in (RULE, 7, RULE, RULE)] == expected
     assert env.simulation.log == [10, 7, 20, 30]
-
-
-def test_a_dict_goes_from_decision_to_action():
-    env = single(decision(counting(), rule_action_mapping={10: 4, 20: 5, 30: 6, 40: 7}))
-    assert [env.step(RULE)[4]["rule_action"] for _ in range(4)] == [4, 5, 6, 7]
-
-
-def test_a_dict_without_the_decision_says_so():
-    env = single(decision(counting(), rule_action_mapping={10: 4}))
-    env.step(RULE)
-    with pytest.raises(InvalidActionError, match="no action for the rule's decision 20") as caught:
-        env.step(RULE)
-    assert "choose" in notes(caught.value)
 
 
 def test_a_mapping_may_take_the_arguments_of_the_call_as_they_were_passed():
@@ -88,7 +75,7 @@ def test_a_mapping_may_take_the_arguments_of_the_call_as_they_were_passed():
         seen.append((decided, args, kwargs))
         return 1
 
-    function = decision(counting(), rule_action_mapping=mapping)
+    function = decision(lambda step=10: step + 1, rule_action_mapping=mapping)
 
     def main(simulation):
         function(5)
@@ -99,48 +86,50 @@ def test_a_mapping_may_take_the_arguments_of_the_call_as_they_were_passed():
     env.reset(seed=0)
     for _ in range(3):
         env.step(RULE)
-    assert seen == [(5, (5,), {}), (12, (), {"step": 7}), (22, (), {})]
+    assert seen == [(6, (5,), {}), (8, (), {"step": 7}), (11, (), {})]
 
 
-def test_none_says_that_no_action_corresponds():
-    env = single(decision(counting(), rule_action_mapping=lambda tens: None if tens == 20 else 1))
-    assert [env.step(RULE)[4] for _ in range(3)] == [{"rule_action": 1}, {}, {"rule_action": 1}]
-
-
-def test_an_action_outside_the_space_is_an_error():
-    env = single(decision(counting(), rule_action_mapping=lambda tens: tens))
-    with pytest.raises(InvalidActionError, match="the rule's decision 10 to the action 10"):
-        env.step(RULE)
-    env.reset(seed=0)
-
-
-def test_a_mapping_that_raises_surfaces_outside_the_models_own_try():
-    function = decision(counting(), rule_action_mapping=lambda tens: 1 / 0)
+@pytest.mark.parametrize(
+    ("mapping", "error", "match", "note"),
+    [
+        (lambda tens: tens, InvalidActionError, "the rule's decision 10 to the action 10", "seed 3"),
+        ({20: 4}, InvalidActionError, "no action for the rule's decision 10", "counting"),
+        (lambda tens: 1 / 0, ZeroDivisionError, "division", "seed 3"),
+    ],
+    ids=["outside the space", "not in the dict", "raising"],
+)
+def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
+    function = decision(counting(), rule_action_mapping=mapping)
 
     def main(simulation):
         try:
             function()
-        except ZeroDivisionError:
+        except Exception:
             simulation.log.append("swallowed")
 
     env = single_env(script(main), function)
     env.reset(seed=3)
-    with pytest.raises(ZeroDivisionError) as caught:
+    with pytest.raises(error, match=match) as caught:
         env.step(RULE)
-    assert "seed 3" in notes(caught.value)
+    assert note in notes(caught.value)
     assert env.simulation.log == []
+    env.reset(seed=0)
 
 
-def test_its_note_names_whose_rule_has_decided():
-    inner = decision(counting(), agent="inner_0")
-    outer = decision(lambda: inner(), agent="outer_0", rule_action_mapping=lambda tens: 1 / 0)
-    env = aec_env(calling(outer), [outer, inner])
-    env.reset()
-    env.step(RULE)
-    assert env.agent_selection == "inner_0"
-    with pytest.raises(ZeroDivisionError) as caught:
-        env.step(1)
-    assert "of 'outer_0'" in notes(caught.value)
+@pytest.mark.parametrize("raising", [False, True])
+def test_decisions_within_rules_do_not_take_each_others_place(raising):
+    inner = decision(lambda: 2, agent="inner_0", rule_action_mapping=lambda decided: decided)
+    outer = decision(
+        lambda: 10 * inner(), agent="outer_0", rule_action_mapping=lambda decided: decided // (0 if raising else 5)
+    )
+    env = aec_env(calling(outer, outer), [outer, inner])
+    if raising:
+        with pytest.raises(ZeroDivisionError) as caught:
+            play(env, RULE, seed=0)
+        assert "of 'outer_0'" in notes(caught.value)
+        return
+    told = [(turn.agent, turn.info.get("rule_action")) for turn in play(env, RULE, seed=0)]
+    assert told == [("outer_0", None), ("inner_0", None), *[("outer_0", 4), ("inner_0", 2)] * 2]
 
 
 @pytest.mark.parametrize("wrong", [3, "name"])
@@ -156,7 +145,7 @@ def test_arrays_are_cast_and_nobody_elses():
         action_space=spaces.Box(0, 1, (2,), np.float32),
         rule_action_mapping=lambda value: value,
     )
-    env = single(function)
+    env = begun(function)
     action = env.step(RULE)[4]["rule_action"]
     assert action.dtype == np.float32
     action[:] = 0
@@ -207,27 +196,19 @@ def test_generators_and_coroutines(driver):
 
     def main(simulation):
         def process():
-            simulation.log.append((yield from slowly()))
-            simulation.log.append((yield from slowly()))
-
-        simulation.log += list(process())
+            for _ in range(2):
+                simulation.log.append((yield from slowly()))
 
         async def twice():
-            simulation.log.append(await later())
-            simulation.log.append(await later())
+            for _ in range(2):
+                simulation.log.append(await later())
 
+        simulation.log += list(process())
         asyncio.run(twice())
 
     env = aec_env(script(main), [slowly, later], driver=driver)
-    turns = play(env, RULE, seed=0)
-    assert [(turn.agent, turn.info.get("rule_action")) for turn in turns] == [
-        ("slow_0", None),
-        ("slow_0", 4),
-        ("late_0", None),
-        ("late_0", 5),
-        ("slow_0", 4),
-        ("late_0", 5),
-    ]
+    told = [(turn.agent, turn.info.get("rule_action")) for turn in play(env, RULE, seed=0)]
+    assert told == [("slow_0", None), ("slow_0", 4), ("late_0", None), ("late_0", 5), ("slow_0", 4), ("late_0", 5)]
     assert env.simulation.log == [3, 3, "wait", "wait", 4, 4]
 
 
@@ -258,33 +239,6 @@ def herd(simulation: Any) -> None:
         simulation.log += [each.move() for each in flock]
 
 
-def test_entities_have_each_their_own():
-    turns = play(aec_env(script(herd), sheep()), RULE, seed=0)
-    assert [(turn.agent, turn.info.get("rule_action")) for turn in turns[3:6]] == [
-        ("sheep_0", 0),
-        ("sheep_1", 1),
-        ("sheep_2", 2),
-    ]
-
-
-def test_decisions_within_rules_do_not_take_each_others_place():
-    inner = decision(lambda: 2, agent="inner_0", rule_action_mapping=lambda decided: decided)
-    outer = decision(lambda: 10 * inner(), agent="outer_0", rule_action_mapping=lambda decided: decided // 5)
-
-    def main(simulation):
-        simulation.log += [outer(), outer()]
-
-    turns = play(aec_env(script(main), [outer, inner]), RULE, seed=0)
-    assert [(turn.agent, turn.info.get("rule_action")) for turn in turns] == [
-        ("outer_0", None),
-        ("inner_0", None),
-        ("outer_0", 4),
-        ("inner_0", 2),
-        ("outer_0", 4),
-        ("inner_0", 2),
-    ]
-
-
 def test_rounds_tell_it_too():
     roster = ["sheep_0", "sheep_1", "sheep_2"]
     env = parallel_env(script(herd), sheep(), possible_agents=roster)
@@ -313,28 +267,51 @@ def test_simulations_and_vectors_run_as_they_did():
 
 
 def test_batched_policies_get_it_in_their_infos_as_single_ones_do():
-    function, seen = decision(counting(), rule_action_mapping=lambda tens: tens // 10), []
+    seen = []
 
     def policy(observations, infos):
-        seen.extend(info.get("rule_action") for info in infos)
-        return [RULE] * len(infos)
+        return [alone(observations, info) for info in infos]
 
-    simulate_many(four(function), {function: policy}, seeds=[0])
-    alone = []
-    function = decision(counting(), rule_action_mapping=lambda tens: tens // 10)
-    simulate(four(function), {function: lambda _, info: alone.append(info.get("rule_action")) or RULE}, seed=0)
-    assert seen == alone == [None, 1, 2, 3]
+    def alone(observation, info):
+        seen.append(info.get("rule_action"))
+        return RULE
+
+    for run, own, seeds in ((simulate_many, policy, {"seeds": [0]}), (simulate, alone, {"seed": 0})):
+        function = decision(counting(), rule_action_mapping=lambda tens: tens // 10)
+        run(four(function), {function: own}, **seeds)
+    assert seen == [None, 1, 2, 3] * 2
 
 
 # -- what was collected -----------------------------------------------------------------------------
 
 
-def test_episodes_that_were_collected_have_the_actions_of_the_rule():
-    function = decision(counting(), rule_action_mapping=lambda tens: tens // 10)
+MOVES = {0: "stay", 1: "north", 2: "south"}
+
+
+@pytest.mark.parametrize(
+    ("rule", "definition", "expected"),
+    [
+        ([10, 20, 30, 40], {"rule_action_mapping": lambda tens: tens // 10}, [1, 2, 3, 4]),
+        ([10, 20, 30, 40], {}, [None] * 4),
+        (["south", "elsewhere", "stay", "north"], {"action_space_mapping": MOVES}, [2, None, 0, 1]),
+        ([["south"], "south", {"south": 1}, "stay"], {"action_space_mapping": MOVES}, [None, 2, None, 0]),
+        (["go"] * 4, {"action_space_mapping": {0: "stay", 1: "stay", 2: "go"}}, [None] * 4),
+        ([[3]] * 4, {"action_space_mapping": {0: [1], 1: [2], 2: [3]}}, [None] * 4),
+        (["b", "a", "a", "z"], {"choices": [["a", "b"], ["b", "c", "a"], ["a"], ["b", "d"]]}, [1, 2, 0, None]),
+    ],
+    ids=["mapping", "nothing", "dict", "unhashable", "ambiguous", "lists", "choices"],
+)
+def test_episodes_that_were_collected_have_the_actions_of_the_rule(rule, definition, expected):
+    if "choices" in definition:
+        offers = iter([*definition["choices"], ["a"]])
+        definition = {"choices": lambda: next(offers)}
+    given = {"action_space": spaces.Discrete(3)} if "rule_action_mapping" not in definition else {}
+    decided = iter(rule)
+    function = decision(lambda: next(decided), **given, **definition)
     found = collect_episodes(four(function), {function: RULE}, seeds=[0])[function]
     assert found.by_rule.all()
-    assert found.known.all()
-    assert found.actions.tolist() == [1, 2, 3, 4]
+    assert found.known.tolist() == [action is not None for action in expected]
+    assert found.actions.tolist() == [action or 0 for action in expected]
 
 
 def test_a_policy_may_decide_some_of_them():
@@ -344,41 +321,6 @@ def test_a_policy_may_decide_some_of_them():
     assert found.actions.tolist() == [1, 9, 2, 8]
     assert found.by_rule.tolist() == [True, False, True, False]
     assert found.known.all()
-
-
-def test_dicts_are_read_backwards():
-    moves = {0: "stay", 1: "north", 2: "south"}
-    rule = iter(["south", "elsewhere", "stay", "north"])
-    function = decision(lambda: next(rule), action_space=spaces.Discrete(3), action_space_mapping=moves)
-    found = collect_episodes(four(function), {function: RULE}, seeds=[0])[function]
-    assert found.actions.tolist() == [2, 0, 0, 1]
-    assert found.known.tolist() == [True, False, True, True]
-
-
-@pytest.mark.parametrize("moves", [{0: "stay", 1: "stay", 2: "go"}, {0: [1], 1: [2], 2: [3]}])
-def test_dicts_that_cannot_be_read_backwards_leave_the_action_unknown(moves):
-    function = decision(lambda: moves[2], action_space=spaces.Discrete(3), action_space_mapping=moves)
-    found = collect_episodes(four(function), {function: RULE}, seeds=[0])[function]
-    assert not found.known.any()
-    assert found.actions.tolist() == [0] * 4
-
-
-def test_choices_are_recognised():
-    offers = [["a", "b"], ["b", "c", "a"], ["a"], ["b", "d"]]
-    rule = iter(["b", "a", "a", "z"])
-    function = decision(
-        lambda: next(rule), action_space=spaces.Discrete(3), choices=lambda: offers.pop(0) if offers else ["a"]
-    )
-    found = collect_episodes(four(function), {function: RULE}, seeds=[0])[function]
-    assert found.actions.tolist() == [1, 2, 0, 0]
-    assert found.known.tolist() == [True, True, True, False]
-
-
-def test_without_any_mapping_it_is_unknown():
-    function = decision(counting())
-    found = collect_episodes(four(function), {function: RULE}, seeds=[0])[function]
-    assert found.by_rule.all()
-    assert not found.known.any()
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -397,23 +339,17 @@ class Herd:
         herd(self)
 
 
-def test_the_one_of_many_that_tells_it_is_told_it():
+@pytest.mark.parametrize(
+    ("actions", "told"), [(RULE, [0, 1, 0, 1]), ({"sheep_0": RULE, "sheep_1": 3}, [0, None, 0, None])]
+)
+def test_entities_are_told_each_their_own(actions, told):
     """Also where the point has no name of its own, and the others follow the policy."""
 
     def pair(simulation):
         simulation.flock = one, other = Sheep(0), Sheep(1)
-        for _ in range(3):
+        for _ in range(2):
             simulation.log += [one.move(), other.move()]
 
-    turns = play(aec_env(script(pair), sheep()), {"sheep_0": RULE, "sheep_1": 3}, seed=0)
-    told = [(turn.agent, turn.info.get("rule_action")) for turn in turns]
-    assert told == [("sheep_0", None), ("sheep_1", None), *[("sheep_0", 0), ("sheep_1", None)] * 3]
-
-
-@pytest.mark.parametrize("decided", [["go"], {"go": 1}])
-def test_decisions_that_cannot_be_looked_up_correspond_to_no_action(decided):
-    rule = iter([decided, "go", decided, "stay"])
-    function = decision(lambda: next(rule), action_space=spaces.Discrete(2), action_space_mapping={0: "stay", 1: "go"})
-    found = collect_episodes(four(function), {function: RULE}, seeds=[0])[function]
-    assert found.known.tolist() == [False, True, False, True]
-    assert found.actions[found.known].tolist() == [1, 0]
+    turns = play(aec_env(script(pair), sheep()), actions, seed=0)
+    found = [(turn.agent, turn.info.get("rule_action")) for turn in turns]
+    assert found == list(zip(["sheep_0", "sheep_1"] * 3, [None, None, *told], strict=True))

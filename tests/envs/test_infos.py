@@ -29,25 +29,18 @@ def clocked(*functions, ends=None):
     return factory
 
 
-def keys_of_aec(env):
+def keys(env):
     """The keys of each agent's infos, as they are seen after the reset and after each step."""
-    env.reset(seed=1)
-    yield {agent: set(info) for agent, info in env.infos.items()}
-    while env.agents:
-        env.step(None if env.terminations[env.agent_selection] else RULE)
-        yield {agent: set(info) for agent, info in env.infos.items()}
-
-
-def keys_of_rounds(env):
-    _, infos = env.reset(seed=1)
+    _, infos = env.reset(seed=1) or (None, env.infos)
     yield {agent: set(info) for agent, info in infos.items()}
     while env.agents:
-        _, _, _, _, infos = env.step(RULE)
-        yield {agent: set(info) for agent, info in infos.items()}
+        in_turns = hasattr(env, "agent_selection")
+        results = env.step(None if in_turns and env.terminations[env.agent_selection] else RULE)
+        yield {agent: set(info) for agent, info in (env.infos if in_turns else results[-1]).items()}
 
 
-@pytest.mark.parametrize(("make", "keys"), [(aec_env, keys_of_aec), (parallel_env, keys_of_rounds)])
-def test_keys_are_there_before_the_first_decision_and_stay(make, keys):
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_keys_are_there_before_the_first_decision_and_stay(make):
     ant, bee, elk = decision(agent="ant_0", **MASKED), decision(agent="bee_0", **MASKED), decision(agent="elk_0")
     env = make(clocked(ant, bee, ant, ant, bee), [ant, bee, elk])
     more = {"deciding", "acted"} if make is parallel_env else set()
@@ -62,9 +55,12 @@ def test_keys_are_there_before_the_first_decision_and_stay(make, keys):
     assert len(seen) > 2
 
 
-def test_everything_is_legal_for_whoever_has_not_decided_yet():
-    ant, bee = decision(agent="ant_0", **MASKED), decision(agent="bee_0", **MASKED)
-    env = aec_env(clocked(ant, bee, bee), [ant, bee])
+def test_everything_is_legal_for_those_who_have_not_decided_yet():
+    ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
+    env = aec_env(clocked(ant, bee, bee), [ant, bee, elk])
+    env.reset()
+    env.infos["bee_0"]["action_mask"][:] = 0  # the user's own
+    assert env.infos["elk_0"]["action_mask"].tolist() == [1] * 10
     env.reset()
     assert env.infos["ant_0"]["action_mask"].tolist() == [0, 1, 1] + [0] * 7
     assert env.infos["bee_0"]["action_mask"].tolist() == [1] * 10
@@ -91,19 +87,15 @@ def test_a_mask_in_an_observation_without_a_decision_is_open(make):
     assert observation["observations"].tolist() == [0.0]
     space = env.observation_space["bee_0"] if make is joint_env else env.observation_space("bee_0")
     assert observation in space
+    if make is parallel_env:
+        observations, *_, infos = env.step({"ant_0": 1})
+        seen, told = observations["bee_0"]["action_mask"], infos["bee_0"]["action_mask"]
+        assert seen.tolist() == told.tolist() == [0, 1, 1] + [0] * 7
+        assert seen.dtype == told.dtype == np.int8
+        assert not np.shares_memory(seen, told)
 
 
-def test_no_two_have_a_mask_in_common():
-    ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
-    env = parallel_env(calling(ant, bee, elk), [ant, bee, elk])
-    _, infos = env.reset()
-    infos["bee_0"]["action_mask"][:] = 0
-    assert infos["elk_0"]["action_mask"].tolist() == [1] * 10
-    _, infos = env.reset()
-    assert infos["bee_0"]["action_mask"].tolist() == [1] * 10
-
-
-def test_whom_the_model_has_let_go_of_keeps_the_keys():
+def test_agents_that_the_model_has_let_go_of_keep_their_keys():
     """Without a word: there is nothing to observe any more, and nobody is said to have ended."""
 
     def main(simulation):

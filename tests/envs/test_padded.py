@@ -11,7 +11,6 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pettingzoo.test import api_test, parallel_api_test, seed_test
 
 from simenv_marl import RULE, aec_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
@@ -87,27 +86,9 @@ def test_turns_are_those_of_the_living_and_all_else_stands_by(world):
     assert env.simulation.trace == plain.trace
     assert {agent: value for agent, value in paid.items() if agent in plain.first} == plain.totals
     assert all(paid[agent] == 0 for agent in everybody if agent not in plain.first)
+    # Each reward stands in ``rewards`` once, after the step that brings it.
+    assert {a: value for a, value in seen.items() if value} == {a: value for a, value in plain.totals.items() if value}
     assert env.agents == []
-
-
-@settings(deadline=None)
-@given(EVERYBODY)
-def test_rewards_are_seen_once_in_the_step_that_brings_them(world):
-    design, seed, kind = world
-    env, bare = (colony(design, kind, aec_env, padded=padded) for padded in (True, False))
-    totals = []
-    for each in (env, bare):
-        each.reset(seed=seed)
-        number, total = defaultdict(int), defaultdict(float)
-        for agent in each.agent_iter():
-            over = each.terminations[agent] or each.truncations[agent]
-            each.step(None if over else answer(seed, agent, number[agent]))
-            number[agent] += not over
-            if not over:
-                for other, value in each.rewards.items():
-                    total[other] += value
-        totals.append({agent: value for agent, value in total.items() if value})
-    assert totals[0] == totals[1]
 
 
 # -- rounds -----------------------------------------------------------------------------------------
@@ -152,6 +133,9 @@ def test_rounds_have_everybody_and_are_those_of_the_living(world):
 # -- what stands by ---------------------------------------------------------------------------------
 
 
+NAMES = ["being_1", "being_2"]
+
+
 def generations(simulation):
     first, second = Being(1), Being(2)
     simulation.log.append(first.act())
@@ -163,7 +147,7 @@ def generations(simulation):
 
 
 def test_the_removed_are_paid_at_once_and_blank_from_then_on():
-    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=["being_1", "being_2"]))
+    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=NAMES))
     observations, infos = env.reset(seed=0)
     assert observations["being_1"].tolist() == [1, 0]
     assert [infos[agent]["present"] for agent in env.agents] == [True, False]
@@ -188,19 +172,15 @@ def test_the_removed_are_paid_at_once_and_blank_from_then_on():
 
 @pytest.mark.parametrize("steps", [1, 2])
 def test_a_limit_of_time_truncates_all_alike(steps):
-    options = {"possible_agents": ["being_1", "being_2"], "max_steps": steps}
-    env = pad_agents(parallel_env(script(generations), beings(), **options))
-    env.reset(seed=0)
-    for _ in range(steps):
-        _, _, terminations, truncations, _ = env.step({"being_1": 1, "being_2": 1})
-    assert truncations == {"being_1": True, "being_2": True}
-    assert terminations == {"being_1": False, "being_2": False}
-    env = pad_agents(aec_env(script(generations), beings(), **options))
-    env.reset(seed=0)
-    for _ in range(steps):
-        env.step(1)
-    assert env.truncations == {"being_1": True, "being_2": True}
-    assert env.terminations == {"being_1": False, "being_2": False}
+    options = {"possible_agents": NAMES, "max_steps": steps}
+    for view, action in ((parallel_env, {"being_1": 1, "being_2": 1}), (aec_env, 1)):
+        env = pad_agents(view(script(generations), beings(), **options))
+        env.reset(seed=0)
+        for _ in range(steps):
+            results = env.step(action)
+        terminations, truncations = results[2:4] if results else (env.terminations, env.truncations)
+        assert truncations == {"being_1": True, "being_2": True}
+        assert terminations == {"being_1": False, "being_2": False}
 
 
 def test_masks_are_open_and_clocks_go_on():
@@ -242,58 +222,37 @@ def test_masks_are_open_and_clocks_go_on():
     assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_nobody_comes_back():
-    def main(simulation):
+def test_errors_surface_and_the_next_episode_is_as_ever():
+    def back(simulation):
         being = Being(1)
         being.act()
         being.leave()
         being.act()
 
-    env = pad_agents(parallel_env(script(main), beings(), possible_agents=["being_1", "being_2"]))
+    env = pad_agents(parallel_env(script(back), beings(), possible_agents=NAMES))
     env.reset(seed=0)
     with pytest.raises(AgentError, match="after its end"):
         env.step({"being_1": 1, "being_2": 1})
-
-
-def test_padding_needs_a_roster():
-    for view in (aec_env, parallel_env):
-        with pytest.raises(ViewError, match="possible_agents"):
-            pad_agents(view(script(generations), beings()))
-
-
-def test_views_of_one_agent_are_not_padded():
-    function = decision()
-    with pytest.raises(ViewError, match="aec_env or parallel_env"):
-        pad_agents(single_env(script(lambda simulation: function()), function))
-
-
-def test_errors_leave_it_as_errors_do():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
-    env = pad_agents(aec_env(script(generations), points, possible_agents=["being_1", "being_2"]))
+    env = pad_agents(aec_env(script(generations), points, possible_agents=NAMES))
     env.reset(seed=0)
     with pytest.raises(ZeroDivisionError) as caught:
         env.step(1)
     assert "being_2" in notes(caught.value)
     env.reset(seed=0)
-    assert sorted(env.agents) == ["being_1", "being_2"]
+    assert sorted(env.agents) == NAMES
 
 
-# -- what others check ------------------------------------------------------------------------------
+def test_padding_needs_a_view_of_many_agents_and_a_roster():
+    for view in (aec_env, parallel_env):
+        with pytest.raises(ViewError, match="possible_agents"):
+            pad_agents(view(script(generations), beings()))
+    function = decision()
+    with pytest.raises(ViewError, match="aec_env or parallel_env"):
+        pad_agents(single_env(script(lambda simulation: function()), function))
 
 
-@pytest.mark.filterwarnings(
-    "ignore:Observation numpy array is all zeros"
-)  # which is what there is to see of the absent
-@settings(deadline=None, max_examples=20)
-@given(EVERYBODY)
-def test_the_tests_of_pettingzoo(world):
-    design, _, kind = world
-    api_test(colony(design, kind, aec_env, padded=True), num_cycles=60)
-    parallel_api_test(colony(design, kind, parallel_env, padded=True), num_cycles=60)
-    seed_test(lambda: colony(design, kind, aec_env, padded=True), num_cycles=30)
-
-
-def test_what_a_round_tells_stands_in_the_order_of_the_roster():
+def test_results_stand_in_the_order_of_the_roster():
     def main(simulation):
         simulation.crowd = [Being(2), Being(0)]
         for _ in range(3):
@@ -311,8 +270,7 @@ def test_what_a_round_tells_stands_in_the_order_of_the_roster():
 
 
 def test_the_state_of_observations_has_blanks_for_the_removed():
-    names = ["being_1", "being_2"]
-    options = {"possible_agents": names, "state_space": "observations"}
+    options = {"possible_agents": NAMES, "state_space": "observations"}
     for view, action in ((parallel_env, {"being_1": 3, "being_2": 4}), (aec_env, 3)):
         env = pad_agents(view(script(generations), beings(), **options))
         env.reset(seed=0)
@@ -322,6 +280,6 @@ def test_the_state_of_observations_has_blanks_for_the_removed():
 
 
 def test_a_copy_in_mid_episode_has_no_agents_before_its_reset():
-    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=["being_1", "being_2"]))
+    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=NAMES))
     env.reset(seed=0)
     assert copy.deepcopy(env).agents == []

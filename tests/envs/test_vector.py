@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import multiprocessing
 import pickle
 import threading
 import weakref
@@ -33,18 +34,20 @@ from simenv_marl.errors import (
     InvalidActionError,
     NotResetError,
     OptionValueError,
-    ReentrancyError,
     ResetNeededError,
     UnknownOptionError,
     ViewError,
     WrongThreadError,
 )
+from simenv_marl.plugins import ChangedResult
+from tests.conftest import DRIVERS
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import decision, notes, script, stacks
 from tests.worlds.worlds import FuseError, designs, seeds
 
 pytestmark = FORKS
+PROCESSES = pytest.mark.parametrize("processes", [0, 2])
 
 
 # -- what is told -----------------------------------------------------------------------------------
@@ -52,15 +55,13 @@ pytestmark = FORKS
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", VARIETY)
-def test_it_tells_what_gymnasium_tells_of_as_many_single_views(kind, mode):
+def test_matches_sync_vector_env(kind, mode):
     model, decision = VARIETY[kind]
     points = {POINT: decision}
     ours = vector_env(model, points, num_envs=5, autoreset_mode=mode)
     theirs = SyncVectorEnv([lambda: single_env(model, points)] * 5, autoreset_mode=mode)
-    assert ours.single_observation_space == theirs.single_observation_space
-    assert ours.single_action_space == theirs.single_action_space
-    assert ours.observation_space == theirs.observation_space
-    assert ours.action_space == theirs.action_space
+    for name in ("single_observation_space", "single_action_space", "observation_space", "action_space"):
+        assert getattr(ours, name) == getattr(theirs, name)
     assert ours.metadata == theirs.metadata
     assert ours.render_mode == theirs.render_mode
     agree(ours, theirs, 40, np.random.default_rng(1))
@@ -68,21 +69,29 @@ def test_it_tells_what_gymnasium_tells_of_as_many_single_views(kind, mode):
     assert [g.random() for g in ours.np_random] == [g.random() for g in theirs.np_random]
     samples = [[space.sample() for space in envs.get_attr("action_space")] for envs in (ours, theirs)]
     assert same(*samples)
-    ours.close()
-    theirs.close()
 
 
 @given(designs(), seeds, st.sampled_from(MODES), st.integers(1, 4))
 @settings(max_examples=150)
-def test_it_tells_what_gymnasium_tells_of_random_worlds(design, seed, mode, number):
+def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number):
     ours = made(design, number, mode)
     if ours is None:
         return
     theirs = made(design, number, mode, sync=True)
     agree(ours, theirs, 15, np.random.default_rng(seed))
     assert [s.trace for s in ours.get_attr("simulation")] == [s.trace for s in theirs.get_attr("simulation")]
-    ours.close()
-    theirs.close()
+
+
+def amount(what, most, agent):
+    """A definition whose observation and reward are one attribute, and whose action is a number."""
+    return make_step(
+        observation_space=spaces.Box(-99, 99, (1,), np.float64),
+        observation_space_mapping=lambda self: [getattr(self, what)],
+        action_space=spaces.Box(-most, most, (1,), np.float64),
+        action_space_mapping=lambda action: float(action[0]),
+        reward_mapping=lambda self: getattr(self, what),
+        agent=agent,
+    )
 
 
 class Pair:
@@ -102,14 +111,7 @@ class Pair:
             for entity in self.entities:
                 entity.size += entity.grow()
 
-    @make_step(
-        observation_space=spaces.Box(-99, 99, (1,), np.float64),
-        observation_space_mapping=lambda self: [self.level],
-        action_space=spaces.Box(-1, 1, (1,), np.float64),
-        action_space_mapping=lambda action: float(action[0]),
-        reward_mapping=lambda self: self.level,
-        agent="steerer",
-    )
+    @amount("level", 1, "steerer")
     def steer(self) -> float:
         return 0.0
 
@@ -118,31 +120,25 @@ class Entity:
     def __init__(self, number: int) -> None:
         self.number, self.size = number, 0.0
 
-    @make_step(
-        observation_space=spaces.Box(-99, 99, (1,), np.float64),
-        observation_space_mapping=lambda self: [self.size],
-        action_space=spaces.Box(-2, 2, (1,), np.float64),
-        action_space_mapping=lambda action: float(action[0]),
-        reward_mapping=lambda self: self.size,
-        agent=lambda self: f"entity_{self.number}",
-    )
+    @amount("size", 2, lambda self: f"entity_{self.number}")
     def grow(self) -> float:
         return 0.0
 
 
+PAIR = [Pair.steer, Entity.grow]
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("flatten", [False, True])
-def test_it_tells_what_gymnasium_tells_of_as_many_joint_views(flatten, mode):
-    points = [Pair.steer, Entity.grow]
-    ours = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode)
-    theirs = SyncVectorEnv([lambda: joint_env(Pair, points, flatten=flatten)] * 3, autoreset_mode=mode)
+def test_matches_sync_vector_env_over_joint_views(flatten, mode):
+    given = {"num_envs": 3, "flatten": flatten, "autoreset_mode": mode}
+    ours, workers = vector_env(Pair, PAIR, **given), vector_env(Pair, PAIR, **given, workers=2, context=FORK)
+    theirs = SyncVectorEnv([lambda: joint_env(Pair, PAIR, flatten=flatten)] * 3, autoreset_mode=mode)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     agree(ours, theirs, 20, np.random.default_rng(0))
-    workers = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode, workers=2, context=FORK)
     agree(workers, ours, 20, np.random.default_rng(0))
-    for envs in (ours, theirs, workers):
-        envs.close()
+    workers.close()
 
 
 def test_the_view_can_be_chosen():
@@ -150,26 +146,24 @@ def test_the_view_can_be_chosen():
     assert isinstance(envs.single_action_space, spaces.Dict)
     envs.close()
     with pytest.raises(ViewError, match="needs one active decision point"):
-        vector_env(Pair, [Pair.steer, Entity.grow], num_envs=2, view="single")
-    with pytest.raises(OptionValueError, match="view must be"):
-        vector_env(Counter, Counter.decide, num_envs=2, view="aec")
+        vector_env(Pair, PAIR, num_envs=2, view="single")
 
 
-@pytest.mark.parametrize("options", [{"driver": "thread"}, {"max_steps": 2}, {"plugins": "some"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"driver": "thread"},
+        {"max_steps": 2},
+        {"plugins": [(lambda model, _result: ChangedResult((_result + 1) // 2), Counter.decide, "after")]},
+    ],
+    ids=lambda options: next(iter(options)),
+)
 def test_options_mean_what_they_mean_to_one_environment(options):
-    if "plugins" in options:
-        options = {"plugins": [(halve, Counter.decide, "after")]}
     ours = vector_env(Counter, Counter.decide, num_envs=3, **options)
     theirs = SyncVectorEnv([lambda: single_env(Counter, Counter.decide, **options)] * 3)
     agree(ours, theirs, 20, np.random.default_rng(0))
     ours.close()
     theirs.close()
-
-
-def halve(model: Any, _result: int) -> Any:
-    from simenv_marl.plugins import ChangedResult
-
-    return ChangedResult((_result + 1) // 2)
 
 
 # -- seeds and resets -------------------------------------------------------------------------------
@@ -199,7 +193,6 @@ def test_seeds_are_one_for_all_or_one_for_each():
             envs.reset(seed=wrong)
     with pytest.raises(TypeError):
         envs.reset(seed=1.5)
-    envs.close()
 
 
 def test_some_can_be_reset_with_options_for_them():
@@ -208,7 +201,7 @@ def test_some_can_be_reset_with_options_for_them():
         envs.step([1, 1, 1])
     with pytest.raises(NotResetError, match="no episodes yet"):
         envs.reset(options={"reset_mask": np.array([True, False, False])})
-    envs.reset(seed=0)
+    envs.reset(seed=0, options={"reset_mask": np.ones(3, np.bool_)})
     envs.step([1, 1, 1])
     options = {"reset_mask": np.array([False, True, False]), "more": 1}
     observations, _ = envs.reset(seed=20, options=options)
@@ -219,48 +212,42 @@ def test_some_can_be_reset_with_options_for_them():
     for wrong in ([True, False, False], np.array([1, 0, 0]), np.array([True]), np.zeros(3, bool)):
         with pytest.raises(OptionValueError, match="reset_mask"):
             envs.reset(options={"reset_mask": wrong})
-    envs.close()
 
 
-def test_a_mask_may_name_all_at_first():
-    envs = vector_env(Counter, Counter.decide, num_envs=2)
-    with pytest.raises(NotResetError, match="no episodes yet"):
-        envs.reset(options={"reset_mask": np.array([True, False])})
-    envs.reset(options={"reset_mask": np.ones(2, np.bool_)})
-    envs.close()
-
-
-def test_without_autoreset_an_ended_episode_must_be_reset():
-    envs = vector_env(Counter, Counter.decide, num_envs=3, autoreset_mode="Disabled")
+@PROCESSES
+def test_without_autoreset_an_ended_episode_must_be_reset(processes):
+    envs = vector_env(Counter, Counter.decide, num_envs=3, autoreset_mode="Disabled", workers=processes, context=FORK)
     envs.reset(seed=0)
     over = np.zeros(3, bool)
     while not over.any():
         *_, terminations, truncations, _ = envs.step([1, 1, 1])
         over = terminations | truncations
-    counts = [simulation.count for simulation in envs.get_attr("simulation")]
+    before = counts(envs)
     with pytest.raises(EpisodeOverError, match="reset_mask"):
         envs.step([1, 1, 1])
-    assert [simulation.count for simulation in envs.get_attr("simulation")] == counts
+    assert counts(envs) == before
     envs.reset(options={"reset_mask": over})
     envs.step([1, 1, 1])
-    envs.close()
+    assert counts(envs) == np.where(over, 1, np.array(before) + 1).tolist()
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("options", "error", "match"),
     [
-        {"num_envs": 0},
-        {"num_envs": "2"},
-        {"num_envs": True},
-        {"num_envs": 2, "workers": -1},
-        {"num_envs": 2, "autoreset_mode": "never"},
+        ({"num_envs": 0}, OptionValueError, "num_envs"),
+        ({"num_envs": "2"}, OptionValueError, "num_envs"),
+        ({"num_envs": True}, OptionValueError, "num_envs"),
+        ({"workers": -1}, OptionValueError, "workers"),
+        ({"autoreset_mode": "never"}, OptionValueError, "autoreset_mode"),
+        ({"view": "aec"}, OptionValueError, "view must be"),
+        ({"workers": 1, "context": "magic"}, OptionValueError, "context must be"),
+        ({"workers": 1, "context": 3}, OptionValueError, "context must be"),
+        ({"max_step": 3}, UnknownOptionError, "max_steps"),
     ],
 )
-def test_numbers_and_modes_that_cannot_be_are_refused(options):
-    with pytest.raises(OptionValueError):
-        vector_env(Counter, Counter.decide, **options)
-    with pytest.raises(UnknownOptionError, match="max_steps"):
-        vector_env(Counter, Counter.decide, num_envs=2, max_step=3)
+def test_options_that_cannot_be_are_refused(options, error, match):
+    with pytest.raises(error, match=match):
+        vector_env(Counter, Counter.decide, **{"num_envs": 2} | options)
 
 
 # -- actions ----------------------------------------------------------------------------------------
@@ -270,8 +257,9 @@ def counts(envs: Any) -> list[int]:
     return [simulation.count for simulation in envs.get_attr("simulation")]
 
 
-def test_one_illegal_action_moves_nobody():
-    envs = vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3)
+@PROCESSES
+def test_one_illegal_action_moves_nobody(processes):
+    envs = vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK)
     envs.reset(seed=0)
     for actions, number in (
         ([1, 1, 9], 2),
@@ -293,11 +281,10 @@ def test_one_illegal_action_moves_nobody():
         assert counts(envs) == [0, 0, 0]
     envs.step([1, 1, 1])
     assert counts(envs) == [1, 1, 1]
-    envs.close()
 
 
 def test_one_illegal_action_in_a_joint_view_moves_nobody():
-    envs = vector_env(Pair, [Pair.steer, Entity.grow], num_envs=2)
+    envs = vector_env(Pair, PAIR, num_envs=2)
     observations, _ = envs.reset(seed=0)
     legal = {agent: np.zeros((2, 1)) for agent in observations}
     for illegal in (
@@ -312,7 +299,6 @@ def test_one_illegal_action_in_a_joint_view_moves_nobody():
             envs.step(illegal)
     assert [simulation.level for simulation in envs.get_attr("simulation")] == [0, 0]
     envs.step(legal)
-    envs.close()
 
 
 def test_the_action_of_one_that_is_reset_is_not_looked_at():
@@ -326,7 +312,6 @@ def test_the_action_of_one_that_is_reset_is_not_looked_at():
     assert not (terminations | truncations).any()
     with pytest.raises(InvalidActionError, match="is not in its action space"):
         envs.step([99, -1])
-    envs.close()
 
 
 def test_boxes_take_actions_in_other_dtypes():
@@ -338,14 +323,14 @@ def test_boxes_take_actions_in_other_dtypes():
         assert counts(envs) == [3, 3]
     with pytest.raises(InvalidActionError, match="sub-environment 1"):
         envs.step(np.array([[0, 0], [0, 3.5]], np.float32))
-    envs.close()
 
 
+@PROCESSES
 @pytest.mark.parametrize("copy", [True, False])
 @pytest.mark.parametrize("kind", ["plain", "nested"])
-def test_observations_are_copies_unless_told_otherwise(kind, copy):
+def test_observations_are_copies_unless_told_otherwise(kind, copy, processes):
     model, decision = VARIETY[kind]
-    envs = vector_env(model, {POINT: decision}, num_envs=2, copy=copy)
+    envs = vector_env(model, {POINT: decision}, num_envs=2, copy=copy, workers=processes, context=FORK)
     told = [envs.reset(seed=0)]
     for _ in range(2):
         image = told[-1][0]["image"] if kind == "nested" else told[-1][0]
@@ -355,25 +340,28 @@ def test_observations_are_copies_unless_told_otherwise(kind, copy):
         assert np.array_equal(image, kept) == copy
     assert not any(np.shares_memory(a, b) for a, b in zip(told[1][1:4], told[2][1:4], strict=True))
     envs.close()
+    assert image.sum() > 0  # it can be read still
 
 
 # -- errors -----------------------------------------------------------------------------------------
 
 
-def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset():
+@pytest.mark.parametrize("culprit", [0, 1])
+def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(culprit):
     stacks_before = stacks()
     envs = vector_env(Counter, Counter.decide, num_envs=3)
     envs.reset(seed=0)
-    envs.envs[1].simulation.failing = True
+    envs.envs[culprit].simulation.failing = True
     with pytest.raises(FuseError) as caught:
         envs.step([1, 1, 1])
-    assert "sub-environment 1" in notes(caught.value)
-    assert "seed 1" in notes(caught.value)
-    with pytest.raises(EpisodeOverError, match="an error has ended"):
-        envs.step([1, 1, 1])
+    assert f"sub-environment {culprit}" in notes(caught.value)
+    assert f"seed {culprit}" in notes(caught.value)
+    for _ in range(2):
+        with pytest.raises(EpisodeOverError, match="an error has ended"):
+            envs.step([1, 1, 1])
     with pytest.raises(EpisodeOverError, match="without a reset_mask"):
         envs.reset(options={"reset_mask": np.array([False, True, False])})
-    envs.envs[1].simulation.failing = False
+    envs.envs[culprit].simulation.failing = False
     fresh = vector_env(Counter, Counter.decide, num_envs=3)
     agree(envs, fresh, 10, np.random.default_rng(0))
     envs.close()
@@ -423,9 +411,10 @@ def test_an_error_after_another_one_was_reset_has_all_be_reset():
     envs = vector_env(Counter, {POINT: definition(action_space_mapping=fail_at_three)}, num_envs=2)
     goals = {seed: int(np.random.default_rng(seed).integers(3, 12)) for seed in range(10)}
     envs.reset(seed=[max(goals, key=goals.__getitem__), min(goals, key=goals.__getitem__)])
-    while not (told := envs.step([1, 1]))[2].any() and not told[3].any():
-        pass
-    assert (told[2] | told[3]).tolist() == [False, True]
+    over = np.zeros(2, bool)
+    while not over.any():
+        over = np.logical_or(*envs.step([1, 1])[2:4])
+    assert over.tolist() == [False, True]
     with pytest.raises(FuseError) as caught:
         envs.step([3, 1])
     assert "sub-environment 0" in notes(caught.value)
@@ -433,7 +422,6 @@ def test_an_error_after_another_one_was_reset_has_all_be_reset():
         envs.step([1, 1])
     envs.reset(seed=0)
     envs.step([1, 1])
-    envs.close()
 
 
 def test_an_error_in_a_reset_says_where_it_was():
@@ -451,23 +439,6 @@ def test_an_error_in_a_reset_says_where_it_was():
         envs.step([1, 1, 1])
     envs.reset(seed=0)
     envs.step([1, 1, 1])
-    envs.close()
-
-
-def test_it_cannot_be_used_from_inside_itself():
-    envs: Any = None
-
-    def meddle(model: Any) -> float:
-        if model.count:
-            envs.step([1, 1])
-        return 0.0
-
-    envs = vector_env(Counter, {POINT: definition(reward_mapping=meddle)}, num_envs=2)
-    envs.reset(seed=0)
-    with pytest.raises(ReentrancyError, match="was used from"):
-        envs.step([1, 1])
-    envs.reset(seed=0)
-    envs.close()
 
 
 def test_inside_another_simulation_it_works_all_the_same():
@@ -483,12 +454,11 @@ def test_inside_another_simulation_it_works_all_the_same():
     outer = vector_env(Outer, {POINT: definition()}, num_envs=2)
     outer.reset(seed=0)
     assert told == [[1, 2], [1, 2]]
-    outer.close()
-    inner.close()
 
 
-def test_another_thread_is_told_so_and_nothing_has_moved():
-    envs = vector_env(Counter, Counter.decide, num_envs=2)
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_another_thread_may_use_it_with_the_thread_driver_alone(driver):
+    envs = vector_env(Counter, Counter.decide, num_envs=2, driver=driver)
     envs.reset(seed=0)
     errors = []
 
@@ -498,51 +468,49 @@ def test_another_thread_is_told_so_and_nothing_has_moved():
                 method()
             except WrongThreadError as error:
                 errors.append(error)
+            if driver == "thread":
+                break
 
     thread = threading.Thread(target=use)
     thread.start()
     thread.join()
-    assert len(errors) == 3
+    assert len(errors) == (0 if driver == "thread" else 3)
+    assert counts(envs) == ([1, 1] if driver == "thread" else [0, 0])
     assert not envs.closed
     envs.step([1, 1])
-    assert counts(envs) == [1, 1]
-    envs.close()
-
-
-def test_with_the_thread_driver_any_thread_may_use_it():
-    envs = vector_env(Counter, Counter.decide, num_envs=2, driver="thread")
-    envs.reset(seed=0)
-    thread = threading.Thread(target=envs.step, args=([1, 1],))
-    thread.start()
-    thread.join()
-    assert counts(envs) == [1, 1]
     envs.close()
 
 
 # -- the simulations themselves -----------------------------------------------------------------------
 
 
-def test_sub_environments_can_be_asked_and_told():
-    envs = vector_env(Timed, {POINT: VARIETY["goal"][1]}, num_envs=3, render_mode="ansi")
-    envs.reset(seed=0)
+@PROCESSES
+def test_sub_environments_can_be_asked_and_told(processes):
+    points = {POINT: VARIETY["goal"][1]}
+    envs = vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK)
+    envs.reset(seed=3)
     envs.step([1, 2, 3])
     assert envs.render() == ("ansi 1", "ansi 2", "ansi 3")
     assert envs.call("compute_reward", np.ones(1), np.zeros(1), {}) == (-1.0,) * 3
-    assert [simulation.count for simulation in envs.get_attr("simulation")] == [1, 2, 3]
-    assert [env.simulation for env in envs.envs] == list(envs.get_attr("simulation"))
-    envs.set_attr("tag", "same")
-    assert envs.get_attr("tag") == ("same",) * 3
-    envs.set_attr("tag", [1, 2, 3])
-    assert envs.get_attr("tag") == (1, 2, 3)
+    assert counts(envs) == [1, 2, 3]
+    assert seeds_of(envs) == [3, 4, 5]
+    if processes:
+        with pytest.raises(AttributeError, match="other processes"):
+            envs.envs  # noqa: B018
+    else:
+        assert [env.simulation for env in envs.envs] == list(envs.get_attr("simulation"))
+    for value, told in (("same", ("same",) * 3), ([1, 2, 3], (1, 2, 3))):
+        envs.set_attr("tag", value)
+        assert envs.get_attr("tag") == told
     with pytest.raises(OptionValueError):
         envs.set_attr("tag", [1, 2])
     spaces_of = envs.get_attr("action_space")
     assert len({id(space) for space in spaces_of}) == 3
     assert spaces_of[0] == envs.single_action_space
-    with pytest.raises(AttributeError):
-        envs.get_attr("nothing")
+    for use in (envs.get_attr, envs.call):
+        with pytest.raises(AttributeError, match="nothing_of_that_name"):
+            use("nothing_of_that_name")
     assert envs.unwrapped is envs
-    envs.close()
 
 
 def test_a_sub_environment_that_somebody_else_resets_is_stepped_where_it_then_stands():
@@ -559,7 +527,6 @@ def test_a_sub_environment_that_somebody_else_resets_is_stepped_where_it_then_st
         envs.step([1, 1])
     envs.reset(seed=[5, 6])
     assert envs.step([1, 1])[0][:, 0].tolist() == [1, 1]
-    envs.close()
 
 
 def test_it_cannot_be_copied_or_pickled():
@@ -567,27 +534,25 @@ def test_it_cannot_be_copied_or_pickled():
     for use in (copy.copy, copy.deepcopy, pickle.dumps):
         with pytest.raises(CopyError, match="cannot be copied or pickled"):
             use(envs)
-    envs.close()
 
 
-def test_close_unwinds_all_and_only_once():
-    stacks_before = stacks()
-    for prepare in (
-        lambda envs: None,
-        lambda envs: envs.reset(),
-        lambda envs: envs.reset() and envs.step([1, 1]),
-    ):
-        envs = vector_env(Counter, Counter.decide, num_envs=2)
+@PROCESSES
+def test_close_unwinds_all_and_only_once(processes):
+    stacks_before, processes_before = stacks(), set(multiprocessing.active_children())
+    for prepare in (lambda envs: None, lambda envs: envs.reset(), lambda envs: envs.reset() and envs.step([1, 1])):
+        envs = vector_env(Counter, Counter.decide, num_envs=2, workers=processes, context=FORK)
         prepare(envs)
         simulations = envs.get_attr("simulation")
         envs.close()
         envs.close()
         assert envs.closed
-        assert all(simulation.unwound for simulation in simulations if hasattr(simulation, "count"))
+        if not processes:
+            assert all(simulation.unwound for simulation in simulations if hasattr(simulation, "count"))
         for use in (envs.reset, lambda envs=envs: envs.step([1, 1]), lambda envs=envs: envs.call("simulation")):
             with pytest.raises(ClosedError, match="the environment is closed"):
                 use()
     assert stacks(stacks_before) == stacks_before
+    assert set(multiprocessing.active_children()) <= processes_before
 
 
 def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
@@ -629,7 +594,7 @@ def test_one_that_is_dropped_unwinds_all():
 
 
 def test_gymnasium_makes_it_of_registered_ids():
-    ids = register_simulation(Pair, [Pair.steer, Entity.grow], name="vectors")
+    ids = register_simulation(Pair, PAIR, name="vectors")
     try:
         for identity in ids[:2]:
             ours = gymnasium.make_vec(identity, num_envs=3, vectorization_mode="vector_entry_point", max_steps=3)
@@ -673,21 +638,6 @@ def test_an_agent_that_is_removed_terminates_and_is_not_truncated(view, mode):
     assert list(zip(terminated.tolist(), truncated.tolist(), strict=True)) == [expected] * 2
     if view == "single":
         assert expected == (True, False)
-    envs.close()
-
-
-@pytest.mark.parametrize("culprit", [0, 1])
-def test_wherever_an_error_was_all_are_to_be_reset(culprit):
-    envs = vector_env(Counter, Counter.decide, num_envs=2)
-    envs.reset(seed=0)
-    envs.envs[culprit].simulation.failing = True
-    with pytest.raises(FuseError) as caught:
-        envs.step([1, 1])
-    assert f"sub-environment {culprit}" in notes(caught.value)
-    for _ in range(2):
-        with pytest.raises(EpisodeOverError, match="an error has ended"):
-            envs.step([1, 1])
-    envs.close()
 
 
 def test_what_is_reset_to_ask_for_the_agents_is_unwound():
@@ -706,9 +656,8 @@ def test_what_is_reset_to_ask_for_the_agents_is_unwound():
             return [(self,)]
 
     point = definition(agent=lambda self: "counter_0")
-    envs = vector_env(Announcing, {f"{__name__}.Counter.decide": point}, num_envs=2)
+    vector_env(Announcing, {f"{__name__}.Counter.decide": point}, num_envs=2)
     assert len(ended) == 1
-    envs.close()
 
 
 def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
@@ -737,4 +686,3 @@ def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
     there.clear()
     envs.step(np.ones(4, np.int64))
     assert there == [0] * 4
-    envs.close()

@@ -16,16 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import make_step, vector_env
+from simenv_marl import vector_env
 from simenv_marl.errors import (
-    ClosedError,
     EpisodeOverError,
-    InvalidActionError,
     OptionValueError,
     RewardError,
     WorkerError,
@@ -90,35 +87,40 @@ class Failing(Counter):
                 os._exit(self.how)
             if self.how == "system exit":
                 raise SystemExit(3)
+            if self.how == "reward":
+                self.count = 7  # for which nothing is paid that were a number
 
 
 ONES = np.ones(4, np.int64)
+KILLED = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+
+
+def goes_on(envs: Any, seed: int = 0) -> None:
+    """All begin anew, and take a step."""
+    envs.reset(seed=seed)
+    assert [simulation.seed for simulation in envs.get_attr("simulation")] == [seed + place for place in range(4)]
+    observations, *_ = envs.step(ONES)
+    assert observations[:, 0].tolist() == [1, 1, 1, 1]
 
 
 # -- the same -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("context", multiprocessing.get_all_start_methods())
-def test_workers_tell_what_one_process_tells_however_they_are_started(context):
-    points = {POINT: definition(action_mask_mapping=lambda self: [1, self.count % 2, 1])}
-    with_workers = vector_env(Counter, points, num_envs=5, workers=2, context=context)
-    without = vector_env(Counter, points, num_envs=5)
-    agree(with_workers, without, 30, np.random.default_rng(1))
-    with_workers.close()
-    without.close()
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("kind", VARIETY)
-def test_workers_tell_the_same_of_all_kinds_of_spaces(kind, mode):
+@pytest.mark.parametrize(
+    ("kind", "mode", "context"),
+    [
+        *[("masked", AutoresetMode.NEXT_STEP, context) for context in multiprocessing.get_all_start_methods()],
+        *[(kind, mode, FORK) for kind in VARIETY for mode in MODES],
+    ],
+)
+def test_workers_tell_what_one_process_tells(kind, mode, context):
+    """However they are started, in all modes of resets and of all kinds of spaces."""
     model, decision = VARIETY[kind]
-    with_workers = workers(model, decision, num_envs=5, autoreset_mode=mode)
+    with_workers = workers(model, decision, num_envs=5, autoreset_mode=mode, context=context)
     without = vector_env(model, {POINT: decision}, num_envs=5, autoreset_mode=mode)
     assert with_workers.metadata == without.metadata
     agree(with_workers, without, 25, np.random.default_rng(1))
     assert same(with_workers.np_random_seed, without.np_random_seed)
-    with_workers.close()
-    without.close()
 
 
 @given(designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.integers(1, 5))
@@ -129,18 +131,6 @@ def test_workers_tell_the_same_of_random_worlds(design, seed, mode, number, proc
         return
     with_workers = made(design, number, mode, workers=processes, context=FORK)
     agree(with_workers, joint_or_single, 12, np.random.default_rng(seed))
-    with_workers.close()
-    joint_or_single.close()
-
-
-def test_simulations_are_spread_evenly_and_there_are_no_more_workers_than_simulations():
-    envs = workers(Failing, num_envs=5, workers=3)
-    assert sorted(map(processes_of(envs).count, set(processes_of(envs)))) == [1, 2, 2]
-    envs.close()
-    envs = workers(Failing, num_envs=2, workers=5)
-    assert len(set(processes_of(envs))) == 2
-    assert os.getpid() not in processes_of(envs)
-    envs.close()
 
 
 def processes_of(envs: Any) -> list[int]:
@@ -148,42 +138,22 @@ def processes_of(envs: Any) -> list[int]:
     return [simulation.process for simulation in envs.get_attr("simulation")]
 
 
+def test_simulations_are_spread_evenly_and_there_are_no_more_workers_than_simulations():
+    for number, asked, sizes in ((5, 3, [1, 2, 2]), (2, 5, [1, 1])):
+        there = processes_of(workers(Failing, num_envs=number, workers=asked))
+        assert sorted(map(there.count, set(there))) == sizes
+        assert os.getpid() not in there
+
+
 def test_models_and_mappings_that_no_module_holds_are_sent_along():
-    class Local:
-        def reset(self, seed: int | None = None) -> None:
-            self.count = seed or 0
-
-        def run(self) -> None:
-            while True:
-                self.count += self.decide()
-
-        @make_step(
-            observation_space=spaces.Box(0, 1000, (1,), np.int64),
-            observation_space_mapping=lambda self: [self.count],
-            action_space=spaces.Discrete(5),
-            action_space_mapping=int,
-            reward_mapping=lambda self: float(self.count),
-        )
-        def decide(self) -> int:
-            return 0
+    class Local(Counter):
+        decide = definition(reward_mapping=lambda self: float(self.seed + self.count))(lambda self: 0)
 
     envs = vector_env(Local, Local.decide, num_envs=3, workers=2, context="spawn")
-    assert envs.reset(seed=4)[0].tolist() == [[4], [5], [6]]
+    assert envs.reset(seed=4)[0][:, 0].tolist() == [0, 0, 0]
     observations, rewards, *_ = envs.step([1, 2, 3])
-    assert observations.tolist() == [[5], [7], [9]]
+    assert observations[:, 0].tolist() == [1, 2, 3]
     assert rewards.tolist() == [5.0, 7.0, 9.0]
-    envs.close()
-
-
-def test_functions_may_be_named_while_another_environment_decides_them():
-    points = {Plain.decide: definition()}
-    first = vector_env(Plain, points, num_envs=2)
-    second = vector_env(Plain, points, num_envs=2, workers=1)
-    third = vector_env(Plain, {Plain.decide: definition()}, num_envs=2, workers=1)
-    agree(first, second, 10, np.random.default_rng(0))
-    agree(first, third, 10, np.random.default_rng(0))
-    for envs in (first, second, third):
-        envs.close()
 
 
 class Plain(Counter):
@@ -193,91 +163,44 @@ class Plain(Counter):
         return 1
 
 
+def test_functions_may_be_named_while_another_environment_decides_them():
+    points = {Plain.decide: definition()}
+    first = vector_env(Plain, points, num_envs=2)
+    for own in (points, {Plain.decide: definition()}):
+        agree(first, vector_env(Plain, own, num_envs=2, workers=1), 10, np.random.default_rng(0))
+
+
 def test_what_cannot_be_sent_is_refused():
     lock = threading.Lock()
     with pytest.raises(OptionValueError, match="cannot be sent to another process"):
         vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
 
 
-def test_calls_and_attributes_go_to_the_workers_and_back():
-    envs = workers(render_mode="ansi")
-    envs.reset(seed=3)
-    assert envs.render() == ("ansi 0",) * 4
-    envs.set_attr("tag", [1, 2, 3, 4])
-    assert envs.get_attr("tag") == (1, 2, 3, 4)
-    assert [simulation.seed for simulation in envs.get_attr("simulation")] == [3, 4, 5, 6]
-    with pytest.raises(AttributeError, match="nothing_of_that_name"):
-        envs.call("nothing_of_that_name")
-    with pytest.raises(AttributeError, match="other processes"):
-        envs.envs  # noqa: B018
-    with pytest.raises(OptionValueError):
-        envs.set_attr("tag", [1])
-    envs.step(ONES)
-    envs.close()
-
-
-@pytest.mark.parametrize("copy", [True, False])
-def test_observations_are_copies_unless_told_otherwise(copy):
-    envs = workers(copy=copy)
-    second, _ = envs.reset(seed=0)
-    for _ in range(2):
-        first, kept = second, second.copy()
-        second, *_ = envs.step(ONES)
-        assert (second is first) != copy
-        assert np.array_equal(first, kept) == copy
-    envs.close()
-    assert first.shape == (4, 2)  # it can be read still
-
-
 # -- errors ---------------------------------------------------------------------------------------------
 
 
-def test_an_illegal_action_anywhere_moves_nothing():
-    envs = workers(Counter, VARIETY["masked"][1])
-    before, _ = envs.reset(seed=0)
-    for illegal in ([1, 1, 1, 9], [1, 1, 2, 1], [1, 1, 1], "none", None):
-        with pytest.raises(InvalidActionError) as caught:
-            envs.step(np.array(illegal) if isinstance(illegal, list) else illegal)
-        if isinstance(illegal, list) and len(illegal) == 4:
-            assert f"sub-environment {np.argmax(np.array(illegal) != 1)}" in str(caught.value)
-    after, *_ = envs.step(ONES)
-    assert (after[:, 0] - before[:, 0]).tolist() == [1, 1, 1, 1]
-    envs.close()
-
-
 def test_errors_come_back_as_themselves_and_the_next_reset_works():
-    envs = workers(Failing)
+    envs = workers(Failing, definition(reward_mapping=lambda self: float("nan") if self.count == 7 else 0.0))
     for how, kind, message in (
         ("odd", Odd, "it is odd"),
         ("local", ValueError, "made here"),
         ("unpicklable", WorkerError, "ValueError: with something in it"),
         ("system exit", SystemExit, "3"),
+        ("reward", RewardError, "not finite"),
     ):
         envs.reset(seed=0, options={2: how})
         with pytest.raises(kind, match=message) as caught:
             envs.step(ONES)
         assert "sub-environment 2" in notes(caught.value)
         assert "seed 2" in notes(caught.value)
-        assert "in run" in str(caught.value.__cause__)
+        assert how == "reward" or "in run" in str(caught.value.__cause__)
         if how == "odd":
             assert caught.value.count == 1
         with pytest.raises(EpisodeOverError, match="begin the next ones"):
             envs.step(ONES)
         with pytest.raises(EpisodeOverError, match="without a reset_mask"):
             envs.reset(options={"reset_mask": np.array([0, 0, 1, 0], bool)})
-        envs.reset(seed=0)
-        observations, *_ = envs.step(ONES)
-        assert observations[:, 0].tolist() == [1, 1, 1, 1]
-    envs.close()
-
-
-def test_errors_of_the_tree_stay_themselves():
-    envs = workers(Counter, definition(reward_mapping=lambda self: float("nan") if self.count else 0.0))
-    envs.reset(seed=0)
-    with pytest.raises(RewardError, match="not finite") as caught:
-        envs.step(ONES)
-    assert "sub-environment 0" in notes(caught.value)
-    envs.close()
+        goes_on(envs)
 
 
 def test_errors_in_a_factory_surface_where_the_environment_is_made():
@@ -296,81 +219,42 @@ class Breaking:
         return Counter() if os.getpid() == self.process else 1 / 0
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
-@pytest.mark.parametrize(("how", "code"), [("kill", -signal.SIGKILL), (7, 7), (1, 1)])
+@KILLED
+@pytest.mark.parametrize(("how", "code"), [("kill", -9), (7, 7), (1, 1)])
 def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, code):
     envs = workers(Failing)
     envs.reset(seed=0, options={3: how})
-    with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* exit code {code}") as caught:
+    with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* died with exit code {code}") as caught:
         envs.step(ONES)
     assert ("__main__" in str(caught.value)) == (code == 1)  # with which an error in a script ends it
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
     with pytest.raises(WorkerError, match="is dead"):
         envs.call("simulation")
-    envs.reset(seed=0)
-    observations, *_ = envs.step(ONES)
-    assert observations[:, 0].tolist() == [1, 1, 1, 1]
-    envs.close()
+    goes_on(envs)
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
-def test_workers_that_are_killed_between_steps_are_noticed():
-    for use in (lambda envs: envs.step(ONES), lambda envs: envs.call("simulation"), None):
-        envs = workers(Failing)
-        envs.reset(seed=0)
-        for process in set(processes_of(envs)):
-            os.kill(process, signal.SIGKILL)
-        if use is not None:
-            with pytest.raises(WorkerError, match="exit code -9"):
-                use(envs)
-        envs.close()
-        assert envs.closed
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
-def test_a_worker_that_dies_in_a_call_ends_all_episodes():
+@KILLED
+@pytest.mark.parametrize("use", ["step", "call", "close"])
+def test_workers_that_are_killed_between_steps_are_noticed(use):
     envs = workers(Failing)
     envs.reset(seed=0)
-    os.kill(processes_of(envs)[0], signal.SIGKILL)
-    with pytest.raises(WorkerError, match=r"worker 0 .* exit code -9"):
-        envs.call("simulation")
-    for use in (lambda: envs.step(ONES), lambda: envs.reset(options={"reset_mask": np.array([0, 0, 0, 1], bool)})):
-        with pytest.raises(EpisodeOverError, match="an error has ended the episodes"):
-            use()
-    envs.reset(seed=0)
-    assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
+    there = set(processes_of(envs)) if use != "call" else processes_of(envs)[:1]
+    for process in there:
+        os.kill(process, signal.SIGKILL)
+    if use != "close":
+        with pytest.raises(WorkerError, match=r"worker 0 .* exit code -9"):
+            envs.step(ONES) if use == "step" else envs.call("simulation")
+        for method in (envs.step, lambda ones: envs.reset(options={"reset_mask": ones > 0})):
+            with pytest.raises(EpisodeOverError, match="an error has ended the episodes"):
+                method(np.array([0, 0, 0, 1]) if method != envs.step else ONES)
+        goes_on(envs)
     envs.close()
-
-
-def test_errors_survive_pickling():
-    envs = workers(Failing)
-    envs.reset(seed=0, options={1: 7})
-    with pytest.raises(WorkerError, match="died with exit code") as caught:
-        envs.step(ONES)
-    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
-    envs.close()
+    assert envs.closed
 
 
 # -- the end --------------------------------------------------------------------------------------------
-
-
-def test_close_ends_the_workers_in_every_state_and_only_once():
-    for prepare in (
-        lambda envs: None,
-        lambda envs: envs.reset(),
-        lambda envs: envs.reset() and envs.step(ONES),
-    ):
-        envs = workers(Failing)
-        prepare(envs)
-        there = set(processes_of(envs))
-        envs.close()
-        envs.close()
-        assert envs.closed
-        assert all(map(gone, there))
-        for use in (envs.reset, lambda envs=envs: envs.step(ONES), lambda envs=envs: envs.call("simulation")):
-            with pytest.raises(ClosedError, match="the environment is closed"):
-                use()
 
 
 class Stubborn(Counter):
@@ -458,10 +342,7 @@ def test_an_interrupted_step_leaves_the_environment_in_step():
         signal.signal(signal.SIGALRM, before)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
-    observations, _ = envs.reset(seed=7)
-    assert observations[:, 0].tolist() == [0, 0, 0, 0]
-    assert [simulation.seed for simulation in envs.get_attr("simulation")] == [7, 8, 9, 10]
-    envs.close()
+    goes_on(envs, 7)
 
 
 class Slow(Counter):
@@ -508,22 +389,20 @@ if __name__ == "__main__":
 """
 
 
+def run_script(path: Path, text: str, *options: str) -> Any:
+    path.write_text(text, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
+    # The output ends when the last worker does.
+    command = [sys.executable, *options, str(path)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+
 @pytest.mark.parametrize("context", ["spawn", FORK])
 @pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "os.kill(os.getpid(), 9)"])
 def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
-    path = tmp_path / "script.py"
-    path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev", str(path)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,  # the output ends when the last worker does
-        check=False,
-    )
-    lines = done.stdout.splitlines()
-    assert lines[0] == "[[1], [0]]"
+    strict = ["-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev"]
+    done = run_script(tmp_path / "script.py", SCRIPT.format(context=context, end=end), *strict)
+    assert done.stdout.splitlines()[0] == "[[1], [0]]"
     assert done.stdout.count("unwound") == 2
     if not end:
         assert done.stderr == ""
@@ -549,30 +428,10 @@ def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
     assert os.waitpid(child, 0)[1] == 0
     observations, *_ = envs.step(ONES)
     assert observations[:, 0].tolist() == [1, 1, 1, 1]
-    envs.close()
 
 
-def test_contexts_that_do_not_exist_are_refused():
-    with pytest.raises(OptionValueError, match="context must be"):
-        workers(context="magic")
-    with pytest.raises(OptionValueError, match="context must be"):
-        workers(context=3)
-    envs = workers(context=multiprocessing.get_context(FORK))
-    envs.close()
-
-
-def test_modes_are_kept_by_the_workers():
-    envs = workers(autoreset_mode=AutoresetMode.DISABLED)
-    envs.reset(seed=0)
-    while True:
-        *_, terminations, truncations, _ = envs.step(ONES)
-        if (terminations | truncations).any():
-            break
-    with pytest.raises(EpisodeOverError, match="reset_mask"):
-        envs.step(ONES)
-    envs.reset(options={"reset_mask": terminations | truncations})
-    envs.step(ONES)
-    envs.close()
+def test_a_context_may_be_an_object_of_multiprocessing():
+    goes_on(workers(context=multiprocessing.get_context(FORK)))
 
 
 class Ending(Breaking):
@@ -585,10 +444,7 @@ class Ending(Breaking):
 @pytest.mark.parametrize(
     ("error", "what"),
     [
-        ("OSError", ("Process.start", 1)),
-        ("OSError", ("Process.start", 2)),
-        ("OSError", ("Pipe", 1)),
-        ("OSError", ("Pipe", 2)),
+        *[("OSError", (what, number)) for what in ("Process.start", "Pipe") for number in (1, 2)],
         ("ZeroDivisionError", ("Breaking",)),
         ("WorkerError", ("Ending",)),
     ],
@@ -624,13 +480,7 @@ def start_in_vain(error: str, what: str, number: int = 0) -> None:
 
 
 def test_a_script_without_its_guard_is_told_what_it_lacks(tmp_path):
-    path = tmp_path / "script.py"
     text = SCRIPT.format(context="spawn", end="").replace('if __name__ == "__main__":', "if True:")
-    path.write_text(text, encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
-    done = subprocess.run(
-        [sys.executable, str(path)], env=environment, capture_output=True, text=True, timeout=60, check=False
-    )
-    last = done.stderr.strip().splitlines()[-1]
+    last = run_script(tmp_path / "script.py", text).stderr.strip().splitlines()[-1]
     assert last.startswith("simenv_marl.errors.WorkerError: ")
     assert 'if __name__ == "__main__":' in last

@@ -4,7 +4,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from textwrap import dedent
 
 import pytest
 
@@ -45,7 +44,7 @@ def folder(tmp_path):
 def run(folder, code):
     # Gymnasium warns (UserWarning) of the listing's float64 bounds, and of humidity that leaves them.
     result = subprocess.run(
-        [sys.executable, "-W", "error", "-W", "ignore::UserWarning", "-c", dedent(code)],
+        [sys.executable, "-W", "error", "-W", "ignore::UserWarning", "-c", code],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -59,18 +58,14 @@ DAY = re.compile(r"day (\d+) alive: (\d+), dead: (\d+)")
 
 
 def test_step_1_the_model_runs_on_its_own(folder):
-    printed = run(
-        folder,
-        """
-        from model import Greenhouse
-        g = Greenhouse(1)
-        for day in range(10):
-            alive = [p.health > 0 for p in g.pots]
-            print(sum(alive))
-            g.update_day()
-        """,
-    )
-    alive = [int(line) for line in printed]
+    code = """
+from model import Greenhouse
+g = Greenhouse(1)
+for day in range(10):
+    print(sum(p.health > 0 for p in g.pots))
+    g.update_day()
+"""
+    alive = [int(line) for line in run(folder, code)]
     assert alive[0] == 200
     assert alive == sorted(alive, reverse=True)
     assert alive[9] < 200  # it is overwatered by default
@@ -103,24 +98,20 @@ assert len({id(obs) for obs in (obs0, obs1, obs2)}) == 3
 
 
 def test_it_is_played_to_the_end_again_and_again(folder):
-    printed = run(
-        folder,
-        """
-        import gymnasium
-        env = gymnasium.make("env_def:Greenhouse-v0")
-        for episode in range(3):
-            env.reset(seed=episode)
-            terminated, steps = False, 0
-            while not terminated:
-                observation, reward, terminated, truncated, info = env.step(1.0)
-                steps += 1
-            print("episode", steps)
-        env.reset()
-        env.step(0.2)
-        env.close()
-        """,
-    )
-    assert sum(line.startswith("episode") for line in printed) == 3
+    code = """
+import gymnasium
+env = gymnasium.make("env_def:Greenhouse-v0")
+for episode in range(3):
+    env.reset(seed=episode)
+    while not env.step(1.0)[2]:
+        pass
+    print("episode")
+env.reset()
+env.step(0.2)
+env.close()
+"""
+    printed = run(folder, code)
+    assert printed.count("episode") == 3
     days = [DAY.fullmatch(line) for line in printed if line.startswith("day")]
     first_days = [number for number, day in enumerate(days) if day[1] == "0"]
     assert len(first_days) == 4
@@ -128,40 +119,27 @@ def test_it_is_played_to_the_end_again_and_again(folder):
         assert days[number - 1][2] == "0"  # an episode ends when all plants have died
 
 
-def test_with_the_rule_it_is_the_plain_model(folder):
-    printed = run(
-        folder,
-        """
-        import random
-        from env_def import GreenhouseSim, env_cls
-        from simenv_marl import RULE
-        random.seed(7)
-        plain = GreenhouseSim()
-        plain.reset()
-        plain.run()
-        print("--")
-        random.seed(7)
-        env = env_cls()
-        env.reset()
-        while not env.step(RULE)[2]:
-            pass
-        state = lambda simulation: [(p.health, p.water) for p in simulation.greenhouse.pots]
-        assert state(plain) == state(env.unwrapped.simulation)
-        assert plain.day == env.unwrapped.simulation.day
-        """,
-    )
+def test_with_the_rule_it_is_the_plain_model_and_the_agent_has_the_functions_name(folder):
+    code = """
+import random
+from env_def import GreenhouseSim, env_cls
+from simenv_marl import RULE, aec_env
+random.seed(7)
+plain = GreenhouseSim()
+plain.reset()
+plain.run()
+print("--")
+random.seed(7)
+env = env_cls()
+env.reset()
+while not env.step(RULE)[2]:
+    pass
+state = lambda simulation: [(p.health, p.water) for p in simulation.greenhouse.pots]
+assert state(plain) == state(env.unwrapped.simulation)
+assert plain.day == env.unwrapped.simulation.day
+for points in (["model.Greenhouse.choose_water_amount"], []):
+    assert aec_env(GreenhouseSim, *points).possible_agents == ["choosewateramount_0"]
+"""
+    printed = run(folder, code)
     middle = printed.index("--")
     assert printed[:middle] == printed[middle + 1 :]
-
-
-def test_the_environments_agent_has_the_functions_name(folder):
-    printed = run(
-        folder,
-        """
-        import env_def
-        from simenv_marl import aec_env
-        print(*aec_env(env_def.GreenhouseSim(), "model.Greenhouse.choose_water_amount").possible_agents)
-        print(*aec_env(env_def.GreenhouseSim).possible_agents)
-        """,
-    )
-    assert printed == ["choosewateramount_0"] * 2

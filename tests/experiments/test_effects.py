@@ -9,6 +9,7 @@ from scipy import stats
 
 from simenv_marl.errors import OptionValueError
 from simenv_marl.experiments import design, effects, run_experiment, sobol_indices
+from tests.worlds.shops import POINTS
 
 
 class Sum:
@@ -24,15 +25,13 @@ class Sum:
         self.y = self.a + 2 * self.b * (1 if self.c == "x" else 3) + self.noise * self.generator.normal()
 
 
-def points():
-    from tests.worlds.shops import POINTS
+def results(table, store, make=Sum, **arguments):
+    given = {"metric": {"y": lambda s: s.y}, "points": POINTS, "seeds": [1, 2], **arguments}
+    return run_experiment(make, table, store=store, **given)
 
-    return POINTS
 
-
-def results(table, store, **arguments):
-    given = {"metric": {"y": lambda s: s.y}, **arguments}
-    return run_experiment(Sum, table, points=points(), store=store, seeds=[1, 2], **given)
+def labels(axes):
+    return [label.get_text() for label in axes.get_xticklabels()]
 
 
 def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
@@ -54,10 +53,12 @@ def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
 
 
 def test_many_numbers_are_grouped(tmp_path):
-    found = effects(results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "sobol", 64), tmp_path), "y")
+    table = design({"a": (0.0, 1.0), "b": (0.0, 1.0), "c": ["x", "y"]}, "sobol", 64)
+    found = effects(results(table, tmp_path), "y")
     assert found.main.loc["a"]["count"].tolist() == [32] * 4
     assert found.main.loc["b"]["mean"].is_monotonic_increasing
-    found.plot()
+    slants = [[label.get_rotation() for label in axes.get_xticklabels()] for axes in found.plot().axes[:3]]
+    assert slants == [[30] * 4, [30] * 4, [0] * 2]  # names that are long do not run into each other
 
 
 def test_all_that_is_missing_is_one_level(tmp_path):
@@ -67,41 +68,21 @@ def test_all_that_is_missing_is_one_level(tmp_path):
     assert found.main.loc["c"]["mean"].tolist() == [0.5, 0.5]
     assert found.cells("a", "c").to_numpy().tolist() == [[0, 0], [1, 1]]
     drawn = found.plot().axes
-    assert [label.get_text() for label in drawn[1].get_xticklabels()] == ["1", "nan"]
+    assert labels(drawn[1]) == ["1", "nan"]
 
 
 def test_levels_of_one_factor_are_not_taken_for_those_of_another(tmp_path):
     table = pd.DataFrame({"flag": [True, False] * 3, "a": [0, 1, 2] * 2, "c": [None, "x", "y"] * 2}, dtype=object)
-    frame = run_experiment(
-        lambda flag, a, c: Sum(a, float(flag)),
-        table,
-        points=points(),
-        metric={"y": lambda s: s.y},
-        seeds=[1],
-        store=tmp_path,
-    )
-    found = effects(frame, "y")
-    assert [[type(level) for level in own] for own in found.levels.values()] == [
-        [bool, bool], [int, int, int], [type(None), str, str]
-    ]  # fmt: skip
-    below = [[label.get_text() for label in axes.get_xticklabels()] for axes in found.plot().axes[:3]]
+    found = effects(results(table, tmp_path, lambda flag, a, c: Sum(a, float(flag)), seeds=[1]), "y")
+    types = [[type(level) for level in own] for own in found.levels.values()]
+    assert types == [[bool, bool], [int, int, int], [type(None), str, str]]
+    below = [labels(axes) for axes in found.plot().axes[:3]]
     assert below == [["True", "False"], ["0", "1", "2"], ["None", "x", "y"]]
 
 
-def test_names_that_are_long_do_not_run_into_each_other(tmp_path):
-    figure = effects(results(design({"a": (0.0, 1.0), "b": [0.0, 1.0]}, "sobol", 16), tmp_path), "y").plot()
-    slants = [[label.get_rotation() for label in axes.get_xticklabels()] for axes in figure.axes[:2]]
-    assert slants == [[30] * 4, [0] * 2]
-
-
 def test_many_factors_are_drawn_in_rows(tmp_path):
-    class Total(Sum):
-        def __init__(self, **factors):
-            super().__init__(sum(factors.values()), 0)
-
     table = design({f"x{place}": [0, 1] for place in range(7)}, "plackett_burman")
-    frame = run_experiment(Total, table, points=points(), metric={"y": lambda s: s.y}, seeds=[1], store=tmp_path)
-    figure = effects(frame, "y").plot()
+    figure = effects(results(table, tmp_path, lambda **row: Sum(sum(row.values()), 0), seeds=[1]), "y").plot()
     drawn = [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
     assert drawn[:7] == list(table.columns)
     assert figure.get_figwidth() < 14
@@ -116,57 +97,53 @@ def test_sobol_indices_are_those_of_the_model(tmp_path):
 
 
 def test_what_cannot_be_is_refused(tmp_path):
-    frame = results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "sobol", 6), tmp_path)
-    with pytest.raises(OptionValueError, match="saltelli"):
-        sobol_indices(frame, "y")
-    with pytest.raises(OptionValueError, match="not a column of numbers"):
-        effects(frame, "a")
+    factors = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
+    frame = results(design(factors, "sobol", 6), tmp_path)
+    odd = {"text": lambda s: "x", "some": lambda s: s.y if s.a > 0.5 else None}
+    whole = results(design(factors, "saltelli", 2), tmp_path / "odd", metric=odd)
+    for look, given, message in (
+        (sobol_indices, (frame, "y"), "saltelli"),
+        (effects, (frame, "a"), "not a column of numbers"),
+        *[(each, (wrong,), "that run_experiment returned")
+          for each in (effects, sobol_indices) for wrong in (None, frame["y"], frame[["a"]])],
+        *[(each, (whole, "text"), "'text' is not a column of numbers") for each in (effects, sobol_indices)],
+        (sobol_indices, (whole, "some"), "'some' is missing or not finite"),
+        (sobol_indices, (whole, "return"), "no variance"),
+    ):  # fmt: skip
+        with pytest.raises(OptionValueError, match=message):
+            look(*given)
     with pytest.raises(OptionValueError, match="no contender 'x'"):
         effects(frame, "y", contender="x")
-    with pytest.raises(OptionValueError, match="that run_experiment returned"):
-        effects(frame[["a"]])
-    for wrong in (None, frame["y"]):
-        with pytest.raises(OptionValueError, match="that run_experiment returned"):
-            effects(wrong)
-        with pytest.raises(OptionValueError, match="that run_experiment returned"):
-            sobol_indices(wrong)
     for look in (effects, sobol_indices):
         with pytest.raises(OptionValueError, match="confidence must lie between 0 and 1"):
             look(frame, "y", confidence=95)
-    whole = design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 2)
-    odd = {"text": lambda s: "x", "some": lambda s: s.y if s.a > 0.5 else None}
-    frame = results(whole, tmp_path / "odd", metric=odd)
-    for look in (effects, sobol_indices):
-        with pytest.raises(OptionValueError, match="'text' is not a column of numbers"):
-            look(frame, "text")
-    with pytest.raises(OptionValueError, match="'some' is missing or not finite"):
-        sobol_indices(frame, "some")
-    with pytest.raises(OptionValueError, match="no variance"):
-        sobol_indices(results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 2), tmp_path / "b"), "return")
+
+
+def row(a, seed, **more):
+    """A row of a table of results."""
+    told = {"contender": "rule", "seed": seed, "agent": "team", "length": 1, "status": "ok", "error": None}
+    return {"a": a, **told, **more}
 
 
 def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
     rows = [
-        {"a": a, "b": b, "contender": "rule", "seed": seed, "agent": "team", "return": 100 * b + noise * (seed - 1.5),
-         "length": 1, "status": "ok", "error": None}
-        for noise in (0, 4) for a in (f"quiet{noise}", f"loud{noise}") for b in (0, 1) for seed in range(4)
-    ]  # fmt: skip
+        row(a, seed, b=b) | {"return": 100 * b + noise * (seed - 1.5)}
+        for a, noise in (("quiet", 0), ("still", 0), ("loud", 4))
+        for b in (0, 1)
+        for seed in range(4)
+    ]
     found = effects(pd.DataFrame(rows)).main
-    for a in ("quiet0", "loud0"):
+    for a in ("quiet", "still"):
         assert found.loc[("a", a), "mean"] == 50
         assert found.loc[("a", a), ["low", "high"]].isna().all()  # the same on all seeds
     expected = stats.t.interval(0.95, 3, 50, stats.sem([44, 48, 52, 56]))
-    assert found.loc[("a", "loud4"), ["low", "high"]].tolist() == pytest.approx(expected)
-    alone = effects(pd.DataFrame([row for row in rows if row["seed"] == 1])).main
-    assert alone.loc[("a", "quiet0"), "low"] < 50 < alone.loc[("a", "quiet0"), "high"]
+    assert found.loc[("a", "loud"), ["low", "high"]].tolist() == pytest.approx(expected)
+    alone = effects(pd.DataFrame([own for own in rows if own["seed"] == 1])).main
+    assert alone.loc[("a", "quiet"), "low"] < 50 < alone.loc[("a", "quiet"), "high"]
 
 
 def test_shares_have_the_intervals_of_shares():
-    rows = [
-        {"a": a, "contender": "rule", "seed": seed, "agent": "team", "return": 0.0, "length": 1, "won": seed < 3 * a,
-         "status": "ok", "error": None}
-        for a in (0, 1) for seed in range(12)
-    ]  # fmt: skip
+    rows = [row(a, seed, won=seed < 3 * a) | {"return": 0.0} for a in (0, 1) for seed in range(12)]
     found = effects(pd.DataFrame(rows), "won").main
     for a in (0, 1):
         expected = stats.binomtest(3 * a, 12).proportion_ci(0.95, method="wilson")

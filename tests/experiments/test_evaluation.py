@@ -20,7 +20,7 @@ from simenv_marl.plugins import ChangedResult
 from tests.conftest import DRIVERS
 from tests.worlds.many_worlds import Colony, Design, colony_points
 from tests.worlds.models import notes
-from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some, some_of_many
+from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some
 
 SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
@@ -95,10 +95,18 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
 
 @pytest.mark.parametrize("arguments", [{"workers": 2}, {"batched": True}, {"batched": True, "workers": 2}], ids=str)
 def test_the_same_comes_of_all_ways_to_run_it(arguments):
-    contenders = {"rule": {}, "much": {"keeper": much_of_many if arguments.get("batched") else much}}
+    asked = []
+
+    def policy(observations):
+        asked.append(len(observations))
+        return much_of_many(observations)
+
+    contenders = {"rule": {}, "much": {"keeper": policy if arguments.get("batched") else much}}
     alone = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, metric=level)
     assert evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, metric=level, **arguments).frame.equals(alone.frame)
     assert "metric" in alone.frame.columns
+    if arguments == {"batched": True}:
+        assert max(asked) == len(SEEDS)
 
 
 @pytest.mark.parametrize(
@@ -131,41 +139,23 @@ def test_points_and_options_that_can_be_asked_for_once_serve_all_contenders():
     assert found.frame.equals(expected.frame)
 
 
-def test_batched_policies_answer_many():
-    asked = []
-
-    def policy(observations):
-        asked.append(len(observations))
-        return some_of_many(observations)
-
-    evaluate(Shop, {"some": {"keeper": policy}}, seeds=SEEDS, points=POINTS, batched=True)
-    assert max(asked) == len(SEEDS)
-
-
-def test_the_summary_is_paired_by_seed():
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
+def test_the_summary_is_paired_by_seed(confidence):
     contenders = {"rule": {}, "some": {"keeper": some}}
-    found = evaluate(Shop, contenders, seeds=range(32), points=POINTS, baseline="rule")
+    given = {"points": POINTS, "confidence": confidence}
+    found = evaluate(Shop, contenders, seeds=range(32), baseline="rule", **given)
     summary, values = found.summary(), found.values()
     assert summary.index.name == "contender"
     assert list(summary.index) == ["rule", "some"]
     assert list(summary.columns) == ["mean", "low", "high", "difference", "difference_low", "difference_high"]
     assert summary.loc["rule", ["difference", "difference_low", "difference_high"]].tolist() == [0.0, 0.0, 0.0]
-    apart = (values["some"] - values["rule"]).to_numpy()
-    assert summary.loc["some", "difference"] == pytest.approx(apart.mean())
-    expected = stats.ttest_rel(values["some"], values["rule"]).confidence_interval(0.95)
+    assert summary.loc["some", "difference"] == pytest.approx((values["some"] - values["rule"]).mean())
+    expected = stats.ttest_rel(values["some"], values["rule"]).confidence_interval(confidence)
     assert summary.loc["some", ["difference_low", "difference_high"]].tolist() == pytest.approx(list(expected))
-    assert (summary["low"] < summary["mean"]).all()
-    assert (summary["mean"] < summary["high"]).all()
-    assert list(evaluate(Shop, CONTENDERS, seeds=[1, 2], points=POINTS).summary().columns) == ["mean", "low", "high"]
-    assert np.isnan(evaluate(Shop, CONTENDERS, seeds=[1], points=POINTS).summary()["low"]).all()
-
-
-def test_wider_intervals_are_surer():
-    widths = []
-    for confidence in (0.8, 0.99):
-        found = evaluate(Shop, {"rule": {}}, seeds=SEEDS, points=POINTS, confidence=confidence).summary()
-        widths.append(float((found["high"] - found["low"]).iloc[0]))
-    assert widths[0] < widths[1]
+    expected = stats.ttest_1samp(values["some"], 0).confidence_interval(confidence)
+    assert summary.loc["some", ["low", "high"]].tolist() == pytest.approx(list(expected))
+    assert list(evaluate(Shop, CONTENDERS, seeds=[1, 2], **given).summary().columns) == ["mean", "low", "high"]
+    assert np.isnan(evaluate(Shop, CONTENDERS, seeds=[1], **given).summary()["low"]).all()
 
 
 def test_intervals_are_those_of_scipy():
@@ -175,25 +165,22 @@ def test_intervals_are_those_of_scipy():
     wins = np.array([0.0] * 7 + [1.0])
     expected = stats.binomtest(1, 8).proportion_ci(0.9, method="wilson")
     assert interval(wins, 0.9, proportion=True) == (*expected, "")
-    assert interval(np.zeros(8), 0.9, proportion=True).high > 0.1
+    assert interval(np.zeros(8), 0.9, proportion=True)[1] > 0.1
 
 
-@pytest.mark.parametrize("proportion", [False, True])
 @pytest.mark.parametrize(
-    ("values", "note"),
-    [([], "a single"), ([1.0], "a single"), ([1.0, np.nan], "missing"), ([1.0, np.inf], "missing")],
+    ("values", "note", "proportion"),
+    [
+        *[([], "a single", proportion) for proportion in (False, True)],
+        *[([1.0], "a single", proportion) for proportion in (False, True)],
+        *[([1.0, odd], "missing", proportion) for odd in (np.nan, np.inf) for proportion in (False, True)],
+        *[(equal, "equal", False) for equal in ([2.0] * 5, [0.1 + 0.2, 0.3, 0.3], [0.0, 0.0])],
+    ],
 )
-def test_nothing_is_known_of_one_value_or_of_missing_ones(values, note, proportion):
+def test_some_values_have_no_interval(values, note, proportion):
     low, high, why = interval(np.array(values), 0.95, proportion=proportion)
     assert np.isnan([low, high]).all()
     assert note in why
-
-
-@pytest.mark.parametrize("values", [[2.0] * 5, [0.1 + 0.2, 0.3, 0.3], [0.0, 0.0]], ids=str)
-def test_nothing_is_known_of_equal_values(values):
-    low, high, why = interval(np.array(values), 0.95)
-    assert np.isnan([low, high]).all()
-    assert "equal" in why
 
 
 def test_the_summary_says_why_there_is_no_interval():
@@ -271,8 +258,22 @@ def test_it_stops_as_soon_as_intervals_are_narrow_enough():
     assert len(evaluate(Shop, {"rule": {}}, seeds=range(40), points=POINTS, width=1e-9).values()) == 40
 
 
+def of_those_that_have_decided(returns):
+    assert "keeper" in returns
+    assert "stranger" not in returns
+    assert returns["keeper"] in returns
+    return returns.get("stranger", returns["keeper"])
+
+
 @pytest.mark.parametrize(
-    "team", [max, lambda returns: max(returns.values()), lambda returns: returns["keeper"], lambda r: dict(r)["keeper"]]
+    "team",
+    [
+        max,
+        lambda returns: max(returns.values()),
+        lambda returns: returns["keeper"],
+        lambda returns: dict(returns)["keeper"],
+        of_those_that_have_decided,
+    ],
 )
 def test_the_team_is_what_its_user_makes_of_the_returns(team):
     found = evaluate(Shop, {"much": {"keeper": much}}, seeds=[1], points=POINTS, team=team)
@@ -280,25 +281,23 @@ def test_the_team_is_what_its_user_makes_of_the_returns(team):
     assert rows["team"] == rows["keeper"] > rows["helper"]
 
 
-def test_the_team_is_asked_for_those_alone_that_have_decided():
-    def team(returns):
-        assert "keeper" in returns
-        assert "stranger" not in returns
-        assert returns["keeper"] in returns
-        return returns.get("stranger", 0.5)
-
-    frame = evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, team=team).frame
-    assert frame["return"].tolist()[-1] == 0.5
-
-
+# As joblib closes, loky's thread may find that tasks which it has cancelled are gone.
 # As joblib closes, loky's thread may find that tasks which it has cancelled are gone.
 @pytest.mark.filterwarnings("ignore:Exception in thread ExecutorManager:pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True, "batch_size": 1}], ids=str)
-def test_a_team_that_fails_does_so_at_once(arguments):
-    with pytest.raises(KeyError, match=r"'stranger' did not decide .*: keeper, helper") as caught:
-        evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, team=lambda returns: returns["stranger"], **arguments)
+@pytest.mark.parametrize(
+    ("team", "policy", "contender"),
+    [(lambda returns: returns["stranger"], None, "rule"), (None, lambda seen: {}["stranger"], "bad")],
+    ids=["team", "policy"],
+)
+def test_what_fails_does_so_at_once_and_says_of_which_seed(team, policy, contender, arguments):
+    contenders = {"rule": {}, "bad": {"keeper": policy}} if policy else {"rule": {}, "much": {"keeper": much}}
+    with pytest.raises(
+        KeyError, match="stranger" if policy else "'stranger' did not decide .*: keeper, helper"
+    ) as caught:
+        evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, **{"team": team} if team else {}, **arguments)
     assert "seed 0" in notes(caught.value)
-    assert "of the contender 'rule'" in notes(caught.value)
+    assert f"of the contender '{contender}'" in notes(caught.value)
 
 
 def test_what_is_no_number_has_no_mean():
@@ -311,13 +310,6 @@ def test_what_is_no_number_has_no_mean():
     assert np.isnan(found.summary("some")["mean"]).all()
 
 
-def test_columns_are_those_of_experiments():
-    given = {"some": lambda shop: "a" if shop.seed else None, "number": lambda shop: shop.seed or None}
-    frame = evaluate(Shop, {"rule": {}}, seeds=[0, 1], points=POINTS, metric=given).frame
-    assert frame["some"].tolist() == [None] * 3 + ["a"] * 3
-    assert frame["number"].dtype == np.float64
-
-
 def test_a_variant_brings_its_own_points_and_policies():
     variant = Variant("v", Shop, points=POINTS, parameters={"days": 2}, policies={"keeper": much})
     frame = evaluate(variant, {"rule": {}}, seeds=SEEDS, metric=level).frame
@@ -326,15 +318,11 @@ def test_a_variant_brings_its_own_points_and_policies():
     assert frame[frame.agent == "team"]["metric"].tolist() == expected
 
 
-def test_pairs_are_drawn():
+def test_pairs_are_drawn_and_pictures_of_many_contenders_can_be_read():
     found = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, baseline="rule", metric=level)
     values, differences = found.plot("metric").axes
     assert sum(len(line.get_xdata()) == 2 for line in values.lines) == len(SEEDS)
     assert len(differences.collections[0].get_offsets()) == len(SEEDS)
-    assert len(evaluate(Shop, CONTENDERS, seeds=[1], points=POINTS).plot().axes) == 1
-
-
-def test_pictures_of_many_contenders_can_be_read():
     names = [f"the contender of number {number}" for number in range(20)]
     figure = evaluate(Shop, {name: {} for name in names}, seeds=[1], points=POINTS).plot()
     (axes,) = figure.axes
@@ -369,7 +357,7 @@ def refused(match, error=OptionValueError, **arguments):
         ("must be a dict", {"contenders": [much]}),
         ("must be a string", {"contenders": {1: {}}}),
         ("must be a dict from agents", {"contenders": {"a": much}}),
-        ("must be callable", {"contenders": {"a": {"keeper": 3}}}),
+        ("must be a callable", {"contenders": {"a": {"keeper": 3}}}),
         ("baseline 'x' is not one of the contenders: rule, much", {"baseline": "x"}),
         ("is not one of the contenders", {"baseline": ["rule"]}),
         ("there are none", {"seeds": []}),
@@ -387,9 +375,6 @@ def refused(match, error=OptionValueError, **arguments):
 )
 def test_what_cannot_be_is_refused_before_anything_runs(match, arguments):
     refused(match, **arguments)
-
-
-def test_a_policy_of_an_unknown_agent_is_refused():
     caught = refused("stranger", UnknownPointError, contenders={"rule": {}, "a": {"stranger": much}})
     assert "of the contender 'a'" in notes(caught)
 
@@ -401,21 +386,17 @@ def test_an_agent_must_not_be_called_team():
 
 
 def test_metrics_are_numbers_strings_or_none():
-    values = {"f": lambda s: np.float32(0.5), "n": lambda s: None, "s": lambda s: "a", "a": lambda s: np.array(3)}
-    row = evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric=values).frame.iloc[0]
-    assert [row["f"], row["n"], row["s"], row["a"]] == [0.5, None, "a", 3]
+    values = {
+        "f": lambda shop: np.float32(0.5),
+        "s": lambda shop: "a" if shop.seed else None,
+        "n": lambda shop: shop.seed or None,
+        "a": lambda shop: np.array(3),
+    }
+    frame = evaluate(Shop, {"rule": {}}, seeds=[0, 1], points=POINTS, metric=values).frame
+    assert [frame[name].tolist() for name in "fsa"] == [[0.5] * 6, [None] * 3 + ["a"] * 3, [3] * 6]
+    assert frame["n"].dtype == np.float64
     with pytest.raises(OptionValueError, match="metric 'x' must be a number"):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda s: [1]})
-
-
-def test_errors_tell_of_which_seed():
-    def failing(observation):
-        raise ZeroDivisionError("here")
-
-    with pytest.raises(ZeroDivisionError) as caught:
-        evaluate(Shop, {"rule": {}, "a": {"keeper": failing}}, seeds=[7], points=POINTS)
-    assert "seed 7" in notes(caught.value)
-    assert "of the contender 'a'" in notes(caught.value)
 
 
 def test_what_no_worker_can_be_given_is_found_out_before_anything_runs(tmp_path):

@@ -20,17 +20,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simenv_marl import evaluate, simulate
+from simenv_marl import evaluate
 from simenv_marl.data import Mixture
 from simenv_marl.errors import OptionValueError, StoreError, UnknownPointError
 from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.experiments import store as stores
 from simenv_marl.experiments.runner import Outcome
-from simenv_marl.planning import RolloutPolicy
 from simenv_marl.plugins import ChangedResult
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
-from tests.worlds.models import notes
-from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some, some_of_many
+from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 DESIGN = pd.DataFrame({"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]})
 ROOT = Path(__file__).parents[2]
@@ -73,11 +71,23 @@ def test_the_table_is_tidy_and_in_order(tmp_path):
     assert good.reset_index(drop=True).equals(alone.frame)
 
 
-@pytest.mark.parametrize("workers", [1, 2, 4])
-def test_the_table_is_the_same_for_every_number_of_workers(workers, tmp_path):
-    alone = run(tmp_path / "alone")
-    assert run(tmp_path / "shared", workers=workers).equals(alone)
-    assert len({path.name.split("-")[2] for path in (tmp_path / "shared").glob("*.jsonl")}) <= workers
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *({"workers": workers} for workers in (1, 2, 4)),
+        *({"batched": True, **more} for more in ({}, {"workers": 2}, {"batch_size": 2})),
+    ],
+    ids=str,
+)
+def test_the_table_is_the_same_however_it_is_run(arguments, tmp_path, capsys):
+    if arguments.get("batched"):
+        arguments = {"contenders": {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}}, **arguments}
+    alone, store = run(tmp_path / "alone"), tmp_path / "shared"
+    assert run(store, progress=True, **arguments).equals(alone)
+    assert "36/36" in capsys.readouterr().err
+    assert len({path.name.split("-")[2] for path in store.glob("*.jsonl")}) <= arguments.get("workers", 1)
+    run(store, progress=True, seeds=range(5), **arguments)
+    assert "45/45" in capsys.readouterr().err
 
 
 @pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents that did not appear")
@@ -97,12 +107,6 @@ def test_the_table_is_the_same_whoever_is_born_and_dies(tmp_path):
     assert frames[0].groupby(["ticks", "contender", "seed"]).size().nunique() > 2
 
 
-@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batch_size": 2}], ids=str)
-def test_batched_policies_bring_the_same(arguments, tmp_path):
-    contenders = {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}}
-    assert run(tmp_path / "b", contenders=contenders, batched=True, **arguments).equals(run(tmp_path / "a"))
-
-
 @pytest.mark.parametrize(
     "make",
     [
@@ -118,29 +122,22 @@ def test_whatever_makes_simulations(make, tmp_path):
 
 
 @pytest.mark.parametrize("arguments", [{}, {"batched": True}, {"batched": True, "batch_size": 2}], ids=str)
-def test_a_run_that_cannot_be_closed_has_failed(arguments, tmp_path):
-    class Stuck(Shop):
-        def close(self):
-            if self.seed % 2:
-                raise OSError("stuck")
-
-    frame = run(tmp_path, {"days": [1]}, make=Stuck, contenders=None, **arguments)
-    assert [frame[frame.seed == seed]["status"].tolist() for seed in range(4)] == [["ok"] * 3, ["error"]] * 2
-    assert len(lines(tmp_path)) == 4
-
-
-@pytest.mark.parametrize("batched", [False, True])
 @pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError, MemoryError])
-def test_whatever_ends_a_run_is_an_error_of_that_run(error, batched, tmp_path):
+@pytest.mark.parametrize("method", ["run", "close"])
+def test_whatever_ends_a_run_is_an_error_of_that_run(method, error, arguments, tmp_path):
     class Ending(Shop):
-        def run(self):
-            super().run()
-            if self.seed == 1:
-                raise error("enough")
+        pass
 
-    frame = run(tmp_path, {"days": [1]}, make=Ending, contenders=None, batched=batched)
+    def end(shop):
+        getattr(Shop, method, lambda shop: None)(shop)
+        if shop.seed == 1:
+            raise error("enough")
+
+    setattr(Ending, method, end)
+    frame = run(tmp_path, {"days": [1]}, make=Ending, contenders=None, **arguments)
     assert frame["status"].tolist() == ["ok"] * 3 + ["error"] + ["ok"] * 6
     assert frame["error"][3] == f"{error.__name__}: enough"
+    assert len(lines(tmp_path)) == 4
 
 
 @pytest.mark.parametrize("batched", [False, True])
@@ -204,43 +201,28 @@ def test_what_is_known_is_not_run_again(tmp_path):
         calls.append(days)
         return Shop(days)
 
-    def again(days, seeds=range(3), contenders=None):
+    def again(days, seeds=range(3), contenders=None, **options):
         calls.clear()
-        return run_experiment(make, {"days": days}, contenders=contenders, seeds=seeds, points=POINTS, store=tmp_path)
+        given = {"contenders": contenders, "seeds": seeds, "points": POINTS, **options}
+        return run_experiment(make, {"days": days}, store=tmp_path, **given)
 
     first = again([1, 2])
     assert again([1, 2]).equals(first)
     assert len(calls) <= 1  # it is looked at
     assert again([1, 2], range(2)).equals(first[first.seed < 2].reset_index(drop=True))
+    twice = again([1, 2, 1, 2])
+    assert all(half.reset_index(drop=True).equals(first) for half in (twice[: len(first)], twice[len(first) :]))
+    failed = again([1, 2, 3], team=lambda returns: returns["stranger"])
+    assert set(failed["agent"]) == {"team"}
+    assert set(failed["status"]) == {"error"}
+    assert "'stranger' did not decide in this episode; these agents did: keeper, helper" in failed["error"][0]
+    known = len(lines(tmp_path))
+    assert set(again([1, 2, 3], team=max)["status"]) == {"ok"}  # the team is mended
+    assert len(lines(tmp_path)) == known == 3 * 3
     again([3, 1, 2], range(4), {"much": {"keeper": much}})
     assert len(lines(tmp_path)) == 3 * 4 * 2
     with pytest.warns(UserWarning, match="1 rows that this design does not have"):
         assert again([1, 2]).equals(first)
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_planners_are_contenders(workers, tmp_path):
-    planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1)
-    contenders = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
-    frame = run(tmp_path, DESIGN[::2], contenders=contenders, points=NEAR, seeds=range(2), workers=workers)
-    runs = frame[(frame["agent"] == "team") & (frame["contender"] != "rule")]
-    expected = [
-        simulate(Shop(days, price), own, points=NEAR, seed=seed).level
-        for days, price in ((1, 0.5), (2, 2.0))
-        for own in contenders.values()
-        for seed in range(2)
-    ]
-    assert runs["level"].tolist() == expected
-
-
-def test_a_team_that_fails_is_an_error_until_it_is_mended(tmp_path):
-    frame = run(tmp_path, DESIGN[:1], team=lambda returns: returns["stranger"])
-    assert set(frame["agent"]) == {"team"}
-    assert set(frame["status"]) == {"error"}
-    assert "'stranger' did not decide in this episode; these agents did: keeper, helper" in frame["error"][0]
-    known = len(lines(tmp_path))
-    assert set(run(tmp_path, DESIGN[:1], team=max)["status"]) == {"ok"}
-    assert len(lines(tmp_path)) == known  # nothing was run again
 
 
 def test_variants_may_have_any_parameters(tmp_path):
@@ -252,78 +234,54 @@ def test_variants_may_have_any_parameters(tmp_path):
     assert lines(tmp_path)[0]["provenance"]["parameters"] == {"table": {"1": 1, "[2, 3]": 1.0}}
 
 
-def test_a_torn_last_line_is_a_run_that_is_not_known(tmp_path):
-    first = run(tmp_path)
-    (path,) = tmp_path.glob("*.jsonl")
-    whole = path.read_bytes()
-    for cut in (1, 20, 700):
-        path.write_bytes(whole[:-cut])
-        assert run(tmp_path).equals(first)
-        for other in set(tmp_path.glob("*.jsonl")) - {path}:
-            other.unlink()
-    path.write_bytes(whole.replace(b'"status":"ok"', b'"status:"ok"', 1))
-    with pytest.warns(UserWarning, match="line 1 of .* cannot be read"):
-        assert run(tmp_path).equals(first)
+RUN = '{"factors": {"days": 1}, "contender": "rule", "seed": 0, '
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "3", "null", "[]", "{}", "", "\0\0", '{"factors": {"days": 1}}',
-        '{"factors": {"days": 1}, "contender": "rule", "seed": 0, "status": "ok", "error": null, "returns": 3}',
-        '{"factors": {"days": 1}, "contender": "rule", "seed": 0, "status": "error", "error": "", "provenance": 3}',
+        *("3", "null", "[]", "{}", "", "\0\0", '{"factors": {"days": 1}}'),
+        RUN + '"status": "ok", "error": null, "returns": 3}',
+        RUN + '"status": "error", "error": "", "provenance": 3}',
     ],
-)  # fmt: skip
-def test_a_line_that_is_no_run_is_told_and_all_others_can_be_read(line, tmp_path):
+)
+def test_lines_that_are_no_runs_are_told_and_torn_ones_are_run_again(line, tmp_path):
     def again():
         return run(tmp_path, {"days": [1]}, contenders=None)
 
     first = again()
     (path,) = tmp_path.glob("*.jsonl")
-    path.write_bytes(path.read_bytes() + f"{line}\n".encode())
+    whole = path.read_bytes()
+    path.write_bytes(whole + f"{line}\n".encode())
     with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
+        assert again().equals(first)
+    path.write_bytes(whole.replace(b'"status":"ok"', b'"status:"ok"', 1))
+    with pytest.warns(UserWarning, match="line 1 of .* cannot be read"):
+        assert again().equals(first)
+    for cut in (1, 20, 700):
+        for other in set(tmp_path.glob("*.jsonl")):
+            other.unlink()
+        path.write_bytes(whole[:-cut])
         assert again().equals(first)
 
 
 def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
-    Shop.change = False
-    try:
-        design = {"days": [1]}
+    attempt = 0
 
-        def make(days):
-            shop = Shop(days)
-            if not Shop.change:
-                raise OSError("no licence")
-            return shop
-
-        def again(**arguments):
-            return run_experiment(make, design, seeds=[1], points=POINTS, store=tmp_path, **arguments)
-
-        assert again()["error"].tolist() == ["OSError: no licence"]
-        Shop.change = True
-        assert again()["status"].tolist() == ["error"]
-        assert again(retry_errors=True)["status"].tolist() == ["ok"] * 3
-        assert again()["status"].tolist() == ["ok"] * 3
-    finally:
-        del Shop.change
-
-
-def test_the_latest_error_of_a_run_is_told(tmp_path):
     def make(days):
-        raise OSError(f"attempt {len(attempts)}")
+        if attempt < 4:
+            raise OSError(f"attempt {attempt}")
+        return Shop(days)
 
-    attempts = []
-    for number in range(1, 5):
-        attempts.append(number)
-        frame = run_experiment(make, {"days": [1]}, seeds=[1], points=POINTS, store=tmp_path, retry_errors=True)
-        assert frame["error"].tolist() == ["OSError: attempt " + str(number)]
+    def again(**arguments):
+        return run_experiment(make, {"days": [1]}, seeds=[1], points=POINTS, store=tmp_path, **arguments)
 
-
-def test_the_same_row_twice_is_run_once_and_stands_there_twice(tmp_path):
-    frame = run(tmp_path, pd.concat([DESIGN, DESIGN]))
-    half = len(frame) // 2
-    assert frame[half:].reset_index(drop=True).equals(frame[:half])
-    assert len(lines(tmp_path)) == 36
+    for attempt in range(4):
+        assert again(retry_errors=True)["error"].tolist() == [f"OSError: attempt {attempt}"]
+    attempt = 4
+    assert again()["error"].tolist() == ["OSError: attempt 3"]
+    assert again(retry_errors=True)["status"].tolist() == ["ok"] * 3
+    assert again()["status"].tolist() == ["ok"] * 3
 
 
 scalars = st.one_of(
@@ -412,12 +370,6 @@ def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, t
     with pytest.raises((OptionValueError, UnknownPointError, TypeError), match=match):
         run(tmp_path / "store", **arguments)
     assert not (tmp_path / "store").exists()
-
-
-def test_a_policy_that_cannot_be_is_told_with_its_contender(tmp_path):
-    with pytest.raises(UnknownPointError, match="stranger") as caught:
-        run(tmp_path, contenders={"good": {"keeper": much}, "bad": {"stranger": much}})
-    assert "of the contender 'bad'" in notes(caught.value)
 
 
 def test_a_store_of_another_experiment_is_refused(tmp_path):
@@ -554,13 +506,6 @@ def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
     assert len(list((tmp_path / "shared").glob("*.jsonl"))) == 2
 
 
-def test_progress_is_shown(tmp_path, capsys):
-    run(tmp_path, progress=True)
-    assert "36/36" in capsys.readouterr().err
-    run(tmp_path, progress=True, seeds=range(5), workers=2)
-    assert "45/45" in capsys.readouterr().err
-
-
 # -- killed ---------------------------------------------------------------------------------------
 
 SCRIPT = """
@@ -654,14 +599,20 @@ NAMED = """
 """
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_what_a_script_names_is_found_in_its_workers(workers, tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(textwrap.dedent(NAMED), encoding="utf-8")
-    command = [sys.executable, script, tmp_path, str(workers)]
+def output_of(text, tmp_path, *arguments):
+    """What a script prints."""
+    path = tmp_path / "script.py"
+    path.write_text(textwrap.dedent(text), encoding="utf-8")
+    command = [sys.executable, path, tmp_path / "store", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.parametrize("workers", ["0", "2"])
+def test_what_a_script_names_is_found_in_its_workers(workers, tmp_path):
     expected = ["[9.0, 10.0]", "[6.0, 7.0, 9.0, 10.0, 7.0, 8.0, 13.0, 14.0]"] * 4
-    assert done.stdout.splitlines() == expected, done.stderr
+    assert output_of(NAMED, tmp_path, workers) == expected
 
 
 PURE = """
@@ -682,10 +633,5 @@ PURE = """
 
 
 def test_models_that_decide_nothing_have_metrics(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(textwrap.dedent(PURE), encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, script, tmp_path / "s"], capture_output=True, text=True, check=True, timeout=120
-    )
     expected = [[a, seed, "team", 0.0, a + seed] for a in (1, 2) for seed in (5, 6)]
-    assert done.stdout.strip() == str(expected)
+    assert output_of(PURE, tmp_path) == [str(expected)]

@@ -21,6 +21,7 @@ from simenv_marl.experiments import Variant
 from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
 from tests.processes import alone, descriptors
+from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import PAIR, decision, define, notes, script
 
@@ -58,6 +59,12 @@ def test_workers_find_the_same_in_the_same_order(arguments):
     assert traces(workers=2, **arguments) == traces(**arguments)
 
 
+def test_the_work_is_shared():
+    found = simulate_many(script(lambda simulation: None), seeds=range(4), workers=2, collect=lambda s: os.getpid())
+    assert len(found) == 4
+    assert os.getpid() not in found
+
+
 def test_collected_episodes_are_the_same():
     policies = {Creature.act: lambda observations: (policy(observations), {"sums": observations.sum(axis=1)})}
     policies["overseer_0"] = policies[Creature.act]
@@ -78,31 +85,10 @@ def test_collected_episodes_are_the_same():
     assert list(alone) == list(shared) == list(policies)
     for key, found in alone.items():
         for field in dataclasses.fields(found):
-            one, other = getattr(found, field.name), getattr(shared[key], field.name)
-            if isinstance(one, np.ndarray):
-                assert one.dtype == other.dtype, field.name
-                assert np.array_equal(one, other), field.name
-            elif field.name == "extras":
-                assert one.keys() == other.keys()
-                assert all(np.array_equal(one[name], other[name]) for name in one)
-            else:
-                assert one == other, field.name
+            assert same(getattr(found, field.name), getattr(shared[key], field.name)), field.name
 
 
-def test_the_work_is_shared():
-    ant = decision(agent="ant_0")
-    found = simulate_many(
-        script(lambda simulation: simulation.log.append(ant())),
-        {ant: ones},
-        seeds=range(4),
-        workers=2,
-        collect=lambda simulation: (os.getpid(), simulation.log),
-    )
-    assert os.getpid() not in {process for process, _ in found}
-    assert [log for _, log in found] == [[1]] * 4
-
-
-def test_what_is_defined_anywhere_crosses():
+def test_functions_that_are_defined_anywhere_reach_the_workers():
     """Decision functions that nobody can import ask there as here: those of local classes, differences, handlers."""
 
     class Model:
@@ -151,7 +137,7 @@ def test_what_is_defined_anywhere_crosses():
     assert one[Model.decide].rewards.tolist() == two_[Model.decide].rewards.tolist() == [4.0, 4.0, 1.0] * 3
 
 
-def test_undecorated_models_variants_and_closures_cross():
+def test_undecorated_models_variants_and_closures_reach_the_workers():
     number, before = 7, vars(Creature)["act"]
     points = {Creature.act: colony_points(overseen=False)[Creature.act]}
     variant = Variant(
@@ -167,45 +153,50 @@ def test_undecorated_models_variants_and_closures_cross():
     assert vars(Creature)["act"] is before
 
 
-def failing(error, match=None, **arguments):
-    ant = decision(agent="ant_0")
-
-    def main(simulation):
-        simulation.log.append(ant())
-        if simulation.seed == 13:
-            raise arguments["raised"]()
-
-    policies = {ant: arguments.get("policy", ones)}
-    with pytest.raises(error, match=match) as caught:
-        simulate_many(script(main), policies, seeds=range(20), workers=2, collect=lambda simulation: None)
-    return caught.value
-
-
-def test_errors_of_models_surface_as_themselves():
-    error = failing(ZeroDivisionError, raised=lambda: ZeroDivisionError("here"))
-    assert error.args == ("here",)
-    assert "seed 13" in notes(error)
-    assert "in main" in str(error.__cause__)  # where it was raised there
-
-
-def test_errors_of_policies_surface_as_themselves():
+def local_error():
     class LocalError(Exception):
-        pass
+        """Of which workers cannot know by its name."""
 
     def raising(observations):
         raise LocalError("a")
 
-    assert "seed" in notes(failing(LocalError, policy=raising, raised=None))
-    failing(InvalidActionError, policy=lambda observations: [1], raised=None)
+    return LocalError, raising
 
 
-def test_an_error_that_cannot_be_pickled_is_told_of():
-    class PickyError(Exception):
-        def __init__(self, one, two):
-            super().__init__(one)
-            self.held = (number for number in ())
+LocalError, raising = local_error()
 
-    failing(WorkerError, match="PickyError", raised=lambda: PickyError("once", "upon"))
+
+class PickyError(Exception):
+    """Cannot be pickled, nor made again."""
+
+    def __init__(self, one, two):
+        super().__init__(one)
+        self.held = (number for number in ())
+
+
+@pytest.mark.parametrize(
+    ("raised", "policy", "error", "match", "told"),
+    [
+        (lambda: ZeroDivisionError("here"), ones, ZeroDivisionError, "^here", "seed 13"),
+        (lambda: PickyError("once", "upon"), ones, WorkerError, "PickyError", ""),
+        (None, raising, LocalError, "^a", "seed"),
+        (None, lambda observations: [1], InvalidActionError, "decisions", "seed"),
+    ],
+    ids=["model", "cannot be pickled", "policy", "wrong number"],
+)
+def test_errors_surface_as_themselves(raised, policy, error, match, told):
+    ant = decision(agent="ant_0")
+
+    def main(simulation):
+        simulation.log.append(ant())
+        if simulation.seed == 13 and raised:
+            raise raised()
+
+    with pytest.raises(error, match=match) as caught:
+        simulate_many(script(main), {ant: policy}, seeds=range(20), workers=2, collect=lambda simulation: None)
+    assert told in notes(caught.value)
+    if error is ZeroDivisionError:
+        assert "in main" in str(caught.value.__cause__)  # where it was raised there
 
 
 def test_what_nobody_wants_any_more_is_cancelled(monkeypatch):

@@ -60,14 +60,6 @@ public final class Probe {
                     new int[] {1, 2}, new double[] {0.5, Double.NaN}, new boolean[0], Mood.GLAD, 'c', 1.5f, (byte) 3,
                     List.of(Map.of(1, "one")), new AtomicLong(7), new BigDecimal("0.5"), big, null
                 });
-            case "odd strings":
-                String escaped = "\"\\/\b\f\n\r\t\u0000\u007f\u0080\u2028\uffff";
-                return any(List.of("\ud800 alone \udc00", "\ud83d\ude00", escaped, ""));
-            case "doubles":
-                return any(List.of(
-                        0.1, 1e23, 2e-3, 5e-324, Double.MAX_VALUE, -0.0, 1.0 / 3, 1e16, 123456789.125, 2.0f));
-            case "longs":
-                return any(new long[] {Long.MAX_VALUE, Long.MIN_VALUE, 0, (1L << 53) + 1});
             case "typed":
                 List<Object> found = new ArrayList<>();
                 found.add(SimEnv.decideDouble("a", null, a -> {}, () -> 0.25));

@@ -1,6 +1,9 @@
 """What is outside Python is tested with every driver."""
 
+import pytest
+
 from tests.conftest import DRIVERS
+from tests.outside.compiling import SOURCES, compiled
 
 
 def pytest_generate_tests(metafunc) -> None:
@@ -8,3 +11,29 @@ def pytest_generate_tests(metafunc) -> None:
     alone = metafunc.definition.get_closest_marker("greenlet") is not None
     drivers = ["greenlet"] if alone else DRIVERS if chosen == "both" else [chosen]
     metafunc.parametrize("_driver", drivers, indirect=True)
+
+
+@pytest.fixture
+def make_env():
+    """Makes environments, and closes them."""
+    made = []
+
+    def make(kind, *arguments, **options):
+        made.append(kind(*arguments, **options))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """Where programs in C++ are compiled."""
+    return tmp_path_factory.mktemp("cpp")
+
+
+@pytest.fixture(scope="session")
+def probe(folder):
+    """The program that plays what an option names."""
+    return compiled(SOURCES / "probe.cpp", folder)

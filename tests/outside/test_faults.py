@@ -2,14 +2,15 @@
 
 import os
 import signal
+import subprocess
 import sys
+import time
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from simenv_marl import RULE, aec_env, single_env
+import simenv_marl.remote.child as child_module
+from simenv_marl import RULE, aec_env, vector_env
 from simenv_marl.errors import (
     ProcessDiedError,
     ProcessError,
@@ -19,11 +20,12 @@ from simenv_marl.errors import (
     WireError,
     WrongThreadError,
 )
-from simenv_marl.remote.child import Child
-from tests.outside.reservoirs import BOTH, INFLOW, PRICE, broken, by_its_rule, reservoirs
-from tests.outside.test_process import all_told, child, ruled
-from tests.processes import alone, descriptors, runs
+from simenv_marl.remote import ProcessSimulation, guardian
+from simenv_marl.remote.child import GRACE, Child
+from tests.outside.reservoirs import BOTH, PRICE, broken, by_its_rule, child, plays_by_its_rule, reservoirs
+from tests.processes import alone, descriptors, gone, runs
 from tests.worlds.faulty import AT_ONCE, FAULTS
+from tests.worlds.models import play
 
 IN_MID_EPISODE = {
     "garbage": (WireError, "not JSON"),
@@ -52,6 +54,8 @@ IN_MID_EPISODE = {
     "kill": (ProcessDiedError, "was killed by SIGKILL"),
     "closed": (ProcessDiedError, "closed its pipe, and still runs"),
     "grandchild": (ProcessTimeoutError, "has exited with code 5; it has sent nothing"),
+    "updates": (WireError, "has sent 100,001 frames of .* bytes since its latest call, and neither a call nor an end"),
+    "slow updates": (ProcessTimeoutError, "has sent updates and removals for 4 s, and neither a call nor an end"),
     "gigabyte": (WireError, "a line of more than 16,777,216 bytes"),
     "error": (RemoteError, "has raised Flood: a dam broke\ndam.cpp:12"),
     "error, no object": (WireError, "a dam broke.*not a frame of the wire"),
@@ -79,18 +83,25 @@ def test_all_faults_are_tested():
 
 def patience(what: str) -> float:
     """For how long to wait for a simulator, in seconds: not long where no more comes."""
+    if what == "slow updates":
+        return 0.2
     return 2.0 if what in ("silence", "drop by drop", "half a line, silent", "grandchild") else 20.0
 
 
-@pytest.mark.parametrize("what", IN_MID_EPISODE)
-def test_in_mid_episode(what):
-    kind, text = IN_MID_EPISODE[what]
-    simulation = broken("in mid-episode", what)
-    env = aec_env(simulation, "reservoir.inflow")
+def before_its_fault(what, make_env=lambda kind, *arguments: kind(*arguments)):
+    """An environment whose simulator is about to do something wrong in mid-episode."""
+    env = make_env(aec_env, broken("in mid-episode", what), "reservoir.inflow")
     env.reset(seed=1)
+    env.step(RULE)
+    env.step(RULE)
+    return env
+
+
+@pytest.mark.parametrize("what", IN_MID_EPISODE)
+def test_in_mid_episode(make_env, what):
+    kind, text = IN_MID_EPISODE[what]
+    env = before_its_fault(what, make_env)
     number = child(env)
-    env.step(RULE)
-    env.step(RULE)
     env.unwrapped.simulation._child.timeout = patience(what)
     with pytest.raises(kind, match=f"(?s){text}") as caught:
         env.step(RULE)
@@ -102,94 +113,66 @@ def test_in_mid_episode(what):
     for _ in range(3):
         env.step(RULE)
     assert env.terminations == {"a": True}
-    env.close()
 
 
 @pytest.mark.parametrize("what", AT_ONCE_TOLD)
-def test_at_once(what):
+def test_at_once(make_env, what):
     kind, text = AT_ONCE_TOLD[what]
-    env = aec_env(broken("at once", what, timeout=patience(what)), "reservoir.inflow")
+    env = make_env(aec_env, broken("at once", what, timeout=patience(what)), "reservoir.inflow")
     for _ in range(2):
         with pytest.raises(kind, match=f"(?s){text}"):
             env.reset(seed=1)
         left = env.unwrapped.simulation._child
         assert left is None or not left.usable
-    env.close()
 
 
-def test_a_command_that_leads_nowhere_is_told_with_the_reason():
-    simulation = reservoirs()
-    simulation.command = ["/nowhere/at/all"]
-    with pytest.raises(ProcessDiedError, match=r"'/nowhere/at/all' cannot be started: FileNotFoundError"):
-        aec_env(simulation).reset()
-    simulation.command = [str(Path(__file__))]
-    with pytest.raises(ProcessDiedError, match="PermissionError"):
-        aec_env(simulation).reset()
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        (["/nowhere/at/all"], "'/nowhere/at/all' cannot be started: FileNotFoundError"),
+        ([__file__], "PermissionError"),
+        ("", "cannot be started"),
+    ],
+    ids=["no file", "no program", "no name"],
+)
+def test_a_command_that_leads_nowhere_is_told_with_the_reason(command, text):
+    with pytest.raises(ProcessDiedError, match=text):
+        aec_env(ProcessSimulation(command, BOTH)).reset()
 
 
-def test_one_process_that_is_killed_leaves_the_others_alone():
-    envs = [aec_env(reservoirs()) for _ in range(4)]
-    for seed, env in enumerate(envs):
-        env.reset(seed=seed)
-        env.step(RULE)
+@pytest.mark.parametrize("when", ["waiting", "between episodes"])
+def test_one_process_that_is_killed_leaves_the_others_alone(make_env, when):
+    envs = [make_env(aec_env, reservoirs()) for _ in range(3)]
+    for env in envs:
+        env.reset(seed=1)
+        if when == "between episodes":
+            play(env, reset=False)
     os.kill(child(envs[1]), signal.SIGKILL)
     with pytest.raises(ProcessDiedError, match="SIGKILL"):
-        envs[1].step(RULE)
-    for seed in (0, 2, 3):
-        while envs[seed].agents:
-            _, _, terminated, truncated, _ = envs[seed].last()
-            envs[seed].step(None if terminated or truncated else RULE)
-        assert envs[seed].unwrapped.simulation.result == by_its_rule(seed)
-    all_told(envs[1], 1, ruled)
-    assert envs[1].unwrapped.simulation.result == by_its_rule(1)
-    for env in envs:
-        env.close()
+        envs[1].step(RULE) if when == "waiting" else envs[1].reset(seed=2)
+    numbers = [child(env) for env in envs]
+    for seed, env in enumerate(envs):
+        assert plays_by_its_rule(env, seed)
+    assert [number == child(env) for number, env in zip(numbers, envs, strict=True)] == [True, False, True]
 
 
-def test_a_process_that_was_killed_between_episodes_is_told_of():
-    env = aec_env(reservoirs())
-    all_told(env, 1, ruled)
-    os.kill(child(env), signal.SIGKILL)
-    with pytest.raises(ProcessDiedError, match="SIGKILL"):
-        env.reset(seed=2)
-    all_told(env, 2, ruled)
-    assert env.unwrapped.simulation.result == by_its_rule(2)
-    env.close()
-
-
-def test_a_process_that_does_not_read_is_told_of():
-    env = single_env(broken("in mid-episode", "silence", points={"reservoir.inflow": INFLOW}), agent="a")
-    env.reset(seed=1)
+def test_a_process_that_does_not_read_is_told_of(make_env):
+    env = before_its_fault("silence", make_env)
     simulation = env.unwrapped.simulation
     simulation._child.timeout = 0.3
     os.kill(child(env), signal.SIGSTOP)
     with pytest.raises(ProcessTimeoutError, match="sent nothing and read nothing"):
         simulation._child.send(bytes(1 << 20))
     with pytest.raises(ProcessError):
-        env.step(np.ones(1))
-    env.close()
+        env.step(RULE)
 
 
-def test_what_is_long_crosses_in_both_directions():
-    env = aec_env(reservoirs())
-    env.reset(seed=1, options={"long": ["ö" * 1000] * 2000, "hours": 3})
-    while env.agents:
-        _, _, terminated, truncated, _ = env.last()
-        env.step(None if terminated or truncated else RULE)
-    assert env.unwrapped.simulation.result == by_its_rule(1, hours=3)
+def test_what_is_long_crosses_in_both_directions(make_env):
+    env = make_env(aec_env, reservoirs())
+    assert plays_by_its_rule(env, long=["ö" * 1000] * 2000, hours=3)
     with pytest.raises(WireError, match=r"the limit is 16,777,216"):
         env.reset(seed=1, options={"long": "o" * (16 << 20)})
-    env.close()
-
-
-def test_a_process_that_writes_much_on_its_standard_error_is_not_held_up():
-    env = aec_env(reservoirs())
-    env.reset(seed=1, options={"hours": 6, "words": 100_000})
-    while env.agents:
-        _, _, terminated, truncated, _ = env.last()
-        env.step(None if terminated or truncated else RULE)
-    assert env.unwrapped.simulation.result == by_its_rule(1, hours=6)
-    env.close()
+    assert plays_by_its_rule(env, hours=6, words=100_000)  # on its standard error
 
 
 def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
@@ -198,37 +181,51 @@ def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
         broken("at once", "silence", timeout=1.0).reset()
 
 
-def test_a_fork_cannot_go_on_with_the_process_and_can_begin_anew():
-    env = aec_env(reservoirs())
-    env.reset(seed=1)
+def in_a_fork(check) -> None:
+    """Let a fork of this process see whether something is true."""
     pid = os.fork()
     if pid == 0:
         code = 1
         try:
-            try:
-                env.step(RULE)
-            except WrongThreadError:
-                all_told(env, 2, ruled)
-                code = 0 if env.unwrapped.simulation.result == by_its_rule(2) else 2
-                env.close()
+            code = 0 if check() else 2
         finally:
             os._exit(code)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-    all_told(env, 1, ruled)
+
+
+def test_a_fork_can_begin_anew_and_cannot_go_on_with_the_process_nor_end_it(make_env):
+    env = make_env(aec_env, reservoirs())
+    env.reset(seed=1)
+    number = child(env)
+
+    def closes():
+        env.unwrapped.simulation._child.close()
+        env.close()
+        return True
+
+    def begins_anew():
+        with pytest.raises(WrongThreadError):
+            env.step(RULE)
+        well = plays_by_its_rule(env, 2)
+        env.close()
+        return well
+
+    in_a_fork(closes)
+    in_a_fork(begins_anew)
+    assert runs(number)
+    play(env, reset=False)
     assert env.unwrapped.simulation.result == by_its_rule(1)
-    env.close()
 
 
-def test_an_error_in_a_mapping_breaks_the_episode_off_and_leaves_the_process():
+def test_an_error_in_a_mapping_breaks_the_episode_off_and_leaves_the_process(make_env):
     wrong = replace(PRICE, observation_space_mapping=lambda call: [call.total / 0])
-    env = aec_env(reservoirs({**BOTH, "broker.price": wrong}))
+    env = make_env(aec_env, reservoirs({**BOTH, "broker.price": wrong}))
     env.reset(seed=1)
     number = child(env)
     with pytest.raises(ZeroDivisionError):
-        all_told(env, 1, ruled)
+        play(env, seed=1)
     env.reset(seed=1)
     assert child(env) == number
-    env.close()
 
 
 def test_descriptors_and_processes_are_given_back():
@@ -239,10 +236,7 @@ def fail_many_times() -> None:
     """End processes in all ways in which they fail, and look for what is left open."""
     before = descriptors()
     for what in ("exit 3", "garbage", "silence"):
-        env = aec_env(broken("in mid-episode", what), "reservoir.inflow")
-        env.reset(seed=1)
-        env.step(RULE)
-        env.step(RULE)
+        env = before_its_fault(what)
         env.unwrapped.simulation._child.timeout = 0.3
         with pytest.raises(ProcessError):
             env.step(RULE)
@@ -253,22 +247,97 @@ def fail_many_times() -> None:
     assert descriptors() == before
 
 
-def test_a_process_that_does_not_end_is_ended():
-    env = aec_env(broken("in mid-episode", "silence"), "reservoir.inflow")
+@pytest.mark.parametrize("when", ["waiting", "between episodes"])
+def test_a_killed_process_is_not_taken_for_one_that_exited_where_its_exit_code_is_lost(when):
+    alone(ignore_children, when)
+
+
+def ignore_children(when: str) -> None:
+    """Kill a process whose exit code the system does not keep."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    env = aec_env(reservoirs(), "reservoir.inflow")
     env.reset(seed=1)
     number = child(env)
-    os.kill(number, signal.SIGSTOP)
+    if when == "between episodes":
+        play(env, reset=False)
+    os.kill(number, signal.SIGKILL)
+    with pytest.raises(
+        ProcessDiedError, match="has ended; its exit code is lost, because this process ignores SIGCHLD"
+    ):
+        env.step(RULE) if when == "waiting" else env.reset(seed=2)
+    env.reset(seed=2)
+    assert child(env) != number
     env.close()
-    assert not runs(number)
 
 
-def test_an_end_that_follows_a_stop_is_not_the_next_episode():
-    env = aec_env(broken("in mid-episode", "end after stop"), "reservoir.inflow")
+BUSY = """
+import json, os, subprocess, sys
+reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
+descendant = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+os.write(writing, b'{"hello": 1, "points": ["reservoir.inflow", "broker.price"]}\\n')
+os.read(reading, 1000)
+open(sys.argv[1], "w").write(f"{os.getpid()} {descendant.pid}\\n")
+while True:
+    pass
+"""
+
+
+@pytest.mark.parametrize("starter", ["main thread", "thread that has ended"])
+def test_a_process_that_computes_ends_with_its_parent_though_that_is_killed(tmp_path, starter):
+    told, simulator, parent = tmp_path / "told", tmp_path / "busy.py", tmp_path / "parent.py"
+    simulator.write_text(BUSY)
+    parent.write_text(f"""
+import sys, threading
+from simenv_marl.remote.child import Child
+def start():
+    global child
+    child = Child([sys.executable, {str(simulator)!r}, {str(told)!r}], 60.0)
+thread = threading.Thread(target=start)
+thread.start()
+thread.join()
+if {starter!r} == "main thread":
+    child.close()
+    start()
+child.begin(b'{{"start": {{"seed": 1, "options": {{}}}}}}\\n')
+""")
+    process = subprocess.Popen([sys.executable, str(parent)])
+    until = time.monotonic() + 60
+    while not (told.exists() and told.read_text().endswith("\n")) and time.monotonic() < until:
+        time.sleep(0.02)
+    numbers = [int(word) for word in told.read_text().split()]
+    assert all(map(runs, numbers))
+    process.kill()
+    process.wait()
+    assert all(map(gone, numbers))
+
+
+def test_processes_that_do_not_see_the_end_of_their_input_are_ended_together(monkeypatch):
+    clock = [0.0]
+    env = vector_env(reservoirs({"broker.price": PRICE}), "broker.price", num_envs=5)
     env.reset(seed=1)
+    numbers = [simulation._child.pid for simulation in env.get_attr("simulation")]
+    for number in numbers:
+        os.kill(number, signal.SIGSTOP)
+    monkeypatch.setattr(child_module, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(child_module, "sleep", lambda seconds: clock.append(clock.pop() + seconds))
+    env.close()
+    assert not any(map(runs, numbers))
+    assert clock[0] < 1.5 * GRACE
+
+
+def test_closing_does_not_wait_for_a_guardian_that_is_stopped():
+    process = Child(reservoirs().command, 20.0)
+    os.kill(guardian._shell.pid, signal.SIGSTOP)
+    process.close()
+    assert not runs(process.pid)
+    assert guardian._shell is None
+
+
+def test_an_end_that_follows_a_stop_is_not_the_next_episode(make_env):
+    env = before_its_fault("end after stop", make_env)
     with pytest.raises(WireError, match=r"has sent .*end.* (after \"stop\"|before the start)"):
         env.reset(seed=2)
     env.reset(seed=2)
-    env.close()
 
 
 # -- interrupts, and what runs out ----------------------------------------------------------------

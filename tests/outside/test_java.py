@@ -2,19 +2,16 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from examples.jvm_market.build import CLIENT, build, java
 
-from tests.outside.jvm import PATIENCE, Child, rule
+from tests.outside.wire import PATIENCE, VALUES, Child, exactly
 
 pytestmark = pytest.mark.greenlet("no environment takes part")
 
 ODD_STRINGS = ["\ud800 alone \udc00", "\U0001f600", '"\\/\b\f\n\r\t\x00\x7f\x80\u2028\uffff', ""]
-DOUBLES = [0.1, 1e23, 2e-3, 5e-324, sys.float_info.max, -0.0, 1 / 3, 1e16, 123456789.125, 2.0]
-LONGS = [2**63 - 1, -(2**63), 0, 2**53 + 1]
 
 
 @pytest.fixture(scope="session")
@@ -30,21 +27,22 @@ def probe(tmp_path_factory):
 
 @pytest.fixture
 def child(probe):
-    with Child(probe) as child:
-        assert child.hear() == {"hello": 1, "points": ["a", "b"], "can": ["reseed"]}
+    with Child(*probe) as child:
+        assert child.receive() == {"hello": 1, "points": ["a", "b"], "can": ["reseed"]}
         yield child
-
-
-def exactly(value):
-    """A value that is equal only to one of the same types and bits."""
-    return repr(value)
 
 
 def said(child, what, **options):
     """What the only call of an episode tells, after which the rule decides."""
-    (call,), last = child.play(rule, do=what, **options)
+    (call,), last = child.play(do=what, **options)
     assert last == {"end": {"truncated": False, "result": "rule"}}
     return call["args"]["value"]
+
+
+def plays_well(child):
+    """Whether an episode is one like any other."""
+    calls, last = child.play(do="count")
+    return [call["decide"] for call in calls] == [1, 2, 3, 4, 5] and last["end"]["truncated"]
 
 
 def error(frame):
@@ -57,56 +55,35 @@ def error(frame):
 
 
 def test_the_rule_and_answers_decide(child):
-    calls, last = child.play(rule, do="count", seed=-5)
+    calls, last = child.play(do="count", seed=-5)
     assert [call["decide"] for call in calls] == [1, 2, 3, 4, 5]
     assert calls[3] == {"decide": 4, "point": "a", "entity": "x", "args": {"i": 3, "half": 1.5}, "time": 3.0}
     assert last == {"end": {"truncated": True, "result": {"sum": 0.0 + 0.1 + 0.2 + 0.1 * 3 + 0.4, "seed": -5}}}
-    calls, last = child.play(lambda call: {"value": call["args"]["i"]}, do="count", seed=2**63 - 1)
+    calls, last = child.play(lambda call: call["args"]["i"], do="count", seed=2**63 - 1)
     assert [call["decide"] for call in calls] == [1, 2, 3, 4, 5]  # from one again
     assert last["end"]["result"] == {"sum": 10.0, "seed": 2**63 - 1}
 
 
-def test_values_arrive_as_they_were_sent(child):
-    assert said(child, "odd strings") == ODD_STRINGS
-    assert exactly(said(child, "doubles")) == exactly(DOUBLES)
-    assert exactly(said(child, "longs")) == exactly(LONGS)
+def test_values_of_all_classes_are_sent(child):
     big = 123456789012345678901234567890
     things = [[1, 2], [0.5, {"float": "nan"}], [], "GLAD", "c", 1.5, 3, [{"1": "one"}], 7, 0.5, big, None]
     assert exactly(said(child, "java")) == exactly(things)
 
 
 @pytest.mark.parametrize("ascii_only", [True, False])
-@pytest.mark.parametrize(
-    "value",
-    [
-        *DOUBLES[:-1],
-        *LONGS,
-        2**63,
-        -(2**70),
-        {"float": "nan"},
-        {"float": "inf"},
-        {"float": "-inf"},
-        {"float": "much", "ü": [[], {}, [None, True, False]]},
-        "\U0001f600 ü \u2028 \x7f",
-        'escapes " \\ / \b\f\n\r\t\x00',
-        ["x" * 5000],
-        "",
-    ],
-)
+@pytest.mark.parametrize("value", [*VALUES, -(2**70)], ids=repr)
 def test_values_come_back_as_they_went(probe_echo, value, ascii_only):
     child = probe_echo
     line = json.dumps({"start": {"seed": 1, "options": {"do": "echo", "value": value}}}, ensure_ascii=ascii_only)
-    child.say(line.replace("/", "\\/").encode() + b"\r\n")  # blanks and needless escapes are JSON, too
-    call = child.hear()
-    assert exactly(call["args"]["value"]) == exactly(value)
-    child.say({"act": 1, "value": value})
-    assert exactly(child.hear()) == exactly({"end": {"truncated": False, "result": value}})
+    child.send(line.replace("/", "\\/").encode() + b"\r\n")  # blanks and needless escapes are JSON, too
+    assert exactly(child.receive()["args"]["value"]) == exactly(value)
+    assert exactly(child.act(1, value)) == exactly({"end": {"truncated": False, "result": value}})
 
 
 @pytest.fixture(scope="module")
 def probe_echo(probe):
-    with Child(probe) as child:
-        child.hear()
+    with Child(*probe) as child:
+        child.receive()
         yield child
 
 
@@ -115,15 +92,14 @@ def test_lone_surrogates_come_back(child):
 
 
 def test_decisions_have_types(child):
-    answers = iter([3, 2**40, -7, True, "GLAD"])
-    calls, last = child.play(lambda call: {"value": next(answers)}, do="typed")
+    answers = iter([3, 2**40, -7, True, "GLAD", {"float": "-inf"}, 0, 0, False, "GLAD"])
+    calls, last = child.play(lambda call: next(answers), do="typed")
     assert "entity" not in calls[0]
     assert "time" not in calls[0]
     assert exactly(last["end"]["result"]) == exactly([3.0, 2**40, -7, True, "GLAD"])
-    answers = iter([{"float": "-inf"}, 0, 0, False, "GLAD"])
-    _, last = child.play(lambda call: {"value": next(answers)}, do="typed")
+    _, last = child.play(lambda call: next(answers), do="typed")
     assert last["end"]["result"][0] == {"float": "-inf"}
-    _, last = child.play(rule, do="typed")
+    _, last = child.play(do="typed")
     assert exactly(last["end"]["result"]) == exactly([0.25, 3, 2, False, "GLAD"])
 
 
@@ -139,30 +115,28 @@ WRONG_TYPES = {
 @pytest.mark.parametrize(("kind", "value"), [(kind, value) for kind, values in WRONG_TYPES.items() for value in values])
 def test_a_decision_of_another_type_is_an_error_that_the_model_cannot_swallow(probe_echo, kind, value):
     child = probe_echo
-    calls, last = child.play(lambda call: {"value": value}, do="bad decision", type=kind)
+    calls, last = child.play(lambda call: value, do="bad decision", type=kind)
     assert len(calls) == 1
     assert error(last)["type"] == "java.lang.IllegalArgumentException"
     assert error(last)["text"] == f"a cannot take the decision {json.dumps(value)}"
-    assert child.play(rule, do="count")[1]["end"]["truncated"]
+    assert plays_well(child)
 
 
 def test_a_rule_may_decide(child):
-    calls, last = child.play(lambda call: rule(call) if call["point"] == "a" else {"value": 6}, do="nested")
-    assert [(call["decide"], call["point"], call["entity"]) for call in calls] == [(1, "a", "x"), (2, "b", "y")]
-    assert last["end"]["result"] == 60
+    frames = child.begin(do="nested"), child.rule(1)
+    assert [(call["decide"], call["point"], call["entity"]) for call in frames] == [(1, "a", "x"), (2, "b", "y")]
+    assert child.act(2, 6)["end"]["result"] == 60
 
 
 def test_what_is_decided_while_arguments_are_made_is_left_to_the_rule(child):
-    (call,), last = child.play(lambda call: {"value": 9}, do="in arguments")
+    (call,), last = child.play(lambda call: 9, do="in arguments")
     assert call["args"] == {"n": 5}
     assert last["end"]["result"] == 9
 
 
 def test_updates_and_removals_are_told(child):
-    child.start(do="removals")
-    child.hear()
-    child.say({"act": 1, "rule": True})
-    assert [child.hear() for _ in range(5)] == [
+    child.begin(do="removals")
+    assert [child.rule(1), *(child.receive() for _ in range(4))] == [
         {"remove": "x", "point": "a"},
         {"update": "y", "point": "a", "args": {"level": 0.5, "full": True, "mark": "m"}, "time": 3.0},
         {"update": None, "point": "a", "args": {}},
@@ -172,62 +146,55 @@ def test_updates_and_removals_are_told(child):
 
 
 def test_threads_of_the_model_decide_one_at_a_time(child):
-    calls, last = child.play(lambda call: {"value": call["args"]["n"] + 1}, do="threads")
+    calls, last = child.play(lambda call: call["args"]["n"] + 1, do="threads")
     assert [call["decide"] for call in calls] == list(range(1, 201))
     assert last["end"]["result"] == [50, 100, 150, 200]
 
 
 def test_a_stop_reaches_all_threads(child):
-    child.start(do="threads")
-    child.hear()
-    child.say({"stop": True})
-    calls, last = child.play(rule, do="count")
-    assert [call["decide"] for call in calls] == [1, 2, 3, 4, 5]
-    assert "end" in last
+    child.begin(do="threads")
+    child.send(stop=True)
+    assert plays_well(child)
 
 
 # -- seeds ----------------------------------------------------------------------------------------
 
 
 def test_another_future_is_seeded_before_the_answer(child):
-    child.start(do="count", seed=1)
-    for number in range(1, 6):
-        assert child.hear()["decide"] == number
-        if number == 2:
-            child.say({"reseed": 12})
-            child.say({"reseed": 30})
-        child.say({"act": number, "value": 0})
-    assert child.hear()["end"]["result"] == {"sum": 0.0, "seed": 1030}  # the callback's own decision: its rule
+    assert child.begin(do="count", seed=1)["decide"] == 1
+    assert child.act(1, 0)["decide"] == 2
+    child.send(reseed=12)
+    child.send(reseed=30)
+    for number in range(2, 6):
+        last = child.act(number, 0)
+    assert last["end"]["result"] == {"sum": 0.0, "seed": 1030}  # the callback's own decision: its rule
 
 
 def test_an_error_of_the_callback_is_one_of_the_episode(child):
-    child.start(do="count")
-    child.hear()
-    child.say({"reseed": -1})
-    child.say({"act": 1, "value": 0.5})
-    assert error(child.hear())["text"] == "no such seed"
-    assert child.play(rule, do="count")[1]["end"]["truncated"]
+    child.begin(do="count")
+    child.send(reseed=-1)
+    assert error(child.act(1, 0.5))["text"] == "no such seed"
+    assert plays_well(child)
 
 
 def test_a_model_without_a_callback_cannot_be_seeded_anew(probe):
-    with Child(probe, PROBE_CANNOT_RESEED="1") as child:
-        assert child.hear() == {"hello": 1, "points": ["a"], "can": []}
-        child.start(do="count")
-        child.hear()
-        child.say({"reseed": 1})
-        assert "an answer to call 1 was expected" in error(child.hear())["text"]
+    with Child(*probe, PROBE_CANNOT_RESEED="1") as child:
+        assert child.receive() == {"hello": 1, "points": ["a"], "can": []}
+        child.begin(do="count")
+        child.send(reseed=1)
+        assert "an answer to call 1 was expected" in error(child.receive())["text"]
         assert child.ended()[0] == 1
 
 
 def test_where_no_seed_is_named_one_is_drawn(child):
-    seeds = {child.play(rule, do="count", seed=None)[1]["end"]["result"]["seed"] for _ in range(5)}
+    seeds = {child.play(do="count", seed=None)[1]["end"]["result"]["seed"] for _ in range(5)}
     assert len(seeds) == 5
 
 
 @pytest.mark.parametrize("seed", [2**63, 0.5, "7"])
 def test_seeds_are_integers_of_64_bits(child, seed):
-    assert f"and is {json.dumps(seed)}" in error(child.play(rule, do="count", seed=seed)[1])["text"]
-    assert child.play(rule, do="count")[1]["end"]["truncated"]
+    assert f"and is {json.dumps(seed)}" in error(child.play(do="count", seed=seed)[1])["text"]
+    assert plays_well(child)
 
 
 # -- ends -----------------------------------------------------------------------------------------
@@ -235,19 +202,14 @@ def test_seeds_are_integers_of_64_bits(child, seed):
 
 def test_a_stop_unwinds_the_model_silently(child, tmp_path):
     seen = tmp_path / "seen"
-    child.start(do="swallows", file=str(seen))
-    assert child.hear()["decide"] == 1
-    child.say({"act": 1, "value": 3})
-    assert child.hear()["args"] == {"value": "finally"}
-    child.say({"act": 2, "value": 4})
-    assert child.hear() == {"update": "x", "point": "a", "args": {"i": 1}}
-    assert child.hear() == {"remove": "x", "point": "a"}
-    assert child.hear()["decide"] == 3
-    child.say({"stop": True})
-    child.say({"stop": True})  # one too many is none
-    calls, last = child.play(rule, do="count")
-    assert [call["decide"] for call in calls] == [1, 2, 3, 4, 5]  # nothing was said in between
-    assert last["end"]["truncated"]
+    assert child.begin(do="swallows", file=str(seen))["decide"] == 1
+    assert child.act(1, 3)["args"] == {"value": "finally"}
+    assert child.act(2, 4) == {"update": "x", "point": "a", "args": {"i": 1}}
+    assert child.receive() == {"remove": "x", "point": "a"}
+    assert child.receive()["decide"] == 3
+    child.send(stop=True)
+    child.send(stop=True)  # one too many is none
+    assert plays_well(child)  # nothing was said in between
     assert seen.read_text().split("\n") == ["answer 3", "Stop"]  # neither swallowed nor answered
 
 
@@ -263,66 +225,45 @@ def test_a_stop_unwinds_the_model_silently(child, tmp_path):
     ],
 )
 def test_an_error_is_told_and_the_next_episode_works(child, what, kind, text):
-    _, last = child.play(rule, do=what)
+    _, last = child.play(do=what)
     assert error(last)["type"] == kind
     assert error(last)["text"] == text
     assert error(last)["trace"].startswith(kind)
     assert "\tat Probe." in error(last)["trace"]
-    calls, last = child.play(rule, do="count")
-    assert (len(calls), "end" in last) == (5, True)
+    assert plays_well(child)
 
 
 def test_a_stack_that_overflows_is_told_when_it_is_unwound(child):
-    calls, last = child.play(rule, do="overflow")
+    calls, last = child.play(do="overflow")
     assert len(calls) > 100
     assert error(last)["type"] == "java.lang.StackOverflowError"
 
 
 def test_long_lines_go_both_ways(child):
     text = "y" * ((16 << 20) - 100)
-    child.start(do="long line")
-    assert len(child.hear()["args"]["value"]) == len(text)
-    child.say({"act": 1, "value": text})
-    assert child.hear() == {"end": {"truncated": False, "result": text}}
+    assert len(child.begin(do="long line")["args"]["value"]) == len(text)
+    assert child.act(1, text) == {"end": {"truncated": False, "result": text}}
 
 
 @pytest.mark.parametrize("where", ["before", "in mid-episode"])
 def test_a_parent_that_is_gone_is_the_end(child, where, tmp_path):
     if where == "in mid-episode":
-        child.start(do="swallows", file=str(tmp_path / "seen"))
-        child.hear()
-    child.hang_up()
+        child.begin(do="swallows", file=str(tmp_path / "seen"))
+    child.close("out")
+    child.close("into")
     assert child.ended() == (0, "standard output is the model's\n4\n", "")
     assert where != "in mid-episode" or (tmp_path / "seen").read_text() == "Stop"
 
 
-def test_who_was_killed_leaves_no_jvm(probe):
-    script = f"""
-import os, subprocess, sys
-down, up = os.pipe(), os.pipe()
-os.environ["SIMENV_MARL_FDS"] = f"{{down[0]}},{{up[1]}}"
-child = subprocess.Popen({probe!r}, pass_fds=(down[0], up[1]))
-os.close(down[0]); os.close(up[1])
-assert os.read(up[0], 100).startswith(b'{{"hello"')
-os.kill(os.getpid(), 9)
-"""
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as parent:
-        out, err = parent.communicate(timeout=PATIENCE)  # the JVM holds these open for as long as it lives
-        assert (parent.wait(), out, err) == (-9, b"standard output is the model's\n4\n", b"")
-
-
 def test_a_model_that_refuses_to_unwind_is_left_when_the_parent_is_gone(child):
-    child.start(do="refuses")
-    child.hear()
-    child.hang_up()
+    child.begin(do="refuses")
+    child.close("out")
     assert child.ended()[0] == 1
 
 
 def test_a_model_may_exit(child):
-    child.start(do="exits")
-    child.hear()
-    child.say({"act": 1, "rule": True})
-    assert child.hear() is None
+    child.begin(do="exits")
+    assert child.rule(1) is None
     assert child.ended()[0] == 3
 
 
@@ -366,20 +307,17 @@ def test_without_pipes_the_model_runs_by_its_rule(probe):
     ],
 )
 def test_what_is_not_understood_is_an_error_and_the_end(child, line, text):
-    child.start(do="swallows", file="/dev/null")
-    child.hear()
-    child.say(line + b"\n")
-    assert text in error(child.hear())["text"]
-    assert child.hear() is None
+    child.begin(do="swallows", file="/dev/null")
+    child.send(line + b"\n")
+    assert text in error(child.receive())["text"]
+    assert child.receive() is None
     assert child.ended()[0] == 1
 
 
-def test_between_episodes_as_well(child):
-    child.start(do="swallows", file="/dev/null")
-    child.hear()
-    child.say({"stop": True})
-    child.say({"act": 1, "rule": True})
-    assert 'a start was expected, and this came: {"act":1,"rule":true}' in error(child.hear())["text"]
+def test_an_answer_between_episodes_is_an_error_and_the_end(child):
+    child.begin(do="swallows", file="/dev/null")
+    child.send(stop=True)
+    assert 'a start was expected, and this came: {"act":1,"rule":true}' in error(child.rule(1))["text"]
     assert child.ended()[0] == 1
 
 

@@ -7,26 +7,10 @@ import pytest
 
 from simenv_marl.__main__ import main
 from simenv_marl.remote.check import check_wire
-from tests.outside.reservoirs import command
+from tests.outside.reservoirs import EXITS_AFTER_STOP, changed, command
 from tests.worlds import faulty
 
 pytestmark = pytest.mark.greenlet("no environment is made")
-
-WELL = """
-import sys
-sys.path.insert(0, {folder!r})
-import outside
-{change}
-outside.main()
-"""
-
-
-def changed(tmp_path, change):
-    """What starts the reservoirs with some change to them or to their end of the wire."""
-    script = tmp_path / "changed.py"
-    folder = faulty.__file__.rpartition("/")[0]
-    script.write_text(WELL.format(folder=folder, change=change))
-    return [sys.executable, str(script)]
 
 
 def found(report):
@@ -40,17 +24,6 @@ def test_nothing_is_wrong_with_a_simulator_that_does_well():
     assert found(report).pop("a run without an environment") == "note"  # it wants a seed then
     assert "nothing is wrong" in str(report)
     assert check_wire(command("1"), timeout=10).ok  # one episode for each process
-
-
-EXITS_AFTER_STOP = """
-decide = outside.Wire.decide
-def exits(*call):
-    try:
-        return decide(*call)
-    except outside.Stopped:
-        sys.exit({code})
-outside.Wire.decide = exits
-"""
 
 
 def test_a_simulator_may_exit_after_a_stop(tmp_path):

@@ -1,34 +1,77 @@
-"""The other side of the wire for tests: a child over two pipes, told and asked frame by frame; each wait has an end."""
+"""The environment's side of the wire for tests, played by hand, byte by byte; each wait has an end."""
 
 from __future__ import annotations
 
 import json
 import os
 import select
+import signal
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 20.0
+PATIENCE = 30.0
 """Seconds that any wait may take."""
+
+
+VALUES = [
+    None,
+    True,
+    0,
+    -1,
+    2**63 - 1,
+    -(2**63),
+    2**64 - 1,
+    2**53 + 1,
+    0.0,
+    -0.0,
+    0.1,
+    1 / 3,
+    1.0,
+    5e-324,
+    2.2250738585072014e-308,
+    1.7976931348623157e308,
+    1e22,
+    1e23,
+    1e-7,
+    2e-3,
+    123456789.125,
+    9007199254740993.0,
+    "",
+    '\x00\x1f\x7f "quoted" \\ / \b\f\n\r\t',
+    "ä € 𝄞 \ufffd \u2028 \U0010ffff",
+    ["x" * 5000],
+    [],
+    {},
+    [[], {}, [[1, 2.5, "x"]], None],
+    {"": {"a": [1]}, "float": "nan ", "ü": [None, True, False]},
+    {"float": "nan"},
+    {"float": "inf"},
+    {"float": "-inf"},
+    {"float": "nan", "other": 1},
+    {"float": 1.0},
+]
+"""What a model can be sent, and sends back unchanged."""
 
 
 class Child:
     """A process that speaks the wire, whose frames are written and read by hand."""
 
-    def __init__(self, *command: str | Path) -> None:
+    def __init__(self, *command: str | Path, **environment: str) -> None:
         read_by_child, self.out = os.pipe()
         self.into, written_by_child = os.pipe()
         self.descriptors = (read_by_child, written_by_child)
         self._rest = b""
         self.process = subprocess.Popen(
             [str(part) for part in command],
-            env=os.environ | {"SIMENV_MARL_FDS": "{},{}".format(*self.descriptors)},
+            env=os.environ | {"SIMENV_MARL_FDS": "{},{}".format(*self.descriptors)} | environment,
             pass_fds=self.descriptors,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
+            start_new_session=True,
         )
         for descriptor in self.descriptors:
             os.close(descriptor)
@@ -39,43 +82,41 @@ class Child:
     def __exit__(self, *_: object) -> None:
         for end in ("out", "into"):
             self.close(end)
-        self.process.kill()
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
         self.process.communicate(timeout=PATIENCE)
 
-    def close(self, end: str) -> None:
+    def close(self, end: str = "out") -> None:
         """Close what is written to the child (``"out"``) or read from it (``"into"``)."""
         descriptor = getattr(self, end)
         if descriptor is not None:
             setattr(self, end, None)
             os.close(descriptor)
 
-    def write(self, data: bytes) -> None:
-        """Write bytes as they are."""
+    def send(self, line: bytes = b"", **frame: Any) -> None:
+        """Send a frame, or bytes as they are."""
+        data = line or json.dumps(frame).encode() + b"\n"
         try:
             while data:
                 data = data[os.write(self.out, data) :]
         except BrokenPipeError:
             pass
 
-    def send(self, **frame: Any) -> None:
-        """Send a frame."""
-        self.write(json.dumps(frame).encode() + b"\n")
-
     def receive(self) -> Any:
         """The next frame; None where the child has closed its end."""
         until = time.monotonic() + PATIENCE
         while b"\n" not in self._rest:
             if not select.select([self.into], [], [], max(until - time.monotonic(), 0.0))[0]:
-                raise TimeoutError(f"no frame within {PATIENCE} s")
+                raise TimeoutError(f"no frame within {PATIENCE} s, after {self._rest[:200]!r}")
             got = os.read(self.into, 1 << 20)
             if not got:
                 assert self._rest == b""
                 return None
             self._rest += got
         line, _, self._rest = self._rest.partition(b"\n")
-        return json.loads(line)
+        return json.loads(line, parse_constant=_refuse)
 
-    def begin(self, seed: int = 0, **options: Any) -> Any:
+    def begin(self, seed: Any = 0, **options: Any) -> Any:
         """Start an episode; return the first frame of it."""
         self.send(start={"seed": seed, "options": options})
         return self.receive()
@@ -90,7 +131,29 @@ class Child:
         self.send(act=number, rule=True)
         return self.receive()
 
-    def ended(self) -> tuple[int, str]:
-        """Wait until the process has ended: its status, and what it has written on stderr."""
-        _, errors = self.process.communicate(timeout=PATIENCE)
-        return self.process.returncode, errors.decode()
+    def play(self, choose: Callable[[Any], Any] | None = None, seed: Any = 7, **options: Any) -> tuple[list[Any], Any]:
+        """Play an episode, in which each call is answered with what ``choose`` says of it, or left to the rule.
+
+        Returns:
+            The calls, and the frame that came last.
+        """
+        calls, frame = [], self.begin(seed, **options)
+        while frame is not None and "decide" in frame:
+            calls.append(frame)
+            number = frame["decide"]
+            frame = self.rule(number) if choose is None else self.act(number, choose(frame))
+        return calls, frame
+
+    def ended(self) -> tuple[int, str, str]:
+        """Wait until the process has ended: its status, and what it has written on stdout and stderr."""
+        output, errors = self.process.communicate(timeout=PATIENCE)
+        return self.process.returncode, output.decode(), errors.decode()
+
+
+def exactly(value: Any) -> str:
+    """A text that tells apart what compares as equal: 1, 1.0 and True, and the zeros."""
+    return repr(value)
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no JSON")

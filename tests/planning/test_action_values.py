@@ -28,8 +28,8 @@ from simenv_marl.errors import (
     UnknownAgentError,
     ViewError,
 )
-from simenv_marl.planning import action_values
-from simenv_marl.planning.rollouts import RolloutOptions, Rollouts
+from simenv_marl.planning import RolloutPolicy, action_values
+from simenv_marl.planning.rollouts import Rollouts
 from tests.conftest import DRIVERS
 from tests.worlds.duels import LEFT, SPACE, Duel, Unseeded, points, worth
 from tests.worlds.models import define
@@ -52,7 +52,7 @@ def made(view, model=Duel, **options):
 
 def futures_of(env, number, seed=None):
     """The seeds of an environment's futures."""
-    return Rollouts(env, [RULE], RolloutOptions(seed=seed)).seeds(number)
+    return Rollouts(env, RolloutPolicy([RULE], seed=seed)).seeds(number)
 
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):
@@ -85,15 +85,6 @@ def test_every_view_and_driver(view, driver, method):
     env.close()
 
 
-@METHODS
-def test_joint_views_sum_up(method):
-    env = made("joint")
-    actions = [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}]
-    told = action_values(env, actions, futures=3, method=method)
-    assert told.returns == pytest.approx(expected(env, "left", (2, 1, 0), both=True))
-    assert told.best is actions[2]
-
-
 @pytest.mark.parametrize("view", ["aec", "parallel"])
 def test_a_decision_in_mid_episode(view):
     env = made(view)
@@ -118,69 +109,28 @@ def test_the_environment_does_not_move(view):
     assert go_on(env) == go_on(other)
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        *[({"horizon": horizon}, {}) for horizon in (1, 2, 4, 6, 7)],
+        ({"discount": 0.8}, {}),
+        ({"discount": 0.8, "discount_by": "time"}, {"timed": True}),
+        ({"discount": 0}, {"horizon": 1}),
+        *[({"horizon": 2, "discount": 0.5, "method": method}, {}) for method in ("fork", "replay")],
+        *[({"horizon": h, "horizon_by": "time"}, {"timed_horizon": True}) for h in (0.1, 0.5, 2.0, 5, 1e9)],
+    ],
+)
 @pytest.mark.parametrize("view", [*VIEWS, "joint"])
-def test_the_horizon_counts_decisions_of_the_agent(view):
-    env, agent = made(view), "left"
-    actions = [0, 2] if view != "joint" else [{"left": 0, "right": 1}, {"left": 2, "right": 1}]
-    for horizon in (1, 2, 4, 6, 7):
-        table = expected(env, agent, (0, 2), horizon=horizon, both=view == "joint")
-        assert action_values(env, actions, futures=3, horizon=horizon).returns == pytest.approx(table)
-
-
-@pytest.mark.parametrize("view", VIEWS)
-def test_a_horizon_of_one_is_the_reward_of_the_action(view):
-    env = made(view)
-    values = action_values(env, horizon=1, futures=4)
-    step = env.step({"left": 2, "right": RULE} if view == "parallel" else 2)
-    assert step is None or values.means[2] != pytest.approx(step[1]["left"] if view == "parallel" else step[1])
-    env = made(view, Unseeded)
-    with pytest.warns(UserWarning, match="foresees"):
-        values = action_values(env, horizon=1)
-    if view == "aec":
-        env.step(2)
-        env.step(RULE)
-        assert values.means[2] == env.last()[1]
-    else:
-        rewards = env.step({"left": 2, "right": RULE} if view == "parallel" else 2)[1]
-        assert values.means[2] == (rewards["left"] if view == "parallel" else rewards)
-
-
-@METHODS
-@pytest.mark.parametrize("view", ["aec", "single"])
-def test_a_value_at_the_horizon(view, method):
-    env = made(view)
-    told = action_values(
-        env, futures=3, horizon=2, discount=0.5, method=method,
-        terminal_value=lambda env: 10 + env.unwrapped.simulation.value,
-    )  # fmt: skip
-    table = expected(env, "left", horizon=2, discount=0.5, terminal=lambda value: 10 + value)
-    assert told.returns == pytest.approx(table)
-
-
-def test_no_value_at_a_horizon_that_is_the_end():
-    env = made("single")
-    told = action_values(env, futures=2, horizon=6, terminal_value=lambda env: 1e6)
-    assert told.means.max() < 1e3
-    told = action_values(env, futures=2, horizon=5, terminal_value=lambda env: 1e6)
-    assert told.means.min() > 1e5
-
-
-@pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("timed", [False, True])
-def test_discounts(view, timed):
-    env = made(view)
-    told = action_values(env, futures=3, discount=0.8, discount_by="time" if timed else "decision")
-    assert told.returns == pytest.approx(expected(env, "left", discount=0.8, timed=timed))
-    told = action_values(env, futures=3, discount=0)
-    assert told.returns == pytest.approx(expected(env, "left", horizon=1))
-
-
-def test_a_horizon_of_time():
-    env = made("single")
-    for horizon in (0.1, 0.5, 2.0, 5, 1e9):
-        told = action_values(env, futures=3, horizon=horizon, horizon_by="time", terminal_value=lambda env: 7.0)
-        table = expected(env, "left", horizon=horizon, timed_horizon=True, terminal=lambda value: 7.0)
-        assert told.returns == pytest.approx(table)
+def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, told):
+    """At a horizon the state has its value, unless the episode is over."""
+    env, joint = made(view), view == "joint"
+    actions = [{"left": action, "right": 1} for action in range(3)] if joint else None
+    value = {"terminal_value": lambda env: 10 + env.unwrapped.simulation.value}
+    found = action_values(env, actions, futures=3, **given, **value)
+    reference = {name: given[name] for name in ("horizon", "discount") if name in given} | told
+    terminal = None if given.get("discount") == 0 else lambda value: 10 + value
+    table = expected(env, "left", both=joint, terminal=terminal, **reference)
+    assert found.returns == pytest.approx(table)
 
 
 @METHODS
@@ -204,11 +154,16 @@ def test_the_base_is_policies_by_agent(view, method):
     assert told.returns == pytest.approx(expected(env, "left", bases={"right": bases["right"]}))
 
 
-def test_bases_of_the_joint_view():
+@METHODS
+def test_joint_views_sum_up_and_have_joint_bases(method):
     env = made("joint")
+    actions = [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}]
+    told = action_values(env, actions, futures=3, method=method)
+    assert told.returns == pytest.approx(expected(env, "left", (2, 1, 0), both=True))
+    assert told.best is actions[2]
     bases = {"left": greedy, "right": lambda observation: 2 - int(observation[0]) % 3}
     first = {"left": 2, "right": 1}
-    told = action_values(env, [first], futures=3, base={"left": greedy})
+    told = action_values(env, [first], futures=3, base={"left": greedy}, method=method)
     assert told.returns == pytest.approx(expected(env, "left", (2,), both=True, bases={"left": greedy}))
     # A round: the one on the right decides by what was seen before the other one has moved.
     whole = action_values(env, [first], futures=3, base=lambda seen: {n: bases[n](seen[n]) for n in bases})
@@ -216,6 +171,12 @@ def test_bases_of_the_joint_view():
     assert whole.returns == pytest.approx(parts.returns)
     with pytest.raises(OptionValueError, match="without flatten"):
         action_values(made("joint", flatten=True), [[1, 1]], base=bases)
+    env = TransformReward(env, lambda reward: -reward)
+    env.reset(seed=5)
+    with pytest.raises(InvalidActionError, match="not in"):
+        action_values(env, [{"left": 3, "right": RULE}])
+    told = action_values(env, actions, futures=3, method=method)
+    assert told.returns == pytest.approx(-expected(env, "left", (2, 1, 0), both=True))
 
 
 def test_policies_of_the_environment_stay():
@@ -305,15 +266,15 @@ def test_a_candidate_that_changes_nothing_has_the_same_values(method):
 
 
 def test_futures_are_those_of_the_decision():
-    env, other = made("single"), made("aec")
-    first = action_values(env, futures=4)
-    assert action_values(env, futures=4).returns.tolist() == first.returns.tolist()
-    assert action_values(env, futures=6).returns[:, :4].tolist() == first.returns.tolist()
-    assert action_values(env, futures=4, seed=1).returns.tolist() != first.returns.tolist()
-    assert (
-        action_values(env, futures=4, seed=1).returns.tolist() == action_values(env, seed=1, futures=4).returns.tolist()
-    )
-    assert action_values(other, futures=4).returns == pytest.approx(first.returns)
+    env = made("single")
+
+    def returns(env, **given):
+        return action_values(env, **{"futures": 4} | given).returns.tolist()
+
+    first = returns(env)
+    assert returns(env) == returns(made("aec")) == first
+    assert [row[:4] for row in returns(env, futures=6)] == first
+    assert returns(env, seed=1) == returns(env, seed=1) != first
     seeds = futures_of(env, 4)
     env.step(1)
     assert not set(seeds) & set(futures_of(env, 4))
@@ -342,32 +303,26 @@ def test_global_generators_are_common_too(method):
 
 
 @METHODS
-def test_a_base_that_draws_has_the_same_noise_for_all_candidates(method):
+@pytest.mark.parametrize("model", [Duel, Unseeded])
+@pytest.mark.filterwarnings("ignore:Unseeded cannot draw")
+def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
+    """In each of many futures, and in the one exact one."""
+
     def draws(observation):
         return random.randrange(3) if observation[0] % 2 else int(np.random.randint(3))
 
-    env = made("single")
+    def returns(**given):
+        return action_values(made("single", model), [1, RULE, 2], futures=4, method=method, **given).returns.tolist()
+
     random.seed(1)
     state = random.getstate(), np.random.get_state()[1].tolist()
-    told = action_values(env, [1, RULE, 2], futures=4, base=draws, method=method)
-    assert told.returns[0].tolist() == told.returns[1].tolist()
+    told = returns(base=draws)
+    assert told[0] == told[1]
     assert (random.getstate(), np.random.get_state()[1].tolist()) == state
     random.seed(2)
     np.random.seed(2)
-    assert (
-        action_values(env, [1, RULE, 2], futures=4, base=draws, method=method).returns.tolist() == told.returns.tolist()
-    )
-    assert not np.allclose(told.returns, action_values(env, [1, RULE, 2], futures=4, method=method).returns)
-
-
-@METHODS
-def test_in_the_one_exact_future_too_a_base_has_the_same_noise(method):
-    env = made("single", Unseeded)
-    state = random.getstate()
-    with pytest.warns(UserWarning, match="foresees"):
-        told = action_values(env, [1, RULE], base=lambda observation: random.randrange(3), method=method)
-    assert told.means[0] == told.means[1]
-    assert random.getstate() == state
+    assert returns(base=draws) == told or model is Unseeded  # what is drawn there follows the state of the process
+    assert not np.allclose(told, returns())
 
 
 @METHODS
@@ -417,15 +372,6 @@ def test_wrappers_of_pettingzoo(method):
     env.reset(seed=5)
     told = action_values(env, [RULE, 2], futures=3, method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
-
-
-def test_wrappers_of_the_joint_view():
-    env = TransformReward(made("joint"), lambda reward: -reward)
-    env.reset(seed=5)
-    with pytest.raises(InvalidActionError, match="not in"):
-        action_values(env, [{"left": 3, "right": RULE}])
-    told = action_values(env, [{"left": 2, "right": 1}, {"left": 1, "right": RULE}, RULE], futures=3)
-    assert told.returns == pytest.approx(-expected(env, "left", (2, 1, 1), both=True))
 
 
 # -- what cannot be -------------------------------------------------------------------------------
@@ -500,23 +446,14 @@ def test_candidates_must_be_listed_unless_they_are_discrete():
         action_values(made("joint"))
 
 
-def masked(**options):
+@pytest.mark.parametrize("wrapper", [lambda env: env, lambda env: TransformReward(env, float)])
+def test_masked_candidates(wrapper):
     given = points(action_mask_mapping=lambda duel: [1, 1, duel.turn % 2])
-    env = single_env(Duel, {LEFT: given[LEFT]}, **options)
+    env = wrapper(single_env(Duel, {LEFT: given[LEFT]}))
     env.reset(seed=5)
-    return env
-
-
-def test_masked_candidates():
-    env = masked()
     assert action_values(env, futures=2).actions == (0, 1)
     with pytest.raises(InvalidActionError, match="masked"):
         action_values(env, [1, 2])
-    wrapped = TransformReward(env, float)
-    wrapped.reset(seed=5)
-    assert action_values(wrapped, futures=2).actions == (0, 1)
-    with pytest.raises(InvalidActionError, match="masked"):
-        action_values(wrapped, [1, 2])
 
 
 class Timeless(SimulationInterface):

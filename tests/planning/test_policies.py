@@ -24,7 +24,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset
+from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
@@ -77,10 +77,33 @@ def by_hand(seed=5, policy=None, model=Duel, **options):
 # -- sequential halving ---------------------------------------------------------------------------
 
 
-def test_the_budget_is_divided_among_rounds():
+class Wide:
+    """Eight candidates, of which the last is the best."""
+
+    def reset(self, seed=None):
+        self.random, self.paid = random.Random(seed), 0.0
+
+    def reseed(self, seed):
+        self.random.seed(seed)
+
+    def run(self):
+        for _ in range(2):
+            self.paid = self.choose() + self.random.gauss(0, 1)
+
+    @define(action_space=spaces.Discrete(8), reward_mapping=lambda wide: wide.paid)
+    def choose(self):
+        return 0
+
+
+@pytest.fixture
+def wide():
     env = single_env(Wide, Wide.choose)
     env.reset(seed=1)
-    told = RolloutPolicy(budget=96).choose(env)
+    return env
+
+
+def test_the_budget_is_divided_among_rounds(wide):
+    told = RolloutPolicy(budget=96).choose(wide)
     assert sorted(told.counts.tolist()) == [4, 4, 4, 4, 12, 12, 28, 28]
     assert told.best == 7
     assert told.counts[7] == 28
@@ -89,36 +112,29 @@ def test_the_budget_is_divided_among_rounds():
     assert told.means[0] == pytest.approx(np.nanmean(told.returns[0]))
 
 
-@pytest.mark.parametrize("budget", [8, 9, 17, 24, 50, 100])
-def test_the_budget_is_spent_and_not_overspent(budget):
-    env = single_env(Wide, Wide.choose)
-    env.reset(seed=1)
-    counts = RolloutPolicy(budget=budget).choose(env).counts
+@pytest.mark.parametrize(
+    ("given", "budget"),
+    [
+        *[({"budget": budget}, budget) for budget in (8, 9, 17, 24, 50, 100)],
+        ({"futures": 6}, 48),
+        ({"actions": [1, 4, 2], "futures": 6}, 18),
+    ],
+    ids=str,
+)
+def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
+    """By default it is that of all candidates in all futures."""
+    counts = RolloutPolicy(**given).choose(wide).counts
     assert budget - 1 <= counts.sum() <= budget
     assert counts.min() >= 1
 
 
-def test_by_default_the_budget_is_that_of_all_candidates():
-    env = single_env(Wide, Wide.choose)
-    env.reset(seed=1)
-    assert RolloutPolicy(futures=6).choose(env).counts.sum() == 48
-    assert RolloutPolicy([1, 4, 2], futures=6).choose(env).counts.sum() in (17, 18)
-
-
-def test_candidates_of_a_round_meet_the_same_futures():
-    env = single_env(Wide, Wide.choose)
-    env.reset(seed=1)
-    told = RolloutPolicy([2, 2, 2, 2], budget=32).choose(env)
+def test_candidates_of_a_round_meet_the_same_futures(wide):
+    told = RolloutPolicy([2, 2, 2, 2], budget=32).choose(wide)
     assert told.counts.tolist() == [12, 12, 4, 4]
     assert told.returns[0].tolist() == told.returns[1].tolist()
     assert told.returns[2, :4].tolist() == told.returns[0, :4].tolist()
-    assert told.returns[0, :4].tolist() == action_values(env, [2], futures=4).returns[0].tolist()
-
-
-def test_one_candidate_is_not_tried():
-    env = single_env(Wide, Wide.choose)
-    env.reset(seed=1)
-    told = RolloutPolicy([3]).choose(env)
+    assert told.returns[0, :4].tolist() == action_values(wide, [2], futures=4).returns[0].tolist()
+    told = RolloutPolicy([3]).choose(wide)  # one alone is not tried
     assert (told.best, told.counts.tolist()) == (3, [0])
     assert np.isnan(told.means).all()
 
@@ -148,6 +164,7 @@ def test_masked_candidates_are_left_out():
     [
         ({"budget": 0}, "budget"),
         ({"budget": 1.5}, "budget"),
+        ({"budget": 2}, "3 candidates once"),
         ({"futures": 0}, "futures"),
         ({"horizon": 0}, "horizon"),
         ({"seed": -1}, "seed"),
@@ -156,49 +173,22 @@ def test_masked_candidates_are_left_out():
 )
 def test_what_cannot_be(given, match):
     with pytest.raises(OptionValueError, match=match):
-        RolloutPolicy(**given)
-
-
-def test_a_budget_that_does_not_suffice():
-    with pytest.raises(OptionValueError, match="3 candidates once"):
-        RolloutPolicy(budget=2).choose(made("single"))
-
-
-class Wide:
-    """Eight candidates, of which the last is the best."""
-
-    def reset(self, seed=None):
-        self.random, self.paid = random.Random(seed), 0.0
-
-    def reseed(self, seed):
-        self.random.seed(seed)
-
-    def run(self):
-        for _ in range(2):
-            self.paid = self.choose() + self.random.gauss(0, 1)
-
-    @define(action_space=spaces.Discrete(8), reward_mapping=lambda wide: wide.paid)
-    def choose(self):
-        return 0
+        RolloutPolicy(**given).choose(made("single"))
 
 
 # -- all places where it serves -------------------------------------------------------------------
 
 
 @METHODS
+@pytest.mark.parametrize("key", ["left", LEFT])
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_simulate(driver, method):
+def test_simulate(driver, key, method):
     if driver == "thread" and method == "fork":
         method = None
     noted = Noted(planner(method=method))
-    simulation = simulate(Duel, {"left": noted}, points=tame(), seed=5, driver=driver)
+    simulation = simulate(Duel, {key: noted}, points=tame(), seed=5, driver=driver)
     assert (noted.answers, simulation.value) == by_hand()
     assert len(set(noted.answers)) > 1
-
-
-def test_a_point_names_it_as_well_as_an_agent():
-    noted = Noted(planner())
-    assert simulate(Duel, {LEFT: noted}, points=tame(), seed=5).value == by_hand()[1]
 
 
 @pytest.mark.parametrize("method", ["fork", "replay"])
@@ -220,29 +210,17 @@ def test_policies_of_environments(view, method):
     assert noted.answers == by_hand()[0]
 
 
-def test_simulate_many_asks_row_by_row():
-    seeds = [5, 6]
-    found = simulate_many(
-        Duel, {"left": planner(), "right": lambda observations: np.ones(len(observations), int)},
-        points=tame(), seeds=seeds, collect=lambda duel: duel.value,
-    )  # fmt: skip
-    assert found == [by_hand(seed)[1] for seed in seeds]
-    assert found == simulate_many(
-        Duel, {"left": planner()}, points=tame(), seeds=seeds, collect=lambda duel: duel.value
-    )
-
-
 @pytest.mark.parametrize("batch_size", [1, 8])
-def test_collect_episodes(batch_size):
-    seeds = [5, 6]
-    found = collect_episodes(Duel, {"left": planner()}, points=tame(), seeds=seeds, batch_size=batch_size)["left"]
-    for place, seed in enumerate(seeds):
-        assert found.actions[found.episodes == place].tolist() == by_hand(seed)[0]
-    others = collect_episodes(
-        Duel, {"left": planner(), "right": lambda observations: np.ones(len(observations), int)},
-        points=tame(), seeds=seeds, batch_size=batch_size,
-    )  # fmt: skip
-    assert len(others["right"]) == 12
+@pytest.mark.parametrize("policies", [{}, {"right": lambda observations: np.ones(len(observations), int)}])
+def test_many_episodes_ask_row_by_row(batch_size, policies):
+    given = {"points": tame(), "seeds": [5, 6], "batch_size": batch_size, "collect": lambda duel: duel.value}
+    policies = {"left": planner(), **policies}
+    found = collect_episodes(Duel, policies, **given)
+    assert simulate_many(Duel, policies, **given) == list(found["left"].collected)
+    for place, seed in enumerate([5, 6]):
+        own = found["left"].actions[found["left"].episodes == place].tolist()
+        assert (own, found["left"].collected[place]) == by_hand(seed)
+    assert all(len(of_agent) == 12 for of_agent in found.values())
 
 
 @METHODS
@@ -271,13 +249,6 @@ def test_batch_policies_of_others_go_on_in_branches(method):
 
     simulate(Duel, {"left": single, "right": alone}, points=points(), seed=5)
     assert other[0].returns == pytest.approx(values[0].returns)
-
-
-def test_record_dataset(tmp_path, monkeypatch):
-    pytest.importorskip("minari")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    dataset = record_dataset("duel/left-v0", Duel, {"left": planner()}, points=tame(), seeds=[5, 6])
-    assert [episode.actions.tolist() for episode in dataset] == [by_hand(5)[0], by_hand(6)[0]]
 
 
 def test_compare_with_rule():
@@ -355,13 +326,6 @@ def test_the_environment_of_a_policy(view):
             assert came_to == min(turn + 1, 5)
 
 
-def test_a_policy_of_the_observation_alone_may_ask_too():
-    def left(observation, *, _environment):
-        return action_values(_environment, futures=2, horizon=1).best
-
-    assert simulate(Duel, {"left": left}, points=points(), seed=5).value != simulate(Duel, seed=5).value
-
-
 def test_agents_that_die_while_their_policy_plans():
     def left(observation, info, *, _environment):
         told = action_values(_environment, base=lambda observation: 2, futures=4, terminal_value=lambda env: 1e6)
@@ -416,7 +380,7 @@ def test_two_planners_at_once(method):
 @METHODS
 def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
     """In a branch of the one the other is left to its base, or to its rule; else there were a branch of each branch."""
-    calls, seen = [], []
+    calls, seen, plans = [], [], []
 
     def branches(observation, info, *, _environment):
         calls.append(int(observation[0]))
@@ -431,25 +395,19 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
     branches.base = lambda observation: 2
     del seen[:], calls[:]
     simulate(Duel, {"left": branches, "right": branches}, points=points(), seed=5)
-    bases = {"right": branches.base}
-    assert seen[0][1][0] == pytest.approx(worth("left", 1, None, horizon=1, bases=bases))
+    assert seen[0][1][0] == pytest.approx(worth("left", 1, None, horizon=1, bases={"right": branches.base}))
 
+    def plan(observation, *, _environment):
+        plans.append(action_values(_environment, base=greedy, futures=2, method=method))
+        return plans[-1].best
 
-@METHODS
-def test_policies_that_plan_by_themselves_are_left_to_their_base_in_plans(method):
-    calls = []
-
-    def plans(observation, info, *, _environment):
-        calls.append(action_values(_environment, base=greedy, futures=2, method=method))
-        return calls[-1].best
-
-    simulate(Duel, {"left": plans, "right": plans}, points=points(), seed=5)
-    assert [told.counts.tolist() for told in calls] == [[2, 2, 2]] * 12
-    env = aec_env(Duel, points(), policies={"right": plans})
+    simulate(Duel, {"left": plan, "right": plan}, points=points(), seed=5)
+    assert [told.counts.tolist() for told in plans] == [[2, 2, 2]] * 12
+    env = aec_env(Duel, points(), policies={"right": plan})
     env.reset(seed=5)
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(action_values(made("aec"), futures=3, method=method).returns)
-    assert len(calls) == 12
+    assert len(plans) == 12
 
 
 def test_the_users_own_branches_are_exact():
@@ -465,12 +423,6 @@ def test_the_users_own_branches_are_exact():
 
     forked, replayed = branch(env, ahead)[0], branch(env, ahead, method="replay")[0]
     assert forked == replayed == ahead(env, 0)
-
-
-def test_a_planner_as_a_base_is_its_own_base():
-    env = made("single")
-    told = action_values(env, futures=3, base=RolloutPolicy(base=greedy))
-    assert told.returns.tolist() == action_values(env, futures=3, base=greedy).returns.tolist()
 
 
 def test_errors_surface_from_where_the_policy_is_asked():
@@ -495,19 +447,12 @@ def test_a_replay_of_a_branch_of_a_policy_is_refused():
 def test_nothing_is_kept_where_no_policy_asks():
     tapes = []
 
-    class Peeping(Duel):
-        def left(self):
-            return 1
-
     def left(observation):
-        tapes.append(len(session().episode.tape))
-        return 1
-
-    def session():
         frame = sys._getframe()
-        while "self" not in frame.f_locals or type(frame.f_locals["self"]).__name__ != "Session":
+        while type(frame.f_locals.get("self")).__name__ != "Session":
             frame = frame.f_back
-        return frame.f_locals["self"]
+        tapes.append(len(frame.f_locals["self"].episode.tape))
+        return 1
 
     simulate(Duel, {"left": left}, points=points(), seed=5)
     assert tapes == [0] * 6
@@ -551,29 +496,22 @@ def test_seeds_tell_planners_apart():
 @pytest.mark.parametrize(
     "options",
     [
+        {},
         {"skip_forced": True},
         {"max_steps": 4},
         {"global_rng": True},
         {"plugins": [(lambda duel: None, LEFT, "before"), (lambda duel: None, RIGHT, "after")]},
     ],
-    ids=lambda options: next(iter(options)),
+    ids=lambda options: next(iter(options), "padded"),
 )
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_options_of_the_environment(make, options):
-    check_both_methods(make, options)
-
-
-@pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_padded_environments(make):
-    check_both_methods(make, {}, wrapper=pad_agents)
-
-
-def check_both_methods(make, options, wrapper=lambda env: env):
+def test_both_methods_do_alike_with_all_options(make, options):
     """By either method a planner finds the same, and what it does is what comes of it."""
     given, found = points(action_mask_mapping=lambda duel: [1, duel.turn % 2, duel.turn % 2]), []
     for method in ("fork", "replay"):
         noted = Noted(RolloutPolicy(futures=2, horizon=2, method=method))
-        env = wrapper(make(Duel, given, policies={"left": noted}, **options))
+        env = make(Duel, given, policies={"left": noted}, **options)
+        env = env if options else pad_agents(env)
         env.reset(seed=5)
         for _ in range(3):
             env.step(1 if make is aec_env else {"right": 1})

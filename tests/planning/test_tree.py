@@ -41,25 +41,25 @@ def locked(**changes):
     return {f"{__name__}.Lock.turn": define(agent="thief", **given | changes)}
 
 
-def env_of(model, given, **options):
-    env = single_env(model, given, **options)
+def choice(planner, model=Lock, given=None, **options):
+    """What a planner chooses at the first decision of a model."""
+    env = single_env(model, given or locked(), **options)
     env.reset(seed=1)
-    return env
+    return planner.choose(env)
 
 
 @METHODS
 def test_two_decisions_that_are_worth_something_together(method):
-    told = TreeSearchPolicy(futures=10, exploration=1.4, method=method).choose(env_of(Lock, locked()))
+    tree, rollouts = (
+        TreeSearchPolicy(futures=10, exploration=1.4, method=method),
+        RolloutPolicy(futures=10, method=method),
+    )
+    told = choice(tree)
     assert told.best == 2
     assert told.counts.sum() == 40
-    assert RolloutPolicy(futures=10, method=method).choose(env_of(Lock, locked())).best == 0
-
-
-def test_it_serves_where_policies_do():
-    assert simulate(Lock, {"thief": TreeSearchPolicy(futures=10, exploration=1.4)}, points=locked(), seed=1).tried[
-        :2
-    ] == [2, 3]
-    assert not simulate(Lock, {"thief": RolloutPolicy(futures=10)}, points=locked(), seed=1).open
+    assert choice(rollouts).best == 0
+    assert simulate(Lock, {"thief": tree}, points=locked(), seed=1).tried[:2] == [2, 3]
+    assert not simulate(Lock, {"thief": rollouts}, points=locked(), seed=1).open
 
 
 def test_the_depth():
@@ -69,14 +69,14 @@ def test_the_depth():
                 self.tried.append(self.turn())
                 self.open = self.open or self.tried[-3:] == [2, 3, 2]
 
-    assert TreeSearchPolicy(futures=40, depth=3, exploration=1.4).choose(env_of(Deep, locked())).best == 2
-    told = TreeSearchPolicy(futures=40, depth=1).choose(env_of(Lock, locked()))
+    assert choice(TreeSearchPolicy(futures=40, depth=3, exploration=1.4), Deep).best == 2
+    told = choice(TreeSearchPolicy(futures=40, depth=1))
     assert (told.best, told.counts.sum()) == (0, 160)
 
 
 def test_actions_that_are_masked_by_then_are_left_to_the_base():
     given = locked(action_mask_mapping=lambda lock: [1, 1, 1, not lock.tried])
-    told = TreeSearchPolicy(futures=10).choose(env_of(Lock, given))
+    told = choice(TreeSearchPolicy(futures=10), given=given)
     assert told.best == 0
     assert told.counts.sum() == 40
 
@@ -102,7 +102,7 @@ def test_agents_that_end_before_the_depth():
     class Short(Duel):
         ceiling = 2.5
 
-    told = TreeSearchPolicy(depth=4, futures=6).choose(env_of(Short, points(), agent="left"))
+    told = choice(TreeSearchPolicy(depth=4, futures=6), Short, points(), agent="left")
     assert told.counts.sum() == 18
     assert not np.isnan(told.means).any()
 

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import os
 import pickle
 import random
 import re
@@ -79,7 +80,7 @@ def checked(simulation, changes=None, **options):
 
 
 def titles(report, severity=None):
-    return [finding.title for finding in report.findings if severity in (None, finding.severity)]
+    return [each.title for each in report.findings if severity in (None, each.severity)]
 
 
 def finding(report, words):
@@ -96,13 +97,13 @@ def only_error(report, words):
     return finding(report, words)
 
 
-# -- what is right --------------------------------------------------------------------------------
-
-
 def clean(report):
     assert report.ok, str(report)
     assert not report.of("warning"), str(report)
     return report
+
+
+# -- what is right --------------------------------------------------------------------------------
 
 
 def test_a_sound_walk_is_clean():
@@ -113,419 +114,379 @@ def test_a_sound_walk_is_clean():
     assert any("aec, parallel, single, joint" in line for line in report.checked)
 
 
-def test_the_greenhouse_is_clean():
-    report = clean(check_simulation(GreenhouseSim))
-    assert report.calls == "(update_air_exchange choose_water_amount){9}"
-    assert [part.agents for part in report.statistics] == ["waterer_0", "ventilator_0"]
-
-
 @pytest.mark.parametrize("kind", worlds.KINDS)
 def test_worlds_are_clean(kind):
+    """Points of the same name are told apart."""
     design = worlds.Design((kind, "method"), tuple((number % 2, number % 3) for number in range(14)))
     functions = worlds.points_of(design)
-    report = check_simulation(lambda: worlds.World(design, functions), functions, episodes=4)
-    assert report.ok, str(report)
-    assert titles(report, "warning") == []
+    report = clean(check_simulation(lambda: worlds.World(design, functions), functions, episodes=4))
+    if kind == "method":
+        assert len({part.point for part in report.statistics}) == 1
+        assert [(part.agents, part.decisions) for part in report.statistics] == [("point_0", 28), ("point_1", 28)]
 
 
-def test_points_of_the_same_name_are_told_apart():
-    design = worlds.Design(("method", "method"), tuple((number % 2, number % 3) for number in range(14)))
-    functions = worlds.points_of(design)
-    report = check_simulation(lambda: worlds.World(design, functions), functions, episodes=4)
-    assert len({part.point for part in report.statistics}) == 1
-    assert [(part.agents, part.decisions) for part in report.statistics] == [("point_0", 28), ("point_1", 28)]
+COLONY = many_worlds.Design(initial=4, most=10, ticks=6, overseen="before")
 
 
-@pytest.mark.parametrize("simulation", [many_worlds.Colony, many_worlds.Announcing])
-def test_colonies_are_clean(simulation):
-    design = many_worlds.Design(initial=4, most=10, ticks=6, overseen="before")
-    clean(check_simulation(lambda: simulation(design), many_worlds.colony_points(overseen=True), episodes=4))
+@pytest.mark.parametrize(
+    ("simulation", "points", "agents"),
+    [
+        (GreenhouseSim, None, ["waterer_0", "ventilator_0"]),
+        (lambda: many_worlds.Colony(COLONY), many_worlds.colony_points(overseen=True), None),
+        (lambda: many_worlds.Announcing(COLONY), many_worlds.colony_points(overseen=True), None),
+        (Meadow, herd(), ["Sheep", "Wolf"]),
+        (Prison, prisoners(), None),
+    ],
+    ids=["greenhouse", "colony", "announcing", "meadow", "prison"],
+)
+def test_models_whose_agents_come_and_go_are_clean(simulation, points, agents):
+    report = clean(check_simulation(simulation, points, episodes=2, max_steps=300, seeds=[5]))
+    if simulation is GreenhouseSim:
+        assert re.fullmatch(r"\(update_air_exchange choose_water_amount\)\{\d+\}", report.calls)
+        assert [part.agents for part in report.statistics] == agents
+    elif agents:
+        assert sorted(part.point.split(".")[-2] for part in report.statistics) == agents
 
 
 @pytest.mark.parametrize("simulation", [many_worlds.Hunt, many_worlds.AnnouncedHunt])
 def test_entities_that_are_let_go_are_clean(simulation):
-    report = check_simulation(simulation, many_worlds.hunters(), episodes=4)
-    assert report.ok, str(report)
+    assert check_simulation(simulation, many_worlds.hunters(), episodes=4).ok
 
 
-def test_wolves_and_sheep_are_clean():
-    report = check_simulation(Meadow, herd(), episodes=3, max_steps=300, seeds=[5, 6])
-    assert report.ok, str(report)
-    assert titles(report, "warning") == []
-    assert {part.point.rpartition("agents.")[2] for part in report.statistics} == {"Wolf.move", "Sheep.move"}
-
-
-def test_prisoners_are_clean():
-    report = check_simulation(Prison, prisoners(), episodes=2, max_steps=500, seeds=[3])
-    assert report.ok, str(report)
-
-
-def test_generators_of_the_process_are_left_as_they_were():
+def test_generators_and_functions_are_left_as_they_were():
+    before = vars(Walk)["choose"]
     random.seed(4)
     np.random.seed(4)
     expected = random.Random(4).random(), np.random.RandomState(4).rand()
     checked(Walk)
     inspect_simulation(Walk, points(Walk))
     assert (random.random(), np.random.rand()) == expected
-
-
-def test_functions_are_left_as_they_were():
-    before = vars(Walk)["choose"]
-    checked(Walk)
     assert vars(Walk)["choose"] is before
-    decorated = next(iter(points(Walk).values()))(Walk.observe)
-    rule = decorated.__wrapped__
-    assert rule is Walk.observe
 
 
-# -- what behaves differently ---------------------------------------------------------------------
+# -- what is wrong with mappings ------------------------------------------------------------------
 
 
-def test_a_mapping_that_changes_the_model():
-    def observe(walk):
+def moving(result):
+    """A mapping that changes the model."""
+
+    def mapping(walk):
         walk.place += 0.25
-        return walk.observe()
+        return walk.observe() if result is None else result
 
-    found = only_error(checked(Walk, {"observation_space_mapping": observe}), "differently when it is observed")
-    assert "aec view, driver greenlet, seed 0" in found.evidence
-    assert "simulation.place is first" in found.evidence
+    return mapping
 
 
-def test_a_mapping_that_draws_from_the_models_generator():
-    def reward(walk):
-        return walk.random.random()
+@pytest.mark.parametrize(
+    ("changes", "words", "told"),
+    [
+        (
+            {"observation_space_mapping": moving(None)},
+            "differently when it is observed",
+            ["aec view, driver greenlet, seed 0", "simulation.place is first"],
+        ),
+        (
+            {"reward_mapping": lambda walk: walk.random.random()},
+            "differently when it is observed",
+            ["state of the generator", "must not change it or draw random numbers"],
+        ),
+        ({"action_mask_mapping": moving([1, 1, 1])}, "differently when it is observed", []),
+        (
+            {"observation_space_mapping": lambda walk: [np.random.rand(), 0.0]},
+            "a mapping draws from",
+            ["Mappings should only read the model"],
+        ),
+        (
+            {"observation_space": spaces.Box(-1, 1, (2,), np.float32)},
+            "outside their space",
+            ["walker_0 has observed", "Box(-1.0, 1.0, (2,), float32)"],
+        ),
+        ({"observation_space_mapping": lambda walk: [float("nan"), 0.0]}, "outside their space", ["nan"]),
+        ({"observation_space_mapping": lambda walk: [1.0, 2.0, 3.0]}, "raises ObservationError", ["(3,)"]),
+        (
+            {
+                "observation_space": spaces.Box(0, 255, (2,), np.uint8),
+                "observation_space_mapping": lambda walk: np.array([-3, len(walk.log)]),
+            },
+            "raises ObservationError",
+            ["numbers that uint8 cannot hold"],
+        ),
+        (
+            {"action_mask_mapping": lambda walk: [0, 0, 0] if len(walk.log) == 3 else [1, 1, 1]},
+            "raises MaskError",
+            ["no legal action", "decision 4"],
+        ),
+        (
+            {"reward_mapping": lambda walk: float("nan") if len(walk.log) == 5 else 0.5},
+            "raises RewardError",
+            ["nan", "walker_0"],
+        ),
+    ],
+    ids=["moves", "draws", "mask", "global", "bounds", "nan", "shape", "dtype", "no action", "reward"],
+)
+def test_faults_of_mappings_are_errors(changes, words, told):
+    found = only_error(checked(Walk, changes), words)
+    assert all(part in found.evidence + found.explanation for part in told), found
 
-    found = only_error(checked(Walk, {"reward_mapping": reward}), "differently when it is observed")
-    assert "state of the generator" in found.evidence
-    assert "must not change it or draw random numbers" in found.explanation
+
+def seen_by(walk):
+    """An observation that leaves a note."""
+    walk.seen = walk.number
+    return walk.observe()
 
 
-def test_a_mapping_that_leaves_notes_in_the_model_is_warned_of():
-    def reward(walk):
-        walk.paid = walk.place
-        return walk.place
+@pytest.mark.parametrize(
+    ("changes", "words", "severity", "evidence"),
+    [
+        ({"observation_space_mapping": seen_by}, "write into the model", "warning", "simulation.seen"),
+        ({"action_mask_mapping": lambda walk: [1, len(walk.log) % 2, 0]}, "never legal", "note", "actions 2"),
+        ({"reward_mapping": lambda walk: 0}, "always zero", "warning", ""),
+        ({"reward_mapping": lambda walk: 2}, "always the same", "note", ""),
+    ],
+    ids=["notes", "never legal", "zero", "same"],
+)
+def test_oddities_of_mappings_are_no_errors(changes, words, severity, evidence):
+    report = checked(Walk, changes)
+    assert report.ok, str(report)
+    found = finding(report, words)
+    assert found.severity == severity
+    assert evidence in found.evidence
+    assert report.statistics[0].never_legal == ((2,) if words == "never legal" else ())
 
-    report = checked(Walk, {"reward_mapping": reward})
-    assert report.ok
-    assert "simulation.paid" in finding(report, "write into the model").evidence
 
-
-def test_a_mask_that_changes_the_model():
-    def legal(walk):
-        walk.place -= 1
-        return [1, 1, 1]
-
-    only_error(checked(Walk, {"action_mask_mapping": legal}), "differently when it is observed")
-
-
-def test_what_a_simulation_tells_of_itself_is_compared():
-    class Secretive(Walk):
-        def state(self):
-            return np.array([self.place])
+def test_a_fingerprint_of_ones_own_leaves_out_what_it_leaves_out():
+    clean(checked(Walk, {"observation_space_mapping": seen_by}, fingerprint=lambda walk: walk.place))
 
     def observe(walk):
         walk.unseen = walk.random.random() < 2
         return walk.observe()
 
-    changes = {"observation_space_mapping": observe}
-    assert not checked(Secretive, changes).ok  # the place, in the end
-    found = only_error(checked(Walk, changes, fingerprint=lambda walk: [round(walk.place, 6)]), "differently when")
-    assert found
-
-
-def test_a_fingerprint_of_ones_own_leaves_out_what_it_leaves_out():
-    def observe(walk):
-        walk.seen = walk.number
-        return walk.observe()
+    class Secretive(Walk):
+        def state(self):
+            return np.array([self.place])
 
     changes = {"observation_space_mapping": observe}
-    assert finding(checked(Walk, changes), "write into the model")
-    clean(checked(Walk, changes, fingerprint=lambda walk: walk.place))
+    assert not checked(Secretive, changes).ok  # what a simulation tells of itself is compared: the place, in the end
+    only_error(checked(Walk, changes, fingerprint=lambda walk: [round(walk.place, 6)]), "differently when")
 
 
-def test_mappings_that_draw_from_the_global_generators():
-    changes = {"observation_space_mapping": lambda walk: [np.random.rand(), 0.0]}
-    assert (
-        "Mappings should only read the model" in only_error(checked(Walk, changes), "a mapping draws from").explanation
-    )
+# -- what is wrong with models --------------------------------------------------------------------
+
+FOUND = []
 
 
-def test_a_model_that_refuses_to_end():
-    class Stubborn(Walk):
-        def run(self):
-            for _ in range(2000):
-                with contextlib.suppress(BaseException):
-                    self.choose()
+def found(severity, words, *told, changes=None, **options):
+    """Makes a model a row of the table of those of which that is found; an error is all that is wrong with it."""
 
-    report = checked(Stubborn, episodes=1, seeds=[0])
-    found = finding(report, "An environment warns")
-    assert (found.severity, "refuses to end" in found.evidence) == ("warning", True)
+    def add(model):
+        FOUND.append(pytest.param(model, changes, options, severity, words, told, id=model.__name__))
+        return model
+
+    return add
 
 
-def test_a_model_that_fails_when_it_is_closed():
-    class Failing(Walk):
-        def run(self):
-            try:
-                super().run()
-            finally:
-                if self.number < self.steps - 1:
-                    raise OSError("disk full")
-
-    assert "closed in mid-episode: OSError: disk full" in only_error(checked(Failing), "raises OSError").evidence
+def variant(name, **functions):
+    """A walk with other functions."""
+    return type(name, (Walk,), functions)
 
 
-# -- seeds ----------------------------------------------------------------------------------------
+found("error", "same seed does not give the same run", "made without a seed", "test_testing.py")(
+    variant("IgnoresItsSeed", reset=lambda walk, seed=None: Walk.reset(walk))
+)
+found("error", "The simulation never asks for a decision", "choose")(variant("Silent", run=lambda walk: None))
+found("error", "raises TypeError", "needed")(variant("CannotBeMade", __init__=lambda walk, needed: None))
+found("note", "All seeds give the same episode")(variant("Alike", reset=lambda walk, seed=None: Walk.reset(walk, 7)))
+found("note", "takes no seed")(variant("Seedless", reset=lambda walk: Walk.reset(walk, 7)))
 
 
-class Unseeded(Walk):
-    def reset(self, seed=None):
-        super().reset()
+@found("error", "raises OSError", "closed in mid-episode: OSError: disk full")
+class FailsWhenClosed(Walk):
+    def run(self):
+        try:
+            super().run()
+        finally:
+            if self.number < self.steps - 1:
+                raise OSError("disk full")
 
 
-def test_a_model_that_ignores_its_seed():
-    found = only_error(checked(Unseeded), "same seed does not give the same run")
-    assert "made without a seed" in found.evidence
-    assert "test_testing.py" in found.evidence
+@found("error", "same seed does not give the same run", "the clock is read (perf_counter)", "in choose")
+class Timely(Walk):
+    def choose(self):
+        return time.perf_counter() % 1
 
 
-def test_a_model_that_is_always_seeded_alike():
-    class Alike(Walk):
-        def reset(self, seed=None):
-            super().reset(7)
-
-    report = checked(Alike)
-    assert report.ok, str(report)
-    assert finding(report, "All seeds give the same episode").severity == "note"
-
-
-def test_seeds_that_only_attributes_show():
-    class Marked(Walk):
-        def reset(self, seed=None):
-            super().reset(7)
-            self.mark = np.full(3, float(seed))
-
-    report = checked(Marked)
-    assert report.ok, str(report)
-    assert not [title for title in titles(report) if "All seeds" in title]
-
-
-def test_a_model_that_takes_no_seed():
-    class Seedless(Walk):
-        def reset(self):
-            super().reset(7)
-
-    report = checked(Seedless)
-    assert report.ok, str(report)
-    assert finding(report, "takes no seed").severity == "note"
-
-
-def test_a_rule_that_depends_on_the_clock():
-    class Timely(Walk):
-        def choose(self):
-            return time.perf_counter() % 1
-
-    found = only_error(checked(Timely), "same seed does not give the same run")
-    assert "the clock is read (perf_counter)" in found.evidence
-    assert "in choose" in found.evidence
-
-
-def test_what_differs_between_plain_runs_but_decides_nothing_is_no_error():
-    numbers = itertools.count()
-
-    class Numbered(Walk):
-        def reset(self, seed=None):
-            super().reset(seed)
-            self.number_of_the_run = next(numbers)
-
-    report = checked(Numbered)
-    assert report.ok, str(report)
-    assert "simulation.number_of_the_run" in finding(report, "between two plain runs").evidence
-
-
+@found("error", "generators that the whole process shares (Python's random)", "global_rng=True", "in choose")
 class Global(Walk):
     def choose(self):
         return random.choice([-1, 0, 1])
 
 
-def test_a_model_that_draws_from_the_global_generators():
-    found = only_error(checked(Global), "generators that the whole process shares (Python's random)")
-    assert "global_rng=True" in found.explanation
-    assert "in choose" in found.evidence
-
-    class Legacy(Walk):
-        def choose(self):
-            return np.random.randint(3) - 1
-
-    only_error(checked(Legacy), "the whole process shares (numpy.random)")
+@found("error", "the whole process shares (numpy.random)")
+class Legacy(Walk):
+    def choose(self):
+        return np.random.randint(3) - 1
 
 
-def test_a_model_that_seeds_the_global_generators_itself_is_warned_of():
-    class Seeding(Global):
-        def reset(self, seed=None):
-            super().reset(seed)
-            random.seed(seed)
+@found("error", "left over from earlier episodes", "walker_0")
+class Heavy(Walk):
+    luggage = 0
 
-    report = checked(Seeding)
-    assert report.ok, str(report)
-    assert "side by side" in " ".join(finding(report, "shares (Python's random)").explanation.split())
+    def run(self):
+        super().run()
+        self.luggage += 1
 
-
-# -- episodes -------------------------------------------------------------------------------------
+    def observe(self):
+        return [self.place, self.luggage]
 
 
-def test_state_that_is_left_over_between_episodes():
-    class Heavy(Walk):
-        luggage = 0
+@found("error", "same seed does not give the same run", "class attributes")
+class SharesInTheClass(Walk):
+    episodes: list = []  # noqa: RUF012 - that is what is wrong with it
 
-        def run(self):
-            super().run()
-            self.luggage += 1
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.episodes.append(seed)
 
-        def observe(self):
-            return [self.place, self.luggage]
-
-    found = only_error(checked(Heavy), "left over from earlier episodes")
-    assert "walker_0" in found.evidence
+    def observe(self):
+        return [self.place, len(self.episodes)]
 
 
-def test_state_that_is_left_over_in_the_class():
-    class Shared(Walk):
-        episodes: list = []  # noqa: RUF012 - that is what is wrong with it
+@found("error", "disturb each other", "step")
+class Together(Walk):
+    board = {}  # noqa: RUF012 - that is what is wrong with it
 
-        def reset(self, seed=None):
-            super().reset(seed)
-            self.episodes.append(seed)
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.board["place"] = 0.0
 
-        def observe(self):
-            return [self.place, len(self.episodes)]
-
-    found = only_error(checked(Shared), "same seed does not give the same run")
-    assert "class attributes" in found.explanation.replace("\n", " ")
-
-
-def test_environments_that_disturb_each_other():
-    class Together(Walk):
-        board = {}  # noqa: RUF012 - that is what is wrong with it
-
-        def reset(self, seed=None):
-            super().reset(seed)
-            self.board["place"] = 0.0
-
-        def run(self):
-            for _ in range(self.steps):
-                change = self.choose() + self.random.random()
-                self.board["place"] += change
-                self.place = self.board["place"]
-
-    found = only_error(checked(Together), "disturb each other")
-    assert "step" in found.evidence
+    def run(self):
+        for _ in range(self.steps):
+            change = self.choose() + self.random.random()
+            self.board["place"] += change
+            self.place = self.board["place"]
 
 
-def test_a_model_that_never_decides():
-    class Silent(Walk):
-        def run(self):
-            pass
+@found("error", "raises KeyError", "in episode 3 of random legal actions, seed 2", "in run)", "the third", seeds=[0])
+class FailsLate(Walk):
+    played = 0
 
-    found = only_error(checked(Silent), "The simulation never asks for a decision")
-    assert "choose" in found.explanation
-
-
-def test_a_model_that_raises_in_its_third_episode():
-    class Brittle(Walk):
-        played = 0
-
-        def run(self):
-            self.played += 1
-            if self.played == 3:
-                raise KeyError("the third")
-            super().run()
-
-    found = only_error(checked(Brittle, seeds=[0]), "raises KeyError")
-    assert "in episode 3 of random legal actions, seed 2" in found.evidence
-    assert "in run)" in found.evidence
-    assert "the third" in found.evidence
+    def run(self):
+        self.played += 1
+        if self.played == 3:
+            raise KeyError("the third")
+        super().run()
 
 
-def test_a_model_that_raises_by_itself():
-    class Broken(Walk):
-        def run(self):
-            raise SystemExit("bye")
-
-    found = only_error(checked(Broken), "raises SystemExit")
-    assert "in a plain run" in found.evidence
+@found("error", "raises SystemExit", "in a plain run")
+class FailsByItself(Walk):
+    def run(self):
+        raise SystemExit("bye")
 
 
-def test_a_model_that_cannot_be_made():
-    class Unmade(Walk):
-        def __init__(self, needed):
-            self.needed = needed
+@found("error", "raises KeyError", "action_mask_mapping", "decision")
+class Narrow(Walk):
+    effects = {-1: 0.5, 1: 1.5}  # noqa: RUF012
 
-    found = only_error(checked(Unmade), "raises TypeError")
-    assert "needed" in found.evidence
+    def run(self):
+        for _ in range(self.steps):
+            self.place += self.effects[self.choose()]
 
-
-def test_actions_that_the_model_cannot_take():
-    class Narrow(Walk):
-        def run(self):
-            for _ in range(self.steps):
-                self.place += {-1: 0.5, 1: 1.5}[self.choose()]
-
-        def choose(self):
-            return 1
-
-    found = only_error(checked(Narrow), "raises KeyError")
-    assert "action_mask_mapping" in found.explanation
-    assert "decision" in found.evidence
+    def choose(self):
+        return 1
 
 
-def test_a_model_that_never_ends():
-    class Endless(Walk):
-        def run(self):
-            for number in itertools.count():
-                self.number = number
-                self.place = 0.9 * self.place + self.choose() + self.random.random()
-
-    report = checked(Endless)
-    assert report.ok, str(report)
-    assert "60 decisions" in finding(report, "stopped before their end").explanation
-    assert report.episodes == {"terminated": 0, "truncated": 0, "cut": 4}
-
-    def observe(walk):
-        walk.place += 1
-        return walk.observe()
-
-    only_error(checked(Endless, {"observation_space_mapping": observe}), "differently when it is observed")
+@found(
+    "error",
+    "raises KeyError",
+    changes={"action_space": spaces.Discrete(4), "action_mask_mapping": lambda walk: [1, 1, 0, 1]},
+)
+class NarrowBehindAMask(Narrow):
+    effects = {-1: 0.5, 0: 1.0, 1: 1.5}  # noqa: RUF012
 
 
-def test_a_model_that_neither_ends_nor_decides():
-    class Stuck(Walk):
-        def run(self):
-            while True:
-                self.place = 0.0
-
-    found = only_error(checked(Stuck, time_limit=2), "neither ends nor asks")
-    assert "wait forever" in found.explanation
+@found("error", "neither ends nor asks", "wait forever", time_limit=2)
+class Stuck(Walk):
+    def run(self):
+        while True:
+            self.place = 0.0
 
 
-def test_a_model_that_gets_stuck_by_some_actions_and_swallows_what_is_raised_in_it():
-    class Waiting(Walk):
-        def run(self):
+@found("error", "neither ends nor asks", "in episode ", time_limit=8)
+class StuckByItsActions(Walk):
+    """It swallows what is raised in it, too."""
+
+    def run(self):
+        if self.choose() < 1:
             while self.choose() != 1:
                 pass
             while True:
                 with contextlib.suppress(BaseException):
                     self.place = 0.0
 
-        def choose(self):
-            return self.random.choice([1, 2])
+    def choose(self):
+        return self.random.choice([1, 2])
 
-    class Rule(Waiting):
-        def run(self):
-            if self.choose() < 1:
-                super().run()
 
-    report = checked(Rule, time_limit=8)
-    assert only_error(report, "neither ends nor asks").evidence.startswith("in episode ")
+@found("warning", "An environment warns", "refuses to end", episodes=1, seeds=[0])
+class Stubborn(Walk):
+    def run(self):
+        for _ in range(2000):
+            with contextlib.suppress(BaseException):
+                self.choose()
+
+
+@found("note", "between two plain runs", "simulation.number_of_the_run")
+class Numbered(Walk):
+    numbers = itertools.count()
+
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.number_of_the_run = next(self.numbers)
+
+
+@found("warning", "shares (Python's random)", "side by side")
+class Seeding(Global):
+    def reset(self, seed=None):
+        super().reset(seed)
+        random.seed(seed)
+
+
+@found("note", "stopped before their end", "60 decisions")
+class Endless(Walk):
+    def run(self):
+        for number in itertools.count():
+            self.number = number
+            self.place = 0.9 * self.place + self.choose() + self.random.random()
+
+
+@found("warning", "agents do changes nothing")
+class Deaf(Walk):
+    def run(self):
+        for _ in range(self.steps):
+            self.choose()
+            self.place += self.random.random()
+            self.log.append(self.place)
+
+    def choose(self):
+        return 0
+
+
+@pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), FOUND)
+def test_what_is_wrong_or_odd_about_models_is_found(model, changes, options, severity, words, told):
+    report = checked(model, changes, **options)
+    seen = finding(report, words)
+    assert seen.severity == severity
+    if severity == "error":
+        only_error(report, words)
+    elif model is not Stubborn:
+        assert report.ok, str(report)
+    text = " ".join(f"{seen.evidence} {seen.explanation}".split())
+    assert all(part in text for part in told), text
+
+
+class Bury:
+    def bury(self):
+        pass
 
 
 def test_an_agent_that_is_revived():
@@ -534,23 +495,12 @@ def test_an_agent_that_is_revived():
             for number in range(6):
                 self.place = float(self.choose())
                 if number == 2:
-                    self.bury()
-
-        def bury(self):
-            pass
+                    Bury.bury(self)
 
     definition = points(Undead, removed_by={f"{__name__}.Bury.bury": lambda walk: "walker_0"})
-    Bury.bury = Undead.bury
-    Undead.bury = lambda self: Bury.bury(self)
-    report = check_simulation(Undead, definition, episodes=2)
-    found = only_error(report, "raises AgentError")
+    found = only_error(check_simulation(Undead, definition, episodes=2), "raises AgentError")
     assert "after its end" in found.evidence
     assert "walker_0" in found.evidence
-
-
-class Bury:
-    def bury(self):
-        pass
 
 
 def test_errors_are_told_once():
@@ -565,33 +515,43 @@ def test_errors_are_told_once():
     assert titles(report, "error") == ["The simulation raises ZeroDivisionError"]
 
 
-# -- spaces and rewards ---------------------------------------------------------------------------
+def test_episodes_that_are_cut_are_counted_and_compared():
+    assert checked(Endless).episodes == {"terminated": 0, "truncated": 0, "cut": 4}
+    only_error(checked(Endless, {"observation_space_mapping": moving(None)}), "differently when it is observed")
 
 
-def test_observations_beyond_their_bounds():
-    space = spaces.Box(-1, 1, (2,), np.float32)
-    found = only_error(checked(Walk, {"observation_space": space}), "outside their space")
-    assert "walker_0 has observed" in found.evidence
-    assert "Box(-1.0, 1.0, (2,), float32)" in found.evidence
+def test_seeds_that_only_attributes_show():
+    class Marked(Walk):
+        def reset(self, seed=None):
+            super().reset(7)
+            self.mark = np.full(3, float(seed))
+
+    report = checked(Marked)
+    assert report.ok, str(report)
+    assert not [title for title in titles(report) if "All seeds" in title]
 
 
-def test_observations_that_are_no_number():
-    changes = {"observation_space_mapping": lambda walk: [float("nan"), 0.0]}
-    found = only_error(checked(Walk, changes), "raises ObservationError")
-    assert "nan" in found.evidence
+class Both(Walk):
+    """Two decide."""
+
+    def run(self):
+        for _ in range(self.steps):
+            self.place += self.choose() + self.other()
+
+    def other(self):
+        return self.random.random()
 
 
-def test_observations_of_the_wrong_shape():
-    changes = {"observation_space_mapping": lambda walk: [1.0, 2.0, 3.0]}
-    found = only_error(checked(Walk, changes), "raises ObservationError")
-    assert "(3,)" in found.evidence
+def test_points_that_are_never_called():
+    class One(Both):
+        def run(self):
+            Walk.run(self)
+
+    report = check_simulation(One, points(One) | points(One, "other", agent="other_0"), episodes=3)
+    assert finding(report, "other was never called").severity == "warning"
 
 
-def test_observations_that_their_dtype_cannot_hold():
-    space = spaces.Box(0, 255, (2,), np.uint8)
-    changes = {"observation_space": space, "observation_space_mapping": lambda walk: np.array([-3, len(walk.log)])}
-    found = only_error(checked(Walk, changes), "raises ObservationError")
-    assert "numbers that uint8 cannot hold" in found.evidence
+# -- reports --------------------------------------------------------------------------------------
 
 
 def test_statistics_are_those_of_the_episodes():
@@ -614,83 +574,9 @@ def test_statistics_are_those_of_the_episodes():
     assert "Episodes of random legal actions: 2 terminated" in str(report)
 
 
-def test_masks_without_a_legal_action():
-    changes = {"action_mask_mapping": lambda walk: [0, 0, 0] if len(walk.log) == 3 else [1, 1, 1]}
-    found = only_error(checked(Walk, changes), "raises MaskError")
-    assert "no legal action" in found.evidence
-    assert "decision 4" in found.evidence
-
-
-def test_masks_with_actions_that_the_model_cannot_take():
-    class Narrow(Walk):
-        def choose(self):
-            return 0
-
-        def run(self):
-            for _ in range(self.steps):
-                self.place += {-1: 0.5, 0: 1.0, 1: 1.5}[self.choose()]
-
-    changes = {
-        "action_space": spaces.Discrete(4),
-        "action_mask_mapping": lambda walk: [1, 1, 0, 1],
-        "action_space_mapping": lambda action: action - 1,
-    }
-    only_error(checked(Narrow, changes), "raises KeyError")
-
-
-def test_actions_that_never_are_legal():
-    report = checked(Walk, {"action_mask_mapping": lambda walk: [1, len(walk.log) % 2, 0]})
-    assert report.ok, str(report)
-    assert finding(report, "never legal").evidence == "actions 2"
-    assert report.statistics[0].never_legal == (2,)
-
-
-def test_rewards_that_are_no_number():
-    changes = {"reward_mapping": lambda walk: float("nan") if len(walk.log) == 5 else 0.5}
-    found = only_error(checked(Walk, changes), "raises RewardError")
-    assert "nan" in found.evidence
-    assert "walker_0" in found.evidence
-
-
-def test_rewards_that_are_always_zero_or_the_same():
-    assert finding(checked(Walk, {"reward_mapping": lambda walk: 0}), "always zero").severity == "warning"
-    assert finding(checked(Walk, {"reward_mapping": lambda walk: 2}), "always the same").severity == "note"
-
-
-def test_actions_that_change_nothing():
-    class Deaf(Walk):
-        def run(self):
-            for _ in range(self.steps):
-                self.choose()
-                self.place += self.random.random()
-                self.log.append(self.place)
-
-        def choose(self):
-            return 0
-
-    report = checked(Deaf)
-    assert finding(report, "agents do changes nothing").severity == "warning"
-
-
-def test_points_that_are_never_called():
-    class Both(Walk):
-        def other(self):
-            return 0
-
-    named = points(Both) | points(Both, "other", agent="other_0")
-    report = check_simulation(Both, named, episodes=3)
-    assert finding(report, "other was never called").severity == "warning"
-
-
-# -- reports --------------------------------------------------------------------------------------
-
-
 def test_reports_read_as_text_with_the_most_important_first():
-    def observe(walk):
-        walk.place += 0.25
-        return [200.0, 1.0]
-
-    report = checked(Walk, {"observation_space_mapping": observe, "reward_mapping": lambda walk: 0})
+    changes = {"observation_space_mapping": moving([200.0, 1.0]), "reward_mapping": lambda walk: 0}
+    report = checked(Walk, changes)
     text = str(report)
     severities = [finding.severity for finding in report.findings]
     assert severities == sorted(severities, key=("error", "warning", "note").index)
@@ -747,22 +633,10 @@ def test_options_reach_the_environments():
     report = checked(Walk, flatten=True)  # which is of the joint view alone
     assert report.ok
     assert "single, joint; drivers" in report.checked[0]
-    report = checked(Walk, state_space=spaces.Box(0, 1, (1,), np.float32))
-    assert report.ok
-
-
-def test_policies_answer_in_random_episodes_and_run_their_rule_in_comparisons():
-    class Both(Walk):
-        def run(self):
-            for _ in range(self.steps):
-                self.place += self.choose() + self.other()
-
-        def other(self):
-            return self.random.random()
-
+    assert checked(Walk, state_space=spaces.Box(0, 1, (1,), np.float32)).ok
     named = points(Both) | points(Both, "other", agent="other_0")
     report = check_simulation(Both, named, policies={"other_0": lambda observation: 2}, episodes=3)
-    assert report.ok, str(report)
+    assert report.ok, str(report)  # in comparisons, what policies answer is left to the rule
     assert [part.agents for part in report.statistics] == ["walker_0"]
 
 
@@ -786,20 +660,15 @@ def test_the_time_limit_stops_the_check(monkeypatch):
 
 def test_the_library_does_not_import_its_checks():
     code = "import sys, simenv_marl; sys.exit('simenv_marl.testing' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False, env=_environment()).returncode == 0
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    assert subprocess.run([sys.executable, "-c", code], check=False, env=environment).returncode == 0
     assert not hasattr(simenv_marl, "check_simulation")
-
-
-def _environment():
-    import os
-
-    return os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
 # -- inspection -----------------------------------------------------------------------------------
 
 
-def test_inspection_of_the_greenhouse():
+def test_inspection_tells_points_calls_and_the_end():
     seen = inspect_simulation(GreenhouseSim)
     assert seen.calls == "(update_air_exchange choose_water_amount){9}"
     assert [point["agent"] for point in seen.points] == ["waterer_0", "ventilator_0"]
@@ -807,9 +676,6 @@ def test_inspection_of_the_greenhouse():
     assert "terminated" in seen.ended
     assert "waterer_0" in str(seen)
     assert json.dumps(seen.to_dict())
-
-
-def test_inspection_of_wolves_and_sheep():
     seen = inspect_simulation(Meadow, herd(), seed=5)
     assert "truncated" in seen.ended
     assert sum(seen.counts.values()) > 50
@@ -828,20 +694,26 @@ def test_inspection_of_what_fails():
     assert "KeyError" in seen.ended
 
 
-def test_compression_of_calls():
-    assert order_of("abababc") == "(a b){3} c"
-    assert order_of("aaaa") == "a{4}"
-    assert order_of("aabaab" + "c") == "(a{2} b){2} c"
-    assert order_of("") == ""
-    assert order_of("abcbababcbab") == "(a b c b{1} a b){2}".replace("b{1}", "b")
+@pytest.mark.parametrize(
+    ("calls", "told"),
+    [
+        ("abababc", "(a b){3} c"),
+        ("aaaa", "a{4}"),
+        ("aabaabc", "(a{2} b){2} c"),
+        ("", ""),
+        ("abcbababcbab", "(a b c b a b){2}"),
+        (["a.B.run", "a.C.walk"], "run walk"),
+        (["a.B.run", "a.C.run"], "a.B.run a.C.run"),
+    ],
+)
+def test_the_order_of_calls_is_told_shortly(calls, told):
+    assert order_of(calls) == told
+
+
+def test_the_order_of_many_calls_is_cut():
     long = order_of([str(number) for number in range(50)] * 100)
     assert long.startswith("0 1 2")
     assert long.endswith("... and 5000 calls in all")
-
-
-def test_order_of_calls_by_names_that_tell_them_apart():
-    assert order_of(["a.B.run", "a.C.walk"]) == "run walk"
-    assert order_of(["a.B.run", "a.C.run"]) == "a.B.run a.C.run"
 
 
 # -- fingerprints ---------------------------------------------------------------------------------
@@ -971,3 +843,27 @@ def test_objects_that_share_one_agent():
 def test_agents_that_options_name_and_that_never_come():
     report = checked(Walk, {"agent": lambda walk: "walker"}, policies={"wlaker": lambda observation: 0})
     assert "wlaker" in finding(report, "An environment warns").evidence
+
+
+class Paced(Walk):
+    """Its rule draws even where it has one choice only."""
+
+    def choose(self):
+        return self.random.choice(self.moves())
+
+    def moves(self):
+        return [1] if self.number % 3 else [-1, 0, 1]
+
+
+def test_forced_moves_are_no_difference_from_the_plain_run():
+    definition = define(
+        observation_space=BOX,
+        observation_space_mapping=Paced.observe,
+        action_space=spaces.Discrete(3),
+        choices=Paced.moves,
+        reward_mapping=lambda walk: -abs(walk.place),
+        agent="walker_0",
+    )
+    points = {Paced.choose: definition}
+    report = check_simulation(Paced, points, episodes=2, skip_forced=True)
+    assert report.findings == ()

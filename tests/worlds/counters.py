@@ -22,6 +22,20 @@ FORKS = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:Dep
 """That numpy has threads does not matter here: they have nothing to do when a worker is forked."""
 
 
+def definition(**changes: Any) -> Any:
+    """A definition for ``Counter.decide``."""
+    return make_step(
+        **{
+            "observation_space": spaces.Box(-100, 100, (2,), np.float32),
+            "observation_space_mapping": lambda self: [self.count, self.goal],
+            "action_space": spaces.Discrete(3, start=1),
+            "action_space_mapping": int,
+            "reward_mapping": lambda self: self.count / 4,
+            **changes,
+        }
+    )
+
+
 class Counter:
     """Counts to a number that its seed gives; every decision says by how much."""
 
@@ -46,13 +60,7 @@ class Counter:
     def render(self, mode: str) -> str:
         return f"{mode} {self.count}"
 
-    @make_step(
-        observation_space=spaces.Box(-100, 100, (2,), np.float32),
-        observation_space_mapping=lambda self: [self.count, self.goal],
-        action_space=spaces.Discrete(3, start=1),
-        action_space_mapping=int,
-        reward_mapping=lambda self: self.count / 4,
-    )
+    @definition()
     def decide(self) -> int:
         return 1
 
@@ -65,20 +73,6 @@ class Timed(Counter):
 
     def time(self) -> float:
         return 1.5 * self.count
-
-
-def definition(**changes: Any) -> Any:
-    """A definition for ``Counter.decide``."""
-    return make_step(
-        **{
-            "observation_space": spaces.Box(-100, 100, (2,), np.float32),
-            "observation_space_mapping": lambda self: [self.count, self.goal],
-            "action_space": spaces.Discrete(3, start=1),
-            "action_space_mapping": int,
-            "reward_mapping": lambda self: self.count / 4,
-            **changes,
-        }
-    )
 
 
 NESTED = spaces.Dict(
@@ -94,87 +88,59 @@ VARIETY: dict[str, tuple[Any, Any]] = {
     "plain": (Counter, definition()),
     "timed": (Timed, definition()),
     "masked": (Timed, definition(action_mask_mapping=lambda self: [1, self.count % 2, 1])),
-    "choices": (
-        Counter,
-        definition(
-            action_space=spaces.Discrete(4),
-            action_space_mapping=None,
-            choices=lambda self: list(range(1, 2 + self.count % 4)),
-        ),
-    ),
-    "rows": (
-        Counter,
-        definition(
-            observation_space=spaces.Box(-100, 100, (2, 3), np.float64),
-            # Laid out column by column, and of nobody else.
-            observation_space_mapping=lambda self: np.full((2, 3), [self.count, self.goal, 7.0], order="F"),
-        ),
-    ),
-    "flags": (
-        Counter,
-        definition(
-            observation_space=spaces.Box(0, 1, (2,), np.bool_),
-            observation_space_mapping=lambda self: np.array([self.count > 3, True]),
-        ),
-    ),
-    "large": (
-        Counter,
-        definition(
-            observation_space=spaces.Box(-100, 100, (400,), np.float32),
-            observation_space_mapping=lambda self: np.arange(400) % 7 + self.count,
-        ),
-    ),
-    "box": (
-        Counter,
-        definition(action_space=spaces.Box(0, 3, (2,), np.float32), action_space_mapping=lambda a: 1 + int(a.sum())),
-    ),
-    "one of a box": (
-        Counter,
-        definition(action_space=spaces.Box(0, 3, (1,), np.float32), action_space_mapping=lambda a: 1 + int(a[0])),
-    ),
-    "dict action": (
-        Counter,
-        definition(
-            action_space=spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Box(0, 1, (2,), np.float64)}),
-            action_space_mapping=lambda action: 1 + int(action["a"]),
-        ),
-    ),
-    "multi": (
-        Counter,
-        definition(action_space=spaces.MultiDiscrete([2, 3]), action_space_mapping=lambda a: 1 + int(a.sum())),
-    ),
-    "nested": (
-        Counter,
-        definition(
-            observation_space=NESTED,
-            observation_space_mapping=lambda self: {
-                "count": self.count,
-                "both": (self.count / 100, [self.count, self.goal]),
-                "word": "abc"[: 1 + self.count % 3],
-                "image": np.full((2, 3, 1), self.count),
-            },
-        ),
-    ),
-    "number": (
-        Counter,
-        definition(observation_space=spaces.Discrete(100), observation_space_mapping=lambda self: self.count),
-    ),
-    "image": (
-        Counter,
-        definition(
-            observation_space=spaces.Box(0, 255, (4, 2), np.uint8),
-            observation_space_mapping=lambda self: np.full((4, 2), self.count),
-        ),
-    ),
-    "goal": (
-        Counter,
-        definition(
-            goal_space=spaces.Box(0, 100, (1,), np.float64),
-            achieved_goal_mapping=lambda self: [self.count],
-            desired_goal_mapping=lambda self: [self.goal],
-            compute_reward=lambda achieved, desired, info: -np.abs(achieved - desired).sum(-1),
-        ),
-    ),
+    "choices": (Counter, definition(
+        action_space=spaces.Discrete(4),
+        action_space_mapping=None,
+        choices=lambda self: list(range(1, 2 + self.count % 4)),
+    )),
+    "rows": (Counter, definition(
+        observation_space=spaces.Box(-100, 100, (2, 3), np.float64),
+        # Laid out column by column, and of nobody else.
+        observation_space_mapping=lambda self: np.full((2, 3), [self.count, self.goal, 7.0], order="F"),
+    )),
+    "flags": (Counter, definition(
+        observation_space=spaces.Box(0, 1, (2,), np.bool_),
+        observation_space_mapping=lambda self: np.array([self.count > 3, True]),
+    )),
+    "large": (Counter, definition(
+        observation_space=spaces.Box(-100, 100, (400,), np.float32),
+        observation_space_mapping=lambda self: np.arange(400) % 7 + self.count,
+    )),
+    "box": (Counter, definition(
+        action_space=spaces.Box(0, 3, (2,), np.float32), action_space_mapping=lambda a: 1 + int(a.sum())
+    )),
+    "one of a box": (Counter, definition(
+        action_space=spaces.Box(0, 3, (1,), np.float32), action_space_mapping=lambda a: 1 + int(a[0])
+    )),
+    "dict action": (Counter, definition(
+        action_space=spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Box(0, 1, (2,), np.float64)}),
+        action_space_mapping=lambda action: 1 + int(action["a"]),
+    )),
+    "multi": (Counter, definition(
+        action_space=spaces.MultiDiscrete([2, 3]), action_space_mapping=lambda a: 1 + int(a.sum())
+    )),
+    "nested": (Counter, definition(
+        observation_space=NESTED,
+        observation_space_mapping=lambda self: {
+            "count": self.count,
+            "both": (self.count / 100, [self.count, self.goal]),
+            "word": "abc"[: 1 + self.count % 3],
+            "image": np.full((2, 3, 1), self.count),
+        },
+    )),
+    "number": (Counter, definition(
+        observation_space=spaces.Discrete(100), observation_space_mapping=lambda self: self.count
+    )),
+    "image": (Counter, definition(
+        observation_space=spaces.Box(0, 255, (4, 2), np.uint8),
+        observation_space_mapping=lambda self: np.full((4, 2), self.count),
+    )),
+    "goal": (Counter, definition(
+        goal_space=spaces.Box(0, 100, (1,), np.float64),
+        achieved_goal_mapping=lambda self: [self.count],
+        desired_goal_mapping=lambda self: [self.goal],
+        compute_reward=lambda achieved, desired, info: -np.abs(achieved - desired).sum(-1),
+    )),
 }  # fmt: skip
 
 

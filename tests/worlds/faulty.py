@@ -30,6 +30,8 @@ def _flood(wire: Any) -> None:
     os.abort()
 
 
+UPDATE = {"update": "a", "point": "reservoir.inflow", "args": {}}
+
 FAULTS: dict[str, Callable[[Any], Any]] = {
     "garbage": lambda wire: wire.raw(b"hello?\n"),
     "no object": lambda wire: wire.raw(b"[1]\n"),
@@ -57,6 +59,8 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
     "kill": lambda wire: os.kill(os.getpid(), signal.SIGKILL),
     "closed": _close,
     "grandchild": _grandchild,
+    "updates": lambda wire: [wire.send(UPDATE) for _ in range(10**6)],
+    "slow updates": lambda wire: [(wire.send(UPDATE), time.sleep(0.01)) for _ in range(60_000)],
     "gigabyte": lambda wire: [wire.raw(bytes(1 << 20)) for _ in range(1 << 10)],
     "error": lambda wire: wire.send({"error": {"type": "Flood", "text": "a dam broke", "trace": "dam.cpp:12"}}),
     "error, no object": lambda wire: wire.send({"error": "a dam broke"}),

@@ -6,7 +6,8 @@ Each module imports only from those below it::
     provenance                  the record of what an environment was made of
     session                     the simulation of one environment, over all its episodes
     episode, plan               one episode, and the life cycle of a decision; the checked description of an environment
-    agent, rounds, run          one agent; rounds of the parallel and joint views; the run on the simulation's stack
+    run                         the state of an episode, its errors, and how it is unwound
+    agent                       one agent of an episode
     point                       decision points and other events
     greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
     driver                      the switch between a simulation's stack and its user's; what a simulation has opened

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -30,22 +29,44 @@ _SMALL = 16  # up to this many elements, comparing Python floats is faster than 
 # -- checks ----------------------------------------------------------------------------------------
 
 
-def action_check(space: spaces.Space[Any]) -> Check:
+def action_check(space: spaces.Space[Any], *, clips: bool = False) -> Check:
     """Make the function that checks actions against a space.
 
     The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action of a ``Discrete``,
-    and a scalar for a one-element ``Box`` unchanged. All other actions are copied, for a ``Box`` in its dtype.
+    and a scalar for a one-element ``Box`` unchanged. All other actions are copied, for a ``Box`` in its dtype. If it
+    ``clips``, it clips the parts of actions that belong to a ``Box``.
     """
     if isinstance(space, spaces.Discrete):
         return _discrete_check(space)
     if isinstance(space, spaces.Box):
-        return _box_check(space)
+        return _box_check(space, clips)
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        return _parts_check(space, clips)
 
     def check(action: Any) -> Any:
         try:
             return duplicate(action) if space.contains(action) else ILLEGAL
         except Exception:  # some spaces raise for a value that is not in them
             return ILLEGAL
+
+    return check
+
+
+def _parts_check(space: spaces.Dict | spaces.Tuple[Any], clips: bool) -> Check:
+    named = isinstance(space, spaces.Dict)
+    parts: Any = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+    checks: dict[Any, Check] = {key: action_check(part, clips=clips) for key, part in parts}
+
+    def check(action: Any) -> Any:
+        if not isinstance(action, Mapping if named else (tuple, list)) or len(action) != len(checks):
+            return ILLEGAL
+        try:
+            found = {key: check_part(action[key]) for key, check_part in checks.items()}
+        except KeyError:
+            return ILLEGAL
+        if any(part is ILLEGAL for part in found.values()):
+            return ILLEGAL
+        return found if named else tuple(found.values())
 
     return check
 
@@ -68,7 +89,7 @@ def _discrete_check(space: spaces.Discrete) -> Check:
     return check
 
 
-def _box_check(space: spaces.Box) -> Check:
+def _box_check(space: spaces.Box, clips: bool) -> Check:
     shape, dtype = space.shape, space.dtype
     lows, highs = space.low.ravel().tolist(), space.high.ravel().tolist()
     scalar, small = len(lows) == 1, len(lows) <= _SMALL
@@ -83,70 +104,38 @@ def _box_check(space: spaces.Box) -> Check:
 
     def check(action: Any) -> Any:
         if type(action) is ndarray and action.dtype is dtype and action.shape == shape:
-            if scalar:
-                return action.copy() if first_low <= action.item() <= first_high else ILLEGAL
-            return action.copy() if legal(action) else ILLEGAL
-        if type(action) is float and kinds == "iuf" and first_low <= action <= first_high:
+            if first_low <= action.item() <= first_high if scalar else legal(action):
+                return action.copy()
+        elif type(action) is float and kinds == "iuf" and first_low <= action <= first_high:
             return action
         try:
-            array = np.asarray(action)
+            given = array = np.asarray(action)
         except (ValueError, TypeError):
             return ILLEGAL
         if array.dtype.kind not in kinds or (array.shape != shape and not (scalar and array.shape == ())):
             return ILLEGAL
-        if kinds == "iu":  # compare before the cast, because the cast may wrap integers around
-            cast = array.astype(dtype, copy=True) if legal(array) else None
-        else:  # compare after the cast, so that a bound is legal in every precision
-            with np.errstate(over="ignore"):
-                cast = array.astype(dtype, copy=True)
-            cast = cast if legal(cast) else None
-        if cast is None:
+        if clips:
+            array = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape))
+        if kinds == "iu" and not legal(array):  # before the cast, because the cast may wrap integers around
             return ILLEGAL
-        return cast if array.shape == shape else action
+        with np.errstate(over="ignore"):
+            cast = array.astype(dtype, copy=True)
+        if kinds != "iu" and not legal(cast):  # after the cast, so that a bound is legal in every precision
+            return ILLEGAL
+        if array.shape == shape:
+            return cast
+        return action if array == given else cast.item()
 
     return check
-
-
-def clipping_check(space: spaces.Space[Any]) -> Check:
-    """Make the function that clips the parts of actions that belong to a ``Box``, and checks the result."""
-    check, clip = action_check(space), partial(_clipped, space)
-
-    def check_clipped(action: Any) -> Any:
-        legal = check(action)
-        return check(clip(action)) if legal is ILLEGAL else legal
-
-    return check_clipped
-
-
-def _clipped(space: spaces.Space[Any], action: Any) -> Any:
-    """Clip the numbers of an action into the ``Box`` spaces of a space; leave parts that do not fit unchanged."""
-    if isinstance(space, spaces.Dict) and isinstance(action, Mapping):
-        return {key: _clipped(space[key], part) if key in space.spaces else part for key, part in action.items()}
-    if isinstance(space, spaces.Tuple) and isinstance(action, (tuple, list)) and len(action) == len(space):
-        return tuple(_clipped(part, item) for part, item in zip(space.spaces, action, strict=True))
-    if not isinstance(space, spaces.Box):
-        return action
-    try:
-        array = np.asarray(action)
-    except (ValueError, TypeError):
-        return action
-    kinds = "iu" if space.dtype.kind in "iu" else "iuf"
-    fits = array.shape == space.shape or (array.shape == () and space.low.size == 1)
-    if array.dtype.kind not in kinds or not fits:
-        return action
-    with np.errstate(over="ignore"):
-        clipped = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape)).astype(space.dtype)
-    return clipped.item() if type(action) in (int, float) else clipped
 
 
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
-    """Make the function that casts a mask of the legal actions of an action space.
+def mask_cast(space: Any) -> Callable[[Any], Any]:
+    """Make the function that casts a mask of the legal actions to np.int8; that of a ``MultiDiscrete`` is a tuple.
 
-    The function returns a new np.int8 array of 0 and 1, of shape ``(n,)``, for a ``Discrete``, or a tuple of these for
-    a ``MultiDiscrete``. It raises ``MaskError`` for another shape, for other values, and if no action is legal.
+    It raises ``MaskError`` for another shape, for values other than 0 and 1, and if no action is legal.
     """
     if isinstance(space, spaces.MultiDiscrete):
         parts = [_mask_of(int(number), space) for number in space.nvec.ravel()]
@@ -157,7 +146,6 @@ def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
             return tuple(part(item) for part, item in zip(parts, value, strict=True))
 
         return cast
-    assert isinstance(space, spaces.Discrete)
     return _mask_of(int(space.n), space)
 
 
@@ -182,20 +170,18 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
     return cast
 
 
-def open_mask(space: spaces.Space[Any]) -> Any:
+def open_mask(space: Any) -> Any:
     """Make the mask of an action space that allows every action."""
     if isinstance(space, spaces.MultiDiscrete):
         return tuple(np.ones(int(number), np.int8) for number in space.nvec.ravel())
-    assert isinstance(space, spaces.Discrete)
     return np.ones(int(space.n), np.int8)
 
 
-def mask_allows(space: spaces.Space[Any], mask: Any, action: Any) -> bool:
+def mask_allows(space: Any, mask: Any, action: Any) -> bool:
     """Whether a mask that ``mask_cast`` returned allows an action of the space."""
     if isinstance(space, spaces.MultiDiscrete):
         choices = (action - space.start).ravel()
         return all(part[choice] for part, choice in zip(mask, choices, strict=True))
-    assert isinstance(space, spaces.Discrete)
     return bool(mask[action - int(space.start)])
 
 

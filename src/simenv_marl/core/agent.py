@@ -18,12 +18,12 @@ from ..simulation import RULE
 from .actions import MASK, only_choice
 from .driver import WAIT
 from .planner import DeferredPolicy, PlannerPolicy
-from .point import Point
 from .spaces import duplicate
 
 if TYPE_CHECKING:
     from .episode import Episode
     from .plan import Plan
+    from .point import Point
 
 _NOTHING: Final[dict[str, Any]] = {}
 """The keyword arguments of calls without any. Nothing writes to this dict."""
@@ -33,18 +33,11 @@ class Agent:
     """One agent of an episode. If its decision point has no other agent, it is also the event of a decision there.
 
     Attributes:
-        name: The name.
-        point: The decision point at which the agent decides.
         policy: The policy that answers the agent's decisions. None: the environment's user answers them.
-        is_planner: Whether that policy gets the environment.
-        is_deferred: Whether that policy answers many decisions at once, so that the episode waits for it.
-        own: Whether it is an agent of the environment, with rewards and an end.
-        delegated: Whether the environment's user does not answer its decisions: a policy does, or it has ended.
-        clock: Returns the simulation's time. None if the simulation has no time.
+        delegated: Whether its decisions do not wait for an answer from outside: a policy is asked, or it has ended.
         update: Rewards and observes the agent: see ``make_updates``.
         decided: Whether the reward mapping was called in this episode. Its first value is dropped.
         acted: Whether the latest round used an action that the user gave for the agent.
-        ended: Whether the agent's episode ended before the simulation's.
         present: Whether the latest info comes from an observation. False if there was nothing to observe.
         reward: The reward of the agent's previous action, as of its latest decision or its end.
         asked: Whether the user was asked for an action in this episode. Used where forced moves are skipped.
@@ -52,13 +45,10 @@ class Agent:
         consultations: How many decisions were put to a policy that gets the environment.
         observation: The latest observation, cast to its space. None before the first one.
         handed_out: The observation that a view has returned and must not return a second time.
-        info: The info of the latest decision. The dict is the agent's own.
         mask, choices: The legal actions of the pending decision, if the decision point restricts them.
         offered: The choices of the latest decision, among which the rule's decision is looked up.
         rule_action: The action that corresponds to the rule's latest decision. None if it is not known.
         informs_rule_action: Whether the next info contains ``rule_action``.
-        memory: The values that ``difference`` remembers for the agent.
-        plugins: The plugins of the environment. None if it has none.
         now, answered_at: The times of the latest decision and of the one before.
         entity, rest, kwargs: The arguments of the latest decision: see ``keep``.
         group, notes: Used by runners of many episodes.
@@ -66,50 +56,34 @@ class Agent:
 
     __slots__ = (
         "acted", "answered_at", "asked", "carried", "choices", "clock", "consultations", "decided", "delegated",
-        "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "is_deferred",
-        "is_planner", "kwargs", "mask", "memory", "name", "notes", "now", "observation", "offered", "own", "plugins",
-        "point", "policy", "present", "report", "rest", "reward", "rule_action", "update",
+        "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "kwargs", "mask", "memory",
+        "name", "notes", "now", "observation", "offered", "plugins", "point", "policy", "present", "report", "rest",
+        "reward", "rule_action", "update",
     )  # fmt: skip
 
     def __init__(self, name: str, point: Point, plan: Plan, clock: Any) -> None:
         self.name, self.point, self.clock, self.plugins = name, point, clock, plan.plugins
-        self.follow(plan.policy_of(name, point))
-        self.own = plan.owns(self.policy)
-        self.delegated = not self.own
+        self.policy = policy = plan.policy_of(name, point)
+        self.delegated = policy is not None and not (plan.rewarded and isinstance(policy, DeferredPolicy))
         self.deliver, self.report = point.deliver, point.report
         self.update: Callable[..., None] = point.updates[0]
         self.decided = self.acted = self.ended = self.present = self.asked = self.informs_rule_action = False
         self.reward = self.carried = 0.0
         self.consultations = 0
-        self.observation: Any = None
-        self.handed_out: Any = None
-        self.mask: Any = None
-        self.choices: Any = None
-        self.offered: Any = None
-        self.rule_action: Any = None
-        self.group: Any = None
-        self.notes: Any = None
+        nothing: Any = None
+        self.observation = self.handed_out = self.mask = self.choices = self.offered = self.rule_action = nothing
+        self.entity = self.group = self.notes = nothing
         self.info: dict[str, Any] = {}
         self.memory: dict[Any, Any] = {}
         self.now: float | None = None
         self.answered_at: float | None = None
-        self.entity: Any = None
         self.rest: tuple[Any, ...] | None = None
         self.kwargs: dict[str, Any] = _NOTHING
-
-    def follow(self, policy: Any) -> None:
-        """Let a policy answer the agent's decisions. None: the environment's user answers them."""
-        self.policy = policy
-        self.is_planner, self.is_deferred = isinstance(policy, PlannerPolicy), isinstance(policy, DeferredPolicy)
 
     # -- decisions --------------------------------------------------------------------------------
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Handle a decision: update the agent and wait for an action, or do what the episode does instead.
-
-        Returns:
-            The reply to the simulation, or ``WAIT``.
-        """
+        """Handle a decision: update the agent and return ``WAIT``, or the reply if a policy or the episode has one."""
         if self.delegated:
             return self.ask_policy(episode, args, kwargs)
         point = self.point
@@ -133,29 +107,29 @@ class Agent:
         return WAIT
 
     def ask_policy(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Let the agent's policy answer a decision.
-
-        Returns:
-            The reply to the simulation; ``WAIT`` if the policy is asked later, for many decisions at once, or if a
-            replay has reached the other episode's decision.
-        """
-        if self.ended:
-            raise self.decides_after_end()
-        if episode.is_complete:  # else the simulation might run for ever without a decision for the user
-            return self.decide_too_late(episode, args, kwargs, truncated=False)
+        """Let the policy answer a decision, or wait: for a policy of many decisions, or because a replay ends here."""
+        if episode.ended:
+            if self.ended:
+                raise AgentError(
+                    f"the agent {self.name!r} decides at {self.point.point.name} after its end; agent= must name each"
+                    " entity differently, and removed_by= or end_agent() must end an agent only when its entity is gone"
+                )
+            if episode.plan.one_agent in episode.ended:  # else the simulation might run for ever without its user
+                episode.finish(truncated=False)
+                return WAIT
         policy = self.policy
         if policy is RULE:
             return RULE
         episode.latest = self
-        update = self.point.updates[0]
-        update(self, args, kwargs, reward=False)
+        self.point.updates[0](self, args, kwargs, reward=False)
         forced = self.only_action() if episode.skips else None
         if forced is not None:
             return self.answer_forced(episode, forced)
-        if self.is_deferred and not episode.plan.solo:
+        deferred = isinstance(policy, DeferredPolicy)
+        if deferred and not episode.plan.solo:
             episode.pending = self
             return WAIT
-        if self.is_planner:
+        if isinstance(policy, PlannerPolicy):
             self.consultations += 1
             self.keep(episode, args, kwargs)
         if episode.script:
@@ -166,57 +140,47 @@ class Agent:
                 episode.pending = self
                 return WAIT
             try:
-                action = policy.alone(episode, self) if self.is_deferred else policy(self.observation, self.info)
+                action = policy.alone(episode, self) if deferred else policy(self.observation, self.info)
             finally:
                 episode.consulted = None
-        episode.record(duplicate(action))
-        return episode.answer(self, self.checked(action), False)
+        if len(episode.tape) < episode.tape_size:
+            episode.tape.append(duplicate(action))
+        legal = action if action is RULE else self.point.checked(action, self.name, self.mask)
+        return episode.answer(self, legal, False)
 
     def decide_unless_forced(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Update the agent. Its rewards add up until it has more than one legal action."""
         self.update(self, args, kwargs)
-        self.reward, self.carried = self.reward + self.carried, 0.0
         forced = self.only_action()
-        if forced is not None or not self.asked:  # ``reset`` returns no rewards either
-            self.reward, self.carried = 0.0, self.reward
+        self.add_carried_reward(carry_on=forced is not None or not self.asked)
         if forced is not None:
             return self.answer_forced(episode, forced)
         self.asked = True
         episode.pending = self
         return WAIT
 
-    def decide_too_late(
-        self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any], truncated: bool = True
-    ) -> Any:
-        """End the episode in place of a decision: the user has taken the last step, or has no agent left."""
-        episode.finish(truncated=truncated)
+    def add_carried_reward(self, *, carry_on: bool) -> None:
+        """Add the rewards of forced moves. Carry the sum on where no reward is returned, as at a reset."""
+        reward = self.reward + self.carried
+        self.reward, self.carried = (0.0, reward) if carry_on else (reward, 0.0)
+
+    def decide_too_late(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Truncate the episode in place of a decision, because the user has taken the last step."""
+        episode.finish(truncated=True)
         return WAIT
 
     def answer_forced(self, episode: Episode, action: Any) -> Any:
         """Answer with the only legal action. The elapsed time adds up until the agent is asked, as rewards do."""
-        before = self.answered_at
-        reply = episode.answer(self, action, False)
-        if before is not None:
-            self.answered_at = before
-        return reply
+        if self.answered_at is not None:
+            self.now = self.answered_at
+        return episode.answer(self, action, False)
 
     def only_action(self) -> Any:
         """The only legal action of the pending decision; None if there are several."""
         return only_choice(self.point.definition.action_space, self.mask)
 
-    def decides_after_end(self) -> AgentError:
-        """Make the error for a decision after the agent's end."""
-        return AgentError(
-            f"the agent {self.name!r} decides at {self.point.point.name} after its end; agent= must give each entity a"
-            " name of its own, and removed_by= or end_agent() must end an agent only when its entity is gone"
-        )
-
     def keep(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Keep the arguments of a decision.
-
-        At an entity-level point the first argument is the entity. It is held by a weak reference if it supports one,
-        so that the model can free it. While the decision is pending, the simulation holds it.
-        """
+        """Keep the arguments of a decision; its entity, if any, by a weak reference, so that the model can free it."""
         self.entity, self.rest, self.kwargs = None, args, kwargs
         if args and self.point.agent is None:
             with suppress(TypeError):  # not every object supports weak references
@@ -237,19 +201,10 @@ class Agent:
         if args is None:  # the agent never decided, or the model has freed its entity
             self.clear_observation()
         else:
-            update = self.point.updates[0]
-            update(self, args, self.kwargs, last=True)
+            self.point.updates[0](self, args, self.kwargs, last=True)
         self.reward, self.carried = self.reward + self.carried, 0.0
         self.entity = self.rest = self.answered_at = None
         self.kwargs = _NOTHING
-
-    def checked(self, action: Any) -> Any:
-        """Check an action for the pending decision; return it in the form that its mapping takes.
-
-        Raises:
-            InvalidActionError: The action is not legal.
-        """
-        return action if action is RULE else self.point.checked(action, self.name, self.mask)
 
     # -- infos ------------------------------------------------------------------------------------
 
@@ -260,9 +215,7 @@ class Agent:
         if mask is not None:
             info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
         if self.informs_rule_action:
-            action = self.rule_action
-            info["rule_action"] = action if type(action) is int else duplicate(action)
-            self.informs_rule_action = False
+            info["rule_action"], self.informs_rule_action = duplicate(self.rule_action), False
         return info
 
     def read_clock(self) -> dict[str, Any]:
@@ -281,25 +234,18 @@ class Agent:
 
 
 def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Make the functions that reward and observe the agents of a decision point.
+    """Make the two functions that reward and observe the agents of a decision point for the arguments of a call.
 
-    Returns:
-        Two functions. Both take the agent, and the positional and keyword arguments of the call of the decision
-        function. The first also takes three flags: whether to reward, whether to observe, and whether this is the
-        agent's end. The second is for agents that have decided before, and skips what the point does not need.
-        Both raise ``RewardError``, ``ObservationError`` and ``MaskError``.
+    The first also takes whether to reward, whether to observe, and whether this is the agent's end. The second is for
+    agents that have decided before, and skips what the point does not need.
     """
-    reward_mapping, observation_mapping, cast = point.reward_mapping, point.observation_mapping, point.cast
+    reward_mapping, cast = point.definition.reward_mapping, point.cast
+    observation_mapping = point.definition.observation_space_mapping
     legal, masked = point.legal, bool(point.masked_parts)
     plain = legal is None and not point.informs_rule_action and not masked
 
     def update(
-        agent: Agent,
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        reward: bool = True,
-        observe: bool = True,
-        last: bool = False,
+        agent: Agent, args: Any, kwargs: Any, reward: bool = True, observe: bool = True, last: bool = False
     ) -> None:
         here = getcurrent() if DIFFERENCES else None
         if here is not None:
@@ -312,7 +258,7 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
                 agent.decided, agent.update = True, again
             if not observe:
                 return
-            first, agent.present = not agent.present, True
+            agent.present = True
             if legal is not None:
                 try:
                     agent.mask, agent.choices = legal(args, kwargs)
@@ -325,8 +271,6 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
                 agent.observation = point.observe(args, kwargs, agent.mask)
             else:
                 agent.observation = cast(observation_mapping(*args, **kwargs))
-            if first and point.finite is not None:
-                point.finite(agent.observation)
         finally:
             if here is not None:
                 if before is None:  # without a function call, which could fail at the recursion limit
@@ -350,11 +294,7 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
 
 
 def checked_reward(agent: Agent, reward: Any) -> float:
-    """Convert a reward to a Python float.
-
-    Raises:
-        RewardError: The reward is not one finite number.
-    """
+    """Convert a reward to a Python float, or raise ``RewardError`` if it is not one finite number."""
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):
         raise RewardError(f"the reward {short_repr(reward)} is not one number")

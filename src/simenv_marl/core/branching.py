@@ -18,6 +18,8 @@ from contextlib import nullcontext, suppress
 from contextvars import ContextVar
 from functools import partial
 from gc import get_objects
+from subprocess import Popen
+from threading import Thread
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -35,7 +37,7 @@ from ..errors import (
 )
 from .context import preserve_generators, reuse_resources
 from .packing import pack_outcome, pack_plainly, unpack_outcome
-from .rng import is_seed, seed_process
+from .rng import PROCESS, is_seed, seed_globals
 
 if hasattr(os, "fork"):
     import fcntl
@@ -96,8 +98,24 @@ def branch(
     """
     view = pending_view(env, "branch")
     can_fork = hasattr(os, "fork") and view.driver == "greenlet"
-    _check(n, method, seeds, time_limit, can_fork=can_fork)
+    if isinstance(n, bool) or not isinstance(n, int) or n < 0:
+        raise OptionValueError(f"n must be a non-negative integer, not {short_repr(n)}")
+    if method not in (None, "fork", "replay"):
+        suggestion = did_you_mean(method, ["fork", "replay"])
+        raise OptionValueError(f"method must be None, 'fork' or 'replay', not {short_repr(method)}{suggestion}")
+    if method == "fork" and not can_fork:
+        raise OptionValueError(
+            'method="fork" needs a platform that can fork, and driver="greenlet": a forked process does not have the'
+            ' other threads; use "replay"'
+        )
+    if not isinstance(time_limit, (int, float)) or not time_limit > 0:
+        raise OptionValueError(f"time_limit must be a number of seconds, not {short_repr(time_limit)}")
     if seeds is not None:
+        listed = isinstance(seeds, (Sequence, np.ndarray))
+        if not (listed and len(seeds) == n and all(map(is_seed, seeds))):
+            raise OptionValueError(
+                f"seeds must be n = {n} non-negative integers, one for each branch, not {short_repr(seeds)}"
+            )
         view._session.check_reseed()
     depth = _depth.get() + 1
     if depth > DEEPEST:
@@ -107,7 +125,7 @@ def branch(
         )
 
     forks = can_fork and method != "replay"
-    obstacles: dict[Any, str] = view._session.open_resources() if forks else {}
+    obstacles: dict[Any, str] = _open_resources(view.episode.driver.opened) if forks else {}
     loops = loops_on(obstacles) if obstacles else []
     for loop in loops:  # the pair of sockets that wakes an event loop is made anew
         obstacles.pop(loop._ssock.fileno(), None)
@@ -127,7 +145,7 @@ def branch(
             twin = getattr(continuation, "unwrapped", continuation)
             twin.begin_branch()
             if seeds is not None:
-                seed_process(int(seeds[number]))
+                seed_globals(int(seeds[number]), PROCESS)
                 twin._session.reseed(int(seeds[number]))
             return function(continuation, number)
         finally:
@@ -146,27 +164,6 @@ def pending_view(env: Any, user: str) -> Any:
         raise ViewError(f"{user} needs an environment of one simulation, not {short_repr(env)}")
     view.check_pending()
     return view
-
-
-def _check(n: Any, method: Any, seeds: Any, time_limit: Any, *, can_fork: bool) -> None:
-    """Check the arguments of ``branch``."""
-    if isinstance(n, bool) or not isinstance(n, int) or n < 0:
-        raise OptionValueError(f"n must be a non-negative integer, not {short_repr(n)}")
-    if method not in (None, "fork", "replay"):
-        suggestion = did_you_mean(method, ["fork", "replay"])
-        raise OptionValueError(f"method must be None, 'fork' or 'replay', not {short_repr(method)}{suggestion}")
-    if method == "fork" and not can_fork:
-        raise OptionValueError(
-            'method="fork" needs a platform that can fork, and driver="greenlet": a forked process does not have the'
-            ' other threads; use "replay"'
-        )
-    if not isinstance(time_limit, (int, float)) or not time_limit > 0:
-        raise OptionValueError(f"time_limit must be a number of seconds, not {short_repr(time_limit)}")
-    listed = isinstance(seeds, (Sequence, np.ndarray))
-    if seeds is not None and not (listed and len(seeds) == n and all(map(is_seed, seeds))):
-        raise OptionValueError(
-            f"seeds must be n = {n} non-negative integers, one for each branch, not {short_repr(seeds)}"
-        )
 
 
 # -- by replaying ---------------------------------------------------------------------------------
@@ -323,6 +320,21 @@ def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
             torch.set_num_threads(1)  # its threads do not exist here, and torch would wait for them
 
     return separate
+
+
+def _open_resources(opened: Iterable[Any] | None) -> dict[Any, str]:
+    """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
+    found: dict[Any, str] = {}
+    for thing in list(opened or ()):
+        if isinstance(thing, socket.socket):
+            if thing.fileno() >= 0:
+                found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
+        elif isinstance(thing, Thread):
+            if thing.is_alive():
+                found[thing] = "a thread"
+        elif (thing.returncode if isinstance(thing, Popen) else thing.exitcode) is None:
+            found[thing] = f"a child process ({thing.pid})"
+    return found
 
 
 def loops_on(descriptors: Container[int]) -> list[Any]:

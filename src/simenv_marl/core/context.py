@@ -1,29 +1,27 @@
 """Contexts: an environment's code on the user's side, with its own global generators; reused resources.
 
 Models that draw from ``random`` and ``numpy.random`` share one state with the whole process. With ``global_rng=True``
-an environment has a state of its own, which is in place while the environment runs; afterwards the state of whatever
-ran before is restored.
+an environment has a state of its own, which is in place while the environment runs.
 """
 
 from __future__ import annotations
 
 import random
-import sys
 from _random import Random as Twister
-from collections.abc import Hashable
 from contextlib import suppress
 from contextvars import ContextVar
 from copy import deepcopy
 from ctypes import memmove, string_at
 from os import getpid
 from threading import RLock, current_thread, get_ident
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
 
 from ..errors import ReentrancyError, WrongThreadError
-from ..hooks.stacks import SIMULATION, Evaluation, outside_simulation
-from .rng import ENVIRONMENT, NUMPY, PYTHON, generator_of_torch, seed_globals
+from ..hooks.stacks import SIMULATION, outside_simulation
+from .rng import LEGACY, NUMPY, PYTHON, generator_of_torch
 
 
 class ExclusiveLock:
@@ -67,16 +65,9 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
     __slots__ = ("_enters", "_lock", "_rng")
 
     def __init__(
-        self,
-        evaluation: Evaluation | None = None,
-        rng: GlobalRandom | None = None,
-        lock: ExclusiveLock | None = None,
-        driver: Any = None,
+        self, evaluation: Any, rng: GlobalRandom | None, lock: ExclusiveLock | None = None, driver: Any = None
     ) -> None:
-        """Prepare the context of an environment's plugins, generators and lock, where it has these.
-
-        The driver is entered; without one, the simulation cannot be resumed inside.
-        """
+        """Prepare the context. The driver is entered; without one, the simulation cannot be resumed inside."""
         super().__init__(evaluation)
         self._rng, self._lock, self._enters = rng, lock, driver
 
@@ -85,17 +76,15 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
             self._lock.__enter__()
         try:
             super().__enter__()
-            try:
+            if self._enters is not None:
+                self._enters.enter()
+            if self._rng is not None:
                 if self._enters is not None:
-                    self._enters.enter()
-                if self._rng is not None:
-                    self._rng.enter()
-            except BaseException:
-                super().__exit__()
-                raise
+                    self._enters.caller = None  # each step must enter the generators, and so is never direct
+                self._rng.enter()
         except BaseException:
-            if self._lock is not None:
-                self._lock.__exit__()
+            self._rng = None  # it was not entered
+            self.__exit__()
             raise
 
     def __exit__(self, *error: object) -> None:
@@ -112,35 +101,21 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
 
 _HEADER: Final = object.__basicsize__
 _WORDS: Final = 4 * 625  # bytes: the number of words that are used up, and the 624 words of a Mersenne twister
-_legacy: Any = np.random  # NumPy's type stubs lack some of its functions
 
 
-def _find_gauss() -> int:
-    """Return the offset in NumPy's generator of the second normally distributed number, which it keeps.
-
-    A flag before the number says whether there is one. 0: the generators do not have the expected memory layout.
-    """
+def _is_layout_known() -> bool:
+    """Return whether the words of Python's generator are where they are expected in the memory."""
     if Twister.__basicsize__ < _HEADER + _WORDS:
-        return 0
-    generator, state = _legacy.get_bit_generator(), np.random.get_state(legacy=False)
-    try:
-        words = memoryview(string_at(id(PYTHON) + _HEADER, _WORDS)).cast("I")
-        _legacy.set_bit_generator(np.random.MT19937(1))
-        number = np.random.standard_normal(1) * 0 + _legacy.get_state(legacy=False)["gauss"]
-        memory = string_at(id(NUMPY), type(NUMPY).__basicsize__)
-        place = memory.find(number.tobytes()) - 8
-        known = (*words[1:], words[0]) == random.getstate()[1] and place >= _HEADER
-        return place if known and int.from_bytes(memory[place : place + 4], sys.byteorder) == 1 else 0
-    except Exception:  # any error means that the layout differs
-        return 0
-    finally:
-        _legacy.set_bit_generator(generator)
-        np.random.set_state(state)
+        return False
+    words = memoryview(string_at(id(PYTHON) + _HEADER, _WORDS)).cast("I")
+    return bool((*words[1:], *words[:1]) == random.getstate()[1])
 
 
-GAUSS_AT: Final = _find_gauss()
-"""What ``_find_gauss`` returned. If it is not 0, states are copied as bytes, which takes a microsecond. Otherwise the
-generators' own functions copy them, which takes 150 microseconds."""
+IS_COPIED: Final = _is_layout_known()
+"""Whether the state of Python's generator is copied as bytes, which is ten times as fast as its own functions."""
+
+_NO_BITS: Final = SimpleNamespace()
+"""Takes the place of NumPy's bit generator, which takes long to copy, while the normal number beside it is copied."""
 
 
 def save_generators(*, copy: bool = False) -> tuple[Any, Any, Any]:
@@ -148,78 +123,74 @@ def save_generators(*, copy: bool = False) -> tuple[Any, Any, Any]:
 
     Other code that draws from a bit generator that is not copied changes the saved state.
     """
-    generator = _legacy.get_bit_generator()
-    if copy:
-        generator = deepcopy(generator)
-    if not GAUSS_AT:
-        return generator, random.getstate(), np.random.get_state(legacy=False)
-    words = string_at(id(PYTHON) + _HEADER, _WORDS)
-    return generator, (words, PYTHON.gauss_next), string_at(id(NUMPY) + GAUSS_AT, 16)
+    generator = NUMPY._bit_generator
+    python = (string_at(id(PYTHON) + _HEADER, _WORDS), PYTHON.gauss_next) if IS_COPIED else random.getstate()
+    _NO_BITS.state = {"bit_generator": "", "state": None}
+    try:
+        NUMPY._bit_generator = _NO_BITS
+        kept = NUMPY.get_state(legacy=False)
+    finally:
+        NUMPY._bit_generator = generator
+    return deepcopy(generator) if copy else generator, python, kept
 
 
 def load_generators(state: tuple[Any, Any, Any]) -> None:
     """Put a saved state of the global generators in place."""
-    generator, python, numpy = state
-    _legacy.set_bit_generator(generator)  # this drops the number that NumPy keeps
-    if GAUSS_AT:
+    generator, python, kept = state
+    if IS_COPIED:
         words, PYTHON.gauss_next = python
         memmove(id(PYTHON) + _HEADER, words, _WORDS)
-        memmove(id(NUMPY) + GAUSS_AT, numpy, 16)
     else:
         random.setstate(python)
-        np.random.set_state(numpy)
+    LEGACY.set_bit_generator(generator)  # this drops the number that NumPy keeps
+    try:
+        NUMPY._bit_generator = _NO_BITS
+        NUMPY.set_state(kept)
+    finally:
+        NUMPY._bit_generator = generator
 
 
 class GlobalRandom:
     """The context in which a simulation has its own state of the global generators."""
 
-    _entered: Final[list[GlobalRandom]] = []
+    _entered: Final[list[tuple[GlobalRandom, int, Any]]] = []  # each with its thread and the state before
 
     def __init__(self) -> None:
         """Copy the present state, which is used until ``begin`` seeds it."""
-        self._thread = 0
-        self._outer: list[Any] = []
-        outer = save_generators()
-        if type(outer[0]) is not np.random.MT19937:
-            _legacy.set_bit_generator(np.random.MT19937())  # ``numpy.random.seed`` can seed no other type
-        self._own = save_generators(copy=True)
-        load_generators(outer)
+        generator, *others = save_generators(copy=True)
+        if type(generator) is not np.random.MT19937:
+            generator = np.random.MT19937()  # ``numpy.random.seed`` can seed no other type
+        self._own: Any = generator, *others
 
     def begin(self, seed: int) -> None:
         """Seed both generators, whose state must be in place, with the seed of an episode."""
         random.seed(seed)
         np.random.seed(seed % 2**32)
 
-    def begin_anew(self, seed: int) -> None:
-        """Seed the generators, whose state must be in place, for another future."""
-        seed_globals(seed, ENVIRONMENT)
-
     def enter(self) -> None:
         """Put this state in place, unless another thread has put that of another environment in place."""
-        thread = get_ident()
+        thread, present = get_ident(), None
         nested = current_thread().name == SIMULATION  # its user waits in another thread meanwhile
-        if self._entered and self._entered[-1]._thread != thread and not nested:
+        if self._entered and self._entered[-1][1] != thread and not nested:
             raise WrongThreadError(
                 "two environments with global_rng=True ran in two threads at once, but a process has only one state of"
                 " the global generators; run them one after the other, or in separate processes"
             )
-        self._thread = thread
-        if self not in self._entered[-1:]:
-            outer = save_generators()
+        if not self._entered or self._entered[-1][0] is not self:
+            present = save_generators()
             load_generators(self._own)
-            self._outer.append(outer)
-        self._entered.append(self)
+        self._entered.append((self, thread, present))
 
     def leave(self) -> None:
         """Restore the state that was in place before."""
-        self._entered.pop()
-        if self not in self._entered[-1:]:
+        before = self._entered.pop()[2]
+        if before is not None:
             self._own = save_generators()
-            load_generators(self._outer.pop())
+            load_generators(before)
 
     def step_out(self) -> None:
         """Leave as often as this state was entered in a row."""
-        while self in self._entered[-1:]:
+        while self._entered and self._entered[-1][0] is self:
             self.leave()
 
 
@@ -240,8 +211,8 @@ class preserve_generators:  # noqa: N801 - it is used like a function; not a gen
 
 # -- resources that several simulations use -------------------------------------------------------
 
-_FREE: Final[ContextVar[dict[Hashable, list[Any]] | None]] = ContextVar("simenv_marl.free", default=None)
-"""The free resources of the current block, by the arguments that made them. None outside of a block."""
+_FREE: Final[ContextVar[list[tuple[Any, Any]] | None]] = ContextVar("simenv_marl.free", default=None)
+"""The free resources of the current block, with what identifies those that are alike. None outside of a block."""
 
 
 class reuse_resources:  # noqa: N801 - as above
@@ -252,33 +223,28 @@ class reuse_resources:  # noqa: N801 - as above
     """
 
     def __enter__(self) -> None:
-        self._token = _FREE.set({}) if _FREE.get() is None else None
+        self._token = _FREE.set([]) if _FREE.get() is None else None
 
     def __exit__(self, *error: object) -> None:
-        if self._token is None:
-            return
-        resources = [resource for alike in (_FREE.get() or {}).values() for resource in alike]
-        _FREE.reset(self._token)
-        for resource in resources:  # first for all of them, so that they end at the same time
-            resource.close_input()
-        for resource in resources:
-            resource.close()
+        if self._token is not None:
+            free = _FREE.get() or []
+            _FREE.reset(self._token)
+            for _, resource in free:  # first for all of them, so that they end at the same time
+                resource.close_input()
+            for _, resource in free:
+                resource.close()
 
 
-def release(key: Hashable, resource: Any) -> bool:
+def release(key: Any, resource: Any) -> bool:
     """Leave a resource to later simulations; return False if it is not usable, or if there is no block."""
     free = _FREE.get()
     if free is None or not resource.usable:
         return False
-    free.setdefault(key, []).append(resource)
+    free.append((key, resource))
     return True
 
 
-def acquire(key: Hashable) -> Any:
-    """Return a usable resource that was released under an equal key; None if there is none."""
-    alike = (_FREE.get() or {}).get(key, [])
-    while alike:
-        resource = alike.pop()
-        if resource.usable:
-            return resource
-    return None
+def acquire(key: Any) -> Any:
+    """Return a resource that was released under an equal key; None if there is none."""
+    free = _FREE.get() or []
+    return next((free.pop(number)[1] for number, (other, _) in enumerate(free) if other == key), None)

@@ -3,41 +3,36 @@
 A driver keeps one stack for a simulation, over all its episodes: a greenlet, or a thread. *Jobs* run on it one after
 the other: the making of the simulation, then its ``reset`` and its ``run`` for each episode. On the user's side
 ``begin`` prepares a job. ``resume`` starts it, and later passes replies to the simulation. ``throw`` raises
-``SimulationExit`` in it. ``resume`` and ``throw`` return the simulation's next *event*, a tuple ``(event, args,
-kwargs)``. For a decision these are an object of the plan or the episode, and the arguments of the call. For the end of
-a job they are ``FINISHED`` or ``FAILED``, a list with the result or the error, and None. The receiver must empty that
-list, because the waiting stack still refers to it. The episode calls the event's ``handle``, which returns the reply.
+``SimulationExit`` in it. Both return the simulation's next *event*, a tuple ``(event, args, kwargs)``. For a decision
+these are an object of the plan or the episode, and the arguments of the call. For the end of a job they are ``ENDED``,
+a list with the result or the error, and whether it is an error. The receiver must empty that list, because the waiting
+stack still refers to it. The episode calls the event's ``handle``, which returns the reply.
 
 On the simulation's side a driver enters its stack into the hooks of the model's functions, each with the interceptor
-that sends an event and carries out the reply. It also notes what the simulation opens: decisions in its threads are
-refused, and threads, processes and sockets do not continue in a forked process.
+that sends an event and carries out the reply. It also notes which threads, processes and sockets the simulation opens.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextvars import Context, copy_context
 from functools import partial, wraps
 from multiprocessing.process import BaseProcess
 from socket import socket
 from subprocess import Popen
-from threading import Thread
-from types import MappingProxyType
+from threading import Thread, local
+from types import coroutine
 from typing import Any, Final
-from weakref import WeakSet
+from weakref import WeakSet, ref
 
 from greenlet import getcurrent, greenlet
 
 from ..errors import SimulationError, WrongThreadError, annotate
 from ..hooks.hook import Hook
-from ..hooks.stacks import LOCK, STACKS, Interceptor, stack_of
+from ..hooks.stacks import LOCK, STACKS, Interceptor, spawner_of, stack_of
 from ..simulation import TRUNCATED, Sentinel
 
 Event = tuple[Any, Any, Any]
-
-NO_EVENTS: Final[Mapping[Hook, Any]] = MappingProxyType({})
-"""The events while a simulation is made, reset or closed: none, so that decision functions run their rule."""
-
 WAIT: Final = Sentinel("WAIT")
 """What an event's ``handle`` returns instead of a reply if the episode waits for an action, or is over."""
 
@@ -45,15 +40,13 @@ SECONDS_TO_UNWIND: Final = 5.0
 """The seconds that a simulation in a thread may take, while it is unwound, to its next decision or its end."""
 
 UNWINDING_TRIES: Final = 1000
-"""How often ``SimulationExit`` is raised in a simulation before it is given up. It may decide again, or swallow the
-exit. A SimPy model loses one of its processes at each try."""
+"""How often ``SimulationExit`` is raised in a simulation. A SimPy model loses one of its processes at each try."""
 
 
 class SimulationExit(SystemExit):
     """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it.
 
-    It is a ``SystemExit``, because event loops pass that on at once. They would keep any other exception for the code
-    that awaits the task, and let the other tasks continue.
+    It is a ``SystemExit``, because event loops pass that on at once, and keep others for who awaits the task.
     """
 
 
@@ -70,27 +63,20 @@ def is_exit(error: BaseException | None) -> bool:
     return False
 
 
-class _Finished:
-    """The event of a job that has returned."""
+class _Ended:
+    """The event of the end of a job."""
 
-    def handle(self, episode: Any, box: list[Any], _: Any) -> Any:
-        """End the episode of all agents. The box holds the value that ``run`` returned."""
-        episode.running = False
+    def handle(self, episode: Any, box: list[Any], failed: bool) -> Any:
+        """End the episode of all agents with the value that ``run`` returned, or raise its error."""
+        episode.running, episode.failed_in_model = False, failed
+        if failed:
+            raise box.pop()
         episode.finish(truncated=box.pop() is TRUNCATED)
         return WAIT
 
 
-class _Failed:
-    """The event of a job that has raised."""
-
-    def handle(self, episode: Any, box: list[Any], _: Any) -> Any:
-        """Raise the error in the box."""
-        episode.running, episode.failed_in_model = False, True
-        raise box.pop()
-
-
 class _Refused:
-    """The event of a decision after another one was refused: see ``Driver.refuse``."""
+    """The event of a decision after another one was refused."""
 
     deliver = report = None
 
@@ -100,144 +86,146 @@ class _Refused:
         raise episode.driver.refusal()
 
 
-FINISHED: Final[Any] = _Finished()
-FAILED: Final[Any] = _Failed()
+ENDED: Final[Any] = _Ended()
 _REFUSED: Final[Any] = _Refused()
+
+
+class _Thread(local):
+    """What identifies a thread. Unlike the thread's number, it is never reused for another thread."""
+
+    identity: Any = Thread  # of no thread: seen by what the garbage collector runs while that of a thread is made
+
+    def __init__(self) -> None:
+        self.identity = set[None]()  # an object of this thread that can be referenced weakly
+
+
+THREAD: Final = _Thread()
 
 
 class Driver:
     """The base class of drivers.
 
-    Besides the methods here, a driver has ``resume(reply)``, which returns the simulation's next event; ``throw()``,
-    which raises ``SimulationExit`` in the suspended simulation and returns its next event, or None if none comes in
-    time; ``enter()``, which prepares to resume the simulation from the current thread and greenlet, or raises a
-    ``WrongThreadError``; ``end()``, which ends the stack; and ``abandon()``, which gives up a job that does not unwind.
+    A driver adds ``enter()``, which prepares to resume the simulation from here, or raises a ``WrongThreadError``;
+    ``resume(reply)``; ``throw()``, which returns None if no event comes in time; and ``end()``, which ends the stack.
 
     Attributes:
-        stack: The simulation's stack. None before the first job, and after the end.
+        events: The events that the simulation sends, by hook. Empty while it is made, reset or closed.
         caller: The greenlet from which ``resume`` may be called directly. None: ``enter`` must be called before.
-        plugins: The plugins of the simulation's environment, which apply to all code on the stack. None if it has none.
         given_up: The reason why a job was given up. None if no job was.
-        ended: Whether the stack has ended.
-        idle: Whether no job is under way.
-        reachable: Whether the simulation can be resumed from the current thread and process.
-        lost: Whether no thread of this process can resume the simulation any more.
-        at_home: Whether this code runs in the simulation's thread.
-        own_thread: Whether the simulation has a thread of its own.
+        ended: Whether the stack has ended, or was given up.
+        forked: Whether this process was forked by the simulation.
         opened: The sockets, processes and threads that the simulation has opened; None before the first one.
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_events", "_exiting", "_handled", "_job",
-        "_process_refused", "_refused", "caller", "ended", "given_up", "idle", "opened", "plugins", "stack",
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_refused", "_stack", "caller", "ended",
+        "events", "forked", "given_up", "idle", "opened", "plugins",
     )  # fmt: skip
 
     resume: Any
     throw: Any
     enter: Any
     end: Any
-    abandon: Any
-    reachable: Any
-    lost: Any
-    at_home: Any
     _decider: Any
+    _shares_thread = True  # with its user
 
-    own_thread = False
-
-    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None) -> None:
-        """Prepare a driver. The first job begins the stack. ``opened``: what was opened on an earlier stack."""
+    def __init__(self, plugins: Any = None) -> None:
+        """Prepare a driver. The first job begins the stack."""
         self.plugins = plugins
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
-        self.opened = opened
-        self.stack: greenlet | None = None
+        self.events: Mapping[Hook, Any] = {}
+        self._stack: greenlet | None = None
+        self._home = ref(THREAD.identity)  # the thread of the stack
         self.caller: greenlet | None = None
+        self.opened: WeakSet[Any] | None = None
         self.given_up: str | None = None
-        self.ended, self.idle, self._exiting = False, True, False
+        self.ended, self.idle, self.forked, self._exiting = False, True, False, False
         self._job: Any = None
-        self._context: Any = None
-        self._events = NO_EVENTS
-        self._refused: WrongThreadError | None = None
-        self._process_refused: str | None = None
+        self._context: Any = None  # of the job, until it begins
+        self._refused: Any = None  # the error of a refused decision, until the user gets it
 
     # -- on the user's side -----------------------------------------------------------------------
 
-    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job, with the events to send by hook. After ``enter``, the next ``resume`` starts it on the stack.
+    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] | None = None, context: Any = None) -> None:
+        """Prepare a job, with the events to send by hook, and a context or else a copy of the user's context variables.
 
-        All other functions run their rule. Without a context, the job gets a copy of the user's context variables.
+        After ``enter``, the next ``resume`` starts it on the stack.
         """
-        self._job, self._events, self._refused = job, events, None
+        self._job, self.events, self._refused = job, events or {}, None
         self._context = copy_context() if context is None else context
 
     @property
-    def usable(self) -> bool:
-        """Whether a job can begin here."""
-        return self.idle and not self.ended and bool(self.reachable)
+    def reachable(self) -> bool:
+        """Whether the simulation can be resumed from the current thread and process."""
+        return self._home() is THREAD.identity if self._shares_thread else not self.lost
+
+    @property
+    def lost(self) -> bool:
+        """Whether the thread of the stack has ended, or does not exist in this forked process."""
+        return self._home() is None
 
     def run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
         """Run a job to its end, during which decision functions run their rule; return its result."""
         try:
             self.enter()
             self.begin(job, context=context)
-            kind, box, _ = self.resume(None)
+            _, box, failed = self.resume(None)
         except BaseException:
             self.unwind()  # an interrupt has ended the wait
             raise
-        value = box.pop()
-        if kind is FINISHED:
-            return value
-        try:
-            raise value
-        finally:
-            del value
+        if failed:
+            raise box.pop()
+        return box.pop()
 
     def unwind(self) -> list[BaseException]:
-        """Raise ``SimulationExit`` in the current job until it ends. Return the other errors that it raised.
-
-        A job that does not end is given up.
-        """
+        """Raise ``SimulationExit`` in the current job until it ends, or give it up. Return errors that it raised."""
+        self.enter()
+        if self.idle or self.ended:  # the job has ended, or was interrupted before it began
+            self._job = None
+            return []
+        self._exiting = True
         for _ in range(UNWINDING_TRIES):
             event = self.throw()
             if event is None:
                 self.given_up = f"neither decided anything nor ended within {SECONDS_TO_UNWIND} s; it is abandoned"
                 break
-            kind, box, _ = event
-            if kind is FINISHED or kind is FAILED:
+            kind, box, failed = event
+            if kind is ENDED:
                 value = box.pop()
-                return [value] if kind is FAILED and not is_exit(value) else []
+                return [value] if failed and not is_exit(value) else []
         else:
             self.given_up = (
                 f"refuses to end: it went on after SimulationExit was raised in it {UNWINDING_TRIES} times; it is left"
                 " suspended. Let the model re-raise exceptions that it does not know; callbacks from C need a"
                 " CallbackGuard"
             )
-        self.abandon()
+        self.ended = True
         return []
 
     # -- on the simulation's side -----------------------------------------------------------------
 
     def _register(self) -> None:
         """On the stack: register it as a simulation's stack."""
-        self.stack = stack = getcurrent()
-        STACKS[stack] = self
+        self._stack, self._home = getcurrent(), ref(THREAD.identity)
+        STACKS[self._stack] = self
         _watch_resources()
 
     def _work(self) -> Event:
-        """On the stack: run a job; return the event for its end."""
+        """On the stack: run a job; return the event of its end."""
         # No frame here may refer to the stack: it would then refer to itself, and could not be collected.
         self.idle = self._exiting = False
         job, self._job = self._job, None
         try:
-            if self._events or self._handled:
-                self.enter_hooks()
+            self.enter_hooks()
             result = job()
         except BaseException as error:
-            return FAILED, [self._explain(error)], None
+            return ENDED, [self._explain(error)], True
         finally:
             job = None
-            self._leave_hooks()
-            self._events = NO_EVENTS
-        return (FINISHED, [result], None) if self._refused is None else (FAILED, [self.refusal()], None)
+            self.leave_hooks(self._stack)
+            self.events = {}
+        failed = self._refused is not None
+        return ENDED, [self.refusal() if failed else result], failed
 
     def _explain(self, error: BaseException) -> BaseException:
         """Return the error to raise on the user's side for an error of the simulation."""
@@ -245,124 +233,90 @@ class Driver:
             if isinstance(error, SimulationExit):
                 return self.refusal()
             annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
-        if type(error) is not SimulationExit or self._exiting:
-            return error
-        stray = SimulationError(
-            "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of that"
-            " episode has kept; end all of these with their episode (cancel them in stop or in a finally)"
-        )
-        stray.__cause__ = error
-        return stray
+        if type(error) is SimulationExit and not self._exiting:
+            stray = SimulationError(
+                "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of"
+                " that episode has kept; end all of these with their episode (cancel them in stop or in a finally)"
+            )
+            stray.__cause__ = error
+            return stray
+        return error
 
     def _forget_stack(self) -> None:
         """Unregister the stack. From now on it takes no part in decisions."""
         self.ended = True
-        self._leave_hooks()
-        self._events = NO_EVENTS
-        stack, self.stack = self.stack, None
-        if stack is not None:
-            STACKS.pop(stack, None)
+        stack, self._stack = self._stack, None
+        self.leave_hooks(stack)
+        self.events = {}
+        STACKS.pop(stack, None)  # type: ignore[arg-type]
         _watch_resources()
 
-    def decides(self, hook: Hook) -> bool:
-        """Whether the current job sends events for the calls of a hook."""
-        return hook in self._events
-
-    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
-        """Return the interceptor for calls of a hook; None if the rule decides.
-
-        Calls that are ``away`` come from the model's own greenlets or threads, and not from the stack itself.
-        """
-        event = self._events.get(hook)
-        if event is None:
-            return None
-        if self._process_refused is not None:
-            return self.refuse(hook, self._process_refused)
-        if away and not self.at_home:
-            return self.refuse(hook, "a thread that the simulation has started")
-        decide: Interceptor = self._decider(hook, event, away)
-        return decide
-
-    def hide(self) -> None:
-        """On the stack, leave all hooks, so that the driver takes no part in calls until ``show``."""
-        if getcurrent() is self.stack:
-            self._leave_hooks()
-
-    def show(self) -> None:
-        """On the stack, enter all hooks, so that the driver takes part in calls."""
-        if getcurrent() is self.stack:
-            self.enter_hooks()
-
     def enter_hooks(self) -> None:
-        """Enter all hooks with the interceptors that they need now. Any code may call this."""
-        stack = self.stack
-        if stack is not None:
-            for hook in (*self._events, *self._handled):
+        """Enter all hooks with the interceptors that they need now, unless another environment runs on the stack."""
+        stack = self._stack
+        if stack is not None and STACKS.get(stack) is self:
+            for hook in (*self.events, *self._handled):
                 hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
 
-    def _leave_hooks(self) -> None:
-        stack = self.stack
-        if stack is not None:
-            for hook in (*self._events, *self._handled):
-                hook.leave(stack)
+    def leave_hooks(self, here: greenlet | None) -> None:
+        """Leave all hooks, so that the stack takes no part in calls until ``enter_hooks``."""
+        if here is not None:
+            for hook in (*self.events, *self._handled):
+                hook.leave(here)
 
-    # -- refusals ---------------------------------------------------------------------------------
+    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
+        """Return the interceptor for calls of a hook, from the stack or ``away`` from it; None if the rule decides."""
+        event = self.events.get(hook)
+        if event is None:
+            return None
+        where = None
+        if self.forked:
+            where = "a process that the simulation has forked"
+        elif away and self._home() is not THREAD.identity:
+            where = "a thread that the simulation has started"
+        elif away and self._shares_thread and spawner_of(getcurrent()) is not None:
+            where = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
+        if where is not None:
+            return partial(self.refuse, hook, where)
+        rule = hook.rule
+        if event.report is not None:
+            report = _report if hook.kind == "function" else _report_later
+            rule = partial(report, rule, self._decider(None, event.report, away))
+        decide: Interceptor = self._decider(rule, event, away)
+        return decide
 
-    def refuse(self, hook: Hook, where: str) -> Interceptor:
-        """Make the interceptor that refuses a decision in a place where the simulation cannot wait for it.
-
-        The caller gets the error at once, and the user gets one at the simulation's next event.
-        """
-
-        def refuse(args: Any, kwargs: Any) -> Any:
-            error = WrongThreadError(
-                f"{hook.name} was called in {where}, where the environment cannot ask for a decision. Call it where"
-                " run() runs, and pass the decision on"
-            )
-            if self._refused is None and self._process_refused is None:
-                self._refused = error
-                self._events = dict.fromkeys(self._events, _REFUSED)
-                self.enter_hooks()
-            raise error
-
-        return refuse
-
-    def refuse_all(self, where: str) -> None:
-        """Refuse all decisions in this process. Only the model gets the errors."""
-        self._process_refused = where
-        self.enter_hooks()
+    def refuse(self, hook: Hook, where: str, args: Any, kwargs: Any) -> Any:
+        """Refuse a decision with an error; the user gets another one at the simulation's next event."""
+        error = WrongThreadError(
+            f"{hook.name} was called in {where}, where the environment cannot ask for a decision. Call it where"
+            " run() runs, and pass the decision on"
+        )
+        if self._refused is None and not self.forked:
+            self._refused = error
+            self.events = dict.fromkeys(self.events, _REFUSED)
+            self.enter_hooks()
+        raise error
 
     def refusal(self) -> WrongThreadError:
         """Make the error that tells the user of a refused decision."""
         refused, self._refused = self._refused, None
-        error = WrongThreadError(*(() if refused is None else refused.args))
+        error = WrongThreadError(*refused.args)
         error.__cause__ = refused
         return error
 
 
-# -- the rule's decisions -------------------------------------------------------------------------
+def _report(rule: Any, report: Interceptor, /, *args: Any, **kwargs: Any) -> Any:
+    """Run a rule, and pass its decision to an interceptor."""
+    decision = rule(*args, **kwargs)
+    report((decision, args, kwargs), {})
+    return decision
 
 
-def reporting_rule(hook: Hook, report: Interceptor) -> Callable[..., Any]:
-    """Return the rule of a hook, which passes each decision to the interceptor ``report``."""
-    rule: Callable[..., Any] = hook.rule
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        decision = rule(*args, **kwargs)
-        report((decision, args, kwargs), {})
-        return decision
-
-    def generate(*args: Any, **kwargs: Any) -> Any:
-        decision = yield from rule(*args, **kwargs)
-        report((decision, args, kwargs), {})
-        return decision
-
-    async def wait(*args: Any, **kwargs: Any) -> Any:
-        decision = await rule(*args, **kwargs)
-        report((decision, args, kwargs), {})
-        return decision
-
-    return {"function": call, "generator": generate, "coroutine": wait}[hook.kind]
+@coroutine
+def _report_later(rule: Any, report: Interceptor, /, *args: Any, **kwargs: Any) -> Any:
+    decision = yield from rule(*args, **kwargs)
+    report((decision, args, kwargs), {})
+    return decision
 
 
 # -- what simulations open ------------------------------------------------------------------------
@@ -412,18 +366,3 @@ def _run_registered(driver: Driver, run: Callable[[], None]) -> None:
         run()
     finally:
         STACKS.pop(here, None)
-
-
-def open_resources(opened: Iterable[Any] | None) -> dict[Any, str]:
-    """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
-    found: dict[Any, str] = {}
-    for thing in list(opened or ()):
-        if isinstance(thing, socket) and thing.fileno() >= 0:
-            found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
-        elif isinstance(thing, Thread) and thing.is_alive():
-            found[thing] = "a thread"
-        elif isinstance(thing, (Popen, BaseProcess)):
-            code = thing.returncode if isinstance(thing, Popen) else thing.exitcode
-            if code is None:
-                found[thing] = f"a child process ({thing.pid})"
-    return found

@@ -1,4 +1,4 @@
-"""One episode of one simulation. This module and ``rounds`` determine what happens when.
+"""One episode of one simulation. This module determines what happens when.
 
 An episode::
 
@@ -22,111 +22,42 @@ A decision::
       ended              ------>   ``finish``: last reward and last observation of each agent; OVER
 
 In AEC and single views an episode is played in turns: each agent is updated when its decision arises. In parallel and
-joint views it is played in rounds: all live agents are updated when a step returns (``rounds``). Where policies answer
+joint views it is played in rounds: all live agents are updated when a step returns (``Rounds``). Where policies answer
 all agents (``simulate``, ``simulate_many``), agents are observed when a policy is asked, and not rewarded. While an
 episode is RESETTING or MOVING on the user's side, decision functions run their rule.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from greenlet import getcurrent
 
-from ..errors import AgentError, NoDecisionError, short_repr, warn_user
+from ..errors import AgentError, InvalidActionError, NoDecisionError, UnknownAgentError, short_repr, warn_user
 from ..hooks.hook import Hook
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
-from .context import ExclusiveLock, GlobalRandom
-from .driver import WAIT, Driver
+from .driver import WAIT
 from .planner import two_arguments
 from .points import declared_agents
-from .rounds import Rounds
 from .run import Run
 from .spaces import duplicate
 
 if TYPE_CHECKING:
-    from .plan import Plan
     from .point import Point
 
-LONGEST_TAPE: Final = 200_000
-"""How many answers are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""
-
-LOST: Final[deque[Any]] = deque(maxlen=0)
-"""The tape of an episode that has more answers or is never replayed. It keeps nothing."""
+MANY_ROUNDS: Final = 100
+"""The number of rounds in a row without an action for the pending agent after which the user is warned."""
 
 
 class Episode(Run):
-    """One run of a simulation, from its reset to its end. It has no reference to the environment.
+    """One run of a simulation, from its reset to its end. It has no reference to the environment."""
 
-    Attributes:
-        agents: The live agents of the environment, by name, in the order in which they joined.
-        others: The agents for which policies answer, by name.
-        ended: The agents of the environment whose episodes ended before the simulation's, by name.
-        just_ended: The ended agents whose end no view has reported yet.
-        entities: The agent as which an entity last decided, by its point and its id.
-        consulted: The agent whose policy is being asked. In a replay, the one at whose decision the replay ends.
-        decide: What is done with a decision of the user's instead of updating the agent and waiting.
-        rounds: The state of the present round. None if the episode is played in turns.
-        terminated, truncated: How the episode ended. Both are False before its end, and if an error ended it.
-        unreported_end: Whether the episode ended before the user was asked, because all decisions were forced. The
-            first step reports this end.
-        is_complete: Whether the only agent of the environment has ended, so that nothing is left to ask the user.
-        most_steps: The number of turns after which the episode is truncated; infinity without ``max_steps``.
-        limit: The next number of turns at which ``_reach_limit`` is called.
-        tape: The answers of the user and of policies, in order. ``LOST`` if they are not kept.
-        script: During a replay, the answers on the other episode's tape that are still to be given. Else None.
-        skips: Whether a decision with one legal action is answered with it.
-        last_time: The time at the latest step of a joint view.
-    """
-
-    __slots__ = (
-        "agents", "consulted", "decide", "ended", "entities", "is_complete", "just_ended", "last_time", "limit",
-        "most_steps", "others", "rounds", "script", "skips", "tape", "terminated", "truncated", "unreported_end",
-    )  # fmt: skip
-
-    def __init__(
-        self,
-        plan: Plan,
-        simulation: Any,
-        driver: Driver,
-        seed: int,
-        *,
-        in_rounds: bool = False,
-        rng: GlobalRandom | None = None,
-        lock: ExclusiveLock | None = None,
-        script: Iterable[Any] | None = None,
-    ) -> None:
-        """Prepare an episode of a simulation that has been reset. The driver's next ``resume`` begins ``run``.
-
-        An episode ``in_rounds`` updates all agents when a step returns. ``script`` is the tape of another episode to
-        replay; ordinary episodes have none. For the other arguments, see ``Run``.
-        """
-        super().__init__(plan, simulation, driver, seed, rng, lock)
-        self.agents = {name: Agent(name, point, plan, self.clock) for name, point in plan.roster.items()}
-        self.others: dict[str, Agent] = {}
-        self.ended: dict[str, Agent] = {}
-        self.just_ended: list[Agent] = []
-        self.entities: dict[tuple[Point, int], Agent] = {}
-        self.consulted: Agent | None = None
-        self.terminated = self.truncated = self.unreported_end = self.is_complete = False
-        self.most_steps = plan.options.max_steps or inf
-        self.limit = min(self.most_steps, LONGEST_TAPE + 1)
-        self.tape: Any = LOST if plan.unattended and not plan.has_planner else []
-        self.script = None if script is None else deque(script)
-        self.skips = plan.options.skip_forced
-        self.last_time: float | None = None
-        self.rounds = Rounds() if in_rounds else None
-        self.decide: Callable[..., Any] | None = None
-        if self.rounds is not None:
-            self.decide = self.rounds.decide
-        elif self.skips:
-            self.decide = Agent.decide_unless_forced
+    __slots__ = ()
 
     def events_by_hook(self) -> dict[Hook, Any]:
         """The events that the simulation sends: an agent where it is the only one of a point, else the plan's event."""
@@ -150,37 +81,21 @@ class Episode(Run):
                 event = args = kwargs = None
                 if reply is not WAIT:
                     self.advance(reply)
-                if not self.over and self.consulted is None:
-                    if self.rounds is not None:
-                        self.rounds.update_all(self)
-                    elif not self.plan.unattended or self.plan.rewarded:
-                        self._observe_announced()
-                    for agent in self.agents.values() if self.skips else ():
-                        agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards
-                if self.rounds is not None:
-                    self.rounds.ended_at_reset = self.just_ended if self.skips else []
-                self.begun = True
+                if not self.over and self.consulted is None and self.agents:
+                    self.update_all()
             except BaseException as error:
                 self.fail(error)
                 raise
+        self.unreported_end = self.over
         if self.pending is None and not self.plan.unattended:
-            self.unreported_end = self.skips and any(a.decided for a in (*self.agents.values(), *self.just_ended))
-            if not self.unreported_end:
-                raise NoDecisionError(self._without_decision())
-
-    def play(self, action: Any) -> None:
-        """Play a round if the episode is played in rounds, else a step."""
-        if self.rounds is None:
-            self.step(action)
-        else:
-            self.rounds.play(self, action)
+            forced = self.skips and any(agent.decided for agent in (*self.agents.values(), *self.just_ended))
+            if not forced:
+                raise self._without_decision()
 
     def step(self, action: Any, entered: bool = False) -> None:
-        """Answer the pending decision and run to the user's next decision, or to the end.
+        """Answer the pending decision by an action or ``RULE``, and run to the user's next decision, or to the end.
 
-        Args:
-            action: An action of the pending agent, or ``RULE``.
-            entered: Whether the environment's context is already entered.
+        ``entered``: The environment's context is already entered.
 
         Raises:
             InvalidActionError: The action is not legal. Nothing has moved.
@@ -190,7 +105,7 @@ class Episode(Run):
         if agent is None:
             self.report_end()
             return
-        if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
+        if not entered and (getcurrent() is not self.driver.caller or EVALUATING):
             with self.context():
                 self.step(action, True)
             return
@@ -199,7 +114,7 @@ class Episode(Run):
                 check = agent.point.check  # a local variable: calling the attribute directly is slower
                 legal = check(action)
                 if legal is ILLEGAL or agent.mask is not None:
-                    legal = agent.checked(action)
+                    legal = agent.point.checked(action, agent.name, agent.mask)
                 action = legal
             self.advance(self.answer(agent, action))
         except BaseException as error:
@@ -208,6 +123,12 @@ class Episode(Run):
             else:
                 self.annotate(error)
             raise
+
+    def report_end(self) -> None:
+        """Handle a step without a pending decision: report an end during the reset, or refuse."""
+        if not (self.over and self.unreported_end):
+            raise self.refusal()
+        self.unreported_end = False
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
         """Turn the checked action of an agent, or ``RULE``, into the reply for the driver's ``resume``.
@@ -236,9 +157,10 @@ class Episode(Run):
         agent.answered_at = agent.now
         if turn:
             self.turns = turns = self.turns + 1
-            self.tape.append(recorded)
-            if turns == self.limit:
-                self._reach_limit()
+            if len(self.tape) < self.tape_size:
+                self.tape.append(recorded)
+            if turns == self.most_steps:
+                self.decide = Agent.decide_too_late
         return reply
 
     def advance(self, reply: Any) -> None:
@@ -254,57 +176,54 @@ class Episode(Run):
                 return
             event = args = kwargs = None  # so that they keep nothing alive that the model frees meanwhile
 
-    def record(self, answer: Any) -> None:
-        """Keep an answer for a replay."""
-        if len(self.tape) >= LONGEST_TAPE:
-            self.tape = LOST
-        self.tape.append(answer)
+    def update_all(self, *, truncated: bool = False) -> None:
+        """Reward and observe the live agents when a reset or a round returns. ``truncated``: The episode ends here.
 
-    def _reach_limit(self) -> None:
-        """Drop a tape that has grown too long, and prepare the truncation if this was the last step."""
-        if len(self.tape) > LONGEST_TAPE:
-            self.tape = LOST
-        self.limit = self.most_steps
-        if self.turns == self.limit:
-            self.decide = Agent.decide_too_late
-
-    def _observe_announced(self) -> None:
-        """After a reset, observe the agents that ``expected_calls`` announces and that have not decided."""
+        In turns, only agents that have not decided yet are observed, and none is rewarded.
+        """
         following, self.pending = self.pending, None  # so that an action from inside a mapping is refused
-        for agent, args in self.announced().items():
-            if agent is not following and not agent.decided:
-                agent.keep(self, args, {})
-                self.latest = agent
-                agent.update(agent, args, agent.kwargs, reward=False)
+        in_rounds, expected = self.in_rounds, getattr(self.simulation, "expected_calls", None)
+        for agent, call in () if expected is None else self.announced(expected).items():
+            if agent is not following and (in_rounds or not agent.decided):
+                agent.keep(self, call, {})
+        if truncated:
+            self.finish(truncated=True)
+            return
+        for agent in self.agents.values():
+            if agent.decided and not in_rounds:
+                continue
+            args = agent.arguments()
+            if args is None:
+                agent.clear_observation()
+                continue
+            self.latest = agent
+            update = agent.update  # a local variable: calling the attribute directly is slower
+            if in_rounds:
+                update(agent, args, agent.kwargs)
+                if self.skips:
+                    agent.add_carried_reward(carry_on=not self.turns)
+            else:
+                update(agent, args, agent.kwargs, reward=False)
+            if agent is not following:
                 agent.choices = None  # ``legal`` returns them again when the agent decides
         self.pending = following
 
     # -- agents -----------------------------------------------------------------------------------
 
     def agent_for(self, point: Point, name: Any) -> Agent:
-        """Find the agent with a name that decides at a point, or let it join.
-
-        Raises:
-            AgentError: The name is not a string, or belongs to another point, or to an agent that has ended.
-        """
+        """Find the agent with a name that decides at a point, or let it join; raise ``AgentError`` if it cannot."""
         if not isinstance(name, str):
             raise AgentError(f"agent= of {point.point.name} must return a string or None, not {short_repr(name)}")
-        agent = self.others.get(name) or self.agents.get(name)
+        agent = self.others.get(name) or self.agents.get(name) or self.ended.get(name)
         if agent is None:
-            if name in self.ended:
-                raise self.ended[name].decides_after_end()
             agent = Agent(name, point, self.plan, self.clock)
-            (self.agents if agent.own else self.others)[name] = agent
+            (self.others if agent.delegated else self.agents)[name] = agent
         elif agent.point is not point:
             raise AgentError(
                 f"the agent {name!r} decides at {agent.point.point.name} and at {point.point.name};"
                 " an agent has one decision point: give each point's agents names of their own"
             )
         return agent
-
-    def agent_names(self) -> str:
-        """List the names of the live agents, for messages."""
-        return listed(self.agents)
 
     def agent(self, name: str) -> Agent | None:
         """An agent of the environment, live or ended; None if there is no such agent."""
@@ -316,18 +235,15 @@ class Episode(Run):
         args = None if agent is None else agent.arguments()  # to exclude a freed entity that had the same id
         return agent.name if agent is not None and args and args[0] is entity else None
 
-    def announced(self) -> dict[Agent, tuple[Any, ...]]:
+    def announced(self, expected_calls: Any) -> dict[Agent, tuple[Any, ...]]:
         """The live agents that ``expected_calls`` announces, with the arguments of the first call of each."""
-        expected: Any = getattr(self.simulation, "expected_calls", None)
         announced: dict[Agent, tuple[Any, ...]] = {}
-        for point in self.plan.active if expected is not None else ():
-            for call in expected(point.point.name):
+        for point in self.plan.active:
+            for call in expected_calls(point.point.name):
                 args = call if type(call) is tuple else tuple(call)
                 name = point.agent or point.name_agent(*args)
-                if name is None or name in self.ended:
-                    continue
-                agent = self.agent_for(point, name)
-                if agent.own:
+                agent = None if name is None else self.agent_for(point, name)
+                if agent is not None and not agent.delegated:
                     announced.setdefault(agent, args)
         return announced
 
@@ -339,28 +255,23 @@ class Episode(Run):
         agent.ended = agent.delegated = True
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
-        self.is_complete = agent.name == self.plan.one_agent
 
     # -- branches that wait for one agent ---------------------------------------------------------
 
     def single_out(self, agent: Agent) -> None:
-        """In a branch, make one agent the only agent of the environment, and wait for its pending decision.
-
-        Policies answer for all other agents, or the rule where there is no policy.
-        """
+        """In a branch, wait for one agent's decision alone. For all others answer their policies, else the rule."""
         if list(self.agents.values()) != [agent]:
-            self.most_steps = self.limit = inf  # ``max_steps`` counts the steps of other agents
-        plan = self.plan = self.plan.for_one(agent.name)
-        for name, other in self.agents.items():
-            if other is not agent:
-                self.others[name], other.delegated = other, True
-                other.follow(plan.policy_of(name, other.point))
+            self.most_steps = inf  # ``max_steps`` counts the steps of other agents
         self.others.pop(agent.name, None)
-        self.agents, self.just_ended, self.is_complete = {agent.name: agent}, [], False
-        agent.follow(None)
-        agent.delegated, agent.own, agent.asked = False, True, True
-        self.rounds, self.decide = None, Agent.decide_unless_forced if self.skips else None
-        self.begun = True
+        self.agents.pop(agent.name, None)
+        self.plan = self.plan.for_one(agent.name)
+        for name, other in self.agents.items():
+            other.policy, other.delegated = self.plan.policy_of(name, other.point), True
+        self.others |= self.agents
+        self.agents, self.just_ended = {agent.name: agent}, []
+        agent.policy, agent.delegated, agent.asked = None, False, True
+        self.__class__ = Episode  # it is played in turns from now on
+        self.decide = Agent.decide_unless_forced if self.skips else None
         if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
             with self.context():
                 agent.update(agent, agent.arguments(), agent.kwargs, observe=False)
@@ -368,13 +279,11 @@ class Episode(Run):
 
     def delegate(self, policies: Mapping[str, Any]) -> None:
         """In a branch, let policies, given by agent, answer for agents that neither the user nor a policy answers."""
-        others = {name: self.others.get(name) for name, policy in policies.items() if policy is not RULE}
-        others = {name: agent for name, agent in others.items() if agent is None or agent.policy is RULE}
-        found = {name: two_arguments(policies[name]) for name in others if name not in self.agents}
-        self.plan = self.plan.with_policies(found)
-        for name, agent in others.items():
-            if agent is not None:
-                agent.follow(self.plan.policies[name])
+        given = {name: policy for name, policy in policies.items() if policy is not RULE and name not in self.agents}
+        self.plan = self.plan.with_policies({name: two_arguments(policy) for name, policy in given.items()})
+        for name, agent in self.others.items():
+            if name in given and agent.policy is RULE:
+                agent.policy = self.plan.policies[name]
 
     def may_have(self, name: Any) -> bool:
         """Whether there is an agent with that name, or could be one later."""
@@ -391,38 +300,135 @@ class Episode(Run):
         for agent in self.agents.values():
             agent.conclude(self)
         self.over, self.truncated, self.terminated = True, truncated, not truncated
-        if self.plan.unmatched_names:
-            self._warn_of_unmatched_names()
-
-    def _warn_of_unmatched_names(self) -> None:
-        """Warn of agents that the environment's options name and that have not appeared, once for each agent."""
         unmatched = self.plan.unmatched_names
+        if not unmatched:
+            return
         present = [name for name, agent in self.agents.items() if agent.decided or agent.observation is not None]
         present += [*self.others, *self.ended]
         absent = unmatched.difference(present)
         if absent:
-            unmatched -= absent
+            unmatched -= absent  # each is warned of once
             warn_user(
                 f"policies= or possible_agents= name agents that did not appear in the episode:"
                 f" {listed(sorted(absent))}; these did: {listed(present)}"
             )
 
-    def report_end(self) -> None:
-        """Handle a step without a pending decision: report an end that the user does not know of, or refuse."""
-        if not self.unreported_end:
-            raise self.refusal()
-        self.unreported_end = False
-
-    def _without_decision(self) -> str:
-        """Make the message for an episode that ended without a decision for the environment's user."""
-        points = ", ".join(point.point.name for point in self.plan.active)
-        ended = f"{type(self.simulation).__name__}.run() ended without a decision of"
+    def _without_decision(self) -> NoDecisionError:
+        """Make the error for an episode that ended without a decision for the environment's user."""
+        expected = ", ".join(point.point.name for point in self.plan.active)
+        hint = "does the simulation call the decision functions as attributes of their class or module?"
         if self.others:
-            expected = f"{self.plan.one_agent!r} at {points}" if self.plan.one_agent else points
-            return f"{ended} {expected}; these have decided: {listed(self.others)}"
-        return (
-            f"{ended} {points}; does the simulation call the decision functions as attributes of their class or module?"
-        )
+            expected = f"{self.plan.one_agent!r} at {expected}" if self.plan.one_agent else expected
+            hint = f"these have decided: {listed(self.others)}"
+        return NoDecisionError(f"{type(self.simulation).__name__}.run() ended without a decision of {expected}; {hint}")
+
+
+class Rounds(Episode):
+    """An episode that is played in rounds.
+
+    A round uses each action once, up to the first decision without one. Then all live agents are updated.
+    """
+
+    __slots__ = ()
+    in_rounds = True
+
+    def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
+        """Run the simulation to its first decision: see ``Episode``. The first round reports the ends until then."""
+        self.decide, self.actions, self.stalled = decide, {}, 0
+        super().begin(at_first_event)
+        self.unreported_end = self.over or bool(self.just_ended)
+
+    def step(self, action: Mapping[str, Any], entered: bool = False) -> None:
+        """Play a round with an action, or ``RULE``, for each agent's name: see ``Episode``.
+
+        An action that is legal now and illegal at its turn counts as missing.
+
+        Raises:
+            UnknownAgentError: An action is for an agent that is not live. Nothing has moved.
+        """
+        pending = self.pending
+        if pending is None:
+            self.report_end()
+            return
+        if not entered and (getcurrent() is not self.driver.caller or EVALUATING):
+            with self.context():
+                self.step(action, True)
+            return
+        self.actions = actions = self.check(action)
+        self.pending = None
+        try:
+            if len(self.tape) < self.tape_size:
+                answers = {name: part if type(part) is int else duplicate(part) for name, part in actions.items()}
+                self.tape.append(answers)
+            self.turns += bool(action)
+            for agent in (*self.agents.values(), *self.just_ended):
+                agent.acted = False
+            if self.unreported_end:
+                self.unreported_end = False
+            else:
+                self.just_ended = []
+            reply = self.use_action(pending)
+            self.stalled = self.stalled + 1 if reply is WAIT else 0
+            if reply is not WAIT:
+                self.advance(reply)
+            if not self.over and self.consulted is None:  # it is set where a replay ends
+                self.update_all(truncated=bool(action) and self.turns == self.most_steps)
+        except BaseException as error:
+            self.fail(error)
+            raise
+        if self.stalled == MANY_ROUNDS:
+            warn_user(
+                f"the simulation stands still: {short_repr(pending.name)} must decide, but {MANY_ROUNDS} rounds in a"
+                ' row had no action for it; the info of the agent that must decide has "deciding": True'
+            )
+
+    def check(self, actions: Mapping[str, Any]) -> dict[str, Any]:
+        """Check the actions of a round before the simulation moves; return them in the form that mappings take."""
+        pending, agents, checked = self.pending, self.agents, {}
+        if type(actions) is not dict and not isinstance(actions, Mapping):
+            raise InvalidActionError(f"a round takes a dict of actions by agent, not {short_repr(actions)}")
+        for name, action in actions.items():
+            agent = agents.get(name)
+            if agent is None:
+                if self.unreported_end and name in self.ended:
+                    continue
+                raise UnknownAgentError(
+                    f"there is an action for {short_repr(name)}, which is not a live agent; live agents:"
+                    f" {listed(agents)}"
+                )
+            if action is not RULE:
+                check = agent.point.check
+                legal = check(action)
+                mask = agent.mask if agent is pending else None
+                if legal is ILLEGAL or mask is not None:
+                    legal = agent.point.checked(action, name, mask)
+                action = legal
+            checked[name] = action
+        return checked
+
+    def use_action(self, agent: Agent) -> Any:
+        """Answer a decision with the agent's action of this round, or wait for the next round."""
+        action = agent.only_action() if self.skips else None
+        if action is None:
+            action = self.actions.pop(agent.name, WAIT)
+            mask = agent.mask
+            if action is WAIT or (mask is not None and action is not RULE and not agent.point.allows(mask, action)):
+                self.pending = agent
+                return WAIT
+            agent.acted = True
+        self.latest = agent
+        if not agent.decided:  # it acts before it was ever updated
+            agent.update(agent, agent.arguments(), agent.kwargs, observe=False)
+        return self.answer(agent, action, False)
+
+
+def decide(agent: Agent, episode: Rounds, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Handle a decision in a round: the agent was observed when the latest step returned."""
+    if agent.point.legal is not None:
+        agent.mask, agent.choices = agent.point.legal(args, kwargs)
+    if agent.clock is not None:
+        agent.read_clock()
+    return episode.use_action(agent)
 
 
 def listed(names: Collection[str]) -> str:

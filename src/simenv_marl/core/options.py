@@ -106,13 +106,13 @@ class Options:
 
     def __post_init__(self) -> None:
         agents, agent, space, steps = self.possible_agents, self.agent, self.state_space, self.max_steps
+        groups = agents.values() if isinstance(agents, Mapping) else () if agents is None else (agents,)
         is_space = space is None or isinstance(space, spaces.Space) or space == "observations"
         is_count = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool) and steps >= 1
-        policies, plugins = {} if self.policies is None else self.policies, self.plugins
-        is_list = isinstance(plugins, Iterable) and not isinstance(plugins, (str, Mapping))
+        policies = {} if self.policies is None else self.policies
         for name, is_allowed, expected in (
             ("driver", self.driver in ("greenlet", "thread"), '"greenlet" or "thread"'),
-            ("possible_agents", not isinstance(agents, str), "a list of names"),
+            ("possible_agents", all(map(_is_list, groups)), "a list of names, or a dict from points to lists of names"),
             ("undeclared", self.undeclared in ("error", "rule"), '"error" or "rule"'),
             ("agent", agent is None or (isinstance(agent, str) and agent), "the name of an agent or None"),
             ("clip_actions", isinstance(self.clip_actions, bool), "True or False"),
@@ -121,7 +121,7 @@ class Options:
             ("state_space", is_space, 'a gymnasium space or "observations"'),
             ("max_steps", steps is None or is_count, "a positive integer or None"),
             ("policies", isinstance(policies, Mapping), "a dict from agents or points to callables"),
-            ("plugins", is_list, "a list of (handler, target, position)"),
+            ("plugins", _is_list(self.plugins), "a list of (handler, target, position)"),
         ):
             if not is_allowed:
                 raise OptionValueError(f"{name} must be {expected}, not {short_repr(getattr(self, name))}")
@@ -131,8 +131,11 @@ class Options:
                     f"the policy of {short_repr(key)} must be a callable or RULE, not {short_repr(policy)}"
                 )
         # They may be iterators, and every environment reads them.
-        object.__setattr__(self, "possible_agents", None if agents is None else _listed(agents))
-        object.__setattr__(self, "plugins", tuple(plugins))
+        if isinstance(agents, Mapping):
+            object.__setattr__(self, "possible_agents", {key: list(names) for key, names in agents.items()})
+        elif agents is not None:
+            object.__setattr__(self, "possible_agents", list(agents))
+        object.__setattr__(self, "plugins", tuple(self.plugins))
 
     def amended(self, options: Mapping[str, Any]) -> Options:
         """The same options, but for those that are given; raise an error for an unknown name or a wrong value."""
@@ -158,13 +161,5 @@ def explain_arguments(function: Function) -> Function:
     return function
 
 
-def _listed(names: Any) -> Any:
-    """Return names as lists, in a dict if they are in one."""
-    if isinstance(names, Mapping):
-        return {key: _listed(value) for key, value in names.items()}
-    try:
-        return list(names)
-    except TypeError:
-        raise OptionValueError(
-            f"possible_agents must be names, or a dict from points to names, not {short_repr(names)}"
-        ) from None
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Iterable) and not isinstance(value, (str, Mapping))

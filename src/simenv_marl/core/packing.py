@@ -42,9 +42,8 @@ def pack_plainly(thing: Any) -> bytes:
     return pack(thing)
 
 
-def unpack(parcel: bytes) -> Any:
-    """Unpickle an object that ``pack`` or ``pack_plainly`` has pickled."""
-    return pickle.loads(parcel)
+unpack: Final = pickle.loads
+"""Unpickles an object that ``pack`` or ``pack_plainly`` has pickled."""
 
 
 def pack_outcome(pack: Callable[[Any], bytes], function: Callable[..., Any], *args: Any) -> bytes:
@@ -79,9 +78,6 @@ class _Pickler(cloudpickle.Pickler):
 class RemoteTraceback(Exception):
     """The cause of an error from another process. Its message is the traceback there, with all causes."""
 
-    def __str__(self) -> str:
-        return f"\n\n{self.args[0]}"
-
 
 def pack_error(error: BaseException) -> bytes:
     """Pickle an error with its traceback. An error that cannot be pickled becomes a ``WorkerError``."""
@@ -94,8 +90,7 @@ def pack_error(error: BaseException) -> bytes:
         unpack(parcel)  # the class may define pickling that works only in one direction
     except Exception:
         other = WorkerError(f"another process raised an error that cannot be pickled: {describe_error(error)}")
-        for note in error_notes(error):
-            other.add_note(note)
+        other.__notes__ = error_notes(error)
         parcel = pack(other)
     return pickle.dumps((parcel, text), 5)
 
@@ -104,7 +99,7 @@ def unpack_error(parcel: bytes) -> BaseException:
     """Rebuild an error that ``pack_error`` has packed. Its cause becomes the traceback in the other process."""
     inner, text = pickle.loads(parcel)
     error: BaseException = unpack(inner)
-    BaseException.__setattr__(error, "__cause__", RemoteTraceback(text))  # the error's class may be frozen
+    BaseException.__setattr__(error, "__cause__", RemoteTraceback(f"\n\n{text}"))  # the error's class may be frozen
     return error
 
 
@@ -117,24 +112,26 @@ def _reduce_error(error: BaseException) -> tuple[Any, ...] | None:
     kinds = [kind for kind in type(error).__mro__ if kind not in (BaseExceptionGroup, BaseException, object)]
     if any(kind.__flags__ & _IN_PYTHON and {"__reduce__", "__reduce_ex__"} & vars(kind).keys() for kind in kinds):
         return None
-    slots = {
+    members = {
         name: getattr(error, name)
         for kind in kinds
-        for name, slot in vars(kind).items()
-        if isinstance(slot, (MemberDescriptorType, GetSetDescriptorType)) and not name.startswith("__")
+        for name, member in vars(kind).items()
+        if isinstance(member, (MemberDescriptorType, GetSetDescriptorType)) and not name.startswith("__")
         if name != "obj" and hasattr(error, name)  # the ``obj`` of an AttributeError may refer to the whole model
     }
-    attributes = vars(error) | {"__notes__": error_notes(error)}
     args = (error.message, error.exceptions) if isinstance(error, BaseExceptionGroup) else error.args
-    return _rebuild_error, (type(error), args, slots, attributes)
+    return _rebuild_error, (
+        type(error),
+        args,
+        members | {"args": args},
+        vars(error) | {"__notes__": error_notes(error)},
+    )
 
 
-def _rebuild_error(
-    kind: type[BaseException], args: tuple[Any, ...], slots: dict[str, Any], attributes: dict[str, Any]
-) -> BaseException:
-    builtin = next(base for base in kind.__mro__ if not base.__flags__ & _IN_PYTHON)
-    error: BaseException = builtin.__new__(kind, *args)
-    for name, value in {**slots, "args": args}.items():
+def _rebuild_error(kind: Any, args: tuple[Any, ...], members: dict[str, Any], attributes: dict[str, Any]) -> Any:
+    builtin: Any = next(base for base in kind.__mro__ if not base.__flags__ & _IN_PYTHON)
+    error = builtin.__new__(kind, *args)
+    for name, value in members.items():
         if value is not None or getattr(error, name, error) is not None:
             BaseException.__setattr__(error, name, value)
     vars(error).update(attributes)
@@ -151,11 +148,9 @@ _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
 def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
     """How another process finds or makes a function that its name does not lead to; None for all others."""
     place = function.__module__, function.__qualname__
-    if _import(*place) is function:
-        return None
-    for rule in (False, True):
-        if _find(*place, rule) is function:
-            return _find, (*place, rule)
+    for way in _WAYS:
+        if _find(*place, way) is function:
+            return None if way == "itself" else (_find, (*place, way))
     hook = hook_of(function)
     if hook is None:
         return None
@@ -164,26 +159,27 @@ def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
     return _make_wrapper, (token, hook, made_with(function))
 
 
-def _import(module: str | None, path: str) -> Any:
-    """Import the object with a dotted name; None if there is none."""
+_WAYS: Final = {
+    "itself": lambda found: found,
+    "unbound": lambda found: getattr(found, "__func__", found),
+    "rule": unwrap,
+}
+"""The ways from the object with a function's name to the function."""
+
+
+def _find(module: str | None, path: str, way: str) -> Any:
+    """Import the object with a dotted name, and return what a way leads to from there; None if there is none."""
     if module is None or module == "__main__":
         return None
     try:
-        return reduce(getattr, path.split("."), import_module(module))
+        return _WAYS[way](reduce(getattr, path.split("."), import_module(module)))
     except (ImportError, AttributeError):
         return None
 
 
-def _find(module: str | None, path: str, rule: bool) -> Any:
-    """Import a function, without the class that binds it, or the rule behind a decision function."""
-    found = _import(module, path)
-    return unwrap(found) if rule else getattr(found, "__func__", found)
-
-
 def _make_wrapper(token: str, hook: Hook, definition: Definition | None) -> Any:
     """Make the decision function that has a token, unless this process has it."""
-    function = _known.get(token)
-    if function is None:
-        function = _known[token] = hook.make_wrapper(definition)
-        _tokens[function] = token
-    return function
+    if token not in _known:
+        made = _known[token] = hook.make_wrapper(definition)
+        _tokens[made] = token
+    return _known[token]

@@ -52,9 +52,7 @@ def base_of(base: Any, agent: str) -> Any:
 class DeferredPolicy:
     """A policy that answers many decisions in one call. An episode waits for it as it waits for the user."""
 
-    def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer one decision at once, in an episode that is a branch and waits for one agent only."""
-        raise NotImplementedError
+    alone: Any  # a method of episode and agent: answers at once, in a branch that waits for one agent only
 
 
 class PlannerPolicy:

@@ -7,40 +7,30 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
 from ..errors import InvalidActionError, MaskError, short_repr, warn_user
-from ..simulation import RULE, asks_for
+from ..simulation import RULE, asks_for, positional
 from . import actions, spaces
 from .actions import ILLEGAL, MASK
-from .points import NamedPoint
 
 if TYPE_CHECKING:
     from .episode import Episode
-
-MAPPINGS: Final = (
-    "observation_space_mapping", "action_space_mapping", "reward_mapping", "apply", "choices", "rule_action_mapping",
-    "agent", "action_mask_mapping", "achieved_goal_mapping", "desired_goal_mapping",
-)  # fmt: skip
-"""The parts of a definition, besides ``removed_by``, that get the simulation if they ask for it."""
 
 
 def given_simulation(definition: Definition, simulation: Any) -> Definition:
     """Give the simulation to the mappings that ask for it; return the definition itself if no mapping asks."""
 
-    def given(function: Any) -> Any:
-        return partial(function, _simulation=simulation) if asks_for(function, "_simulation") else function
+    def given(part: Any) -> Any:
+        return partial(part, _simulation=simulation) if asks_for(part, "_simulation") else part
 
-    changes = {name: given(getattr(definition, name)) for name in MAPPINGS}
-    changes = {name: function for name, function in changes.items() if function is not getattr(definition, name)}
-    removals = {name: given(agent) for name, agent in definition.removed_by.items()}
-    if removals != definition.removed_by:
-        changes["removed_by"] = removals
-    return replace(definition, **changes) if changes else definition
+    changes = {name: given(part) for name, part in vars(definition).items()}
+    changes["removed_by"] = {name: given(agent) for name, agent in definition.removed_by.items()}
+    return definition if changes == vars(definition) else replace(definition, **changes)
 
 
 class Point:
@@ -49,62 +39,42 @@ class Point:
     It is also the event of a decision there, if the deciding agent must be found.
 
     Attributes:
-        point, definition: The decision point and its definition.
-        agent: The name of the agent. None if ``name_agent`` names it at each call.
-        name_agent: A callable that takes the call's arguments and names the agent. None if ``agent`` names it.
+        agent, name_agent: The name of the agent, or a callable of the call's arguments that returns it; one is None.
         policy: The policy that answers all decisions of the point. None: the agents' own policies answer them, or the
             environment's user does.
-        reward_mapping, observation_mapping: The mappings.
         cast: Casts an observation to the observation space.
-        finite: Raises for an observation that is not finite where its space is bounded. None if no bound is finite.
-        check: Checks an action against the action space. Returns it in the form that its mapping receives, or
-            ``ILLEGAL``.
+        check: Checks an action against the action space. Returns it in the form that ``convert`` takes, or ``ILLEGAL``.
         convert: Turns a checked action into the reply to the simulation.
         legal: Returns the mask of a call, and its choices if it has any. None if all actions are always legal.
         deliver: Turns the reply, on the simulation's side, into the value that the decision function returns. None if
             the reply is that value.
         report: The event of the rule's decisions. None if they are not reported.
-        informs_rule_action: Whether infos contain the action that corresponds to a decision of the rule.
         updates: The functions that reward and observe the agents of the point: see ``make_updates``.
         one_entity: Whether one object is expected to make all decisions, because the definition does not name agents.
     """
 
     __slots__ = (
-        "agent", "cast", "check", "convert", "definition", "deliver", "finite", "informs_rule_action", "legal",
-        "masked_parts", "name_agent", "observation_mapping", "one_entity", "point", "policy", "report",
-        "reward_mapping", "updates",
+        "agent", "cast", "check", "convert", "definition", "deliver", "informs_rule_action", "legal", "masked_parts",
+        "name_agent", "one_entity", "point", "policy", "report", "updates",
     )  # fmt: skip
 
     def __init__(
-        self, named: NamedPoint, agent: str | None, policy: Any = None, *, records: bool = False, clips: bool = False
+        self, point: DecisionPoint, definition: Definition, agent: str | None, policy: Any, records: bool, clips: bool
     ) -> None:
-        """Prepare a decision point.
-
-        Args:
-            named: The decision point and its definition.
-            agent: The name of its agent. None if a callable names its agents.
-            policy: The policy that answers all decisions of the point.
-            records: Whether decisions are recorded, including those of the rule.
-            clips: Whether actions outside a ``Box`` are clipped.
-        """
-        definition = named.definition
-        self.point: DecisionPoint = named.point
-        self.definition: Definition = definition
+        """Prepare a point whose decisions are recorded, including those of the rule, and whose actions are clipped."""
+        self.point, self.definition = point, definition
         self.agent, self.policy = agent, policy
         self.name_agent: Any = definition.agent if agent is None else None
-        self.reward_mapping: Any = definition.reward_mapping
-        self.observation_mapping: Any = definition.observation_space_mapping
         self.cast = spaces.observation_cast(definition.observation_space)
-        self.finite = spaces.finite_check(definition.observation_space)
-        self.check = (actions.clipping_check if clips else actions.action_check)(definition.action_space)
+        self.check = actions.action_check(definition.action_space, clips=clips)
         self.convert: Any = definition.action_space_mapping or _same
-        self.deliver = _delivery(definition, named.point.hook.kind)
-        self.legal = _legal(definition, named.point.name)
-        self.masked_parts = _masked_parts(definition.observation_space)
+        self.deliver = _delivery(definition, point.kind)
+        self.legal = _legal(definition, point.name)
+        self.masked_parts = [] if self.legal is None else _masked_parts(definition.observation_space)
         self.informs_rule_action = definition.rule_action_mapping is not None
         readable = definition.choices is not None or inverse(definition) is not None
         self.report = RuleDecided(self) if self.informs_rule_action or (records and readable) else None
-        self.one_entity = definition.agent is None and named.point.hook.bound
+        self.one_entity = definition.agent is None and point.bound
         self.updates: Any = None
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
@@ -132,28 +102,21 @@ class Point:
     # -- observations -----------------------------------------------------------------------------
 
     def observe(self, args: tuple[Any, ...], kwargs: dict[str, Any], mask: Any) -> Any:
-        """Observe a call. Where the observation space has an entry for the action mask, put the mask there.
-
-        Raises:
-            ObservationError: The observation does not fit its space.
-        """
-        value = self.observation_mapping(*args, **kwargs)
-        for part in self.masked_parts:
-            if part and isinstance(value[part], Mapping):
-                value = {**value, part: {**value[part], MASK: mask}}
-            elif not part and isinstance(value, Mapping):
-                value = {**value, MASK: mask}
-        return self.cast(value)
+        """Observe a call. Where the observation space has an entry for the action mask, put the mask there."""
+        return self.cast(self._with_mask(self.definition.observation_space_mapping(*args, **kwargs), mask))
 
     def blank(self) -> Any:
         """Make the observation of an agent that was not observed yet: zero, with all actions legal."""
         observation = spaces.blank(self.definition.observation_space)
-        if self.legal is None or not self.masked_parts:
-            return observation
+        return self.cast(self._with_mask(observation, self.open_mask())) if self.masked_parts else observation
+
+    def _with_mask(self, observation: Any, mask: Any) -> Any:
         for part in self.masked_parts:
-            whole = observation[part] if part else observation
-            whole[MASK] = self.open_mask()
-        return self.cast(observation)
+            if part and isinstance(observation[part], Mapping):
+                observation = {**observation, part: {**observation[part], MASK: mask}}
+            elif not part and isinstance(observation, Mapping):
+                observation = {**observation, MASK: mask}
+        return observation
 
     # -- actions ----------------------------------------------------------------------------------
 
@@ -166,24 +129,11 @@ class Point:
         return actions.mask_allows(self.definition.action_space, mask, action)
 
     def checked(self, action: Any, agent: str, mask: Any) -> Any:
-        """Check an action.
-
-        Args:
-            action: The action.
-            agent: The agent whose action it is.
-            mask: The mask of the legal actions. None: all actions of the space are legal.
-
-        Returns:
-            The action in the form that ``convert`` takes.
-
-        Raises:
-            InvalidActionError: The action is not legal.
-        """
-        legal = self.check(action)
+        """Return an action of an agent in the form that ``convert`` takes, or raise an ``InvalidActionError``."""
+        legal, space = self.check(action), self.definition.action_space
         if legal is ILLEGAL:
             raise InvalidActionError(
-                f"the action {short_repr(action)} of {agent!r} is not in its action space"
-                f" {short_repr(self.definition.action_space)}"
+                f"the action {short_repr(action)} of {agent!r} is not in its action space {short_repr(space)}"
             )
         if mask is not None and not self.allows(mask, legal):
             raise InvalidActionError(
@@ -230,16 +180,14 @@ def _legal(definition: Definition, name: str) -> Callable[[Any, Any], tuple[Any,
 
 def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
     """Make the function that turns a reply into the value of a call; for a generator function that is a generator."""
-    apply = definition.apply
-    if definition.choices is not None:
-        apply = partial(_deliver_choice, definition.apply)
+    apply = definition.apply if definition.choices is None else partial(_deliver_choice, definition.apply)
     if kind == "function":
         return apply
     wrap = _returning if kind == "generator" else _awaiting
-    if apply is None:
-        return lambda reply, *args, **kwargs: wrap(reply)
 
     def deliver(reply: Any, *args: Any, **kwargs: Any) -> Any:
+        if apply is None:
+            return wrap(reply)
         value = apply(reply, *args, **kwargs)
         return value if inspect.isgenerator(value) or inspect.isawaitable(value) else wrap(value)
 
@@ -263,32 +211,23 @@ async def _awaiting(value: Any) -> Any:
 # -- other events -----------------------------------------------------------------------------------
 
 
-class Notice:
-    """An event that changes nothing in the simulation: the function itself runs, or has run.
+class Removal:
+    """The event of a call that ends the episode of agents. It changes nothing in the simulation: the function runs.
 
     Attributes:
-        deliver, report: None, because there is no reply to deliver and no result to report.
+        of: A tuple for each decision point whose agents it ends: the point (None: any); a callable that takes the
+            call's arguments and names the agent, or None; the class whose instances are such agents, or None if it is
+            not known.
     """
 
     deliver = report = None
 
-
-class Removal(Notice):
-    """The notice of a call that ends the episode of agents: of a function that ``removed_by=`` names.
-
-    Attributes:
-        point: The function.
-        of: A tuple for each decision point whose agents it ends: the point; a callable that takes the call's arguments
-            and names the agent, or None; the class whose instances are such agents, or None if it is not known.
-    """
-
-    def __init__(self, point: DecisionPoint) -> None:
-        self.point = point
-        self.of: list[tuple[Point, Callable[..., Any] | None, type | None]] = []
+    def __init__(self) -> None:
+        self.of: list[tuple[Any, Callable[..., Any] | None, type | None]] = []
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Give the agents their last rewards and observations while their entities are whole; then run the call."""
-        named: list[tuple[Point, Any]] = []  # first all names, since ending an agent may change them
+        named: list[tuple[Any, Any]] = []  # first all names, since ending an agent may change them
         for point, name, owner in self.of:
             if name is not None:
                 named.append((point, name(*args, **kwargs)))
@@ -297,36 +236,21 @@ class Removal(Notice):
                 named.append((point, episode.named_before(point, args[0]) if found is None else found))
         for point, name in named:
             agent = episode.agents.get(name)
-            if agent is not None and agent.point is point:
+            if agent is not None and point in (None, agent.point):
                 episode.end_agent(agent)
         return RULE
 
 
-class EndAgent(Notice):
-    """The notice of a call of the simulation's ``end_agent``."""
+class RuleDecided:
+    """The event of a decision that the rule of a point has made."""
 
-    def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """End the agent's episode if it is a live agent of the environment."""
-        name = kwargs["name"] if "name" in kwargs else args[1]
-        agent = episode.agents.get(name) if isinstance(name, str) else None
-        if agent is not None:
-            episode.end_agent(agent)
-        return RULE
-
-
-class RuleDecided(Notice):
-    """The notice of a decision that the rule of a point has made.
-
-    Attributes:
-        point: The decision point.
-    """
+    deliver = report = None
 
     def __init__(self, point: Point) -> None:
         self.point = point
-        definition, mapping = point.definition, point.definition.rule_action_mapping
-        self._mapping = dict(mapping) if isinstance(mapping, Mapping) else mapping
-        self._decision_only = mapping is not None and not _takes_arguments(mapping)
-        self._inverse = None if mapping is not None or definition.choices is not None else inverse(definition)
+        self._mapping = mapping = point.definition.rule_action_mapping
+        self._takes_arguments = callable(mapping) and _takes_arguments(mapping)
+        self._inverse = inverse(point.definition) or {}
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Note the action that corresponds to the decision. ``args``: the decision, its call's args and kwargs."""
@@ -341,20 +265,19 @@ class RuleDecided(Notice):
             agent.informs_rule_action = point.informs_rule_action and action is not None
 
     def _action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any], choices: Any) -> Any:
-        """Find the action that a decision corresponds to; None if no action does.
-
-        Raises:
-            InvalidActionError: The corresponding action is not in the action space, or the dict lacks the decision.
-        """
-        mapping, point = self._mapping, self.point
-        if mapping is None and choices is not None:
-            same = (place for place, choice in enumerate(choices) if choice is decision or choice == decision)
-            return next(same, None)
+        """Find the action that a decision corresponds to; None if no action does."""
+        mapping: Any = self._mapping
+        point = self.point
         if mapping is None:
+            for place, choice in enumerate(choices or ()):
+                if choice is decision or choice == decision:
+                    return place
             with suppress(TypeError):  # the decision is not hashable
-                return None if self._inverse is None else self._inverse.get(decision)
+                return self._inverse.get(decision)
             return None
-        if isinstance(mapping, dict):
+        if not isinstance(mapping, Mapping):
+            action = mapping(decision, *args, **kwargs) if self._takes_arguments else mapping(decision)
+        else:
             try:
                 action = mapping[decision]
             except (KeyError, TypeError):
@@ -362,8 +285,6 @@ class RuleDecided(Notice):
                     f"the dict rule_action_mapping has no action for the rule's decision {short_repr(decision)}; add"
                     " one, or pass a callable that returns None where no action corresponds"
                 ) from None
-        else:
-            action = mapping(decision) if self._decision_only else mapping(decision, *args, **kwargs)
         legal = None if action is None else point.check(action)
         if legal is ILLEGAL:
             raise InvalidActionError(
@@ -377,8 +298,8 @@ class RuleDecided(Notice):
 def _takes_arguments(mapping: Any) -> bool:
     """Whether a ``rule_action_mapping`` takes the call's arguments after the decision."""
     try:
-        parameters = list(inspect.signature(mapping).parameters.values())
+        parameters = inspect.signature(mapping).parameters.values()
     except (TypeError, ValueError):
         return False
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    return any(p.default is p.empty for p in positional[1:]) or any(p.kind is p.VAR_POSITIONAL for p in parameters)
+    required = [p for p in positional(mapping) if p.default is p.empty]
+    return len(required) > 1 or any(p.kind is p.VAR_POSITIONAL for p in parameters)

@@ -11,11 +11,12 @@ from typing import Any, Unpack
 import numpy as np
 
 from .options import Options, ViewOptions
-from .plan import Plan
+from .plan import Plan, source_name
 from .points import Points
 
-DEPENDENCIES = ("greenlet", "gymnasium", "numpy", "pettingzoo", "simenv-marl")
+DEPENDENCIES = ("greenlet", "gymnasium", "numpy", "pettingzoo", "simenv_marl")
 _distributions = cache(importlib.metadata.packages_distributions)
+_distribution_version = cache(importlib.metadata.version)
 
 
 def provenance(
@@ -74,16 +75,8 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
         "options": options,
         "seed": seed,
         "python": platform.python_version(),
-        "dependencies": {package: _version_of_distribution(package) for package in DEPENDENCIES},
+        "dependencies": {package.replace("_", "-"): _version(package) for package in DEPENDENCIES},
     }
-
-
-def source_name(source: Any) -> str:
-    """Return the dotted name of a class or factory, or of the class of an object."""
-    while isinstance(source, partial):
-        source = source.func
-    named = source if hasattr(source, "__qualname__") else type(source)
-    return f"{named.__module__}.{named.__qualname__}"
 
 
 def as_json(value: Any) -> Any:
@@ -107,14 +100,6 @@ def as_json(value: Any) -> Any:
 def _version(package: str) -> str | None:
     """Return the version of an importable package: that of its distribution, or its own."""
     for distribution in _distributions().get(package, ()):
-        return _version_of_distribution(distribution)
+        return _distribution_version(distribution)
     version = getattr(sys.modules.get(package), "__version__", None)
     return version if isinstance(version, str) else None
-
-
-@cache
-def _version_of_distribution(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None

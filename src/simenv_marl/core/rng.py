@@ -22,7 +22,7 @@ PYTHON: Final[Any] = random.seed.__self__  # type: ignore[attr-defined]
 NUMPY: Final[Any] = np.random.mtrand._rand
 """The generator behind the functions of ``numpy.random``."""
 
-_legacy: Any = np.random  # NumPy's type stubs lack some of its functions
+LEGACY: Final[Any] = np.random  # NumPy's type stubs lack some of its functions
 
 
 def is_seed(value: Any) -> bool:
@@ -35,15 +35,14 @@ def is_seed(value: Any) -> bool:
 _CHECKED: Final[WeakSet[type]] = WeakSet()
 """The classes of simulations that were checked."""
 
-TOO_SHORT: Final = 100_000
+_SHORT: Final = 100_000
 """A time in nanoseconds. Another thread that wakes up and draws runs for longer; the clocks differ by less."""
 
 
 def draws_check(simulation: Any, *, in_thread: bool) -> Callable[[], None] | None:
     """Begin to check whether a simulation draws from the global generators, unless its class was checked before.
 
-    Return a function that ends the check, and warns if the simulation has drawn. If it runs ``in_thread``, other
-    threads of the user may run beside it.
+    Return a function that ends the check, and warns. Beside one that runs ``in_thread``, the user's threads may run.
     """
     kind = type(simulation)
     if kind in _CHECKED:
@@ -55,7 +54,7 @@ def draws_check(simulation: Any, *, in_thread: bool) -> Callable[[], None] | Non
         names = [name for name, state in global_states().items() if state != states[name]]
         alone = all(thread is current_thread() or thread.name == SIMULATION for thread in enumerate_threads())
         time_of_others = process_time_ns() - thread_time_ns() - time
-        if names and (alone or (not in_thread and time_of_others < TOO_SHORT)):
+        if names and (alone or (not in_thread and time_of_others < _SHORT)):
             warn_user(
                 f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which all code in the"
                 " process shares: its environments influence each other, and a seed does not repeat an episode. Make"
@@ -67,7 +66,7 @@ def draws_check(simulation: Any, *, in_thread: bool) -> Callable[[], None] | Non
 
 def global_states() -> dict[str, Any]:
     """Return values that change when a number is drawn from Python's or NumPy's global generator."""
-    return {"random": random.getstate(), "numpy.random": repr(_legacy.get_bit_generator().state)}
+    return {"random": random.getstate(), "numpy.random": repr(LEGACY.get_bit_generator().state)}
 
 
 # -- other futures --------------------------------------------------------------------------------
@@ -76,7 +75,7 @@ _FUTURES: Final = 2**32 - 1
 """The spawn key of the seeds of futures. A model that uses the same seed, or spawns from it, never gets this key."""
 
 ENVIRONMENT: Final = 0
-_PROCESS: Final = 1
+PROCESS: Final = 1
 _SIMULATION: Final = 2
 """Whose generators are seeded: the three have separate streams. A base policy that draws from the generators of the
 process must not get the same numbers as the simulation."""
@@ -87,11 +86,14 @@ _ELSEWHERE: Final = (type, ModuleType, CodeType, np.ndarray, str, int, float, ra
 """Classes that are not searched: they lead to everything in the process, or to nothing. Nor are functions."""
 
 
-def seed_process(seed: int) -> None:
-    """Seed the global generators of the process for a future: Python's, NumPy's, and torch's if it is imported."""
-    another, torchs = seed_globals(seed, _PROCESS), generator_of_torch()
-    if torchs is not None:
-        torchs.manual_seed(_integer(another))
+def seed_globals(seed: int, whose: int) -> None:
+    """Seed Python's and NumPy's global generators for a future; for the process also torch's, if it is imported."""
+    python, numpy, third = np.random.SeedSequence(int(seed), spawn_key=(_FUTURES, whose)).spawn(3)
+    PYTHON.seed(_integer(python))
+    LEGACY.set_bit_generator(type(LEGACY.get_bit_generator())(numpy))  # leaves the old bit generator as it is
+    torchs = generator_of_torch()
+    if whose == PROCESS and torchs is not None:
+        torchs.manual_seed(_integer(third))
 
 
 def generator_of_torch() -> Any:
@@ -128,12 +130,19 @@ def reseed_generators(simulation: Any, seed: int) -> int:
     if not found:
         raise SimulationError(
             f"{short_repr(simulation)} holds no random generator to seed: keep a random.Random or"
-            " numpy.random.Generator in"
-            " an attribute; make the environment with global_rng=True if the model draws from random or numpy.random;"
-            " seed other libraries' generators in the simulation's reseed"
+            " numpy.random.Generator in an attribute; make the environment with global_rng=True if the model draws from"
+            " random or numpy.random; seed other libraries' generators in the simulation's reseed"
         )
-    for generator, stream in zip(found, _streams(seed, _SIMULATION, len(found)), strict=True):
-        _reseed(generator, stream)
+    streams = np.random.SeedSequence(int(seed), spawn_key=(_FUTURES, _SIMULATION)).spawn(len(found))
+    for generator, stream in zip(found, streams, strict=True):
+        if isinstance(generator, random.Random):
+            generator.seed(_integer(stream))
+            continue
+        legacy = isinstance(generator, np.random.RandomState)
+        bits = getattr(generator, "_bit_generator" if legacy else "bit_generator", generator)
+        bits.__setstate__(type(bits)(stream).__getstate__())  # new NumPy: the seed sequence for ``spawn``, too
+        if legacy:
+            generator.set_state(bits.state)  # this drops the second normally distributed number
     return len(found)
 
 
@@ -159,30 +168,5 @@ def _generators(simulation: Any) -> Iterator[Any]:
         level = get_referents(*following)
 
 
-def _streams(seed: int, whose: int, number: int) -> list[np.random.SeedSequence]:
-    """Make the seeds of some number of generators for a future."""
-    return np.random.SeedSequence(int(seed), spawn_key=(_FUTURES, whose)).spawn(number)
-
-
-def _reseed(generator: Any, stream: np.random.SeedSequence) -> None:
-    """Seed a generator in place, so that all references to it see the new state."""
-    if isinstance(generator, random.Random):
-        generator.seed(_integer(stream))
-        return
-    legacy = isinstance(generator, np.random.RandomState)
-    bits = getattr(generator, "_bit_generator" if legacy else "bit_generator", generator)
-    bits.__setstate__(type(bits)(stream).__getstate__())  # new NumPy: the seed sequence for ``spawn``, too
-    if legacy:
-        generator.set_state(bits.state)  # this drops the second normally distributed number
-
-
 def _integer(stream: np.random.SeedSequence) -> int:
     return int(stream.generate_state(1, np.uint64)[0])
-
-
-def seed_globals(seed: int, whose: int) -> np.random.SeedSequence:
-    """Seed Python's and NumPy's global generators for a future from separate streams; return a third stream."""
-    python, numpy, another = _streams(seed, whose, 3)
-    _reseed(PYTHON, python)
-    _legacy.set_bit_generator(type(_legacy.get_bit_generator())(numpy))  # leaves the old bit generator as it is
-    return another

@@ -24,10 +24,8 @@ SMALL: Final = 1024
 def stacker(space: spaces.Space[Any], *, cast: bool = False, other: Stacker | None = None) -> Stacker:
     """Make the function that stacks elements of a space. The stack shares no memory with them.
 
-    Args:
-        space: The space.
-        cast: Whether the items already have the space's dtype and shape, as observations have. If False, they are cast.
-        other: A function that stacks elements of a space without a shape. None: they become an array of objects.
+    ``cast``: whether the items already have the space's dtype and shape, as observations have. ``other`` stacks
+    elements of a space without a shape; without it, they become an array of objects.
     """
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
@@ -107,9 +105,7 @@ def _map(function: Callable[..., Any], *stacks: Any) -> Any:
 def rows(stack: Any, *, integers: bool) -> list[Any] | None:
     """Split what a batched policy returned into one action for each decision; None if it cannot be split.
 
-    Args:
-        stack: An array, an object that converts to one (a tensor), a sequence, or a dict of these.
-        integers: Whether to return integers as Python integers.
+    The stack is an array, an object that converts to one (a tensor), a sequence, or a dict of these.
     """
     if isinstance(stack, Mapping):
         parts = [rows(part, integers=False) for part in stack.values()]

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from os import getpid
 from queue import Empty, SimpleQueue
-from threading import Thread, current_thread
+from threading import Thread
 from typing import Any, Final
-from weakref import WeakSet
 
-from ..errors import WrongThreadError, warn_user
+from ..errors import WrongThreadError
 from ..hooks.hook import Hook
 from ..hooks.stacks import SIMULATION, Interceptor
 from ..simulation import RULE, Sentinel
-from .driver import FAILED, FINISHED, NO_EVENTS, SECONDS_TO_UNWIND, Driver, Event, SimulationExit, reporting_rule
+from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event, SimulationExit
 from .greenlets import silence_unwound_tasks
 
 _LONGEST_WAIT: Final = 1.0
@@ -28,29 +26,30 @@ _END: Final = Sentinel("END")
 class ThreadDriver(Driver):
     """A driver that runs a simulation in a thread of its own. The first ``begin`` starts it, and ``end`` joins it.
 
-    Only one of the two threads runs at a time. They hand over replies and events in two queues. An interrupt (Ctrl-C,
-    for instance) may leave a reply or an event in its queue, or lose an event. So the simulation's thread ignores all
-    replies between two jobs, and each job has a queue of its own for events.
+    Only one of the two threads runs at a time. They hand over replies and events in two queues. An interrupt may leave
+    something in a queue, or lose an event. So replies between two jobs are ignored, and each job has a queue of events.
     """
 
-    __slots__ = ("_arrived", "_process", "_replies", "_thread")
+    __slots__ = ("_arrived", "_replies", "_thread")
 
-    own_thread = True
+    _shares_thread = False
 
-    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None, *, direct: bool = True) -> None:
-        """Prepare a thread, as ``Driver`` does; ``caller`` is always None."""
-        super().__init__(plugins, opened)
-        self._process = getpid()
+    def __init__(self, plugins: Any = None) -> None:
+        """Prepare a thread. ``caller`` is always None."""
+        super().__init__(plugins)
         self._replies: SimpleQueue[Any] = SimpleQueue()
         self._arrived: SimpleQueue[Event] = SimpleQueue()
         self._thread: Thread | None = None
 
     # -- in the user's thread ---------------------------------------------------------------------
 
-    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
+    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] | None = None, context: Any = None) -> None:
         """Prepare a job, and start the thread if there is none."""
-        super().begin(job, events, context)
+        with suppress(Empty):
+            while True:
+                self._replies.get_nowait()
         self._arrived = SimpleQueue()
+        super().begin(job, events, context)
         if self._thread is None:
             self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
             try:
@@ -77,64 +76,27 @@ class ThreadDriver(Driver):
                 continue
 
     def throw(self) -> Event | None:
-        """Raise ``SimulationExit`` in the suspended simulation; return its next event, or None if none comes in time.
-
-        If the simulation still runs, because the user's wait was interrupted, the exit is raised at its next decision.
-        """
-        self.enter()
-        if self.idle:  # the job has ended, or was interrupted before it began
-            with suppress(Empty):
-                while True:
-                    self._replies.get_nowait()
-            self._job = None
-            return (FINISHED, [None], None) if self._arrived.empty() else self._arrived.get()
-        self._exiting = True
+        """Raise ``SimulationExit`` in the simulation, at its next decision if it still runs; return its next event."""
         self._replies.put(_EXIT)
         try:
             return self._arrived.get(True, SECONDS_TO_UNWIND)
         except Empty:
             return None
 
-    @property
-    def lost(self) -> bool:
-        """Whether this process is a fork, in which the simulation's thread does not exist."""
-        return getpid() != self._process
-
-    @property
-    def reachable(self) -> bool:
-        """Whether the simulation can be resumed from the current process."""
-        return not self.lost
-
-    @property
-    def at_home(self) -> bool:
-        """Whether this code runs in the simulation's thread."""
-        return current_thread() is self._thread
-
     def end(self) -> None:
-        """End the stack, whose job has ended or is lost, and wait for the end of its thread.
+        """End the stack, and wait for the end of its thread. After an interrupt this can be called again.
 
-        After an interrupt this can be called again.
+        A job that was given up gets another chance to unwind if it decides again.
         """
         if self.ended and not self.idle:
             return
-        thread = self._thread
-        self._arrived = SimpleQueue()
-        if self.idle and thread is not None and thread is not current_thread() and not self.lost:
+        if self.idle and self._thread is not None and not self.lost:
             self.ended = True  # first, because after an interrupt no job must begin that would come after ``_END``
             self._replies.put(_END)
-            if thread.ident is not None:  # otherwise an interrupt came before the thread started
-                thread.join(SECONDS_TO_UNWIND)
-            if thread.is_alive():
-                warn_user(
-                    f"the thread of a simulation that has ended is still alive after {SECONDS_TO_UNWIND} s",
-                    ResourceWarning,
-                )
+            with suppress(RuntimeError):  # this is that thread, or an interrupt came before it started
+                self._thread.join(SECONDS_TO_UNWIND)
         self._forget_stack()
         self._thread = None
-
-    def abandon(self) -> None:
-        """Give up a job that does not unwind. If it decides again, it gets another chance to unwind."""
-        self.ended = True
 
     # -- in the simulation's thread ---------------------------------------------------------------
 
@@ -151,28 +113,25 @@ class ThreadDriver(Driver):
     def _do(self) -> None:
         context, self._context = self._context, None
         try:
-            event: Event = context.run(self._work)
+            event = context.run(self._work)
         except BaseException as error:  # raised from another thread; without an event the user would wait for ever
-            event = FAILED, [error], None
+            event = ENDED, [error], True
         context = None
-        if isinstance(event[1][0], SimulationExit):
+        _, box, failed = event
+        if isinstance(box[0], SimulationExit):
             # Nothing reads this traceback. Its frames must be freed while this thread runs, because the model's own
             # greenlets can unwind in no other thread.
-            event[1][0].__traceback__ = event[1][0].__context__ = None
-        if self.lost:
+            box[0].__traceback__ = box[0].__context__ = None
+        if self.forked:
             self.ended = True
-            if event[0] is FAILED:
-                raise event[1].pop()  # the model has forked, and this process has no user to tell
-            return
+            if failed:
+                raise box.pop()  # this process has no user to tell
         self.idle = True
         self._arrived.put(event)
 
-    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
+    def _decider(self, rule: Any, event: Any, away: bool) -> Interceptor:
         """Make the function that sends an event for the calls of a hook, and carries out the replies."""
         deliver, ask, answer = event.deliver, self._arrived.put, self._replies.get
-        rule: Any = hook.rule
-        if event.report is not None:
-            rule = reporting_rule(hook, self._decider(hook, event.report))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             ask((event, args, kwargs))

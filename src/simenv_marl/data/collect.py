@@ -1,7 +1,6 @@
 """Episodes of many simulations at once: their trajectories for learning, mixtures of policies, and comparisons."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from math import isfinite
@@ -19,7 +18,7 @@ from ..core.stacking import stacker, taken
 from ..errors import DefinitionError, OptionValueError, short_repr
 from ..many.batch import BatchPolicy, PolicyKey, policy_keys, read_answers, run
 from ..many.parallel import progress_bar, spread
-from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
+from ..many.simulate import check_options, checked_policies, checked_seeds
 from ..simulation import RULE
 from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by, leaves
 
@@ -65,21 +64,12 @@ def collect_episodes(
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
         BaseException: All other errors are those of ``simulate_many``.
     """
-    episodes = list(enumerate(checked_seeds(seeds)))
-    check_numbers(batch_size, workers)
-    check_collect(collect)
-    policies = checked_policies(policies)
+    policies, episodes = checked_policies(policies), list(enumerate(checked_seeds(seeds)))
+    check_options(batch_size, workers, collect)
     plan = learners_plan(simulation, policies, points, options)
-    arguments = ((simulation, policies, points, options), collect, int(batch_size))
-    parts: list[tuple[list[Records], list[Any]]] = []
-    with progress_bar(len(episodes)) if progress else nullcontext() as bar:
-        if workers and episodes:
-            for number, part in spread(_play, arguments, episodes, int(workers), int(batch_size)):
-                parts.append(part)
-                if bar is not None:
-                    bar.update(number)
-        else:
-            parts.append(_play(*arguments, episodes, plan, bar))
+    arguments = (simulation, policies, points, options), None if workers else plan, collect, batch_size
+    with progress_bar(len(episodes), progress) as bar:
+        parts = list(spread(_play, arguments, episodes, workers, batch_size, bar))
     all_seeds = tuple(seed for _, seed in episodes)
     collected = None if collect is None else tuple(value for _, values in parts for value in values)
     return {
@@ -123,17 +113,13 @@ def _follow_rule(observations: Any) -> Any:
 
 def _play(
     arguments: tuple[Any, ...],
+    plan: Plan | None,
     collect: Callable[[Any], Any] | None,
     batch_size: int,
     episodes: list[tuple[int, int]],
-    plan: Plan | None = None,
-    bar: Any = None,
+    bar: Any,
 ) -> tuple[list[Records], list[Any]]:
-    """Play episodes, which are pairs of number and seed. Without a plan, in a worker, it makes one.
-
-    Returns:
-        The records, by the place of their policy, and what ``collect`` returned.
-    """
+    """Play episodes, which are pairs of number and seed. Return the records by place of their policy, and values."""
     plan = plan or learners_plan(*arguments)
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)
@@ -141,8 +127,7 @@ def _play(
     def finish(place: int, simulation: Any) -> None:
         if collect is not None:
             collected[place] = collect(simulation)
-        if bar is not None:
-            bar.update()
+        bar.update()
 
     run(plan, [seed for _, seed in episodes], batch_size, finish, recorder)
     _, policies, *_ = arguments

@@ -45,11 +45,7 @@ STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def style(what: str) -> Iterator[Any]:
-    """Set the style of these plots; yield a function that makes a new figure from its width and height in inches.
-
-    Raises:
-        MissingExtraError: Matplotlib is missing.
-    """
+    """Set the style of these plots; yield a function that makes a new figure from its width and height in inches."""
     rc_context = import_extra("matplotlib", what).rc_context
     make = import_extra("matplotlib.figure", what).Figure
 

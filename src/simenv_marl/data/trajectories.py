@@ -21,7 +21,7 @@ from ..core.point import Point
 from ..core.spaces import blank
 from ..core.stacking import Stacker, joined, stack_masks, stacker, taken
 from ..errors import AgentError, OptionValueError, short_repr
-from ..many.batch import Group, PolicyKey
+from ..many.batch import Answers, Group, PolicyKey
 from ..simulation import RULE
 
 # -- what learners get ----------------------------------------------------------------------------
@@ -270,13 +270,14 @@ class Recorder:
         self._first_episode = first_episode
         self._logs: dict[Group, _DecisionLog] = {}
 
-    def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
-        """Record the decisions that are about to be answered: see ``Watcher``."""
+    def record(self, group: Group, places: list[int], waiting: list[Any], observations: Any, answers: Answers) -> None:
+        """Record decisions and their answers: see ``Watcher``."""
+        actions, extras = answers
         log = self._logs.get(group)
         if log is None:
             log = self._logs[group] = _DecisionLog(group.point)
         row, turns = len(log.rewards), log.turns
-        agents: list[Any] = [episode.pending for episode in waiting]
+        agents = [episode.pending for episode in waiting]
         for place, episode, agent in zip(places, waiting, agents, strict=True):
             trajectory = agent.notes
             if trajectory is None:
@@ -292,10 +293,6 @@ class Recorder:
             log.masks.append(stack_masks([agent.mask for agent in agents]))
         if waiting[0].clock is not None:
             log.times.extend([agent.now for agent in agents])  # the policy may have been given the info
-
-    def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
-        """Record the answers: see ``Watcher``."""
-        log = self._logs[group]
         log.by_rule += [action is RULE for action in actions]
         log.actions.append(log.stack_actions([log.unknown_action if action is RULE else action for action in actions]))
         # Copied because policies may reuse their arrays; in two steps because np.array cannot copy every tensor.
@@ -308,8 +305,8 @@ class Recorder:
                 )
         log.extras.append(arrays)
 
-    def moved(self, episode: Episode) -> None:
-        """Record the reward when an episode reaches its next decision or its end: see ``Watcher``."""
+    def pay(self, episode: Episode) -> None:
+        """Record the rewards: see ``Watcher``."""
         if episode.pending is not None:
             _reward(episode.pending)
         if not (episode.over or episode.just_ended):

@@ -39,7 +39,6 @@ def view_class(plan: Plan, view: str | None) -> Any:
             f"view must be None or one of {', '.join(map(repr, VIEWS))}, not"
             f" {short_repr(view)}{did_you_mean(view, VIEWS)}"
         )
-    VIEWS[view].adapt(plan)
     return VIEWS[view]
 
 
@@ -58,6 +57,7 @@ def generate_env(
     """
     plan = Plan(simulation, points, options)
     base = view_class(plan, view)
+    base.adapt(plan)  # raises errors at once
 
     def initialise(self: Any, **changes: Any) -> None:
         current = Plan(simulation, points, options) if plan.stale else plan

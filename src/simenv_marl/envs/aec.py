@@ -56,15 +56,12 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             BaseException: Any exception of the model, a mapping or a policy.
         """
         session = self._session
-        if session.lock is not None and not session.lock.held:  # the lock also covers recording the results
-            with session.lock:
-                SimulationAECEnv.step(self, action)
-            return
         episode = session.episode
-        if episode is None:
-            raise session.refusal()
+        if episode is None or (session.lock is not None and not session.lock.held):
+            self._step_alone(SimulationAECEnv.step, action)
+            return
         if self._leaving:
-            self._dead_step(action)
+            self._dead_step(episode, action)
             return
         try:
             episode.step(action)
@@ -94,15 +91,13 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         """
         episode, observation = self._session.episode, None
         if self._leaving:
-            name = self.agent_selection
-            observation = self.observe(name) if observe else None
+            observation = self.observe(self.agent_selection) if observe else None
         elif episode is None or episode.pending is None:
             raise self._session.refusal()
-        else:
-            name = episode.pending.name
-            if observe:
-                observation = episode.pending.observation
-                observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
+        elif observe:
+            observation = episode.pending.observation
+            observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
+        name = self.agent_selection
         reward = self._cumulative_rewards[name]
         return observation, reward, self.terminations[name], self.truncations[name], self.infos[name]
 
@@ -113,7 +108,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             UnknownAgentError: There is no such agent.
             ResetNeededError: There is no episode.
         """
-        return self._observation(self.episode, agent)
+        found = self.episode.agent(agent)
+        if found is None or found.observation is None:
+            return self._point(agent).blank()
+        return duplicate(found.observation)
 
     # -- PettingZoo's books -----------------------------------------------------------------------
 
@@ -129,16 +127,12 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.infos: dict[str, dict[str, Any]] = {}
 
     def _begin(self, episode: Episode) -> None:
-        with self._session.context():
-            for agent in episode.agents.values():
-                if not (agent.present or episode.over):
-                    agent.clear_observation()
-                self._join(agent)
+        for agent in episode.agents.values():
+            self._join(agent)
         self._record(episode)
         episode.unreported_end = False  # the books report it
 
     def _join(self, agent: Agent) -> None:
-        """Enter an agent in the books."""
         name = agent.name
         self._places[name] = len(self.agents)
         self.agents.append(name)
@@ -179,13 +173,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.agent_selection = name
 
     def _clear_rewards(self) -> None:
-        """Reset the rewards of the previous step."""
         for name in self._rewarded:
             self.rewards[name] = 0.0
         self._rewarded = []
 
-    def _dead_step(self, action: Any) -> None:
-        """Take the final step of an agent that has ended."""
+    def _dead_step(self, episode: Episode, action: Any) -> None:
         if action is not None and action is not RULE:
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not"
@@ -199,12 +191,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         place, mover = self._places.pop(name), self.agents.pop()
         if mover != name:
             self.agents[place], self._places[mover] = mover, place
-        pending = self.episode.pending
         if self._leaving:
             self.agent_selection = self._leaving[-1]
-        elif pending is not None:
-            self.agent_selection = pending.name
-
-    def begin_branch(self) -> None:
-        """Prepare the environment of a branch: see ``View``."""
-        self.episode.just_ended = []  # they are in the books already
+        elif episode.pending is not None:
+            self.agent_selection = episode.pending.name

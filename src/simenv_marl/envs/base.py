@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import pickle
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from functools import cached_property
-from sys import modules
 from typing import Any, ClassVar
+from zlib import crc32
 
 import gymnasium as gym
 import numpy as np
@@ -19,15 +21,12 @@ from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import Point
 from ..core.provenance import describe
-from ..core.session import Session, checked_seed, seed_space
-from ..core.spaces import duplicate, observation_cast
-from ..errors import UnknownAgentError, UnknownOptionError, ViewError, did_you_mean, short_repr
+from ..core.session import Session, checked_seed
+from ..core.spaces import observation_cast
+from ..errors import UnknownAgentError, UnknownOptionError, ViewError, did_you_mean, short_repr, warn_user
 from ..plugins import Entry
 
-Spaces = tuple[spaces.Space[Any], spaces.Space[Any]]
-"""An observation space and an action space."""
-
-_OWN = frozenset(("_definition", "_finalizer", "_own", "_plan", "_session", "joint", "metadata"))
+_OWN = frozenset(("_definition", "_finalizer", "_own", "_roster", "_session", "joint", "metadata"))
 """The attributes that no copy takes over."""
 
 
@@ -46,15 +45,9 @@ class View:
     _finalizer: Any = None
     _set_up: Callable[[], None]  # completes what is made
     _begin: Callable[[Episode], Any]  # makes the records of a new episode, and returns the results of its reset
-    _all_spaces: Callable[[], dict[str, spaces.Space[Any]]]  # returns the observation spaces of all possible agents
-    _observation: Callable[[Episode, str], Any]  # returns a copy of an agent's latest observation
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the view of a plan, of a session that its owner closes, or else of a new session.
-
-        Raises:
-            SimEnvError: Something in the plan cannot work.
-        """
+        """Make the view of a plan, of a session that its owner closes, or else of a new session."""
         adapted = self.adapt(plan)
         super().__init__()
         self._plan = plan
@@ -64,17 +57,14 @@ class View:
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
         self._shows = self.render_mode == "human"  # render after every reset and step
-        self._spaces: dict[str, Spaces] = {}  # by agent
+        self._roster: Mapping[str, Point] = self._session.plan.roster  # of agents that are known beforehand
+        self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}  # of observations and of actions, by agent
         self._clear()
         self._set_up()
 
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
-        """Check that a plan allows this view, and return the plan of its sessions.
-
-        Raises:
-            UnknownOptionError, ViewError: It does not.
-        """
+        """Check that a plan allows this view, and return the plan of its sessions."""
         for option, view in (("flatten", "joint"), ("agent", "single")):
             if getattr(plan.options, option) and option != cls._option:
                 raise UnknownOptionError(f"{option} is an option of the {view} view only")
@@ -128,7 +118,7 @@ class View:
         space = self._plan.options.state_space
         if not isinstance(space, str):
             return space
-        parts = spaces.Tuple(self._all_spaces().values())
+        parts = spaces.Tuple([point.definition.observation_space for point in self._roster.values()])
         together = spaces.flatten_space(parts)
         if not isinstance(together, spaces.Box):
             raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
@@ -146,8 +136,11 @@ class View:
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
         if isinstance(self._plan.options.state_space, str):
-            episode, parts = self.episode, self._all_spaces().items()
-            value = np.concatenate([spaces.flatten(part, self._observation(episode, agent)) for agent, part in parts])
+            parts: list[Any] = []
+            for agent in self._agents():
+                seen = agent.point.blank() if agent.observation is None else agent.observation
+                parts.append(spaces.flatten(agent.point.definition.observation_space, seen))
+            value: Any = np.concatenate(parts)
         else:
             tell = getattr(self.simulation, "state", None)
             if not callable(tell):
@@ -166,12 +159,24 @@ class View:
             raise self._session.refusal()
         return episode
 
+    def _agents(self) -> list[Agent]:
+        """The agents of the roster; raise ``ResetNeededError`` if there is no episode."""
+        episode = self.episode
+        return [episode.agent(name) or episode.others[name] for name in self._roster]
+
     def render(self) -> Any:
         """Render the simulation in ``render_mode``. Without a render mode, warn and return None.
 
         In the mode "human", every ``reset`` and ``step`` renders by itself.
         """
-        return self._session.render()
+        if self.render_mode is None:
+            warn_user(
+                "render() shows nothing without a render_mode; the simulation's render modes are"
+                f" {self._plan.render_modes}"
+            )
+            return None
+        with self._session.context():
+            return self.simulation.render(self.render_mode)
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.
@@ -179,21 +184,16 @@ class View:
         Raises:
             BaseException: Any exception of the simulation while it unwinds.
         """
-        try:
-            self._end(self._session.close)
-        finally:
-            if self._finalizer is not None and self._session.idle:  # else closing was refused, or interrupted
-                # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
-                self._finalizer.detach()
+        self._end(self._session.close)
 
     def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
         """Begin another episode, which ends if the environment is abandoned. Return the results of the reset."""
         session = self._session
-        with session.exclusive():
+        with session.lock or nullcontext():
             seed = checked_seed(seed)
+            self._end(session.end)
             if self._finalizer is not None and not self._finalizer.alive:
                 self._finalizer = weakref.finalize(self, session.abandon)
-            self._end(session.end)
             results = self._begin(session.start(seed, options, in_rounds=self._in_rounds))
             if not self._plan.complete:  # the agents of the last episode may never appear again
                 self._spaces = {}
@@ -203,6 +203,13 @@ class View:
                 self.render()
             return results
 
+    def _step_alone(self, step: Callable[..., Any], action: Any) -> Any:
+        """Take a step with the lock, which also covers reading the results; refuse it if there is no episode."""
+        if self._session.episode is None:
+            raise self._session.refusal()
+        with self._session.lock or nullcontext():
+            return step(self, action)
+
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode, and forget its records unless that was refused."""
         try:
@@ -211,20 +218,26 @@ class View:
             episode = self._session.episode
             if episode is None or episode.over:
                 self._clear()
+            if self._finalizer is not None and self._session.idle:
+                # It would keep the session alive, and with it an environment that its own parts refer to.
+                self._finalizer.detach()
 
     def _clear(self) -> None:
         """Forget the records of the episode."""
 
-    def _make_spaces(self, agent: str, definition: Any, seed: int | None) -> Spaces:
+    def _make_spaces(self, agent: str, definition: Any) -> tuple[spaces.Space[Any], ...]:
         """Make the spaces of an agent, which no other environment shares, on demand: many may never need them."""
         made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
-        self._seed_spaces(agent, seed)
+        given = self._session.np_random_seed if self._plan.complete else -1
+        self._seed_spaces(agent, self._session.seed if given == -1 else given)
         return made
 
     def _seed_spaces(self, agent: str, seed: int | None) -> None:
-        if seed is not None and seed >= 0:
+        """Seed the spaces of an agent by its name, and not by the order in which agents join."""
+        if seed is not None:
+            sequence = np.random.SeedSequence([seed, crc32(agent.encode(errors="surrogatepass"))])
             for space in self._spaces[agent]:
-                seed_space(space, seed, agent)
+                space.seed(int(sequence.generate_state(1)[0]))
 
     # -- copies -----------------------------------------------------------------------------------
 
@@ -233,30 +246,36 @@ class View:
 
     def __deepcopy__(self, memory: dict[int, Any]) -> Any:
         """Make an environment like this one, with a simulation of its own. It needs a reset."""
-        made = memory[id(self)] = _make_again(type(self), self._plan)
+        made = memory[id(self)] = type(self).__new__(type(self))
         made.__setstate__(copy.deepcopy(self._state(), memory))
         return made
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset."""
         view: Any = type(self)
-        found: Any = modules.get(view.__module__)
-        for name in view.__qualname__.split("."):
-            found = getattr(found, name, None)
-        if found is not view:  # a class that generate_env made and that its name does not lead to
+        try:
+            pickle.dumps(view)
+        except Exception:  # a class that generate_env made and that its name does not lead to
             view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-        return _make_again, (view, self._plan), self._state()
+        return object.__new__, (view,), self._state()
 
     def _state(self) -> dict[str, Any]:
         """Return what a copy takes over."""
         own = {name: value for name, value in vars(self).items() if name not in _OWN}
         return own | {"session": self._session.snapshot()}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._session.restore(state.pop("session"))
+    def __setstate__(self, state: dict[str, Any], original: Session | None = None) -> None:
+        """Make this environment from the state of another, and replay its episode if its session is given."""
+        View.__init__(self, state.pop("_plan"))
+        if original is not None:
+            self._session.replay(original)
+        for name, value in state.pop("session").items():
+            setattr(self._session, name, value)
         vars(self).update(state)
-        if self._session.episode is None:  # otherwise it was replayed, and has the same records
+        if original is None:
             self._clear()
+        else:
+            self._set_up()
 
     # -- branches and planners --------------------------------------------------------------------
 
@@ -267,20 +286,12 @@ class View:
 
     def replayed(self) -> Any:
         """Make an environment in exactly the same state in mid-episode, or raise as ``Session.replay``."""
-        made = _make_again(type(self), self._plan)
-        made._session.replay(self._session)
-        made.__setstate__(copy.deepcopy(self._state()))
+        made = type(self).__new__(type(self))
+        made.__setstate__(copy.deepcopy(self._state()), self._session)
         return made
 
     def begin_branch(self) -> None:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
-
-
-def _make_again(view: type[View], plan: Plan) -> View:
-    """Make an environment of a class from its plan alone. Generated classes have other arguments."""
-    made = view.__new__(view)
-    View.__init__(made, plan)
-    return made
 
 
 class AgentsView(View):
@@ -296,15 +307,10 @@ class AgentsView(View):
     def _set_up(self) -> None:
         if self._plan.possible_agents is not None:
             self.possible_agents = self._plan.possible_agents
-
-    @classmethod
-    def adapt(cls, plan: Plan) -> Plan:
-        """Check that a plan allows this view: see ``View``."""
-        if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
+        elif isinstance(self._plan.options.state_space, str):
             raise ViewError(
                 'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='
             )
-        return super().adapt(plan)
 
     @classmethod
     def metadata_of(cls, plan: Plan) -> dict[str, Any]:
@@ -317,11 +323,11 @@ class AgentsView(View):
         Raises:
             UnknownAgentError: There is no such agent.
         """
-        return (self._spaces.get(agent) or self._own_spaces(agent))[0]
+        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """The action space of an agent, as ``observation_space`` returns the observation space."""
-        return (self._spaces.get(agent) or self._own_spaces(agent))[1]
+        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[1]
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
@@ -337,14 +343,11 @@ class AgentsView(View):
         """The action spaces of all possible agents, as ``observation_spaces`` has the observation spaces."""
         return {agent: self.action_space(agent) for agent in self.possible_agents}
 
-    def _own_spaces(self, agent: str) -> Spaces:
-        return self._make_spaces(agent, self._point(agent).definition, self._session.seed)
-
     def _point(self, agent: str) -> Point:
         """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
         episode = self._session.episode
         found = None if episode is None else episode.agent(agent)
-        point = self._plan.roster.get(agent) if found is None else found.point
+        point = self._roster.get(agent) if found is None else found.point
         if point is None:
             raise UnknownAgentError(
                 f"there is no agent {short_repr(agent)}; the agents now are {self.agents[:10]}"
@@ -352,37 +355,23 @@ class AgentsView(View):
             )
         return point
 
-    def _observation(self, episode: Episode, agent: str) -> Any:
-        found = episode.agent(agent)
-        if found is None or found.observation is None:
-            return self._point(agent).blank()
-        return duplicate(found.observation)
-
-    def _all_spaces(self) -> dict[str, spaces.Space[Any]]:
-        return self.observation_spaces
-
 
 class OneAgentView(View, gym.Env[Any, Any]):
     """A view with one agent: a Gymnasium environment."""
 
     _agent: str
     _definition: Any  # has the spaces, of which this environment has copies
-    _deciders: Callable[[Episode], list[Agent]]  # returns the agents whose decisions a step answers
     _np_random, _np_random_seed = View.np_random, View.np_random_seed  # where Gymnasium's checks look
 
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The observation space. No other environment shares it."""
-        return self._own_spaces()[0]
+        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[0]
 
     @cached_property
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The action space. No other environment shares it."""
-        return self._own_spaces()[1]
-
-    def _own_spaces(self) -> Spaces:
-        seed = self._session.np_random_seed
-        return self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition, seed)
+        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[1]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the simulation and run it to its first decision.
@@ -412,10 +401,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
                 " environment of discrete actions has a MultiDiscrete with flatten=True"
             )
         parts: list[Any] = []
-        for agent in self._deciders(self.episode):
+        for agent in self._agents():
             mask = agent.point.open_mask() if agent.mask is None else agent.mask
             parts += mask if isinstance(mask, tuple) else (mask,)
         return np.concatenate(parts).astype(np.bool_)
-
-    def _all_spaces(self) -> dict[str, spaces.Space[Any]]:
-        return {self._agent: self.observation_space}

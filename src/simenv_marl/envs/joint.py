@@ -17,12 +17,7 @@ from .base import OneAgentView
 
 
 class Joint:
-    """The agents of a roster, combined into one.
-
-    Attributes:
-        roster: The points of the agents, by name.
-        observation_space, action_space: The combined spaces: see ``SimulationJointEnv``.
-    """
+    """The agents of a roster, combined into one: its spaces, and its actions and results in an episode."""
 
     def __init__(self, roster: Mapping[str, Point], *, flatten: bool) -> None:
         """Combine the spaces, or raise ``ViewError`` if they cannot be flattened."""
@@ -33,7 +28,7 @@ class Joint:
         self.action_space: spaces.Space[Any] = spaces.Dict(actions)
         if flatten:
             self.observation_space = _concatenate(list(observations.values()))
-            self.action_space = _concatenate_actions(list(actions.values()))
+            self.action_space = _concatenate(list(actions.values()), discrete=True)
             self._places: dict[str, int | slice] = {}  # of each agent's action in the flattened one
             begin = 0
             for name, space in actions.items():
@@ -65,7 +60,7 @@ class Joint:
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
             raise InvalidActionError("RULE is not an action in vector environments; use joint_env, or policies=")
-        episode.rounds.check(episode, actions)  # type: ignore[union-attr]
+        episode.check(actions)  # type: ignore[attr-defined]
 
     def observe(self, episode: Episode) -> Any:
         """Return the observations of all agents; an agent that has ended keeps its last observation."""
@@ -136,9 +131,10 @@ class SimulationJointEnv(OneAgentView):
             agents = session.start(0, None, in_rounds=True).agents
             roster = {name: agent.point for name, agent in agents.items()}
             session.close()
-            session.seed = session.np_random_seed = None
+            session.seed = session.np_random_seed = session.bound_plan = None
             self._plan = session.plan = self._plan.declared(roster)
-        self.joint = self._definition = Joint(self._plan.roster, flatten=self._plan.options.flatten)
+        self._roster = self._plan.roster
+        self.joint = self._definition = Joint(self._roster, flatten=self._plan.options.flatten)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a round with an action for each agent.
@@ -158,11 +154,11 @@ class SimulationJointEnv(OneAgentView):
             BaseException: Any other error of ``SimulationAECEnv.step``.
         """
         session = self._session
-        if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
-            with session.lock:
-                return SimulationJointEnv.step(self, action)
-        episode, joint = self.episode, self.joint
-        episode.play(joint.actions(episode, action))
+        episode = session.episode
+        if episode is None or (session.lock is not None and not session.lock.held):
+            return self._step_alone(SimulationJointEnv.step, action)  # type: ignore[no-any-return]
+        joint = self.joint
+        episode.step(joint.actions(episode, action))
         if self._shows:
             self.render()
         info = joint.inform(episode)
@@ -171,30 +167,18 @@ class SimulationJointEnv(OneAgentView):
     def _begin(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
         return self.joint.observe(episode), self.joint.inform(episode)
 
-    def _observation(self, episode: Episode, agent: str) -> Any:
-        return self.joint.observe(episode)
 
-    def _deciders(self, episode: Episode) -> list[Agent]:
-        return list(self.joint.agents(episode).values())
-
-
-def _concatenate(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
-    """Return the space of concatenated vectors."""
+def _concatenate(parts: list[Any], *, discrete: bool = False) -> spaces.Space[Any]:
+    """Return the space of concatenated vectors. ``discrete``: they may all be discrete, too."""
+    kinds = (spaces.Discrete, spaces.MultiDiscrete)
+    if discrete and all(isinstance(space, kinds) and np.ndim(space.start) < 2 for space in parts):
+        numbers = [np.atleast_1d(space.nvec if isinstance(space, kinds[1]) else space.n) for space in parts]
+        starts = [np.atleast_1d(space.start) for space in parts]
+        return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))
     for space in parts:
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            raise ViewError(f"flatten=True needs one-dimensional Box spaces, not {space}")
+            raise ViewError(
+                "flatten=True needs one-dimensional Box spaces, and actions that are all continuous or all discrete,"
+                f" not {space}"
+            )
     return spaces.flatten_space(spaces.Tuple(parts))
-
-
-def _concatenate_actions(parts: list[Any]) -> spaces.Space[Any]:
-    """Return the space of concatenated actions, which must be all continuous or all discrete."""
-    kinds = (spaces.Discrete, spaces.MultiDiscrete)
-    discrete = [space for space in parts if isinstance(space, kinds) and np.ndim(space.start) < 2]
-    if not discrete:
-        return _concatenate(parts)
-    if len(discrete) < len(parts):
-        given = ", ".join(map(str, parts))
-        raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {given}")
-    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in discrete]
-    starts = [np.atleast_1d(space.start) for space in discrete]
-    return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))

@@ -8,7 +8,6 @@ from typing import Any
 from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
-from ..core.agent import Agent
 from ..errors import ViewError, short_repr
 from .base import AgentsView
 from .parallel import Results
@@ -35,25 +34,18 @@ def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
     return PaddedAECEnv(env) if isinstance(env, AECEnv) else PaddedParallelEnv(env)
 
 
-def _is_present(agent: Agent) -> bool:
-    """Whether an agent is live and was observed."""
-    return agent.present and not agent.ended
-
-
-def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any], idle: dict[str, Any]) -> tuple[Any, ...]:
-    """Return the rewards, terminations, truncations and infos of all possible agents, from those of the live ones.
-
-    ``idle`` is what the infos of agents that are not present have besides the open mask and the time.
-    """
+def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the rewards, terminations, truncations and infos of all possible agents, from those of the live ones."""
     episode, roster, padded = view.episode, view.possible_agents, {}
     for name in roster:
         agent: Any = episode.agent(name)
-        info, present = infos.get(name, idle), _is_present(agent)
-        if not present:
+        present = agent.present and not agent.ended
+        if present:
+            info = infos[name]
+        else:
             agent.clear_observation()
-            if agent.ended:
-                agent.observation = None  # so that ``state`` has blanks, too
-            info = agent.info | {key: info[key] for key in idle}
+            agent.observation = None  # so that ``observe`` and ``state`` have blanks
+            info = agent.info | ({"deciding": False, "acted": agent.acted} if view._in_rounds else {})
         padded[name] = {**info, "present": present}
     terminations, truncations = dict.fromkeys(roster, episode.terminated), dict.fromkeys(roster, episode.truncated)
     return {name: rewards.get(name, 0.0) for name in roster}, terminations, truncations, padded
@@ -86,9 +78,9 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
     def _padded(self, results: Results) -> Results:
         """Add the agents that are not present to the results of a round, and let all agents end together."""
         view, (observations, rewards, _, _, infos) = self.unwrapped, results
-        agents = {name: view.episode.agent(name) for name in view.possible_agents}
-        padded = {name: observations[name] if _is_present(a) else a.point.blank() for name, a in agents.items()}
-        return padded, *_pad(view, rewards, infos, {"deciding": False, "acted": False})
+        *padded, infos = _pad(view, rewards, infos)
+        seen = {name: observations[name] if i["present"] else view._point(name).blank() for name, i in infos.items()}
+        return seen, *padded, infos
 
 
 class PaddedAECEnv(BaseWrapper[str, Any, Any]):
@@ -119,20 +111,13 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
         self._cumulative_rewards[selected] = 0.0
         self._update()
 
-    def observe(self, agent: str) -> Any:
-        """Return the latest observation of an agent; zero, with all actions legal, if it is not present."""
-        found = self.unwrapped.episode.agent(agent)
-        if found is not None and not _is_present(found):
-            return found.point.blank()
-        return super().observe(agent)
-
     def _update(self) -> None:
         """Read the rewards, infos and ends of a reset or a step."""
         env, episode = self.env, self.unwrapped.episode
         rewards, infos = dict(env.rewards), dict(env.infos)
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
-        self.rewards, self.terminations, self.truncations, self.infos = _pad(self.unwrapped, rewards, infos, {})
+        self.rewards, self.terminations, self.truncations, self.infos = _pad(self.unwrapped, rewards, infos)
         for name, reward in self.rewards.items():
             self._cumulative_rewards[name] += reward
         self.agent_selection = self.agents[0] if episode.over else env.agent_selection

@@ -60,18 +60,15 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
         session = self._session
-        if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
-            with session.lock:
-                return SimulationParallelEnv.step(self, actions)
         episode = session.episode
-        if episode is None:
-            raise session.refusal()
+        if episode is None or (session.lock is not None and not session.lock.held):
+            return self._step_alone(SimulationParallelEnv.step, actions)  # type: ignore[no-any-return]
         if not self.agents and not actions and (episode.terminated or episode.truncated):
             return {}, {}, {}, {}, {}  # PettingZoo's own do so
         if isinstance(actions, Sentinel):
             actions = dict.fromkeys(episode.agents, actions)
         try:
-            episode.play(actions)
+            episode.step(actions)
         except BaseException:
             if episode.over:  # an error has ended it
                 self.agents = []

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..errors import BranchError, CopyError, ReentrancyError, ViewError
+from ..errors import CopyError, ReentrancyError, ViewError
 from ..simulation import asks_for
 from .base import OneAgentView
+
+_REFUSAL = "a policy cannot move the environment that it is given: it must return an action; branch tries actions out"
 
 
 class SimulationEnv(OneAgentView):
@@ -69,12 +71,9 @@ class SimulationEnv(OneAgentView):
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
         session = self._session
-        if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
-            with session.lock:
-                return SimulationEnv.step(self, action)
         episode = session.episode
-        if episode is None:
-            raise session.refusal()
+        if episode is None or (session.lock is not None and not session.lock.held):
+            return self._step_alone(SimulationEnv.step, action)  # type: ignore[no-any-return]
         episode.step(action)
         if self._shows:
             self.render()
@@ -108,18 +107,8 @@ class SimulationEnv(OneAgentView):
         self._own = episode.agent(self._agent)
         return self._own.observation, self._own.info
 
-    def begin_branch(self) -> None:
-        """Prepare the environment of a branch: see ``View``."""
-        self._begin(self.episode)
-
     def _clear(self) -> None:
         self._own = None
-
-    def _observation(self, episode: Episode, agent: str) -> Any:
-        return self._own.observation
-
-    def _deciders(self, episode: Episode) -> list[Agent]:
-        return [self._own]
 
 
 class PlannerEnv(SimulationEnv):
@@ -130,34 +119,22 @@ class PlannerEnv(SimulationEnv):
     """
 
     def _set_up(self) -> None:
+        episode: Any = self._session.episode
+        if episode is not None:  # otherwise the session is going to replay one
+            self._own = episode.consulted or episode.pending
+            self._agent, self._definition = self._own.name, self._own.point.definition
+            self._roster = {self._agent: self._own.point}
         self._shows = self._branched = False
-        if self._session.episode is not None:  # otherwise the session is going to replay one
-            self._find_agent()
 
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Allow every plan: the agent is the one whose planner is being asked."""
         return plan
 
-    def _find_agent(self) -> None:
-        episode: Any = self.episode
-        self._own = episode.consulted or episode.pending
-        self._agent, self._definition = self._own.name, self._own.point.definition
-
-    def replayed(self) -> Any:
-        """Make a copy for ``branch`` that stands at the same decision, by a replay."""
-        if self.episode.plan.solo:
-            raise BranchError(
-                "a branch of the environment that a policy is given cannot be branched again by replay; use"
-                ' method="fork"'
-            )
-        return super().replayed()
-
     def begin_branch(self) -> None:
         """Turn this environment into a branch that waits for the agent only."""
         if not self._branched:
             self._branched = True
-            self._find_agent()
             self._session.step_out()
             self.episode.single_out(self._own)
 
@@ -170,26 +147,20 @@ class PlannerEnv(SimulationEnv):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """In a branch, answer the pending decision and run to the agent's next one."""
         if not self._branched:
-            raise _refusal("step")
+            raise ReentrancyError(_REFUSAL)
         return super().step(action)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
         """Refuse the reset: this is the environment of one decision."""
-        raise _refusal("reset")
+        raise ReentrancyError(_REFUSAL)
 
     def close(self) -> None:
         """End a branch."""
         if not self._branched:
-            raise _refusal("close")
+            raise ReentrancyError(_REFUSAL)
         super().close()
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         raise CopyError("the environment that a policy is given cannot be copied; use branch to continue it")
 
     __deepcopy__ = __reduce_ex__  # type: ignore[assignment]
-
-
-def _refusal(use: str) -> ReentrancyError:
-    return ReentrancyError(
-        f"a policy cannot {use} the environment that it is given: it must return an action; branch tries actions out"
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from copy import deepcopy
 from functools import cached_property
 from typing import Any
@@ -33,17 +33,10 @@ class SimulationBatch:
 
     Attributes:
         arguments: The arguments that make the same in another process, with what only this process can find out.
-        plan: The plan of the sessions.
-        view_plan: The plan from which views of the sub-environments are made.
-        view: The class of these views.
+        plan, view_plan: The plans of the sessions and of views of them, whose class is ``view``.
         joint: What joint views share. None if the views are single ones.
-        observation_space, action_space: The spaces of one sub-environment.
-        sessions: The sessions of the sub-environments.
-        untouched: Whether the latest ``reset`` or ``step`` raised an error before any simulation had moved.
-        broken: False: there is no worker that could die.
+        failed: Whether an error has left them at different steps, so that all of them need a reset.
     """
-
-    broken = False
 
     def __init__(
         self,
@@ -59,7 +52,7 @@ class SimulationBatch:
         ``part`` has the numbers of the sub-environments in the vector environment.
         """
         plan = Plan(simulation, points, options)
-        if points is None and [named.point.name for named in plan._named] == decision_points():
+        if points is None and [point.name for point in plan._named] == decision_points():
             points = decision_points()
         if view is None:
             view = "joint" if plan.one_agent is None else "single"
@@ -88,14 +81,14 @@ class SimulationBatch:
         self._observed: list[Any] = [None] * len(part)
         self._episodes: list[Any] = []  # the episodes of ``_agents``, in the single view
         self._agents: list[Any] = []
-        self._first = -1
-        self.untouched = False
+        self._first: int | None = None  # the sub-environment that moves first in a reset or a step
+        self.failed = False
         self.sessions: list[Session] = []
         try:
             while len(self.sessions) < len(part):
                 self.sessions.append(Session(self.plan))
         except BaseException as error:
-            annotate(error, f"simenv_marl: in sub-environment {part[len(self.sessions)]}")
+            annotate(error, f"simenv_marl: in sub-environment {part.start + len(self.sessions)}")
             self.abandon()
             raise
 
@@ -108,22 +101,24 @@ class SimulationBatch:
     def reset(
         self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: NDArray[np.bool_]
     ) -> tuple[Any, Infos]:
-        """Begin new episodes of the chosen sub-environments.
-
-        Returns:
-            The observations of all sub-environments, and the infos of those that were reset.
-        """
+        """Begin new episodes of the chosen sub-environments. Return all observations, and the infos of these."""
         numbers = chosen.nonzero()[0].tolist()
-        self._first, self.untouched = numbers[0] if numbers else -1, False
+        self._first = next(iter(numbers), None)
         infos = [(self._part[number], self._begin(number, seeds[number], options)) for number in numbers]
+        self.failed = False
         return self._stacked(), infos
 
-    def check(self, actions: Sequence[Any], ended: NDArray[np.bool_]) -> list[Any]:
-        """Check actions against the pending decisions; return them in the form that mappings take."""
-        return checked_actions(actions, ended, self._checked, self._part.start)
+    def check(self, actions: list[Any], ended: Set[int]) -> list[Any]:
+        """Check the actions that will be used; return them in the form that mappings take."""
+        for number, own in enumerate(self._part):
+            try:
+                if own not in ended:
+                    actions[number] = self._checked(self.sessions[number], actions[number])
+            except InvalidActionError as error:
+                raise InvalidActionError(f"sub-environment {own}: {error}") from None
+        return actions
 
-    def _checked(self, number: int, action: Any) -> Any:
-        session = self.sessions[number]
+    def _checked(self, session: Session, action: Any) -> Any:
         if session.episode is None:  # its view was closed
             raise session.refusal()
         pending = session.episode.pending
@@ -134,25 +129,33 @@ class SimulationBatch:
         self.joint.check(session.episode, action)
         return action
 
-    def step(self, actions: Sequence[Any], ended: NDArray[np.bool_]) -> tuple[Any, ...]:
-        """Answer all pending decisions by checked actions, and run each simulation to its next decision.
-
-        Where an episode has ended, the next one begins instead.
+    def step(self, actions: Sequence[Any], ended: Set[int]) -> tuple[Any, ...]:
+        """Answer all pending decisions by checked actions, or begin the next episode where one has ended.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos.
+            Observations, rewards, terminations, truncations, the numbers of those that have ended now, and infos.
         """
-        begun = ended.nonzero()[0].tolist()
-        self._first, self.untouched = -1 if begun else 0, False
+        begun = [number for number, own in enumerate(self._part) if own in ended] if ended else []
+        self._first = None if begun else 0
         for number in begun:
             self._begin(number)
-        self._move((~ended).nonzero()[0].tolist() if begun else range(len(actions)), actions)
         episodes: list[Any] = [session.episode for session in self.sessions]
+        if None in episodes:  # its view was closed
+            raise self.sessions[episodes.index(None)].refusal()
+        moving: Sequence[int] = range(len(episodes))
+        waiting, own = episodes, actions
+        if begun:
+            moving = [number for number, own in enumerate(self._part) if own not in ended]
+            waiting, own = [episodes[number] for number in moving], [actions[number] for number in moving]
+        if self.joint is not None:
+            own = list(map(self.joint.actions, waiting, own))
+        step_all(waiting, own, lambda place, error: self._fail(moving[place], error))
         self._observed, earned, news = self._read(episodes)
         rewards = np.array(earned, np.float64)
         if begun:
             rewards[begun] = 0.0
         terminations, truncations = np.zeros(len(episodes), np.bool_), np.zeros(len(episodes), np.bool_)
+        ends: list[int] = []
         infos: Infos = []
         eventful = any(news) or None in [episode.pending for episode in episodes]
         for number, (episode, info) in enumerate(zip(episodes, news, strict=True)) if eventful else ():
@@ -160,15 +163,17 @@ class SimulationBatch:
                 removed = self.joint is None and self._agent in episode.ended
                 terminations[number] = removed or episode.terminated
                 truncations[number] = episode.truncated and not removed
-                if self._mode == AutoresetMode.SAME_STEP:
+                if self._mode != AutoresetMode.SAME_STEP:
+                    ends.append(self._part[number])
+                else:
                     final = {"final_obs": self._observed[number], "final_info": info}
                     infos.append((self._part[number], final))
                     info = self._begin(number)
             if info:
                 infos.append((self._part[number], info))
-        for session in self.sessions if self._shows else ():
-            session.render()
-        return self._stacked(), rewards, terminations, truncations, infos
+        for view in self.views if self._shows else ():
+            view.render()
+        return self._stacked(), rewards, terminations, truncations, ends, infos
 
     def _begin(self, number: int, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
         """Begin an episode, note its first observation, and return its first info."""
@@ -176,22 +181,12 @@ class SimulationBatch:
         try:
             episode = session.start(seed, options, in_rounds=self.joint is not None)
             if self._shows:
-                session.render()
+                self.views[number].render()
             (self._observed[number],), _, (info,) = self._read([episode])
         except BaseException as error:
             self._fail(number, error)
             raise
         return info
-
-    def _move(self, moving: Sequence[int], actions: Sequence[Any]) -> None:
-        """Answer the decisions of some sub-environments."""
-        episodes: list[Any] = [self.sessions[number].episode for number in moving]
-        if None in episodes:  # its view was closed
-            raise self.sessions[moving[episodes.index(None)]].refusal()
-        own = actions if len(moving) == len(actions) else [actions[number] for number in moving]
-        if self.joint is not None:
-            own = list(map(self.joint.actions, episodes, own))
-        step_all(episodes, own, lambda place, error: self._fail(moving[place], error))
 
     def _read(self, episodes: list[Any]) -> tuple[list[Any], list[float], list[dict[str, Any]]]:
         """Read the observations, the rewards and the infos of episodes."""
@@ -220,7 +215,7 @@ class SimulationBatch:
         """Say in an error which sub-environment raised it. Nothing has moved if it is the first and still waits."""
         annotate(error, f"simenv_marl: in sub-environment {self._part[number]}")
         episode = self.sessions[number].episode
-        self.untouched = number == self._first and episode is not None and episode.pending is not None
+        self.failed = self.failed or number != self._first or episode is None or episode.pending is None
 
     # -- views ------------------------------------------------------------------------------------
 
@@ -257,21 +252,3 @@ class SimulationBatch:
         """Unwind all simulations, from a finalizer. Warn of errors instead of raising them."""
         for session in self.sessions:
             session.abandon()
-
-
-def checked_actions(
-    actions: Iterable[Any], ended: NDArray[np.bool_], check: Callable[[int, Any], Any], first: int = 0
-) -> list[Any]:
-    """Check the actions of sub-environments, except of those whose next episode begins; return the checked actions.
-
-    Raises:
-        InvalidActionError: An action is not legal. The message names the sub-environment.
-    """
-    checked = list(actions)
-    for number, action in enumerate(checked):
-        if not ended[number]:
-            try:
-                checked[number] = check(number, action)
-            except InvalidActionError as error:
-                raise InvalidActionError(f"sub-environment {first + number}: {error}") from None
-    return checked

@@ -2,13 +2,12 @@
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, product
 from math import inf, isfinite, nan
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
+from typing import TYPE_CHECKING, Any, Final, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,22 +275,18 @@ def evaluate(
     all_seeds = distinct_seeds(seeds)
     # Plans are made and pickled here even if workers do the work, so that errors come first.
     plans = {name: runner.plan(simulation, name) for name in runner.contenders}
+    arguments = simulation, runner, None if workers else plans
     if workers:
-        pack((simulation, runner))
+        pack(arguments)
     rows: list[Any] = []
     names, done, number = list(plans), 0, len(all_seeds)
-    with progress_bar(len(names) * number, "episode") if progress else nullcontext() as bar, reuse_resources():
+    with progress_bar(len(names) * number, progress, "episode") as bar, reuse_resources():
         while True:
             # The intervals' width is checked at growing distances, since each check takes time, too.
             end = number if width is None else min(number, max(FIRST, done + max(4, done // 8)))
             runs = list(product(names, all_seeds[done:end]))
-            if workers:
-                for size, part in spread(_run, (simulation, runner), runs, int(workers), runner.batch_size):
-                    rows += part
-                    if bar is not None:
-                        bar.update(size)
-            else:
-                rows += _run(simulation, runner, runs, plans, bar)
+            for part in spread(_run, arguments, runs, workers, runner.batch_size, bar):
+                rows += part
             rows.sort(key=lambda row: names.index(row[0]))
             evaluation = Evaluation(make_table((*RUN_COLUMNS, *runner.metrics), rows), baseline, float(confidence))
             done = end
@@ -300,19 +295,14 @@ def evaluate(
 
 
 def _run(
-    simulation: Any,
-    runner: Runner,
-    runs: Sequence[tuple[str, int]],
-    plans: Mapping[str, Plan] | None = None,
-    bar: Any = None,
+    simulation: Any, runner: Runner, plans: Mapping[str, Plan] | None, runs: Sequence[tuple[str, int]], bar: Any
 ) -> list[Any]:
     """Run pairs of contender and seed, and return the rows of the table. Without plans, in a worker, it makes them."""
     rows: dict[tuple[str, int], list[Any]] = {}
 
     def report(name: str, seed: int, outcome: Outcome) -> None:
         rows[name, seed] = [(name, seed, *row) for row in runner.rows(outcome)]
-        if bar is not None:
-            bar.update()
+        bar.update()
 
     with reuse_resources():
         for name, own in groupby(runs, itemgetter(0)):
@@ -349,34 +339,30 @@ def is_proportion(values: Any) -> bool:
     return set(np.unique(values.dropna())) == {0, 1}
 
 
-class Interval(NamedTuple):
-    """A confidence interval. Bounds of which nothing is known are nan, and ``note`` says why."""
+def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool = False) -> tuple[float, float, str]:
+    """Return a confidence interval of the mean: by Student's t or, of a proportion, by Wilson's score.
 
-    low: float
-    high: float
-    note: str = ""
-
-
-def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool = False) -> Interval:
-    """Return a confidence interval of the mean: by Student's t or, of a proportion, by Wilson's score."""
+    Bounds of which nothing is known are nan. Then the third value says why; otherwise it is empty.
+    """
     stats, number = import_extra("scipy.stats", "an interval"), len(values)
     if number < 2:
-        return Interval(nan, nan, "a single value")
+        return nan, nan, "a single value"
     if not np.isfinite(values).all():
-        return Interval(nan, nan, "a value is missing or not finite")
+        return nan, nan, "a value is missing or not finite"
     if proportion:
         bounds = stats.binomtest(round(values.sum()), number).proportion_ci(confidence, method="wilson")
-        return Interval(float(bounds.low), float(bounds.high))
+        return float(bounds.low), float(bounds.high), ""
     if np.ptp(values) <= 1e-12 * np.abs(values).max():  # they differ by rounding errors at most
-        return Interval(nan, nan, "all are equal")
+        return nan, nan, "all are equal"
     low, high = stats.t.interval(confidence, number - 1, values.mean(), stats.sem(values))
-    return Interval(float(low), float(high))
+    return float(low), float(high), ""
 
 
 def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
     """Return the number of seeds that detects a mean difference: see ``Evaluation.seeds_needed``."""
     stats = import_extra("scipy.stats", "the number of seeds")
-    if interval(differences, confidence).note:
+    *_, note = interval(differences, confidence)
+    if note:
         return nan
     ratio = float(np.std(differences, ddof=1)) / abs(difference)
 

@@ -13,6 +13,7 @@ import numpy as np
 from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
+from ..core.planner import PlannerPolicy
 from ..core.session import Session
 from ..data.collect import learners_plan
 from ..decision import decision_points
@@ -20,7 +21,7 @@ from ..errors import AgentError, OptionValueError, UnknownPointError, annotate, 
 from ..hooks.stacks import outside_simulation
 from ..many.batch import Group, run, takes_identities
 from ..many.parallel import import_extra
-from ..many.simulate import check_numbers, checked_seeds
+from ..many.simulate import check_options, checked_seeds
 from ..simulation import RULE
 
 if TYPE_CHECKING:
@@ -85,12 +86,7 @@ def noting(note: str) -> Iterator[None]:
 class Runner:
     """Runs episodes of contenders, with the arguments that ``evaluate`` and ``run_experiment`` share.
 
-    Workers get a copy.
-
-    Attributes:
-        contenders: By name, the policies of each.
-        metrics: By column, the callables of an ended simulation.
-        batch_size: The number of simulations that policies answer together. 0: they answer one decision at a time.
+    Workers get a copy. With a ``batch_size`` of 0, policies answer one decision at a time.
     """
 
     def __init__(
@@ -107,7 +103,7 @@ class Runner:
         factors: Sequence[str] = (),
     ) -> None:
         """Check the arguments. ``factors`` are the columns of the design, whose names metrics must not have."""
-        check_numbers(batch_size, workers)
+        check_options(batch_size, workers)
         if not isinstance(contenders, Mapping):
             raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
         for name, policies in contenders.items():
@@ -119,15 +115,10 @@ class Runner:
                     f" it is, not {short_repr(policies)}"
                 )
             for key, policy in policies.items():
-                whose = f"the policy of {short_repr(key)} in {name!r}"
-                if policy is RULE:
-                    continue
-                if not callable(policy):
-                    raise OptionValueError(f"{whose} must be callable, not {short_repr(policy)}")
-                if not batched and takes_identities(policy):
+                if callable(policy) and policy is not RULE and not batched and takes_identities(policy):
                     raise OptionValueError(
-                        f"{whose}, {short_repr(policy)}, answers many decisions at once, as mixtures do; pass"
-                        " batched=True, and only policies as simulate_many takes them"
+                        f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)}, answers many decisions at"
+                        " once, as mixtures do; pass batched=True, and only policies as simulate_many takes them"
                     )
         if team is not None and not callable(team):
             raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
@@ -193,10 +184,10 @@ class Runner:
             with outside_simulation():
                 episode = session.start(seed, None)
                 context = episode.context if plan.options.global_rng else nullcontext
-                tally.moved(episode)
+                tally.pay(episode)
                 while (agent := episode.pending) is not None:
                     tally.count(0, agent)
-                    if agent.is_planner:
+                    if isinstance(agent.policy, PlannerPolicy):
                         agent.consultations += 1
                     try:
                         with context():
@@ -205,7 +196,7 @@ class Runner:
                         episode.fail(error)
                         raise
                     episode.step(action)
-                    tally.moved(episode)
+                    tally.pay(episode)
                 session.end()
                 with noting(f"after the simulation's end; seed {seed}"):
                     outcome = tally.outcome(0, session.simulation, self.metrics)
@@ -239,17 +230,13 @@ class Tally:
             account = agent.notes = self._accounts.setdefault(place, {}).setdefault(agent.name, [0.0, 0])
         account[1] += 1
 
-    def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
-        """Count the decisions that are about to be answered: see ``Watcher``."""
+    def record(self, group: Group, places: list[int], waiting: list[Any], *_: Any) -> None:
+        """Count decisions: see ``Watcher``."""
         for place, episode in zip(places, waiting, strict=True):
-            agent: Any = episode.pending
-            self.count(place, agent)
+            self.count(place, episode.pending)
 
-    def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
-        """Do nothing: returns do not depend on the answers."""
-
-    def moved(self, episode: Episode) -> None:
-        """Add the rewards when an episode reaches its next decision or its end: see ``Watcher``."""
+    def pay(self, episode: Episode) -> None:
+        """Add the rewards: see ``Watcher``."""
         paid = [*episode.just_ended, *(episode.agents.values() if episode.over else ())]
         episode.just_ended = []
         if episode.pending is not None:

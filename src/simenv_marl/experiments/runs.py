@@ -10,25 +10,27 @@ import json
 import os
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial, wraps
 from itertools import groupby, product
 from math import nan
 from pathlib import Path
+from time import time_ns
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Unpack
+from uuid import uuid4
 
 from ..core.context import reuse_resources
 from ..core.options import EpisodeOptions
 from ..core.packing import pack
-from ..core.plan import Plan
+from ..core.plan import Plan, source_name
 from ..core.points import Points, portable
-from ..core.provenance import as_json, describe, source_name
+from ..core.provenance import as_json, describe
 from ..errors import OptionValueError, SimEnvError, SimulationError, StoreError, describe_error, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Returns, Runner, distinct_seeds, make_table, plain_value
-from .store import Provenance, Result, Run, Store, Writer, new_session, to_json
+from .store import Provenance, Result, Run, Store, Writer, to_json
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -112,7 +114,8 @@ def run_experiment(
     storage = Store(folder, list(table.columns), list(runner.metrics))
     storage.read(keys)
     storage.check_rows(keys)
-    work = make, runner, folder, new_session()
+    session = f"{time_ns():016x}{uuid4().hex[:8]}"  # of all processes that do runs now; later ones sort after it
+    work = make, runner, folder, session
     if workers:
         pack(work)  # errors of pickling come before any run, and so do those of contenders
     row, provenances = _try_contenders(make, runner, sorted(keys, key=lambda key: key != storage.sample))
@@ -122,14 +125,10 @@ def run_experiment(
     # A row that occurs twice has the same results.
     runs = list(product(dict.fromkeys(keys), runner.contenders, all_seeds))
     missing = [run for run in runs if run not in finished]
-    with progress_bar(len(runs), "run", len(runs) - len(missing)) if progress else nullcontext() as bar:
-        if workers and missing:
+    with progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar:
+        if missing:
             least, share = len(all_seeds) if batched else 1, 16  # few parts cost nothing, many end together
-            for number, _ in spread(_run_part, work, missing, int(workers), least, share):
-                if bar is not None:
-                    bar.update(number)
-        elif missing:
-            _run_part(*work, missing, bar)
+            list(spread(_run_part, work, missing, workers, least, bar, share))
     storage.read(keys)
     return _make_frame(table, keys, all_seeds, storage.runs, runner)
 
@@ -206,7 +205,7 @@ def _prepare(make: Any, runner: Runner, key: str, contender: str) -> tuple[Plan,
     return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
 
 
-def _run_part(make: Any, runner: Runner, folder: Path, session: str, runs: Sequence[Run], bar: Any = None) -> None:
+def _run_part(make: Any, runner: Runner, folder: Path, session: str, runs: Sequence[Run], bar: Any) -> None:
     """Do runs and store their results."""
     with closing(Writer(folder, session)) as writer, reuse_resources():
         for (key, contender), group in groupby(runs, lambda run: run[:2]):
@@ -222,8 +221,7 @@ def _run_seeds(
     def report(seed: int, result: Result, trace: str | None = None) -> None:
         writer.write((key, contender, seed), result, {**provenance, "seed": seed}, trace)
         del remaining[seed]
-        if bar is not None:
-            bar.update()
+        bar.update()
 
     while remaining:
         provenance: dict[str, Any] = {}  # unknown if the simulation cannot be made

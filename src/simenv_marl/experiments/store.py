@@ -17,7 +17,6 @@ import json
 import os
 import re
 import threading
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -74,12 +73,7 @@ class Store:
         self._unusable = f"{folder} cannot be made or read as the folder of an experiment"
 
     def exists(self) -> bool:
-        """Return whether the folder is the store of this experiment; False if it is empty or missing.
-
-        Raises:
-            OptionValueError: The folder belongs to something else.
-            StoreError: The folder cannot be read.
-        """
+        """Return whether the folder is the store of this experiment; False if it is empty or missing."""
         header = self.folder / HEADER
         with _explain(self._unusable):
             found = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
@@ -197,11 +191,6 @@ def _changes(then: Iterable[tuple[str, Any]], now: Mapping[str, Any]) -> str:
 
 
 # -- writing --------------------------------------------------------------------------------------
-
-
-def new_session() -> str:
-    """Return an id for all processes that participate from now on. Later ids sort after earlier ones."""
-    return f"{time.time_ns():016x}{uuid4().hex[:8]}"
 
 
 _processes: dict[tuple[int, int], str] = {}

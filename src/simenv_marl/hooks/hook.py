@@ -8,35 +8,25 @@ simulation's stack, with the environment's decision inside and the handlers arou
 from __future__ import annotations
 
 import inspect
+import re
 from contextlib import suppress
 from functools import partial, update_wrapper
 from threading import local
 from types import FunctionType
 from typing import Any, Final
+from weakref import WeakValueDictionary, finalize
 
 from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
-from .handlers import CALLS, ITEMS, Target
-from .stacks import EVALUATING, OUTSIDE, STACKS, Interceptor, spawner_of, stack_of
-
-_SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
+from .handlers import CALLS, ITEMS, Handler, each, run, slots, wait
+from .stacks import EVALUATING, LOCK, OUTSIDE, STACKS, Interceptor, spawner_of, stack_of
 
 _ROOTS: Final[set[greenlet]] = set()
 """Roots of threads on which no simulation runs. Hooks without handlers run their rule there at once."""
 
 _THREAD: Final = local()
-"""Has a ``_Root`` in each thread whose root is in ``_ROOTS``."""
-
-
-class _Root:
-    """Forgets the root of a thread when the thread ends. A root that outlives its thread makes greenlets crash."""
-
-    def __init__(self, root: greenlet) -> None:
-        self._forget = partial(_ROOTS.discard, root)
-
-    def __del__(self) -> None:
-        self._forget()
+"""Has a mark in each thread whose root is in ``_ROOTS``. It is freed with the thread."""
 
 
 # -- wrappers -------------------------------------------------------------------------------------
@@ -55,14 +45,14 @@ _INTERCEPT = "(INTERCEPTORS.get(getcurrent()) or intercept)"
 
 _RETURN = {"function": "return {}", "generator": "return (yield from {})", "coroutine": "return (await {})"}
 
-# This determines the cost of a call without interceptors: two plain calls if ``incomplete`` is "False", else three.
-_TEMPLATE = """
-def wrapper({parameters}):
+# These determine the cost of a call without interceptors: two plain calls if no call can be incomplete, else three.
+_INCOMPLETE = """
     if {incomplete}:
         args = {passed}
         if {rule} or ({doubtful}) and not fits(*args, **kwargs):
             {rule_as_passed}
-        {intercept_as_passed}
+        {intercept_as_passed}"""
+_COMPLETE = """
     if {rule}:
         {rule_at_once}
     {intercept}
@@ -75,10 +65,10 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
     parameters = [] if signature is None else list(signature.parameters.values())
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
-    incomplete = doubtful = "True"
+    incomplete, doubtful, template = "True", "True", _INCOMPLETE + _COMPLETE
     passed, accepted = "args", "*args, **kwargs"
     if (hook.alone and parameters[0].name not in scope) or (signature is not None and not parameters):
-        incomplete = "False"
+        template = _COMPLETE
         names = [p.name for p in positional]  # a staticmethod that looks like a method may be passed it by keyword
         accepted = ", ".join(names)
     elif positional and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
@@ -94,8 +84,7 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
             passed = f"({', '.join(names[: number + 1])},) if {name} is not ABSENT else {passed}"
     given = ", ".join(names)
     answer = _RETURN[hook.kind].format
-    source = _TEMPLATE.format(
-        parameters=accepted,
+    source = f"def wrapper({accepted}):" + template.format(
         incomplete=incomplete,
         passed=passed,
         doubtful=doubtful,
@@ -103,9 +92,9 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
         rule_as_passed=answer("rule(*args, **kwargs)"),
         intercept_as_passed=answer(f"{_INTERCEPT}(args, kwargs)"),
         rule_at_once=answer(f"rule({given})"),
-        intercept=answer(f"{_INTERCEPT}(({given + ',' if given else ''}), {{}})"),
+        intercept=answer(f"{_INTERCEPT}(({given + ',' if given else ''}), NOTHING)"),
     )
-    return f"async {source.lstrip()}" if hook.kind == "coroutine" else source
+    return f"async {source}" if hook.kind == "coroutine" else source
 
 
 def unbind(value: Any) -> Any:
@@ -154,31 +143,34 @@ class Interceptors(dict[Any, Interceptor]):
         return getattr, (self.hook, "interceptors")
 
 
-class Hook(Target):
-    """A function of a model that is decided or extended, with the interceptors of its calls.
+class Hook:
+    """A function of a model that is decided or extended, or an exposed iterable: handlers, and interceptors of calls.
+
+    It is in force while it has users: its handlers, and environments.
 
     Attributes:
         function: The function. Its signature is its own, not that of what it wraps.
         rule: The innermost part of a call: the function, or its temporary replacement.
         kind: What a call returns: "function" (a value), "generator" or "coroutine".
         bound: Whether its first argument is the object it is called on, which is never passed by keyword.
-        alone: Whether every call has one argument, the object it is called on.
-        interceptors: Those of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
-            other calls while an environment with these plugins, or without plugins, is evaluated.
+        alone: Whether every call has only that argument.
+        interceptors: Those of calls on the stacks of simulations. An entry for None says that all other calls do not
+            just run the function.
+        slot: Its handlers, as ``slots`` returns them. Empty while it has none.
+        stale: Whether another object has replaced it while nothing was set in its place.
         permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
-        point: The object that the layer above makes of the hook.
+        definition: The latest definition of a decision function, which its name means; None for all other functions.
+        removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
     """
 
     permanent = True
+    stale = False
 
     def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None) -> None:
-        """Make the hook of a function; raise a ``PatchError`` for an async generator function.
+        """Make the hook of a function with a dotted name; raise a ``PatchError`` for an async generator function.
 
-        Args:
-            function: The function.
-            name: Its dotted name.
-            bound: Whether, in a class, its first argument is the object it is called on.
-            like: The function that determines what calls return, if ``function`` only forwards to it.
+        ``bound`` tells whether, in a class, its first argument is the object it is called on; ``like`` determines what
+        calls return if the function only forwards to it.
         """
         like = function if like is None else like
         if inspect.isasyncgenfunction(like):
@@ -186,30 +178,45 @@ class Hook(Target):
         awaited = "coroutine" if inspect.iscoroutinefunction(like) else "function"
         self.kind = "generator" if inspect.isgeneratorfunction(like) else awaited
         self.function = self.rule = function
-        signature = None
+        self.name, self.positions = name, CALLS + ITEMS if self.kind == "generator" else CALLS
+        self.signature: inspect.Signature | None = None
         with suppress(TypeError, ValueError):  # the signature is unknown
-            signature = inspect.signature(function, follow_wrapped=False)
-        super().__init__(name, CALLS + ITEMS if self.kind == "generator" else CALLS, signature)
+            self.signature = inspect.signature(function, follow_wrapped=False)
         self.bound = bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
-        parameters = [] if signature is None else list(signature.parameters.values())
+        parameters = [] if self.signature is None else list(self.signature.parameters.values())
         first = [
             p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
         ]
         self.alone = self.bound and len(first) == len(parameters) == 1
         self.interceptors = Interceptors(self)
-        self.point: Any = None
+        self.definition: Any = None
+        self.removed_by: dict[Any, Any] = {}
+        self.slot: dict[Any, list[list[list[Handler]]]] = {}
+        self.exposed = self._applied = False
+        # The users of each handler, and those of the hook itself under None, in the order in which they came.
+        self._users: dict[Handler | None, set[object]] = {}
+        _HOOKS[id(self)] = self
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name}>"
 
     def __reduce__(self) -> Any:
-        return _restored, (self.function, self.name, self.bound, self.kind, self.exposed), self.point
+        return _restored, (self.function, self.name, self.bound, self.kind, self.exposed), self.definition
 
-    def __setstate__(self, point: Any) -> None:
-        """Do nothing: the layer above unpickles the point itself and gives it to the hook of this process."""
+    def __setstate__(self, definition: Any) -> None:
+        """Set the definition after unpickling, unless the hook has one of this process."""
+        self.definition = self.definition or definition
+
+    @property
+    def letters(self) -> str:
+        """The letters of the function's name in lower case, for the default name of its agent."""
+        return re.sub("[^a-z]", "", self.name.rpartition(".")[2].lower()) or "agent"
 
     def make_wrapper(self, made_with: Any = None) -> FunctionType:
         """Make a wrapper of the hook's function, for which the function ``made_with`` returns that object."""
         scope: dict[str, Any] = {
             "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors, "fits": self._fits,
-            "getcurrent": getcurrent, "intercept": self._intercept, "rule": self.function,
+            "getcurrent": getcurrent, "intercept": self._intercept, "rule": self.function, "NOTHING": {},
         }  # fmt: skip
         exec(compile(_source(self, scope), f"{_FILE}{self.name}>", "exec"), scope)
         made: FunctionType = scope["wrapper"]
@@ -221,8 +228,7 @@ class Hook(Target):
     def _fits(self, *args: Any, **kwargs: Any) -> bool:
         """Return whether the function takes these arguments. If not, it is called, and raises Python's own error."""
         try:
-            if self.signature is not None:
-                self.signature.bind(*args, **kwargs)
+            self.signature.bind(*args, **kwargs)  # type: ignore[union-attr]
         except TypeError:
             return False
         return True
@@ -232,21 +238,16 @@ class Hook(Target):
         return self._interceptor_at(getcurrent())(args, kwargs)
 
     def _interceptor_at(self, here: greenlet) -> Interceptor:
-        driver = stack_of(here) if STACKS else None
-        spawner = spawner_of(here)
-        if spawner is not None and not spawner.own_thread and spawner.decides(self):
-            refuse: Interceptor = spawner.refuse(self, _SPAWNED)
-            return refuse
+        driver = (stack_of(here) or spawner_of(here)) if STACKS else None
         evaluation = EVALUATING.get(here) if driver is None else driver
         plugins = None if evaluation is None else evaluation.plugins
         decide = None if driver is None else driver.interceptor(self)
-        if decide is not None:
-            return self.around(decide, plugins)
         if here.parent is None and here not in STACKS:
-            if not hasattr(_THREAD, "root"):
-                _THREAD.root = _Root(here)
+            if not hasattr(_THREAD, "mark"):
+                _THREAD.mark = set()
+                finalize(_THREAD.mark, _ROOTS.discard, here)  # a root that outlives its thread makes greenlets crash
             _ROOTS.add(here)
-        return self.interceptors.get(plugins) or self.interceptors.get(None) or self.run_rule
+        return self.around(decide or self.run_rule, plugins)
 
     # -- who takes part ---------------------------------------------------------------------------
 
@@ -256,12 +257,10 @@ class Hook(Target):
         ``decide`` decides instead of the rule. None: the rule decides, with handlers if the plugins have some.
         """
         _ROOTS.discard(stack)
-        if decide is not None:
-            self.interceptors[stack] = self.around(decide, plugins)
-        elif plugins in self.slot and plugins is not None:
-            self.interceptors[stack] = self.around(self.run_rule, plugins)
-        else:
+        if decide is None and plugins not in self.slot:
             self.leave(stack)
+        else:
+            self.interceptors[stack] = self.around(decide or self.run_rule, plugins)
 
     def leave(self, stack: greenlet) -> None:
         """Remove the interceptor of a stack, if there is one."""
@@ -272,7 +271,13 @@ class Hook(Target):
         found = self.slot.get(plugins) or self.slot.get(None)
         if found is None:
             return inner
-        return partial(found.call if self.kind == "function" else found.wait, inner)
+        calls, items, (traces,) = found
+        if any(items):
+            inner = partial(each, self, inner)
+        around: Interceptor = partial(run if self.kind == "function" else wait, calls, inner)
+        for trace in traces:
+            around = trace.function(self, self.kind, around)
+        return around
 
     def run_rule(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Run the rule."""
@@ -283,25 +288,84 @@ class Hook(Target):
         self.rule = self.function if rule is None else rule
         self._update()
 
+    # -- users ------------------------------------------------------------------------------------
+
+    @property
+    def handlers(self) -> list[Handler]:
+        """The handlers of all owners, in the order in which they were attached."""
+        return [handler for handler in list(self._users) if handler is not None]
+
+    def install(self, user: object, handler: Handler | None = None) -> None:
+        """Set it in its place, or attach a handler, until every user has called ``uninstall``.
+
+        Handlers of the whole process have one user. Raise a ``PatchError`` if it cannot be set.
+        """
+        with LOCK:
+            user = user if handler is None else handler.owner and user
+            try:
+                # Noted first: garbage collection may close another environment that uses it meanwhile.
+                users = self._users.get(handler, set())
+                users.add(user)
+                self._users[handler] = users
+                if not self._applied:
+                    self._apply()
+                    self._applied = True
+                if handler is not None and len(users) == 1:
+                    self._update()
+            except BaseException:
+                self.uninstall(user, handler)
+                raise
+
+    def uninstall(self, user: object, handler: Handler | None = None) -> None:
+        """Undo ``install``; the last user restores the original. After an interrupt, call it again."""
+        with LOCK:
+            users = self._users.get(handler, set())
+            users.discard(user if handler is None else handler.owner and user)
+            if not users:
+                self._users.pop(handler, None)
+                if handler is not None:
+                    self._update()
+            if not self._users:
+                self._applied = False
+                self._revert()
+
+    def _apply(self) -> None:
+        """Set it in its place."""
+
+    def _revert(self) -> None:
+        """Undo ``_apply``, also where that failed half-way or was never called."""
+
     def _update(self) -> None:
-        super()._update()
-        interceptors, replaced = self.interceptors, self.rule is not self.function
-        for plugins in [None, *self.slot] if replaced else [*self.slot]:
-            interceptors[plugins] = self.around(self.run_rule, plugins)
-        for key in list(interceptors):
-            if isinstance(key, greenlet):
-                driver = STACKS.get(key, OUTSIDE)
-                if driver is not OUTSIDE:
-                    driver.enter_hooks()
-            elif key not in self.slot and (key is not None or not replaced):  # garbage collection may change the slot
-                interceptors.pop(key, None)
-        interceptors.roots = set() if self.slot or replaced else _ROOTS
+        """Fill the slot, and enter the stacks of simulations again."""
+        present: Any = None
+        # Meanwhile, garbage collection may close an environment and remove its handlers.
+        while present != (attached := self.handlers):
+            present = attached
+            self.slot = slots(present)  # one assignment, because another thread may run a call
+        if self.slot or self.rule is not self.function:
+            self.interceptors[None], self.interceptors.roots = self.run_rule, set()
+        else:
+            self.interceptors.pop(None, None)
+            self.interceptors.roots = _ROOTS
+        for stack in list(self.interceptors):
+            driver = STACKS.get(stack, OUTSIDE)
+            if driver is not OUTSIDE:
+                driver.enter_hooks()
+
+
+_HOOKS: Final[WeakValueDictionary[int, Hook]] = WeakValueDictionary()
+
+
+def hooks() -> list[Hook]:
+    """Return all hooks, in the order in which they were made."""
+    # The list of references is taken at once: other threads may make hooks meanwhile.
+    return [hook for reference in _HOOKS.valuerefs() if (hook := reference()) is not None]
 
 
 def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -> Hook:
     """Return the hook of an unpickled function: an existing one, or a new one."""
-    for hook in list(Target.all.values()):
-        if isinstance(hook, Hook) and hook.function is function and hook.name == name:
+    for hook in hooks():
+        if hook.function is function and hook.name == name:
             return hook
     hook = Hook(function, name, bound=bound)
     hook.bound, hook.kind, hook.exposed = bound, kind, exposed

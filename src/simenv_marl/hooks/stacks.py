@@ -4,8 +4,6 @@ A *stack* is a greenlet; a thread without greenlets has one, too, its root. ``ST
 by its stack. A greenlet belongs to the simulation whose stack is the nearest among itself and its parents. All other
 code is the user's: there, decision functions run their rule. While an environment evaluates something on the user's
 side (mappings, policies, the clock), ``EVALUATING`` has an entry for the greenlet that runs it.
-
-Resuming or suspending a simulation changes nothing here, since other stacks have other keys.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from threading import RLock
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from greenlet import getcurrent, greenlet
 
@@ -22,19 +20,6 @@ Interceptor = Callable[[tuple[Any, ...], dict[str, Any]], Any]
 
 LOCK: Final = RLock()
 """Held while patches or handlers change. Calls do not need it."""
-
-
-class Evaluation(Protocol):
-    """The environment or agent for which code is evaluated."""
-
-    @property
-    def memory(self) -> dict[Any, Any] | None:
-        """The memory of differences; None if there is none."""
-
-    @property
-    def plugins(self) -> Any:
-        """The plugins that take part. None: only the handlers of the whole process."""
-
 
 SIMULATION: Final = "simulation"
 """The name of the threads in which simulations run."""
@@ -46,8 +31,9 @@ STACKS: Final[dict[greenlet, Any]] = {}
 """The driver of each simulation by its stack, or ``OUTSIDE``; and its driver for each thread that a simulation
 has started, by its root."""
 
-EVALUATING: Final[dict[greenlet, Evaluation]] = {}
-"""The running evaluation of each greenlet. Code that sets an entry restores the previous one."""
+EVALUATING: Final[dict[greenlet, Any]] = {}
+"""For each greenlet, the agent or the plugins of the environment for which it evaluates something: an object with the
+``plugins`` that take part, and the ``memory`` of differences. Code that sets an entry restores the previous one."""
 
 DIFFERENCES: Final[list[str]] = []
 """Not empty once a difference was made. While it is empty and there are no plugins, mappings need no entry in
@@ -87,47 +73,47 @@ class outside_simulation:  # noqa: N801 - it is used like a function
     because the context manager of a generator cannot pass on immutable errors, such as frozen dataclasses.
     """
 
-    __slots__ = ("_before", "_driver", "_entry", "_evaluation", "_here")
+    __slots__ = ("_before", "_entry", "_evaluation", "_here")
 
-    def __init__(self, evaluation: Evaluation | None = None) -> None:
+    def __init__(self, evaluation: Any = None) -> None:
         self._evaluation = evaluation
+        self._here: greenlet | None = None
 
     def __enter__(self) -> None:
-        self._here = here = getcurrent()
+        here = getcurrent()
         self._before, self._entry = EVALUATING.get(here), STACKS.get(here)
-        self._driver = stack_of(here) if STACKS else None
-        if self._driver is not None:
+        self._here = here  # from now on there is something to restore
+        if STACKS and stack_of(here) is not None:
             if self._entry is not None:
-                self._driver.hide()
+                self._entry.leave_hooks(here)
             STACKS[here] = OUTSIDE
-        _put(EVALUATING, here, self._evaluation)
+        if self._evaluation is not None:
+            EVALUATING[here] = self._evaluation
+        else:
+            EVALUATING.pop(here, None)
 
     def __exit__(self, *error: object) -> None:
-        _put(EVALUATING, self._here, self._before)
-        if self._driver is not None:
-            _put(STACKS, self._here, self._entry)
-            if self._entry is not None:
-                self._driver.show()
-        del self._here, self._before, self._entry, self._driver
-
-    def __del__(self) -> None:
-        # An interrupt at the entry of ``__exit__`` kept it from running.
-        if hasattr(self, "_driver") and EVALUATING.get(self._here) is self._evaluation:
-            outside_simulation.__exit__(self)
-
-
-def _put(entries: dict[greenlet, Any], here: greenlet, value: Any) -> None:
-    if value is None:
-        entries.pop(here, None)
-    else:
-        entries[here] = value
+        here = self._here
+        if here is None:
+            return
+        if self._before is not None:
+            EVALUATING[here] = self._before
+        else:
+            EVALUATING.pop(here, None)
+        if self._entry is None:
+            STACKS.pop(here, None)
+            return
+        STACKS[here] = self._entry
+        if self._entry is not OUTSIDE:
+            self._entry.enter_hooks()
 
 
 def _refuse_after_fork() -> None:
     """In a process that a simulation has forked: refuse its decisions, because its user is in the other process."""
     driver = stack_of(getcurrent())
     if driver is not None:
-        driver.refuse_all("a process that the simulation has forked")
+        driver.forked = True
+        driver.enter_hooks()
 
 
 if hasattr(os, "register_at_fork"):

@@ -34,6 +34,9 @@ from ..errors import InvalidActionError, annotate, short_repr
 from ..hooks.stacks import EVALUATING, outside_simulation
 from ..simulation import RULE, positional
 
+Answers = tuple[list[Any], Mapping[str, Any]]
+"""The actions of a policy for many decisions, and the extras that it has returned beside them."""
+
 # -- who is asked ---------------------------------------------------------------------------------
 
 
@@ -43,10 +46,8 @@ class BatchPolicy:
     Attributes:
         keys: The keys of ``policies`` that have this policy.
         policy: The policy, a callable of observations and infos.
-        informed: Whether it takes the infos.
-        identifying: Whether it also takes the identities of the decisions.
+        informed, identifying: Whether it takes the infos, and the identities of the decisions.
         asking: Whether it asks for the environment and therefore answers one decision at a time.
-        groups: The groups of its decisions, by decision point.
     """
 
     def __init__(self, policy: Callable[..., Any]) -> None:
@@ -81,12 +82,7 @@ def takes_identities(policy: Callable[..., Any]) -> bool:
 
 
 class PolicyKey(DeferredPolicy):
-    """A batched policy in a plan, with the key under which it was given.
-
-    Attributes:
-        place: The place of its key in ``policies``.
-        asked: The policy.
-    """
+    """A batched policy in a plan, with the place of its key in ``policies``."""
 
     def __init__(self, place: int, asked: BatchPolicy) -> None:
         self.place = place
@@ -135,12 +131,8 @@ class Group:
     """Decisions that are answered in one batch: those of one policy in the same spaces.
 
     Attributes:
-        asked: The policy.
         point: One of the points of the decisions; the others have the same spaces.
-        stack: A callable that stacks observations.
-        waiting: The episodes whose decisions wait.
-        places: The index of each waiting episode's seed.
-        observations: The observation of each waiting episode.
+        waiting, places, observations: The episodes whose decisions wait, the indices of their seeds, and what they see.
     """
 
     __slots__ = ("_discrete", "asked", "observations", "places", "point", "stack", "waiting")
@@ -163,9 +155,7 @@ class Group:
             and (self.point.legal is None) == (point.legal is None)
         )
 
-    def ask(
-        self, observations: Any, waiting: Sequence[Episode], agents: Sequence[Any]
-    ) -> tuple[list[Any], Mapping[str, Any]]:
+    def ask(self, observations: Any, waiting: Sequence[Episode], agents: Sequence[Any]) -> Answers:
         """Ask the policy about the stacked observations of waiting episodes; return the actions, and the extras."""
         asked = self.asked
         infos: list[Any] = []
@@ -183,14 +173,8 @@ class Group:
             raise
 
 
-def read_answers(
-    answers: Any, policy: Any, number: int, *, integers: bool = False
-) -> tuple[list[Any], Mapping[str, Any]]:
-    """Return the actions and the extras in what a policy has returned for a number of decisions.
-
-    Raises:
-        InvalidActionError: It has not returned one action for each.
-    """
+def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = False) -> Answers:
+    """Return the actions and the extras in what a policy has returned for a number of decisions."""
     extras: Mapping[str, Any] = {}
     if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
         answers, extras = answers
@@ -223,14 +207,11 @@ def _each(agents: Sequence[Any]) -> Any:
 class Watcher(Protocol):
     """An observer of the episodes."""
 
-    def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
-        """Note that decisions are about to be answered. The watcher may keep the observations."""
+    def record(self, group: Group, places: list[int], waiting: list[Any], observations: Any, answers: Answers) -> None:
+        """Note what a policy has answered, before the simulations move. The watcher may keep the observations."""
 
-    def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
-        """Note that the policy has answered them."""
-
-    def moved(self, episode: Episode) -> None:
-        """Note that an episode has reached its next decision or its end."""
+    def pay(self, episode: Episode) -> None:
+        """Note the rewards when an episode has reached its next decision or its end."""
 
 
 CROWD: Final = 256
@@ -287,16 +268,15 @@ class _Simulations:
         watcher, number, begun = self.watcher, len(waiting), perf_counter()
         recorded = None if watcher is None else group.stack(observations)  # policies may change what they get
         agents = [episode.pending for episode in waiting]
-        actions, extras = group.ask(group.stack(observations), waiting, agents)
+        answers = group.ask(group.stack(observations), waiting, agents)
         asked = perf_counter()
+        actions = list(map(_checked, waiting, answers[0]))
         if watcher is not None:
-            watcher.asking(group, places, waiting, recorded)
-        step_all(waiting, list(map(_checked, waiting, actions)))
+            watcher.record(group, places, waiting, recorded, answers)
+        step_all(waiting, actions)
         waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
         for place in places:
             self._queue(place, waiting.pop())
-        if watcher is not None:
-            watcher.answered(group, actions, extras)
         if 2 * number > self.crowd < self.size and asked - begun > perf_counter() - asked:
             self.crowd = min(self.size, 2 * self.crowd)
         self.refill()
@@ -317,7 +297,7 @@ class _Simulations:
     def _queue(self, place: int, episode: Episode) -> None:
         """Queue an episode that waits at a decision, or end it if it is over."""
         if self.watcher is not None:
-            self.watcher.moved(episode)
+            self.watcher.pay(episode)
         agent = episode.pending
         if agent is None:
             self._end(place)
@@ -375,16 +355,14 @@ def step_all(
         return
     agents: list[Any] = [episode.pending for episode in episodes]
     callers = {episode.driver.caller for episode in episodes}
-    in_rounds, plugins = episodes[0].rounds is not None, episodes[0].plugins
-    together = callers == {getcurrent()} and not (EVALUATING or None in agents or plugins or in_rounds)
-    step = Episode.play if in_rounds else Episode.step
+    together = callers == {getcurrent()} and not (EVALUATING or None in agents or episodes[0].in_rounds)
     number = 0
     event: Any = None
     events: Any = []
     try:
         if not together:
             for number, episode in enumerate(episodes):
-                step(episode, actions[number])
+                episode.step(actions[number])
             return
         replies: list[Any] = []
         for number, episode in enumerate(episodes):
@@ -419,13 +397,14 @@ def close_all(sessions: Iterable[tuple[str, Session]], error: BaseException | No
 
     ``error`` is an error before.
     """
-    for name, session in sessions:
-        try:
-            session.close()
-        except BaseException as problem:
-            if error is None:
-                error = problem
-                annotate(error, f"simenv_marl: in {name}")
-            else:
-                annotate(error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well")
+    with reuse_resources():  # it waits for all processes of simulations together
+        for name, session in sessions:
+            try:
+                session.close()
+            except BaseException as problem:
+                if error is None:
+                    error = problem
+                    annotate(error, f"simenv_marl: in {name}")
+                else:
+                    annotate(error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well")
     return error

@@ -13,13 +13,13 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from importlib import import_module
 from math import ceil
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import BaseContext
 from time import monotonic
-from types import FunctionType
+from types import FunctionType, SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -41,8 +41,14 @@ def import_extra(module: str, feature: str) -> Any:
         raise MissingExtraError(f"{feature} needs {package}: install simenv-marl[{extra}] ({error})") from None
 
 
-def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
-    """Return a progress bar over ``total`` units, of which some are done already."""
+NO_BAR: Final[Any] = SimpleNamespace(update=lambda number=1: None)
+"""A progress bar that shows nothing."""
+
+
+def progress_bar(total: int, progress: bool, unit: str = "simulation", done: int = 0) -> Any:
+    """Return a context with a progress bar over ``total`` units, of which some are done; without ``progress``, none."""
+    if not progress:
+        return nullcontext(NO_BAR)
     return import_extra("tqdm.auto", "progress=True").tqdm(total=total, unit=unit, initial=done)
 
 
@@ -50,20 +56,27 @@ def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
 
 
 def spread(
-    work: Callable[..., Any], arguments: tuple[Any, ...], seeds: Sequence[Any], workers: int, least: int, share: int = 4
-) -> Iterator[tuple[int, Any]]:
-    """Call ``work``, a function of this package, in worker processes: for each part of the seeds (or of other items).
+    work: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    items: Sequence[Any],
+    workers: int,
+    least: int,
+    bar: Any,
+    share: int = 4,
+) -> Iterator[Any]:
+    """Call ``work``, a function of this package, for all items in this process, or for parts of them in workers.
 
-    With -1 workers there are as many as joblib's backend has. A process gets about ``share`` parts, none of which is
-    smaller than ``least`` as long as every process gets some seeds.
-
-    Yields:
-        The number of seeds of a part, and the function's result; in the order of the seeds.
+    It gets the arguments, the items, and a progress bar. The results come in the order of the items. With -1 workers
+    there are as many as joblib's backend has. A worker gets about ``share`` parts, none of which is smaller than
+    ``least``, unless a worker would get none.
     """
+    if not workers or not items:
+        yield work(*arguments, items, bar)
+        return
     joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
-    size = max(1, ceil(len(seeds) / (share * processes)), min(least, ceil(len(seeds) / processes)))
-    parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]
+    size = max(1, ceil(len(items) / (share * processes)), min(least, ceil(len(items) / processes)))
+    parts = [list(items[start : start + size]) for start in range(0, len(items), size)]
     parcel = _pack_with_names((work, arguments))
     try:
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
@@ -76,7 +89,8 @@ def spread(
             result, error = unpack_outcome(outcome)
             if error is not None:
                 raise error
-            yield len(part), result
+            bar.update(len(part))
+            yield result
     finally:
         if hasattr(outcomes, "close"):  # cancels the remaining work when the caller stops reading results
             with warnings.catch_warnings():  # joblib warns that it cancels
@@ -98,7 +112,7 @@ def _pack_with_names(thing: Any) -> bytes:
     return pack((thing, named)) if named else parcel
 
 
-def _work(parcel: bytes, seeds: list[Any]) -> Any:
+def _work(parcel: bytes, items: list[Any]) -> Any:
     """Call the function, in a worker. The functions it refers to by name are put into the main module."""
     (work, arguments), named = unpack(parcel)
     main = sys.modules["__main__"]
@@ -106,7 +120,7 @@ def _work(parcel: bytes, seeds: list[Any]) -> Any:
         if name in _received or not hasattr(main, name):
             setattr(main, name, found)
             _received.add(name)
-    return work(*arguments, seeds)
+    return work(*arguments, items, NO_BAR)
 
 
 # -- processes of their own -----------------------------------------------------------------------
@@ -147,17 +161,10 @@ def serve(pipe: Connection, other_end: Connection | None) -> None:
 
 
 class Worker:
-    """A process with some of the simulations, as its user sees it.
-
-    Attributes:
-        part: The numbers of its simulations.
-        name: Its name in messages.
-        pipe: The user's end of the pipe.
-    """
+    """A process with some of the simulations, as its user sees it, who has one end of its pipe."""
 
     def __init__(self, context: Any, number: int, part: range) -> None:
         """Start the process."""
-        self.part = part
         self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
         self.pipe, theirs = context.Pipe()
         copied = self.pipe if context.get_start_method() == "fork" else None
@@ -179,11 +186,7 @@ class Worker:
             raise self._died() from None
 
     def receive(self, seconds: float | None = None) -> tuple[Any, BaseException | None] | None:
-        """Wait for the answer: a result, or None and an error. Return None if it does not come within some seconds.
-
-        Raises:
-            WorkerError: The worker is dead.
-        """
+        """Wait for the answer: a result, or None and an error. Return None if it does not come within some seconds."""
         if not wait([self.pipe, self._process.sentinel], seconds):
             return None
         try:
@@ -233,11 +236,11 @@ class WorkerPool:
 
     Attributes:
         broken: Whether a worker has died, or a wait for an answer was interrupted. Then a reset starts all anew.
-        untouched: False: if a reset or a step fails, some simulations may have moved.
+        failed: Whether an error has left the simulations at different steps, so that all of them need a reset.
         idle: True: no simulation runs in this process.
     """
 
-    untouched, idle = False, True
+    failed, idle = False, True
 
     def __init__(
         self, make: Callable[..., Any], arguments: tuple[Any, ...], number: int, workers: int, context: Any
@@ -286,7 +289,7 @@ class WorkerPool:
                 worker.send(message)
             answers: list[Any] = [worker.receive() for worker in self._workers]
         except BaseException:
-            self.broken = True
+            self.broken = self.failed = True
             raise
         for _, error in answers:
             if error is not None:
@@ -311,7 +314,11 @@ class WorkerPool:
         for part in self._recipes:
             own = [a[part.start : part.stop] if isinstance(a, (list, np.ndarray)) else a for a in arguments]
             messages.append(pack_plainly((method, own)))
-        return self._exchange(messages)
+        moves = method in ("reset", "step")
+        self.failed = self.failed or moves
+        answers = self._exchange(messages)
+        self.failed = self.failed and not moves
+        return answers
 
     def close(self) -> None:
         """Close the objects and end the workers, by force after some seconds. Raise the first error of an object."""

@@ -1,7 +1,7 @@
 """Policies in the model: simulations run their own loops, and policies answer their decisions."""
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import nullcontext
+from itertools import chain
 from typing import Any, Unpack
 
 import numpy as np
@@ -107,38 +107,29 @@ def simulate_many(
         BaseException: Any exception of a model, a mapping, a policy or ``collect``, with a note that names the seed.
             All other simulations are unwound first.
     """
-    checked = checked_seeds(seeds)
-    check_numbers(batch_size, workers)
-    check_collect(collect)
-    episodes = simulation, checked_policies(policies), points, options
-    arguments = episodes, collect, int(batch_size)
-    if workers:  # errors show up before any work starts
-        _draw_up(*episodes)
-    with progress_bar(len(checked)) if progress else nullcontext() as bar:
-        if not workers or not checked:
-            return _simulate(*arguments, checked, bar)
-        results: list[Any] = []
-        for number, part in spread(_simulate, arguments, checked, int(workers), int(batch_size)):
-            results += part
-            if bar is not None:
-                bar.update(number)
-        return results
+    checked, episodes = checked_seeds(seeds), (simulation, checked_policies(policies), points, options)
+    check_options(batch_size, workers, collect)
+    plan = _draw_up(*episodes)  # errors show up before any work starts
+    arguments = episodes, None if workers else plan, collect, batch_size
+    with progress_bar(len(checked), progress) as bar:
+        return list(chain.from_iterable(spread(_simulate, arguments, checked, workers, batch_size, bar)))
 
 
 def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
     return Plan(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
 
 
-def _simulate(episodes: tuple[Any, ...], collect: Any, batch_size: int, seeds: list[int], bar: Any = None) -> list[Any]:
+def _simulate(
+    episodes: tuple[Any, ...], plan: Plan | None, collect: Any, batch_size: int, seeds: list[int], bar: Any
+) -> list[Any]:
     """Simulate some of the seeds, in this process."""
     results: list[Any] = [None] * len(seeds)
 
     def finish(place: int, ended: Any) -> None:
         results[place] = ended if collect is None else collect(ended)
-        if bar is not None:
-            bar.update()
+        bar.update()
 
-    run(_draw_up(*episodes), seeds, batch_size, finish)
+    run(plan or _draw_up(*episodes), seeds, batch_size, finish)
     return results
 
 
@@ -163,14 +154,10 @@ def checked_policies(policies: Any) -> Mapping[Any, Any]:
     return policies or {}
 
 
-def check_collect(collect: Any) -> None:
-    """Check that the argument ``collect`` is a callable or None."""
+def check_options(batch_size: Any, workers: Any, collect: Any = None) -> None:
+    """Check the options that all functions for many simulations have."""
     if collect is not None and not callable(collect):
         raise OptionValueError(f"collect must be a callable of a simulation, or None, not {short_repr(collect)}")
-
-
-def check_numbers(batch_size: Any, workers: Any) -> None:
-    """Check that ``batch_size`` and ``workers`` are valid."""
     for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"

@@ -26,15 +26,10 @@ from ..simulation import RULE
 
 
 class Player:
-    """The agent whose decision is pending, in the single view.
+    """The agent whose decision is pending, in the single view; ``base`` decides after the candidate.
 
     Attributes:
-        env: The environment, with or without wrappers.
-        view: The unwrapped environment.
-        episode: Its episode.
-        record: The episode's record of the agent.
-        agent: The name of the agent.
-        base: What decides after the candidate: ``RULE``, a policy of the agent, or a dict of policies by agent.
+        env, view: The environment, with or without wrappers, and the unwrapped one.
         may_be: Returns whether an agent of a name exists, or may appear.
         over: Whether the agent's episode has ended.
     """
@@ -193,7 +188,7 @@ class JointPlayer(Player):
 
     def _check(self, action: Any, mask: Any) -> None:
         if self._space_of(self.agent) == self.view.action_space:
-            self.episode.rounds.check(self.episode, self.view.joint.actions(self.episode, action))
+            self.episode.check(self.view.joint.actions(self.episode, action))
         elif isinstance(action, Mapping):
             super()._check({name: self._sample(name) if part is RULE else part for name, part in action.items()}, mask)
         else:
@@ -274,7 +269,7 @@ def rollout(player: Player, actions: Sequence[Any], options: Any) -> list[float]
     """Take actions in a branch, one after the other, and continue with the base.
 
     If an action is illegal when its decision arises, the base decides. Return the discounted reward of each decision of
-    the agent; the terminal value is added to the last one. ``options`` are ``RolloutOptions``.
+    the agent; the terminal value is added to the last one. ``options`` is a ``RolloutPolicy``.
     """
     player.start()
     rewards: list[float] = []

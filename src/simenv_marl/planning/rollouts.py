@@ -109,21 +109,18 @@ def action_values(
         BranchError: A branch died, took too long, or cannot be made.
         BaseException: Any exception of the model, a mapping or the base in a branch.
     """
-    options = RolloutOptions(
-        base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
+    policy = RolloutPolicy(
+        actions, base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
         discount=discount, discount_by=discount_by, seed=seed, method=method, time_limit=time_limit,
     )  # fmt: skip
     if PLANNING.get():
         return base_value(env, base)
-    rollouts = Rollouts(env, actions, options)
+    rollouts = Rollouts(env, policy)
     candidates = range(len(rollouts.actions))
-    if progress:
-        with progress_bar(len(candidates) * futures, "branch") as bar:
-            for _ in range(futures):
-                rollouts.add(candidates, 1)
-                bar.update(len(candidates))
-    else:
-        rollouts.add(candidates, futures)
+    with progress_bar(len(candidates) * futures, progress, "branch") as bar:
+        for number in [1] * futures if progress else [futures]:
+            rollouts.add(candidates, number)
+            bar.update(number * len(candidates))
     return rollouts.values(candidates)
 
 
@@ -133,69 +130,26 @@ def base_value(env: Any, base: Any) -> ActionValues:
     return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)))
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
-class RolloutOptions:
-    """The options of rollouts: the arguments of ``action_values``, which describes them."""
-
-    base: Any = RULE
-    futures: int = 16
-    horizon: float | None = None
-    horizon_by: str = "decision"
-    terminal_value: Callable[[Any], float] | None = None
-    discount: float = 1.0
-    discount_by: str = "decision"
-    seed: int | None = None
-    method: str | None = None
-    time_limit: float = 600.0
-
-    def __post_init__(self) -> None:
-        self.timed = "time" in (self.discount_by, self.horizon_by)
-        for name in ("horizon_by", "discount_by"):
-            self.require(name, getattr(self, name) in ("decision", "time"), '"decision" or "time"')
-        self.require("futures", is_count(self.futures), "a positive integer")
-        horizon: Any = self.horizon
-        if self.horizon_by == "time":
-            fine, kind = is_number(horizon) and horizon > 0, "a positive time or None"
-        else:
-            fine, kind = is_count(horizon), "a number of decisions, 1 or more, or None"
-        self.require("horizon", horizon is None or fine, kind)
-        self.require("discount", is_number(self.discount) and 0 <= self.discount <= 1, "a number from 0 to 1")
-        fine = self.terminal_value is None or callable(self.terminal_value)
-        self.require("terminal_value", fine, "a callable of the environment")
-        self.seed = checked_seed(self.seed)
-
-    def require(self, name: str, fine: bool, kind: str) -> None:
-        """Refuse the value of an option unless it is fine."""
-        if not fine:
-            raise OptionValueError(f"{name} must be {kind}, not {short_repr(getattr(self, name))}")
-
-
 def is_count(value: Any) -> bool:
     """Return whether a value is a positive integer."""
     return is_seed(value) and value > 0
 
 
 class Rollouts:
-    """The rollouts of the candidates for a pending decision. Future number i is the same for all candidates.
+    """The rollouts of the candidates for a pending decision. Future number i is the same for all candidates."""
 
-    Attributes:
-        actions: The candidates.
-        reseeds: Whether there are unlimited futures. Otherwise there is only the one exact future.
-        returns: The returns of each candidate's rollouts.
-    """
-
-    def __init__(self, env: Any, actions: Any, options: RolloutOptions, *, legal: bool = False) -> None:
-        """Check the candidates, the base and the options. Masked candidates are left out if ``legal``."""
-        self._env, self._options = env, options
-        player = player_of(env, options.base)
+    def __init__(self, env: Any, policy: RolloutPolicy, *, legal: bool = False) -> None:
+        """Check the candidates and the base of a policy. Masked candidates are left out if ``legal``."""
+        self._env, self._policy = env, policy
+        player = player_of(env, policy.base)
         player.check_base()
-        if options.timed and player.episode.clock is None:
+        if policy.timed and player.episode.clock is None:
             raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
-        self.actions = player.candidates(actions, legal=legal)
+        self.actions = player.candidates(policy.actions, legal=legal)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
-        self._entropy = [*decision, _KEY, *(() if options.seed is None else (options.seed,))]
+        self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
         try:
             player.view._session.check_reseed()
             self.reseeds = True
@@ -214,18 +168,17 @@ class Rollouts:
 
     def add(self, candidates: Iterable[int], number: int) -> None:
         """Try candidates, given by their places, in some more futures; at most in one if there is only one."""
-        self.run(
-            [
-                ((place,), future)
-                for place in candidates
-                for future in range(len(self.returns[place]), len(self.returns[place]) + number)
-                if self.reseeds or future == 0
-            ]
-        )
+        rollouts = [
+            ((place,), future)
+            for place in candidates
+            for future in range(len(self.returns[place]), len(self.returns[place]) + number)
+            if self.reseeds or future == 0
+        ]
+        self.run(rollouts)
 
     def run(self, rollouts: Sequence[tuple[Plan, int]]) -> list[list[float]]:
         """Run rollouts, given by their plans and the numbers of their futures; return what each ``rollout`` returns."""
-        options, seeds = self._options, None
+        policy, seeds = self._policy, None
         if self.reseeds:
             numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
             seeds = [numbers[future] for _, future in rollouts]
@@ -235,7 +188,7 @@ class Rollouts:
             actions = [self.actions[place] for place in plan]
             planning = PLANNING.set(True)
             try:
-                return rollout(player_of(env, options.base), actions, options)
+                return rollout(player_of(env, policy.base), actions, policy)
             except BaseException as error:
                 tried = ", ".join(map(short_repr, actions))
                 annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
@@ -244,7 +197,7 @@ class Rollouts:
                 PLANNING.reset(planning)
 
         results: list[list[float]] = branch(
-            self._env, run_one, len(rollouts), method=options.method, seeds=seeds, time_limit=options.time_limit
+            self._env, run_one, len(rollouts), method=policy.method, seeds=seeds, time_limit=policy.time_limit
         )
         for (plan, _), rewards in zip(rollouts, results, strict=True):
             self.returns[plan[0]].append(sum(rewards))
@@ -269,7 +222,7 @@ class Rollouts:
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class RolloutPolicy(RolloutOptions):
+class RolloutPolicy:
     """A policy that looks one decision ahead: it tries candidate actions in branches and takes the best one.
 
     It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds. In each round, all
@@ -292,13 +245,41 @@ class RolloutPolicy(RolloutOptions):
     """
 
     actions: Any = field(default=None, kw_only=False)
+    base: Any = RULE
+    futures: int = 16
+    horizon: float | None = None
+    horizon_by: str = "decision"
+    terminal_value: Callable[[Any], float] | None = None
+    discount: float = 1.0
+    discount_by: str = "decision"
+    seed: int | None = None
+    method: str | None = None
+    time_limit: float = 600.0
     budget: int | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        self.timed = "time" in (self.discount_by, self.horizon_by)
+        for name in ("horizon_by", "discount_by"):
+            self.require(name, getattr(self, name) in ("decision", "time"), '"decision" or "time"')
+        self.require("futures", is_count(self.futures), "a positive integer")
+        horizon: Any = self.horizon
+        if self.horizon_by == "time":
+            fine, kind = is_number(horizon) and horizon > 0, "a positive time or None"
+        else:
+            fine, kind = is_count(horizon), "a number of decisions, 1 or more, or None"
+        self.require("horizon", horizon is None or fine, kind)
+        self.require("discount", is_number(self.discount) and 0 <= self.discount <= 1, "a number from 0 to 1")
+        fine = self.terminal_value is None or callable(self.terminal_value)
+        self.require("terminal_value", fine, "a callable of the environment")
+        self.seed = checked_seed(self.seed)
         self.require("budget", self.budget is None or is_count(self.budget), "a number of branches or None")
         if isinstance(self.actions, Iterable) and not isinstance(self.actions, (str, Mapping)):
             self.actions = list(self.actions)  # an iterator would be used up by the first decision
+
+    def require(self, name: str, fine: bool, kind: str) -> None:
+        """Refuse the value of an option unless it is fine."""
+        if not fine:
+            raise OptionValueError(f"{name} must be {kind}, not {short_repr(getattr(self, name))}")
 
     def choose(self, env: Any) -> ActionValues:
         """Find the best candidate for the pending decision of an environment.
@@ -315,7 +296,7 @@ class RolloutPolicy(RolloutOptions):
         """
         if PLANNING.get():
             return base_value(env, self.base)
-        rollouts = Rollouts(env, self.actions, self, legal=True)
+        rollouts = Rollouts(env, self, legal=True)
         number = len(rollouts.actions)
         budget = number * self.futures if self.budget is None else self.budget
         if budget < number:

@@ -6,6 +6,7 @@
     process    ProcessSimulation: from frames to calls of decision functions, and back
     calls      the calls as mappings see them, and the functions that represent a simulator's points
     child      the process: starting it, its frames, waiting for it, ending it
+    guardian   ends the processes of simulators when this process has ended
     callbacks  CallbackGuard: exceptions in callbacks of C code
     wire       lines and their JSON
 """

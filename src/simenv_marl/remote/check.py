@@ -8,12 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from itertools import zip_longest
+from math import inf
 from subprocess import DEVNULL, PIPE, TimeoutExpired, run
 from typing import Any, Final, NamedTuple
 
-from ..errors import ProcessDiedError, ProcessError, short_repr
+from ..core.rng import is_seed
+from ..errors import OptionValueError, ProcessDiedError, ProcessError, short_repr
 from ..simulation import RULE
-from .child import Child
+from .child import MOST_FRAMES, Child
 from .wire import DESCRIPTORS, encode, encode_answer
 
 OK, NOTE, WRONG = "ok", "note", "wrong"
@@ -82,7 +84,15 @@ def check_wire(
         seed: The seed of the episodes.
         decisions: The number of decisions after which an episode is broken off.
         timeout: The time to wait for each line, in seconds.
+
+    Raises:
+        OptionValueError: An argument cannot be used.
+        WireError: The options are not JSON data.
     """
+    if not is_seed(seed) or seed >= 2**31:
+        raise OptionValueError(f"seed must be an integer from 0 to 2**31 - 1, not {short_repr(seed)}")
+    if decisions < 1 or not 0 < timeout < inf:
+        raise OptionValueError(f"decisions and timeout must be positive, not {decisions} and {timeout}")
     start = encode({"start": {"seed": seed, "options": dict(options or {})}})
     return _Check(list(command), start, decisions, timeout).run()
 
@@ -135,7 +145,7 @@ class _Check:
         while "end" not in frames[-1]:
             if "decide" in frames[-1]:
                 number = child.number
-                if number in (stop, self._most):
+                if number in (stop, self._most) or len(frames) > MOST_FRAMES:
                     child.break_off()
                     break
                 before = encode({"reseed": reseed[1]}) if number == reseed[0] else b""

@@ -6,6 +6,7 @@ blocks; errors show the last part of it. The process leads its own process group
 
 from __future__ import annotations
 
+import atexit
 import os
 import select
 import signal
@@ -15,6 +16,7 @@ from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
 from types import NoneType
 from typing import Any, Final, NoReturn
+from weakref import WeakSet, finalize
 
 from ..errors import (
     ProcessDiedError,
@@ -27,6 +29,7 @@ from ..errors import (
     short_repr,
     warn_user,
 )
+from . import guardian
 from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, decode
 
 CHUNK: Final = 1 << 16
@@ -37,6 +40,18 @@ STDERR_TAIL: Final = 4096
 
 GRACE: Final = 2.0
 """The time in seconds that a process has to end by itself."""
+
+MOST_FRAMES: Final = 100_000
+"""The number of frames that may come between two calls. A birth, an update and a removal are one each."""
+
+MOST_BYTES: Final = 1 << 30
+"""The number of bytes that may come between two calls."""
+
+MOST_WAITS: Final = 20
+"""How many times the time to wait for a line the frames between two calls may take."""
+
+LOST: Final = 1 << 16
+"""The exit code of a process whose exit code was lost. No process can exit with it."""
 
 
 class Child:
@@ -66,14 +81,19 @@ class Child:
         self._rest = b""  # received bytes of the next lines
         self._tail = bytearray()  # the last part of its standard error
         self._owner, self._closed = os.getpid(), False
+        self._without_input = 0.0  # when its input was closed
+        self._frames = self._bytes = 0  # since the latest call
+        self._since = 0.0  # when the first of these frames came
         try:
             self._start(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
             raise ProcessDiedError(f"{command[0]!r} cannot be started: {describe_error(error)}") from error
         self.pid = self._popen.pid
+        _children.add(self)
         self._name = f"the process {self.pid} ({command[0]})"
         self._output = self._poll(self._reading, select.POLLIN)
         try:
+            guardian.guard(self.pid)
             hello = self.receive()
         except BaseException:  # an interrupt, too
             self.close(patience=0.0)
@@ -125,7 +145,12 @@ class Child:
     def begin(self, start: bytes) -> dict[str, Any]:
         """Begin an episode with a line; return the first frame, as ``next_frame``."""
         stopped = self.state == "stopped"
-        self.state, self.number, self.time = "running", 0, None  # first, since the process may have exited
+        self.state, self.number, self.time, self._frames = (
+            "running",
+            0,
+            None,
+            0,
+        )  # first, since the process may have exited
         if self._rest or self._reading in dict(self._output.poll(0)):
             frame = self.receive()
             self.refuse(frame, f"has sent {short_repr(frame)} before the start of an episode")
@@ -156,14 +181,28 @@ class Child:
             if type(number) is not int or number != due:
                 self.fail(WireError(f"{self} has made call {short_repr(number)} where call {due} was due"))
             self._check_call(frame, frame.get("entity"))
-            self.number, self.state = number, "waiting"
+            self.number, self.state, self._frames = number, "waiting", 0
         elif "update" in frame:
             self._check_call(frame, frame["update"])
         elif "remove" in frame:
             self._check_call(frame, frame["remove"])
         else:
             self.refuse(frame, f"has sent {short_repr(frame)}, which is not a frame of the wire")
+        if self.state == "running":
+            self._check_flood()
         return frame
+
+    def _check_flood(self) -> None:
+        """Count a frame that is neither a call nor an end, so that such frames end some time."""
+        if not self._frames:
+            self._bytes, self._since = 0, monotonic()
+        self._frames, self._bytes = self._frames + 1, self._bytes + self._length
+        if self._frames > MOST_FRAMES or self._bytes > MOST_BYTES:
+            what = f"{self._frames:,} frames of {self._bytes:,} bytes"
+            self.fail(WireError(f"{self} has sent {what} since its latest call, and neither a call nor an end"))
+        if monotonic() - self._since > MOST_WAITS * self.timeout:
+            what = f"has sent updates and removals for {MOST_WAITS * self.timeout:g} s, and neither a call nor an end"
+            self.fail(ProcessTimeoutError(f"{self} {what}"))
 
     def _check_call(self, frame: dict[str, Any], entity: Any) -> None:
         """Check a frame's point, entity, arguments and time; note entity and time."""
@@ -220,6 +259,7 @@ class Child:
             line += part
             if len(line) >= LONGEST:
                 self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
+        self._length = len(line)
         try:
             return decode(line)
         except WireError as error:
@@ -288,7 +328,12 @@ class Child:
         return not self._closed and self._owner == os.getpid()
 
     def exit_code(self) -> int | None:
-        """Return its exit code, or minus the signal that ended it; None while it runs."""
+        """Return its exit code, or minus the signal that ended it; None while it runs; ``LOST`` if it is not known."""
+        if self._popen.returncode is None:
+            try:
+                os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+            except ChildProcessError:  # ``poll`` would say 0
+                self._popen.returncode = LOST
         return self._popen.poll()
 
     def fail(self, error: SimEnvError) -> NoReturn:
@@ -310,12 +355,13 @@ class Child:
         """Close its input; its output can still be received."""
         if self._writing >= 0:
             os.close(self._writing)
-            self._writing = -1
+            self._writing, self._without_input = -1, monotonic()
 
     def close(self, patience: float = GRACE) -> None:
-        """Close its pipes; after ``patience`` seconds at most, kill it and its group.
+        """Close its pipes; ``patience`` seconds after the end of its input at the latest, kill it and its group.
 
-        A fork of this process only closes its copies of the pipes.
+        So processes whose inputs were closed together end together. A fork of this process only closes its copies of
+        the pipes.
         """
         if self._closed:
             return
@@ -324,7 +370,7 @@ class Child:
             os.close(self._reading)
             self.close_input()
             if mine:
-                self._wait_for_exit(patience)
+                self._wait_for_exit(self._without_input + patience - monotonic())
         finally:  # also after an interrupt
             if mine:
                 self._kill()
@@ -336,6 +382,7 @@ class Child:
         """Kill it and its group at once, and read the rest of its standard error."""
         with suppress(ProcessLookupError, PermissionError):  # the group is empty
             os.killpg(self.pid, signal.SIGKILL)
+        guardian.release(self.pid)
         try:
             self._popen.wait(GRACE)
         except TimeoutExpired:
@@ -355,9 +402,28 @@ class Child:
         code = self.exit_code()
         if code is None:
             return "still runs"
+        if code == LOST:
+            return "has ended; its exit code is lost, because this process ignores SIGCHLD or other code has read it"
         if code >= 0:
             return f"has exited with code {code}"
         try:
             return f"was killed by {signal.Signals(-code).name}"
         except ValueError:
             return f"was killed by signal {-code}"
+
+
+# -- at the end of this process -------------------------------------------------------------------
+
+_children: Final[WeakSet[Child]] = WeakSet()
+
+
+def _close_inputs() -> None:
+    """Close the inputs of all simulators, so that those that do not notice are waited for together."""
+    for child in list(_children):
+        if child.usable:
+            child.break_off()
+            child.close_input()
+
+
+finalize(Child, int).detach()  # registers the hook by which finalizers run at exit, for this one to run before it
+atexit.register(_close_inputs)

@@ -6,6 +6,8 @@ from math import inf
 from typing import Any
 from weakref import finalize
 
+import numpy as np
+
 from ..core.context import acquire, release
 from ..decision import BY_NAME, Definition
 from ..errors import (
@@ -62,15 +64,20 @@ class ProcessSimulation(SimulationInterface):
             cwd: The folder in which it runs. None: that of this process.
 
         Raises:
-            OptionValueError: The command or the timeout is invalid.
+            OptionValueError: The command, the timeout, ``env`` or ``cwd`` is invalid.
             DefinitionError: ``points`` is not a dict from names to definitions.
             ProcessError: The platform is not POSIX.
         """
         if os.name != "posix":
             raise ProcessError("ProcessSimulation needs POSIX: elsewhere a process cannot inherit the descriptors")
         self.command = _words(command)
-        if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < inf:
+        if isinstance(timeout, bool) or not isinstance(timeout, (int, float, np.number)) or not 0 < timeout < inf:
             raise OptionValueError(f"timeout must be a positive number of seconds, not {short_repr(timeout)}")
+        words = [word for pair in env.items() for word in pair] if isinstance(env, Mapping) else []
+        if not (env is None or isinstance(env, Mapping)) or not all(isinstance(word, str) for word in words):
+            raise OptionValueError(f"env must be a dict from names to values, all strings, not {short_repr(env)}")
+        if cwd is not None and not isinstance(cwd, (str, os.PathLike)):
+            raise OptionValueError(f"cwd must be the path of a folder, not {short_repr(cwd)}")
         self.timeout, self.env, self.cwd = float(timeout), None if env is None else dict(env), cwd
         self.points = _by_function(points)
         self.result: Any = None

@@ -15,11 +15,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, Unpack
 
-import numpy as np
-
 from ..core.options import CheckOptions
 from ..core.plan import Plan
 from ..core.points import Points
+from ..core.rng import is_seed
 from ..errors import OptionValueError, SimEnvError, short_repr
 from ..simulation import TRUNCATED
 from .checks import CHECKS, Report, fitting_views, make_environment
@@ -74,7 +73,7 @@ def check_simulation(
         SimEnvError: The simulation, the points or the options cannot be used at all. The subclass tells why.
     """
     chosen = tuple(dict.fromkeys(seeds))
-    if not chosen or any(isinstance(s, bool) or not isinstance(s, (int, np.integer)) or s < 0 for s in chosen):
+    if not chosen or not all(map(is_seed, chosen)):
         raise OptionValueError(f"seeds must be non-negative integers, at least one, not {short_repr(seeds)}")
     for name, number in (("episodes", episodes), ("max_steps", max_steps)):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
@@ -138,6 +137,8 @@ def inspect_simulation(
         SimEnvError: The simulation, the points or the options cannot be used at all. The subclass tells why.
         Exception: Any exception of the model's constructor.
     """
+    if not is_seed(seed):
+        raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
     with quietly():
         plan = Plan(simulation, points, options)
         subject = Subject(plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None)

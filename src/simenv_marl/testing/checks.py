@@ -146,7 +146,8 @@ def check_views(subject: Subject, report: Report) -> None:
         if subject.late or not plain.calls:
             continue
         seed_global_generators(seed)
-        with report.opened(subject, view, driver=driver, policies=policies, max_steps=None) as env:
+        asking = {"policies": policies, "max_steps": None, "skip_forced": False}  # so that rules take all decisions
+        with report.opened(subject, view, driver=driver, **asking) as env:
             run = subject.run_rules(env, seed)
         where = f"{view} view, driver {driver}, seed {seed}"
         if run.error is not None:

@@ -242,21 +242,21 @@ class Subject:
         """Play a run in which the decisions of the rules are recorded."""
         points = list(dict.fromkeys(bound.point for bound in self.plan.points))
         for point in points:
-            point.hook.replace_rule(self._recording_rule(run, point))
+            point.replace_rule(self._recording_rule(run, point))
         try:
             return self.play(start, run, seed=seed)
         finally:
             for point in points:
-                point.hook.replace_rule()
+                point.replace_rule()
 
     def _recording_rule(self, run: Run, point: DecisionPoint) -> Callable[..., Any]:
         """Return a rule that records each of its decisions, and cuts the run at the limit."""
-        name, rule = point.name, point.rule
+        name, rule = point.name, point.function
 
         def decide(*args: Any, **kwargs: Any) -> Any:
             stack = stack_of(getcurrent())
             # In a reset or a mapping, rules do not count as decisions.
-            if not (run.in_main_loop if stack is None else stack.decides(point.hook)):
+            if not (run.in_main_loop if stack is None else stack.events):
                 return rule(*args, **kwargs)
             if len(run.calls) >= self.max_steps:
                 if not run.cut:
@@ -264,7 +264,7 @@ class Subject:
                 raise LimitReached
             step = run.begin_step(name)
             value = rule(*args, **kwargs)
-            return end(step, value) if point.hook.kind == "function" else wait(step, value)
+            return end(step, value) if point.kind == "function" else wait(step, value)
 
         def end(step: str, value: Any) -> Any:
             run.steps |= fingerprint(step, value, follow=False)
@@ -272,7 +272,7 @@ class Subject:
 
         @types.coroutine
         def wait(step: str, running: Any) -> Generator[Any, Any, Any]:
-            awaited = running.__await__() if point.hook.kind == "coroutine" else running
+            awaited = running.__await__() if point.kind == "coroutine" else running
             return end(step, (yield from awaited))
 
         return decide

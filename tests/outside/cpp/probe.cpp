@@ -100,7 +100,6 @@ int main(int argc, char** argv) {
         if (play == "name") client.remove("probe.echo", "\xc0\x80");
         if (play == "truncated") client.end({{"reached", 3}}, true);
         if (play == "shell") return std::system(episode.option("command", "true").c_str());
-        if (play == "number") return client.decide("probe.echo", "a", {}, [] { return 0.5; });
         if (play == "crash") [&]() noexcept { fail("nested"); }();
         if (play == "leave") std::exit(episode.option("status", 0));
         if (play == "remove") {

@@ -9,6 +9,7 @@ import shlex
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
+from unicodedata import normalize
 
 from ...errors import OptionValueError, short_repr
 
@@ -42,6 +43,8 @@ def write_template(kind: str, name: str, folder: Path | None = None) -> str:
     problem = ""
     if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower() or name.startswith("_"):
         problem = "cannot be the name of a module"
+    elif normalize("NFKC", name) != name:  # as with a ligature
+        problem = f"is {normalize('NFKC', name)!r} in Python, which would not find the file"
     elif (spec := find_spec(name)) is not None and spec.origin is not None:
         problem = f"is the name of another module ({spec.origin}), which the new file would hide"
     if problem:

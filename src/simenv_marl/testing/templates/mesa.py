@@ -50,9 +50,9 @@ class MyModel(mesa.Model):
 
     def __init__(self, rng: int | None = None) -> None:
         super().__init__(rng=rng)  # the model's own generators: the same seed brings the same run
-        self.grid = OrthogonalVonNeumannGrid((16, 16), torus=True, random=self.random)
-        self.grass = self.rng.random((16, 16))
-        for cell in self.random.sample(list(self.grid.all_cells), 20):
+        self.grid = OrthogonalVonNeumannGrid((12, 12), torus=True, random=self.random)
+        self.grass = self.rng.random((12, 12))
+        for cell in self.random.sample(list(self.grid.all_cells), 12):
             Rabbit(self, cell, 2.0)
 
     def step(self) -> None:
@@ -86,12 +86,12 @@ move = make_step(
 
 
 class MySimulation(SteppedSimulation):
-    """A hundred days: each reset makes a model with its seed, and run steps it."""
+    """Fifty days: each reset makes a model with its seed, and run steps it."""
 
     points = {Rabbit.choose_cell: move}  # the model's classes stay as they are
 
     def __init__(self) -> None:
-        super().__init__(MyModel, 100)
+        super().__init__(MyModel, 50)
 
 
 # -- 4. The environment, training, and what it is worth -------------------------------------------

@@ -1,0 +1,66 @@
+"""Each study that needs a learner runs from its command line to its figures, in a small way."""
+
+import csv
+import json
+
+import pytest
+
+from . import commands, page
+
+pytestmark = pytest.mark.filterwarnings("default")  # learners warn of much that is theirs
+
+
+def test_imitation_of_the_rule(capsys):
+    pytest.importorskip("minari"), pytest.importorskip("torchrl")
+    from studies.imitation import rule
+
+    results = rule.main(["--episodes", "10", "--steps", "1000", "--seeds", "4"])
+    assert results["agreement"] > 0.5
+    assert results["imitation"] == pytest.approx(results["rule"], abs=2)
+    assert "in the model itself" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("plainly", [[], ["--plainly"]])
+def test_imitation_of_plans(plainly):
+    pytest.importorskip("minari"), pytest.importorskip("torchrl")
+    options = "--budget", 2800, "--learners", 1, "--steps", 5, "--seeds", 1, "--workers", 2
+    assert "learner 1: " in commands.module("studies.imitation.plans", *options, *plainly)
+
+
+def test_learner_sweep_resumes(tmp_path):
+    pytest.importorskip("optuna")
+    line = ["--days", 250, "--seeds", 1, "--trials", 1, "--out", tmp_path]
+    told = commands.module("studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
+    assert "found by Optuna: {'learning_rate': " in told
+    assert told == commands.module("studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
+
+
+def test_learner_sweep_has_the_table_of_its_page(tmp_path, monkeypatch):
+    pytest.importorskip("optuna"), pytest.importorskip("seaborn"), pytest.importorskip("statsmodels")
+    from studies.learner_sweep import sweep
+
+    monkeypatch.setattr(sweep, "LEVELS", {"learning_rate": [1e-3, 3e-3], "gamma": [0.8, 0.9]})
+    names = {"table": sweep.sweep(tmp_path, 250, range(2))}
+    (code,) = page.blocks("sweeps.md", "The table elsewhere")
+    exec(code, names)
+    assert names["mean"].shape == (2, 2)
+    assert names["shares"]["C(learning_rate)"] == names["shares"].max()
+    assert names["axes"].get_ylabel() == "gain"
+
+
+def test_wolf_sheep_from_training_to_the_pictures(tmp_path):
+    pytest.importorskip("torchrl"), pytest.importorskip("mesa")
+    from studies.wolf_sheep import picture
+
+    curves, path = tmp_path / "shared-policy-training.csv", tmp_path / "shared-policy.json"
+    options = "--seeds", 2, "--decisions", 1, "--ticks", 5, "--out", tmp_path, "--curves", curves
+    commands.module("examples.wolf_sheep.train", *options)
+    with curves.open(newline="") as file:
+        assert {(row["sight"], row["seed"]) for row in csv.DictReader(file)} == {(s, n) for s in "12" for n in "01"}
+    commands.module("studies.wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
+    compared = json.loads(path.read_text())
+    assert list(compared["results"]) == list(picture.STYLES)
+    told = commands.module("studies.wolf_sheep.picture", "--figures", tmp_path)
+    assert (tmp_path / "shared-policy.png").stat().st_size > 10_000
+    assert (tmp_path / "shared-policy-training.png").stat().st_size > 10_000
+    assert told.count("\n") == 2 + len(picture.STYLES)

@@ -1,0 +1,146 @@
+"""The agency that collects debts: its money, the law, its views, and what a better policy is worth."""
+
+import collections
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from random import Random
+
+import pytest
+from studies.debt_collection.env import CASES, COLLECTOR, NAMED_CASES, NAMED_COLLECTOR, CollectionSim, lawful
+from studies.debt_collection.model import CHOICES, LIMITATION, VALIDATION, Agency, Debtor, Parameters
+from studies.debt_collection.study import HELD_OUT, LEARNED, compare
+
+from simenv_marl import aec_env, joint_env, parallel_env, single_env
+from simenv_marl.testing import check_simulation
+from tests.worlds.models import follow_the_rule
+
+ROOT = Path(__file__).parents[2]
+DAYS = 60
+
+
+def state(agency):
+    """All that there is to know of an agency and its debtors."""
+    plain = [name for name in vars(Debtor(Agency(0))) if name not in ("agency", "calls", "contract", "draw", "life")]
+    return (
+        agency.world.month,
+        agency.cents,
+        [[getattr(debtor, name) for name in plain] for debtor in agency.cases.values()],
+        [tuple(debtor.calls) for debtor in agency.cases.values()],
+        [(debtor.draw.getstate(), debtor.life.getstate()) for debtor in agency.cases.values()],
+        [(contract.debtor.name, contract.cents, contract.missed) for contract in agency.world.contracts.values()],
+        dict(agency.world.ledger.flows),
+        dict(agency.world.counts),
+        len(agency.world.calendar),
+    )
+
+
+def plain(seed, days=DAYS):
+    agency = Agency(seed)
+    for _ in range(days):
+        agency.advance()
+    return agency
+
+
+def test_runs_on_its_own():
+    command = [sys.executable, "-m", "studies.debt_collection.model", "--days", "90", "--seed", "3"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, cwd=ROOT)
+    assert f"{plain(3, 90).profit / 100:.2f}" in run.stdout.splitlines()[2]
+
+
+class Audit:
+    """Has an agency choose at random among what is lawful, and checks the law and the staff by the record alone."""
+
+    def __init__(self, seed, **parameters):
+        self.agency = agency = Agency(seed, Parameters(**parameters))
+        self.draw, self.calls, self.letters = Random(seed), {}, {}
+        self.eager = self.draw.choice([0.0, 0.9])  # how often it calls where that is lawful
+        self.today = collections.Counter()
+        agency.world.calendar.every(1, self.end_day, start=0)
+
+    def choose(self, agency, debtor, choices):
+        day, eager = agency.world.month, "call" in choices and self.draw.random() < self.eager
+        choice = "call" if eager else self.draw.choice(choices)
+        calls, letters = self.calls.setdefault(debtor, []), self.letters.setdefault(debtor, [])
+        assert choice == "leave" or day % 7 < 5
+        if choice == "call":
+            self.today[day] += 1
+            assert letters
+            assert not debtor.ceased
+            assert len([earlier for earlier in calls if earlier > day - 7]) < 7
+            assert debtor.talked is None or day >= debtor.talked + 7
+            calls.append(day)
+        elif choice == "write":
+            assert not debtor.ceased
+            letters.append(day)
+        elif choice == "sue":
+            assert letters[0] + VALIDATION <= day < debtor.since + LIMITATION
+        return choice
+
+    def end_day(self):
+        assert self.today[self.agency.world.month] <= self.agency.parameters.calls
+        self.agency.world.check()
+
+
+def test_no_cent_is_lost_and_no_law_broken_by_random_lawful_choices(monkeypatch):
+    counts, last_calls = collections.Counter(), 0
+    for seed in range(100):
+        draw = Random(seed)
+        audit = Audit(seed, arrivals=draw.choice([0.0, 0.5, 1.0]), stock=draw.randrange(1, 20), calls=draw.randrange(9))
+        monkeypatch.setattr(Agency, "choose_contact", lambda *call, audit=audit: audit.choose(*call))
+        for _ in range(150):
+            audit.agency.advance()
+        counts += audit.agency.world.counts
+        last_calls += any(number == audit.agency.parameters.calls > 0 for number in audit.today.values())
+    assert last_calls > 30  # the staff was fully used somewhere
+    happened = {"paid", "insolvent", "not owed", "dismissed", "nothing to garnish", "Plan granted"}
+    assert happened | set(CHOICES) <= set(counts)
+
+
+VIEWS = {"aec": aec_env, "parallel": parallel_env, "single": single_env, "joint": joint_env}
+ROSTER = {"possible_agents": [f"debtor_{number}" for number in range(20)], "undeclared": "rule"}
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("points", [CASES, NAMED_CASES, COLLECTOR, NAMED_COLLECTOR])
+def test_the_rule_through_every_view_is_the_plain_run(view, points):
+    options = {}
+    if points in (CASES, NAMED_CASES):
+        options |= {"joint": ROSTER, "single": {"agent": "debtor_3"}}.get(view, {})
+    environment = pickle.loads(pickle.dumps(VIEWS[view](CollectionSim(DAYS), points, **options)))
+    agency = follow_the_rule(environment, 4).agency
+    assert view == "single" or agency.world.month == DAYS
+    assert state(agency) == state(plain(4, agency.world.month))
+
+
+def test_actions_number_the_lawful_choices_and_rewards_sum_up_to_the_profit():
+    environment = single_env(CollectionSim(200), COLLECTOR)
+    observation, info = environment.reset(seed=4)
+    counts = environment.simulation.agency.world.counts
+    asked, total, over = set(), 0.0, [False]
+    while not any(over):
+        choices = lawful(observation)
+        assert info["action_mask"].tolist() == [1] * len(choices) + [0] * (len(CHOICES) - len(choices))
+        assert info["time"] % 7 < 5
+        asked.add(choices[-1])
+        before = counts[choices[-1]]
+        observation, reward, *over, info = environment.step(len(choices) - 1)
+        assert counts[choices[-1]] == before + 1
+        total += reward
+    assert asked == set(CHOICES)
+    assert over == [False, True]
+    assert info["time"] == 200
+    assert total == pytest.approx(environment.simulation.agency.profit / 100_00)
+
+
+@pytest.mark.parametrize("points", [CASES, COLLECTOR, NAMED_CASES])
+def test_the_librarys_check_finds_nothing(points):
+    report = check_simulation(lambda: CollectionSim(30), points, episodes=2)
+    assert not [finding for finding in report.findings if finding.severity != "note"], report
+
+
+def test_the_learned_policy_beats_the_rule_on_unseen_seeds():
+    third = CollectionSim(parameters=Parameters(arrivals=0.3, stock=20, calls=1))  # of what it has learned from
+    result = compare({"learned": LEARNED}, range(HELD_OUT, HELD_OUT + 32), third).summary().loc["learned"]
+    assert result["difference"] > result["difference_low"] > 0

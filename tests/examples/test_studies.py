@@ -1,0 +1,121 @@
+"""Each study runs from its command line to its figures, in a small way; those of learners are in ``tests/clients``."""
+
+import json
+
+import pytest
+from examples.greenhouse_coop import plan, train
+from examples.greenhouse_coop.env import DAYS, GreenhouseSim
+from studies.debt_collection import study as debts
+from studies.demo import picture
+from studies.greenhouse_matrix import matrix, variants
+from studies.greenhouse_plans import figures as plans
+from studies.pension import study as pension
+
+
+def big(path):
+    return path.stat().st_size > 10_000
+
+
+class Short(GreenhouseSim):
+    """A greenhouse that is nearly at its end when it begins."""
+
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.greenhouse.day = DAYS - 4
+
+
+class ShortHouse(variants.House):
+    """The same for the matrix."""
+
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.greenhouse.day = DAYS - 4
+
+
+def test_demo_draws_what_was_trained_and_what_was_planned(tmp_path, monkeypatch):
+    monkeypatch.setattr(plan, "GreenhouseSim", Short)
+    train.main(["--budget", "1", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)])
+    plan.main(["--seeds", "1", "--futures", "1", "--out", str(tmp_path)])
+    for name in picture.TITLES:
+        picture.main([str(tmp_path / f"{name}.json")])
+        assert big(tmp_path / f"{name}.png")
+
+
+def test_greenhouse_matrix_shows_what_it_has_found(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("seaborn")
+    pytest.importorskip("statsmodels")
+    monkeypatch.setattr(variants, "House", ShortHouse)
+    table = matrix.main(["--quick", "--workers", "0", "--out", str(tmp_path)])
+    assert set(table.status) == {"ok"}
+    assert list(dict.fromkeys(table.contender)) == ["rule", "learned at home 1", "learned all over 1", "planned"]
+    assert all(big(tmp_path / f"matrix-{name}.png") for name in ("returns", "behind", "factors"))
+    shown = capsys.readouterr().out
+    for name in ("compared", "moved", "shares", "learners"):
+        assert (tmp_path / f"matrix-{name}.md").read_text() in shown
+
+
+def test_greenhouse_plans_draws_budgets_and_horizons(tmp_path, monkeypatch):
+    monkeypatch.setattr(plan, "GreenhouseSim", Short)
+    plans.main(["--seeds", "1", "--horizons", "1", "--futures", "1", "--figures", str(tmp_path)])
+    assert big(tmp_path / "plan-budget.png")
+    assert big(tmp_path / "plan-horizon.png")
+    rows = (tmp_path / "plan.md").read_text().splitlines()[2:]
+    assert [row.split(" | ")[0].removeprefix("| ") for row in rows[:5]] == [line.title for line in plans.LINES]
+
+
+def test_credit_compares_estimators_with_the_truth(capsys):
+    pytest.importorskip("mesa")
+    from studies.credit import estimators
+
+    world = next(estimators.worlds())
+    ways, truth = estimators.measure(world, number=2, futures=3, episodes=3, seed=0)
+    returns, apart, paired, *_ = ways
+    assert truth > 0
+    assert apart.bias == paired.bias == 0
+    assert paired.deviation < apart.deviation
+    assert paired.days == 2 * returns.days
+    assert all(way.title in estimators.table(world, ways, truth) for way in ways)
+
+
+def test_wolf_sheep_plan_lets_one_sheep_plan(capsys):
+    pytest.importorskip("mesa")
+    from studies.wolf_sheep import plan as sheep
+
+    found = sheep.main(["--herds", "2", "--horizon", "1", "--futures", "1", "--ticks", "3", "--workers", "1"])
+    assert found.own.shape == found.same.shape == (2,)
+    assert "plans longer than by the rule" in capsys.readouterr().out
+
+
+def test_pension_shows_what_it_has_found(tmp_path, capsys):
+    pytest.importorskip("seaborn")
+    pension.main(["--quick", "--workers", "0", "--out", str(tmp_path)])
+    shown = capsys.readouterr().out
+    for name in ("compared", "worlds", "moved"):
+        assert (tmp_path / f"pension-{name}.md").read_text() in shown
+    assert all(big(tmp_path / f"pension-{name}.png") for name in ("worlds", "learned", "years"))
+
+
+def test_debt_collection_learns_and_compares(capsys):
+    debts.main(["--generations", "1", "--seeds", "2", "--days", "60"])
+    shown = capsys.readouterr().out
+    assert "Thresholds(" in shown
+    assert all(name in shown for name in ("learned", "rule", *debts.CONSTANTS))
+
+
+def test_pages_state_the_figures_of_the_finals():
+    """The table of the greenhouse's experiment is made of the runs that are under version control."""
+    pytest.importorskip("pandas")
+    import pandas as pd
+    from studies.greenhouse_experiment import results
+
+    finals = pd.read_csv(results.DATA / "finals.csv", dtype={"library": str, "question": str})
+    assert results.table(finals) == (results.FIGURES / "experiment.md").read_text()
+
+
+def test_results_of_the_shared_policy_are_those_of_its_page():
+    from studies.wolf_sheep import picture as drawn
+
+    results = json.loads((drawn.FIGURES / "shared-policy.json").read_text())
+    page = (drawn.FIGURES.parent / "shared-policy.md").read_text()
+    assert list(results["results"]) == list(drawn.STYLES)
+    assert drawn.table(results) in page

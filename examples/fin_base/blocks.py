@@ -1,14 +1,6 @@
 """Building blocks for models of financial entities: entities, money, contracts, requests, a calendar.
 
-- ``World``: the shared state of a model: month, ids, seed, ledger, calendar, contracts.
-- ``Entity``: an owner of money and a party to contracts.
-- ``Ledger``: moves money, in whole cents, from one entity to another. No cent appears or vanishes.
-- ``share``: divides an amount of cents in proportion to weights, without losing a cent.
-- ``Contract``: one party pays another a fixed amount at regular intervals, from a start to an end.
-- ``Request``: one entity asks another for something, which is granted, or denied with a reason.
-- ``Calendar``: the schedule of events by month.
-
-Time is an integer number of months. ``World.advance`` simulates one month.
+Time is an integer number of months, and money an integer number of cents. ``World.advance`` simulates one month.
 
 >>> world = World(seed=1)
 >>> landlord, tenant = Entity(world), Entity(world)
@@ -21,18 +13,14 @@ Time is an integer number of months. ``World.advance`` simulates one month.
 >>> rent.missed  # the tenant could not pay 100 in the third month, nor in the fourth
 2
 >>> world.check()
-
-As a script, the module runs random payments between entities, and checks that no cent is lost::
-
-    python -m examples.fin_base.blocks
 """
 
 from __future__ import annotations
 
-import argparse
 import heapq
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from random import Random
 from typing import Any, ClassVar
 
@@ -42,47 +30,23 @@ class Shortage(ValueError):
 
 
 class World:
-    """The shared state of a model.
-
-    Attributes:
-        seed: The seed of all randomness in the model.
-        random: The generator for everything that has no ``stream`` of its own.
-        month: The current month; the first is 0.
-        ledger: The ledger, which moves money.
-        calendar: The scheduled events.
-        contracts: The contracts in force, by number.
-        entities: The existing entities, by name.
-        outside: The rest of the economy. All money comes from it, so it is the one entity that may owe money.
-        counts: How often each kind of event has happened.
-    """
+    """The shared state of a model: the month, the ledger, the calendar, entities, and the contracts in force."""
 
     def __init__(self, seed: int | None = None) -> None:
-        """Make an empty world.
-
-        Args:
-            seed: The seed of all randomness; None: a new one each time.
-        """
+        """Make an empty world; without a seed, a new one each time."""
         self.seed = Random().getrandbits(64) if seed is None else seed
-        self.random = Random(self.seed)
         self.month = 0
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # how often each kind of event has happened
         self.entities: dict[str, Entity] = {}
         self.contracts: dict[int, Contract] = {}
         self._ids: Counter[str] = Counter()
-        self.ledger = Ledger(self)
+        self.ledger = Ledger()
         self.calendar = Calendar()
-        self.outside = Entity(self)
+        self.outside = Entity(self)  # the rest of the economy, where all money comes from
         self.outside.may_owe = True
 
     def stream(self, name: str) -> Random:
-        """Make a random number generator for one purpose, which draws for other purposes do not affect.
-
-        Args:
-            name: The name of the purpose.
-
-        Returns:
-            A generator that depends on the world's seed and the name alone.
-        """
+        """Make a generator for one purpose, which depends on the world's seed and the name of the purpose alone."""
         return Random(f"{self.seed}/{name}")
 
     def next_id(self, kind: str) -> int:
@@ -107,24 +71,19 @@ class World:
                 contract.perform()
 
     def check(self) -> None:
-        """Check that no cent has appeared or vanished; this takes some nanoseconds per entity.
-
-        Raises:
-            AssertionError: Money is not conserved, or an entity other than ``outside`` has a negative balance.
-        """
-        self.ledger.check()
+        """Check that no cent has appeared or vanished, and that no entity but ``outside`` owes money."""
+        total = 0
+        for entity in self.entities.values():
+            cents = entity.cents
+            if cents.__class__ is not int or (cents < 0 and not entity.may_owe):
+                raise AssertionError(f"{entity.name} has {cents} cents")
+            total += cents
+        if total:
+            raise AssertionError(f"all money should sum up to 0, and is {total} cents")
 
 
 class Entity:
-    """An entity, which owns money and can be a party to contracts.
-
-    Attributes:
-        world: The world of the entity.
-        number: Its id among the entities of its kind in this world.
-        name: Its name, unique in its world.
-        cents: The money that it owns, in cents. Only the ledger changes it.
-        may_owe: Whether its balance may become negative.
-    """
+    """An entity, which owns money and can be a party to contracts. Only the ledger changes its cents."""
 
     __slots__ = ("__weakref__", "cents", "may_owe", "name", "number", "world")
 
@@ -140,12 +99,7 @@ class Entity:
         world.entities[self.name] = self
 
     def vanish(self, heir: Entity, reason: str = "estate") -> None:
-        """Remove the entity from its world.
-
-        Args:
-            heir: The entity that gets the remaining money.
-            reason: The reason under which the ledger books this payment.
-        """
+        """Remove the entity from its world; the heir gets the remaining money."""
         if self.cents:
             self.world.ledger.move(self, heir, self.cents, reason)
         del self.world.entities[self.name]
@@ -156,43 +110,18 @@ class Ledger:
 
     Attributes:
         flows: The cents moved so far, by reason.
-
-    >>> world = World()
-    >>> company = Entity(world)
-    >>> world.ledger.move(world.outside, company, 500, "capital")
-    >>> company.cents, world.outside.cents
-    (500, -500)
-    >>> world.ledger.move(company, world.outside, 501, "rent")
-    Traceback (most recent call last):
-    ...
-    examples.fin_base.blocks.Shortage: entity_1 has 500 cents and cannot pay 501 (rent)
-    >>> company.cents += 1
-    >>> world.check()
-    Traceback (most recent call last):
-    ...
-    AssertionError: all money should sum up to 0, and is 1 cents
     """
 
-    __slots__ = ("_world", "flows")
+    __slots__ = ("flows",)
 
-    def __init__(self, world: World) -> None:
-        """Open the books of a world."""
-        self._world = world
+    def __init__(self) -> None:
         self.flows: dict[str, int] = {}
 
     def move(self, source: Entity, target: Entity, cents: int, reason: str) -> None:
-        """Move money.
-
-        Args:
-            source: The payer.
-            target: The payee.
-            cents: The amount: a non-negative integer.
-            reason: The reason under which the payment is booked.
+        """Move a non-negative amount, booked under a reason.
 
         Raises:
-            Shortage: The payer does not have the amount. Nothing has changed.
-            TypeError: The amount is not an integer.
-            ValueError: The amount is negative.
+            Shortage: The source does not have the amount. Nothing has changed.
         """
         if cents.__class__ is not int:
             raise TypeError(f"money is whole cents, not {cents!r}")
@@ -205,39 +134,9 @@ class Ledger:
         flows = self.flows
         flows[reason] = flows.get(reason, 0) + cents
 
-    def check(self) -> None:
-        """Check that all balances sum to zero: the debt of ``outside`` equals the money of all other entities.
-
-        Raises:
-            AssertionError: The sum is not zero, or an entity has a negative balance without ``may_owe``.
-        """
-        total = 0
-        for entity in self._world.entities.values():
-            cents = entity.cents
-            if cents.__class__ is not int or (cents < 0 and not entity.may_owe):
-                raise AssertionError(f"{entity.name} has {cents} cents")
-            total += cents
-        if total:
-            raise AssertionError(f"all money should sum up to 0, and is {total} cents")
-
 
 def share(cents: int, weights: Sequence[int]) -> list[int]:
-    """Divide money in proportion to weights, by the largest remainder method: the parts sum to the whole.
-
-    Args:
-        cents: The amount to divide; not negative.
-        weights: One weight for each part; not negative, not all of them 0.
-
-    Returns:
-        The parts, in cents. Each differs from its exact proportion by less than a cent. Where remainders are equal,
-        the first parts get the cents.
-
-    Raises:
-        ValueError: The amount is negative, a weight is negative, or all weights are 0.
-
-    >>> share(100, [1, 1, 1])
-    [34, 33, 33]
-    """
+    """Divide money in proportion to weights, by the largest remainder method: the parts sum to the whole."""
     total = sum(weights)
     if total <= 0 or cents < 0 or min(weights) < 0:
         raise ValueError(f"{cents} cents cannot be divided by weights that sum up to {total}")
@@ -249,41 +148,25 @@ def share(cents: int, weights: Sequence[int]) -> list[int]:
     return parts
 
 
+@dataclass(slots=True, weakref_slot=True, eq=False)
 class Contract:
-    """A contract: one party pays another a fixed amount at regular intervals, from a start to an end.
+    """A contract: one party pays another a fixed amount at regular intervals, from a start to an end."""
 
-    Attributes:
-        debtor: The party that pays.
-        creditor: The party that is paid.
-        cents: The amount of each payment; it may be amended at any time.
-        reason: The reason under which the ledger books the payments.
-        start: The month of the first payment.
-        end: The first month in which the contract is no longer in force; None: it runs until it is terminated.
-        every: The interval between two payments, in months.
-        missed: The number of payments for which the debtor did not have the money.
-        number: The contract's id in its world.
-    """
+    debtor: Entity
+    creditor: Entity
+    cents: int
+    reason: str
+    start: int = -1  # the month of the first payment; by default the current one
+    end: int | None = None  # the first month in which it is no longer in force
+    every: int = 1  # the months between two payments
+    missed: int = field(default=0, init=False)  # the number of payments for which the debtor did not have the money
+    number: int = field(init=False)  # its id in the world
 
-    __slots__ = ("__weakref__", "cents", "creditor", "debtor", "end", "every", "missed", "number", "reason", "start")
-
-    def __init__(
-        self,
-        debtor: Entity,
-        creditor: Entity,
-        cents: int,
-        reason: str,
-        *,
-        start: int | None = None,
-        end: int | None = None,
-        every: int = 1,
-    ) -> None:
-        """Conclude the contract. ``start=None`` means the current month; the other arguments are the attributes."""
-        world = debtor.world
-        if every < 1 or creditor.world is not world:
+    def __post_init__(self) -> None:
+        world = self.debtor.world
+        if self.every < 1 or self.creditor.world is not world:
             raise ValueError("a contract binds two entities of one world, every month or less often")
-        self.debtor, self.creditor, self.cents, self.reason = debtor, creditor, cents, reason
-        self.start = world.month if start is None else start
-        self.end, self.every, self.missed = end, every, 0
+        self.start = world.month if self.start < 0 else self.start
         self.number = world.next_id("contract")
         world.contracts[self.number] = self
 
@@ -298,11 +181,7 @@ class Contract:
         return passed >= 0 and (self.every == 1 or passed % self.every == 0)
 
     def perform(self) -> bool:
-        """Make one payment.
-
-        Returns:
-            Whether the debtor could pay.
-        """
+        """Make one payment; return whether the debtor could pay."""
         try:
             self.debtor.world.ledger.move(self.debtor, self.creditor, self.cents, self.reason)
         except Shortage:
@@ -315,33 +194,14 @@ class Contract:
         self.debtor.world.contracts.pop(self.number, None)
 
 
+@dataclass
 class Request:
     """A request of one entity to another.
 
     Each kind of request is a subclass: ``objection`` says why the request is denied, ``carry_out`` fulfils it.
-
-    Attributes:
-        applicant: The entity that makes the request.
-
-    >>> class Loan(Request):
-    ...     def __init__(self, applicant, bank, cents):
-    ...         super().__init__(applicant)
-    ...         self.bank, self.cents = bank, cents
-    ...     def objection(self):
-    ...         return "the bank has not enough" if self.bank.cents < self.cents else None
-    ...     def carry_out(self):
-    ...         self.applicant.world.ledger.move(self.bank, self.applicant, self.cents, "loan")
-    >>> world = World()
-    >>> print(Loan(Entity(world), Entity(world), 100).submit())
-    the bank has not enough
-    >>> world.counts
-    Counter({'Loan denied: the bank has not enough': 1})
     """
 
-    __slots__ = ("applicant",)
-
-    def __init__(self, applicant: Entity) -> None:
-        self.applicant = applicant
+    applicant: Any
 
     def objection(self) -> str | None:
         """Return the reason for a denial; None: the request is granted. This changes nothing."""
@@ -352,11 +212,7 @@ class Request:
         raise NotImplementedError
 
     def submit(self) -> str | None:
-        """Submit the request: it is granted and carried out, or denied. The world counts the outcomes.
-
-        Returns:
-            None, or the reason for the denial. A denied request has changed nothing.
-        """
+        """Submit the request: return the reason for its denial, or None once it is carried out. The world counts."""
         reason = self.objection()
         kind = type(self).__name__
         self.applicant.world.counts[f"{kind} granted" if reason is None else f"{kind} denied: {reason}"] += 1
@@ -366,17 +222,7 @@ class Request:
 
 
 class Calendar:
-    """The schedule of events by month; events of one month happen in the order in which they were scheduled.
-
-    >>> calendar = Calendar()
-    >>> calendar.at(3, print, "later")
-    >>> calendar.at(2, print, "first")
-    >>> calendar.at(3, print, "latest")
-    >>> calendar.run(3)
-    first
-    later
-    latest
-    """
+    """The schedule of events by month; events of one month happen in the order in which they were scheduled."""
 
     __slots__ = ("_entered", "_events")
 
@@ -388,24 +234,12 @@ class Calendar:
         return len(self._events)
 
     def at(self, month: int, action: Callable[..., object], *arguments: Any) -> None:
-        """Schedule an event.
-
-        Args:
-            month: The month of the event.
-            action: The function that the event calls.
-            *arguments: The arguments of the action.
-        """
+        """Schedule an event: the call of an action."""
         heapq.heappush(self._events, (month, self._entered, action, arguments))
         self._entered += 1
 
     def every(self, months: int, action: Callable[[], object], *, start: int) -> None:
-        """Schedule a recurring event.
-
-        Args:
-            months: The interval between two occurrences, in months.
-            action: The function that the event calls.
-            start: The month of the first occurrence.
-        """
+        """Schedule a recurring event, every so many months from a start."""
         self.at(start, self._recur, months, action, start)
 
     def _recur(self, months: int, action: Callable[[], object], month: int) -> None:
@@ -419,28 +253,3 @@ class Calendar:
         while events and events[0][0] <= month:
             _, _, action, arguments = heapq.heappop(events)
             action(*arguments)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run random payments between entities, and check every month that money is conserved."""
-    parser = argparse.ArgumentParser(description="Run random payments; check that no cent is lost.")
-    parser.add_argument("--months", type=int, default=120, help="how many months to simulate (default: 120)")
-    parser.add_argument("--seed", type=int, help="seed of all randomness (default: a new one each time)")
-    options = parser.parse_args(arguments)
-    world = World(options.seed)
-    people = [Entity(world) for _ in range(50)]
-    draw = world.random
-    for person in people:
-        world.ledger.move(world.outside, person, draw.randrange(1000_00), "savings")
-    for _ in range(options.months):
-        debtor, creditor = draw.sample(people, 2)
-        Contract(debtor, creditor, draw.randrange(100_00), "instalment", end=world.month + draw.randrange(1, 24))
-        world.advance()
-        world.check()
-    missed = sum(contract.missed for contract in world.contracts.values())
-    paid = world.ledger.flows["instalment"]
-    print(f"{options.months} months: {paid} cents paid, {missed} payments missed, no cent appeared or vanished")
-
-
-if __name__ == "__main__":
-    main()

@@ -24,14 +24,7 @@ from .people import Client, PensionContract, RecoveryPlan, clients_of
 
 
 class Manager(Entity):
-    """The asset manager of a company.
-
-    Attributes:
-        company: The company whose assets it manages.
-        equities: The share of the assets in equities; the rest is in bonds.
-    """
-
-    __slots__ = ("company", "equities")
+    """The asset manager of a company, which decides on the share of its assets in equities; the rest is in bonds."""
 
     kind = "manager"
 
@@ -55,16 +48,10 @@ class Manager(Entity):
 class Regulator(Entity):
     """The regulator, which decides what recovery plans must contain."""
 
-    __slots__ = ()
-
     kind = "regulator"
 
     def choose_demand(self, company: Company) -> float:
-        """Choose the cut of rights to demand this year.
-
-        Returns:
-            A tenth of the shortfall if coverage is critical or was below the minimum too often; 0 otherwise.
-        """
+        """Choose the cut of rights to demand: a tenth of the shortfall, if it is critical or has lasted too long."""
         due = company.policy_coverage() < CRITICAL or company.measured_short >= MEASUREMENTS
         return company.shortfall() / SPREAD if due else 0.0
 
@@ -73,30 +60,11 @@ class Company(Entity):
     """A pension company, which promises pensions and holds assets to pay them.
 
     Attributes:
-        market: The market in which its assets are invested.
         tables: The mortality that it assumes.
-        manager: The manager of its assets.
-        regulator: The regulator that supervises it.
         measured_short: The number of yearly measurements in a row at which its policy coverage was below the minimum.
         rations: The cents paid by each pension contract in the last month, if the money did not suffice for all.
         indexed: The current amount of a right that was 1 in the first month, after indexation and cuts.
     """
-
-    __slots__ = (
-        "_factors",
-        "_history",
-        "_policy_coverage",
-        "_provisions",
-        "_rationed",
-        "_rights",
-        "indexed",
-        "manager",
-        "market",
-        "measured_short",
-        "rations",
-        "regulator",
-        "tables",
-    )
 
     kind = "company"
 
@@ -114,18 +82,12 @@ class Company(Entity):
         self._factors = annuity_factors(tables, market.yield_steps, RETIREMENT)
         self._provisions: float | None = None
 
-    # state
-
     def factor(self, age: int) -> float:
         """The value of a pension of 1 a year at an age in months, at the current yield."""
         return self._factors[OLDEST - 1 - age]
 
     def provisions(self) -> float:
-        """The value of all rights, in cents.
-
-        The company keeps sums of rights by month of birth, which do not change as time passes. Each change of a right
-        is one addition, and each valuation is one product of sums and factors, whatever the number of clients.
-        """
+        """The value of all rights, in cents: a product of sums of rights, by month of birth, and factors."""
         if self._provisions is None:
             youngest = self.world.month
             self._provisions = sum(map(mul, self._rights[youngest : youngest + OLDEST], self._factors))
@@ -154,11 +116,7 @@ class Company(Entity):
         return cost * (0.8 if self.policy_coverage() >= REQUIRED else 1.0), min(1.3 * cost, HIGHEST_PREMIUM)
 
     def repair(self) -> float:
-        """The lawful growth of rights in addition to inflation, if coverage has the level required in the long run.
-
-        Returns:
-            A fifth of the gap between rights and prices.
-        """
+        """The lawful growth of rights in addition to inflation: a fifth of the gap, if coverage is as required."""
         behind = self.market.price_level / max(self.indexed, 1e-9) - 1
         return max(0.0, behind) / 5 if self.policy_coverage() >= REQUIRED else 0.0
 
@@ -166,15 +124,8 @@ class Company(Entity):
         """The highest lawful indexation: inflation plus repair, if coverage is high enough."""
         return max(0.0, self.market.inflation) + self.repair() if self.policy_coverage() >= INDEXING else 0.0
 
-    # decisions
-
     def set_premium(self, client: Client) -> float:
-        """Choose a client's premium for the next year, as a share of the wage.
-
-        Returns:
-            The cost of the accrual plus 5 % of it for solvency. The surcharge is 15 % in a shortfall; where coverage
-            is well above what is required, there is a discount of 10 % instead.
-        """
+        """Choose a premium, as a share of the wage: the accrual's cost, and 5 % (or 15 or -10 %) of it for solvency."""
         coverage = self.policy_coverage()
         surcharge = 1.15 if coverage < MINIMUM else 0.9 if coverage > REQUIRED + 0.15 else 1.05
         return surcharge * self.cost_rate(client) * (1 + client.extra)
@@ -188,8 +139,6 @@ class Company(Entity):
         """Choose the cut of rights in a shortfall: a tenth of the shortfall, from the third measurement on."""
         return self.shortfall() / SPREAD if self.measured_short >= 3 else 0.0
 
-    # actions
-
     def book_right(self, born: int, cents: int) -> None:
         """Record a change in the rights of those born in a month."""
         place = born + OLDEST - 1
@@ -200,10 +149,7 @@ class Company(Entity):
         self._provisions = None
 
     def review(self, client: Client) -> None:
-        """Set premium and accrual for a client's next year, and amend the contract.
-
-        Contributions beyond the standard end if the premium for them would be above the legal maximum.
-        """
+        """Set premium and accrual for a client's next year; extra contributions end where they are too dear."""
         if self.cost_rate(client) * (1 + client.extra) > HIGHEST_PREMIUM:
             client.extra = 0.0
         lowest, highest = self.lawful_premium(client)
@@ -237,11 +183,7 @@ class Company(Entity):
         self._provisions = None
 
     def ration(self) -> dict[int, int]:
-        """Check, once a month, whether the money suffices for all pensions; if not, divide it among them.
-
-        Returns:
-            Cents by the number of the contract; empty if the money suffices.
-        """
+        """Return the cents of each pension contract if the money does not suffice for all; checked once a month."""
         month, contracts = self.world.month, self.world.contracts.items()
         if self._rationed == month:
             return self.rations

@@ -1,8 +1,7 @@
 """The economy and the mortality around a pension fund: prices, yields, returns and lifetimes.
 
-**Mortality** is Makeham's law: at age x, the force of mortality is A + B c^x. ``Mortality`` has the parameters of the
-Standard Ultimate Survival Model, A = 0.00022, B = 2.7e-6, c = 1.124 (Dickson, Hardy and Waters, Actuarial Mathematics
-for Life Contingent Risks; also behind the Standard Ultimate Life Table of the Society of Actuaries' FAM-L exam).
+**Mortality** has the parameters of the Standard Ultimate Survival Model (Dickson, Hardy and Waters, Actuarial
+Mathematics for Life Contingent Risks; also behind the Life Table of the Society of Actuaries' FAM-L exam).
 
 **The market** has three correlated variables in monthly steps. Inflation and the bond yield are first-order
 autoregressive, as inflation is in Wilkie's model (A stochastic investment model for actuarial use, Transactions of the
@@ -29,56 +28,25 @@ STEP = 0.0025
 
 @dataclass(frozen=True)
 class Mortality:
-    """Makeham's law of mortality.
-
-    Attributes:
-        a: The part that does not depend on age.
-        b: The level of the part that grows with age.
-        c: The growth factor of that part per year of age.
-        factor: A factor on the whole force; below 1, people live longer than the tables say.
-
-    >>> round(Mortality().life_expectancy(65 * 12), 1)
-    22.7
-    """
+    """Makeham's law of mortality: at age x, the force of mortality is A + B c^x."""
 
     a: float = 0.00022
     b: float = 2.7e-6
     c: float = 1.124
-    factor: float = 1.0
-
-    def force(self, years: float) -> float:
-        """The force of mortality at an age in years."""
-        return self.factor * (self.a + self.b * exp(years * log(self.c)))
+    factor: float = 1.0  # of the whole force; below 1, people live longer than the tables say
 
     def monthly(self) -> list[float]:
-        """Compute the probability of death within a month, by age in months up to ``OLDEST``.
-
-        It is 1 - exp(-the integral of the force over the month), which has a closed form.
-        """
+        """Compute the probability of death within a month, by age in months up to ``OLDEST``."""
         growth = (self.c ** (1 / 12) - 1) / log(self.c)
         hazards = [self.factor * (self.a / 12 + self.b * self.c ** (age / 12) * growth) for age in range(OLDEST)]
         return [1 - exp(-hazard) for hazard in hazards[:-1]] + [1.0]
 
-    def life_expectancy(self, age: int) -> float:
-        """Compute the remaining life expectancy, in years, at an age in months."""
-        months, alive = 0.0, 1.0
-        for probability in self.monthly()[age:]:
-            alive *= 1 - probability
-            months += alive
-        return months / 12
-
 
 @lru_cache(maxsize=256)
 def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[float, ...]:
-    """Compute the value of a pension of 1 a year, paid monthly for life from retirement on.
+    """Compute the value of a pension of 1 a year, paid monthly for life from retirement on, at a yield in ``STEP``.
 
-    Args:
-        mortality: The law of mortality.
-        steps: The yield, in units of ``STEP``.
-        retirement: The age in months from which the pension is paid.
-
-    Returns:
-        The values by age in months, from ``OLDEST - 1`` *down to* 0, that is, in the order of birth.
+    The values are by age in months, from ``OLDEST - 1`` *down to* 0, that is, in the order of birth.
     """
     discount = (1 + STEP * steps) ** (-1 / 12)
     value, values = 0.0, []
@@ -90,43 +58,23 @@ def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[
 
 @dataclass(frozen=True)
 class Climate:
-    """The parameters of the market. Rates are annual.
+    """The parameters of the market. Rates are annual, and standard deviations those of the long run."""
 
-    Attributes:
-        inflation: Mean inflation: the European Central Bank's target.
-        inflation_sd: Its long-run standard deviation.
-        inflation_memory: The share of a deviation from the mean that remains after a year.
-        bond_yield: Mean yield of bonds.
-        yield_sd: Its long-run standard deviation.
-        yield_memory: The share of a deviation from the mean that remains after a year.
-        equity_premium: The excess of the mean log return of equities over the mean yield.
-        equity_sd: Standard deviation of that return.
-        correlations: The correlations of the shocks to inflation and yield, inflation and equities, yield and equities.
-    """
-
-    inflation: float = 0.02
+    inflation: float = 0.02  # its mean: the European Central Bank's target
     inflation_sd: float = 0.015
-    inflation_memory: float = 0.58
+    inflation_memory: float = 0.58  # the share of a deviation from the mean that remains after a year
     bond_yield: float = 0.025
     yield_sd: float = 0.012
     yield_memory: float = 0.85
-    equity_premium: float = 0.03
+    equity_premium: float = 0.03  # the excess of the mean log return of equities over the mean yield
     equity_sd: float = 0.18
-    correlations: tuple[float, float, float] = (0.4, -0.1, 0.1)
+    correlations: tuple[float, float, float] = (0.4, -0.1, 0.1)  # inflation and yield, and equities; yield and equities
 
 
 class Market:
-    """The market: inflation, yields and returns, in monthly steps.
+    """The market in monthly steps: annual inflation and yield, the price level, and the returns of the last month."""
 
-    Attributes:
-        inflation: The current annual inflation.
-        bond_yield: The current annual yield.
-        price_level: The current price of what cost 1 in the first month.
-        equity_return: The equity return of the last month.
-        bond_return: The bond return of the last month, for bonds with a duration of ``DURATION`` years.
-    """
-
-    DURATION = 12.0
+    DURATION = 12.0  # of bonds, in years
 
     def __init__(self, climate: Climate, random: Random) -> None:
         """Create a market, with inflation and yield at their long-run means."""

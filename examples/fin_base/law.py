@@ -23,29 +23,15 @@ from __future__ import annotations
 
 from typing import Final
 
-RETIREMENT: Final = 67 * 12
-"""The retirement age in months."""
+RETIREMENT: Final = 67 * 12  # the retirement age in months
+LATEST_ENTRY: Final = 60 * 12  # the age in months from which candidates are no longer admitted
+ACCRUAL: Final = 0.0175  # the share of the yearly wage that a year of membership adds to the yearly pension
 
-LATEST_ENTRY: Final = 60 * 12
-"""The age in months from which candidates are no longer admitted."""
-
-ACCRUAL: Final = 0.0175
-"""The accrual rate: the share of the yearly wage that a year of membership adds to the yearly pension."""
-
+# levels of coverage: the minimum, for indexation, required in the long run, critical, for transfers
 MINIMUM, INDEXING, REQUIRED, CRITICAL, TRANSFERABLE = 1.043, 1.10, 1.25, 0.90, 1.0
-"""Levels of coverage: the minimum, for indexation, required in the long run, critical, for transfers."""
 
-MEASUREMENTS: Final = 6
-"""The number of yearly measurements in a row below the minimum that makes a cut compulsory."""
-
-SPREAD: Final = 10
-"""The number of years over which a cut is spread."""
-
-HIGHEST_PREMIUM: Final = 0.35
-"""The highest premium, as a share of the wage."""
-
-EXTRAS: Final = (0.0, 0.25, 0.5)
-"""Contributions beyond the standard that a client can choose, as shares of the standard; the accrual grows alike."""
-
-DISPOSABLE: Final = 0.3
-"""The share of a wage that remains after living expenses."""
+MEASUREMENTS: Final = 6  # the yearly measurements in a row below the minimum that make a cut compulsory
+SPREAD: Final = 10  # the number of years over which a cut is spread
+HIGHEST_PREMIUM: Final = 0.35  # as a share of the wage
+EXTRAS: Final = (0.0, 0.25, 0.5)  # contributions beyond the standard, as shares of it; the accrual grows alike
+DISPOSABLE: Final = 0.3  # the share of a wage that remains after living expenses

@@ -1,8 +1,7 @@
 """A model of a pension company and its clients over decades, in monthly steps. It contains no reinforcement learning.
 
-People join, pay premiums, change jobs, retire, draw a pension, transfer their rights to another fund, and die. A right
-is an accrued yearly pension, paid from retirement on, for life. The company holds assets to pay for these rights. Its
-*coverage* is the ratio of its assets to its *provisions*, the value of all rights at current yields.
+People join, pay premiums, change jobs, retire, transfer their rights to another fund, and die. A right is an accrued
+yearly pension, paid for life. The *coverage* is the ratio of assets to *provisions*, the value of all rights.
 
 **Decisions**, each of them a method with a plausible rule:
 
@@ -17,10 +16,7 @@ is an accrued yearly pension, paid from retirement on, for life. The company hol
 ``Client.choose_to_leave`` with a new job       whether to transfer the rights to another fund
 ========================= ==================== =====================================================================
 
-``people`` contains the clients, ``company`` the company with its manager and its regulator, and ``law`` the rules for
-them. This module contains the fund. As a script, it prints the fund's results and the speed of the computation::
-
-    python -m examples.fin_base.pension --clients 10000 --years 40
+``python -m examples.fin_base.pension --clients 10000 --years 40`` prints the fund's results, and how fast it runs.
 """
 
 from __future__ import annotations
@@ -40,44 +36,24 @@ from .people import Admission, Client, Contribution, PensionContract, PremiumCon
 
 @dataclass(frozen=True)
 class Parameters:
-    """The initial state of a fund, and the world around it.
-
-    Attributes:
-        clients: The number of clients.
-        coverage: The ratio of the company's assets to its provisions.
-        climate: The parameters of the market.
-        tables: The mortality that the company assumes.
-        mortality: The actual mortality.
-        job_change: The monthly probability that a worker changes jobs.
-        entry: The yearly number of candidates, relative to the initial number of clients.
-    """
+    """The initial state of a fund, and the world around it."""
 
     clients: int = 10_000
-    coverage: float = 1.15
+    coverage: float = 1.15  # the ratio of assets to provisions
     climate: Climate = field(default_factory=Climate)
-    tables: Mortality = field(default_factory=Mortality)
-    mortality: Mortality = field(default_factory=Mortality)
-    job_change: float = 0.008
-    entry: float = 0.025
+    tables: Mortality = field(default_factory=Mortality)  # the mortality that the company assumes
+    mortality: Mortality = field(default_factory=Mortality)  # the actual mortality
+    job_change: float = 0.008  # the monthly probability that a worker changes jobs
+    entry: float = 0.025  # the yearly number of candidates, relative to the initial number of clients
 
 
 class Fund:
-    """A pension company, its clients, and the world around them.
-
-    Attributes:
-        parameters: The initial state.
-        world: The shared state: month, ledger, calendar, contracts.
-        market: Inflation, yields and returns.
-        company: The pension company.
-    """
+    """A pension company, its clients, and the world around them."""
 
     def __init__(self, seed: int | None = None, parameters: Parameters | None = None) -> None:
         """Create a fund, with clients of all ages who have paid since they were 25.
 
-        Args:
-            seed: The seed of all randomness. Market and people have separate generators, so decisions about people
-                do not change the market.
-            parameters: The initial state; None: the defaults.
+        Market and people have separate generators, so decisions about people do not change the market.
         """
         self.parameters = parameters = parameters or Parameters()
         self.world = world = World(seed)
@@ -183,7 +159,7 @@ class Fund:
             if not candidate.choose_to_join():
                 world.counts["declined"] += 1
                 candidate.vanish(world.outside)
-            elif Admission(candidate, self.company).submit() is None:
+            elif Admission(candidate).submit() is None:
                 self._enter_dates(candidate)
             else:
                 candidate.vanish(world.outside)
@@ -207,11 +183,7 @@ class Fund:
         self.company.review(client)
 
     def run(self, months: int) -> None:
-        """Simulate months, and check at the end of each year and of the run that money is conserved.
-
-        Args:
-            months: The number of months.
-        """
+        """Simulate months, and check at the end of each year and of the run that money is conserved."""
         for _ in range(months):
             self.advance()
             if self.world.month % 12 == 0:
@@ -227,12 +199,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, help="seed of all randomness (default: a new one each time)")
     options = parser.parse_args(arguments)
     fund = Fund(options.seed, Parameters(clients=options.clients))
-    taken = 0.0
+    start = perf_counter()
     print("year clients coverage yield inflation equities rights/prices")
     for year in range(1, options.years + 1):
-        start = perf_counter()
         fund.run(12)
-        taken += perf_counter() - start
         company, market = fund.company, fund.market
         if year % 5 == 0 or year == options.years:
             print(
@@ -241,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
     for event, count in sorted(fund.world.counts.items()):
         print(f"{count:8} {event}")
-    print(f"{options.years / taken:.1f} years a second")
+    print(f"{options.years / (perf_counter() - start):.1f} years a second")
 
 
 if __name__ == "__main__":

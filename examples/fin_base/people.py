@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from .blocks import Contract, Entity, Request, World
@@ -44,13 +45,6 @@ class PensionContract(Contract):
 class Admission(Request):
     """A candidate's request to become a client."""
 
-    __slots__ = ("company",)
-    applicant: Client
-
-    def __init__(self, candidate: Client, company: Company) -> None:
-        super().__init__(candidate)
-        self.company = company
-
     def objection(self) -> str | None:
         """Deny candidates who are too old or already clients."""
         client = self.applicant
@@ -60,19 +54,14 @@ class Admission(Request):
 
     def carry_out(self) -> None:
         """Start to work and to pay premiums."""
-        client = self.applicant
-        client.enter()
+        self.applicant.enter()
 
 
+@dataclass
 class Contribution(Request):
     """A client's request to pay and accrue a given share more than the standard."""
 
-    __slots__ = ("extra",)
-    applicant: Client
-
-    def __init__(self, client: Client, extra: float) -> None:
-        super().__init__(client)
-        self.extra = extra
+    extra: float
 
     def objection(self) -> str | None:
         """Deny clients who do not work, and increases that are unlawful or that the client cannot afford."""
@@ -88,15 +77,11 @@ class Contribution(Request):
 
     def carry_out(self) -> None:
         """Set the extra contribution; the next review sets the premium accordingly."""
-        client = self.applicant
-        client.extra = self.extra
+        self.applicant.extra = self.extra
 
 
 class Transfer(Request):
     """A client's request to transfer the value of the accrued rights to another fund."""
-
-    __slots__ = ()
-    applicant: Client
 
     def objection(self) -> str | None:
         """Deny pensioners, transfers while coverage is too low, and values that the company cannot pay."""
@@ -115,15 +100,12 @@ class Transfer(Request):
         client.world.ledger.move(client.company, client.world.outside, value, "transfer")
 
 
+@dataclass
 class RecoveryPlan(Request):
     """A company's proposal to the regulator, in a shortfall: by how much to cut rights this year."""
 
-    __slots__ = ("cut", "demand")
-    applicant: Company
-
-    def __init__(self, company: Company, cut: float, demand: float) -> None:
-        super().__init__(company)
-        self.cut, self.demand = cut, demand
+    cut: float
+    demand: float
 
     def objection(self) -> str | None:
         """Deny a cut below the regulator's demand."""
@@ -131,40 +113,27 @@ class RecoveryPlan(Request):
 
     def carry_out(self) -> None:
         """Cut rights."""
-        company = self.applicant
-        company.change_rights(-self.cut)
+        self.applicant.change_rights(-self.cut)
 
 
 class Client(Entity):
     """A client of a pension company, or a candidate: accrues a pension and later draws it.
 
     Attributes:
-        company: The client's company, or the one that the candidate may join.
         born: The month of birth, which may be before the first month.
         wage: The yearly wage of the current or last job, in cents.
         status: "candidate", "working", "away" (in a job without pension, or in none), "retired" or "gone".
         accrued: The accrued right to a yearly pension, in cents.
         accrual: The cents that a month's premium adds to it.
         extra: The contribution beyond the standard, as a share of the standard: one of ``EXTRAS``.
-        premium: The premium, as a share of the wage.
-        contract: The contract by which the client pays premiums or draws the pension.
         caution: From 0 (trusting) to 1 (cautious).
         disposable: The monthly income after living expenses while working, in cents.
     """
 
     __slots__ = (
-        "accrual",
-        "accrued",
-        "born",
-        "caution",
-        "company",
-        "contract",
-        "disposable",
-        "extra",
-        "premium",
-        "status",
+        "accrual", "accrued", "born", "caution", "company", "contract", "disposable", "extra", "premium", "status",
         "wage",
-    )
+    )  # fmt: skip
 
     kind = "client"
 
@@ -181,24 +150,12 @@ class Client(Entity):
         """Age in months."""
         return self.world.month - self.born
 
-    @property
-    def works(self) -> bool:
-        """Whether the client currently works and pays premiums."""
-        return self.status == "working"
-
-    # decisions
-
     def choose_to_join(self) -> bool:
         """Decide whether to become a client: yes, if coverage is high enough for the candidate's caution."""
         return self.company.policy_coverage() >= 0.75 + 0.3 * self.caution
 
     def choose_extra(self) -> float:
-        """Choose the contribution beyond the standard.
-
-        Returns:
-            One of ``EXTRAS``: from age 45 on, one step more if the client has savings and the company is sound; one
-            step less if the client missed a premium.
-        """
+        """Choose the extra contribution: more from 45 on, with savings in a sound company; less after a default."""
         step = EXTRAS.index(self.extra)
         if self.contract is not None and self.contract.missed:
             step = max(0, step - 1)
@@ -210,8 +167,6 @@ class Client(Entity):
         """Decide whether to transfer the rights: yes, if they are small, or coverage is too low for the caution."""
         little = self.accrued < 2 * ACCRUAL * self.wage
         return little or self.company.policy_coverage() < 0.85 + 0.3 * self.caution
-
-    # events
 
     def enter(self) -> None:
         """Start to work and to pay premiums, for the first time or again."""

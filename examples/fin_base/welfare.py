@@ -1,4 +1,4 @@
-"""The welfare of a fund's members: the utility by which the study compares policies.
+"""The welfare of a fund's members: the utility by which policies are compared.
 
 In each year a pensioner lives on the pension, and a worker on the wage less the premium. Each is measured relative to
 full income: a pension that has kept up with prices, or a wage without a premium. The utility of a year is the mean,
@@ -8,8 +8,7 @@ a loss of the same amount counts more for a member who is poorer already.
 The time after the last year counts as ``AFTER`` more years, in which rights keep their purchasing power, as far as
 assets cover them. So it does not pay to spend today what later pensions need.
 
-The ratio of a pension to one that has kept up with prices is the *pension result* of the feasibility test that Dutch
-funds have to pass. One point of welfare is one per cent of a year's income, for each member.
+One point of welfare is one per cent of a year's income, for each member.
 """
 
 from __future__ import annotations
@@ -19,38 +18,21 @@ from typing import Final, NamedTuple
 
 from .pension import Fund
 
-AFTER: Final = 10
-"""The number of years that the time after the last year counts for."""
-
-LEAST: Final = 0.05
-"""The minimum income of a member, from other sources, as a share of full income."""
+AFTER: Final = 10  # the number of years that the time after the last year counts for
+LEAST: Final = 0.05  # the minimum income of a member, from other sources, as a share of full income
 
 
 class Year(NamedTuple):
-    """The results of a year, at its end.
+    """The results of a year, at its end."""
 
-    Attributes:
-        right: The purchasing power of a right that was 1 in the first month, in prices of that month.
-        coverage: The ratio of assets to provisions.
-        equities: The share of the assets in equities.
-        premium: The mean premium, as a share of the wage.
-        utility: The mean logarithm of the members' incomes, relative to full income.
-    """
-
-    right: float
+    right: float  # the purchasing power of a right that was 1 in the first month, in prices of that month
     coverage: float
-    equities: float
-    premium: float
-    utility: float
+    premium: float  # its mean, as a share of the wage
+    utility: float  # the mean logarithm of the members' incomes, relative to full income
 
 
 class Account:
-    """The account of the welfare of a fund's members.
-
-    Attributes:
-        fund: The fund.
-        years: The results of the past years.
-    """
+    """The account of the welfare of a fund's members."""
 
     def __init__(self, fund: Fund) -> None:
         """Open an account without years."""
@@ -70,7 +52,7 @@ class Account:
         total = sum(log(1 - premium) for premium in premiums) + retired * log(max(right, LEAST))
         utility = total / max(len(premiums) + retired, 1)
         mean = sum(premiums) / max(len(premiums), 1)
-        self.years.append(Year(right, company.coverage(), company.manager.equities, mean, utility))
+        self.years.append(Year(right, company.coverage(), mean, utility))
         self._lived += utility
 
     def close_for_ever(self, years: float) -> None:

@@ -33,23 +33,12 @@ from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import ClipOutOfBoundsWrapper, OrderEnforcingWrapper
 
 import simenv_marl
-from simenv_marl import (
-    TRUNCATED,
-    Definition,
-    SimulationInterface,
-    aec_env,
-    difference,
-    make_step,
-    single_env,
-)
-from simenv_marl.envs import (
-    SimulationAECEnv,
-    SimulationEnv,
-    SimulationJointEnv,
-    SimulationParallelEnv,
-)
+from simenv_marl import TRUNCATED, Definition, SimulationInterface, aec_env, difference, make_step, single_env
+from simenv_marl.envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
 
 from .model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, POT_CAPACITY, Greenhouse
+
+WATERER, VENTILATOR = "waterer_0", "ventilator_0"
 
 DAYS: Final = 100
 """The number of days after which an episode is truncated."""
@@ -104,14 +93,14 @@ def _unit(value: float) -> float:
 
 
 @difference
-def _water_since(greenhouse: Greenhouse) -> float:
+def water_since(greenhouse: Greenhouse) -> float:
     """Litres poured since the previous decision of the agent that gets the reward."""
     return greenhouse.water_use
 
 
 def reward(greenhouse: Greenhouse) -> float:
     """Compute the reward for the day since the agent's previous decision."""
-    return greenhouse.alive / len(greenhouse.pots) - float(_water_since(greenhouse)) / 1000
+    return greenhouse.alive / len(greenhouse.pots) - float(water_since(greenhouse)) / 1000
 
 
 def to_fraction(action: Any) -> float:
@@ -124,10 +113,20 @@ def to_litres(action: Any) -> float:
     return MOST_WATER * to_fraction(action)
 
 
+def from_litres(litres: float) -> list[float]:
+    """Map the litres of the model's rule to the waterer's action."""
+    return [litres / MOST_WATER]
+
+
 def exchange_air(action: Any, greenhouse: Greenhouse) -> None:
     """Exchange the fraction of the air that the ventilator's action says, in place of the model's fixed 20 %."""
     fraction = to_fraction(action)
     greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
+
+
+def usual_exchange(nothing: None, greenhouse: Greenhouse) -> list[float]:
+    """Return the action of the model's rule: a fixed 20 %, which the model's function applies and does not return."""
+    return [0.2]
 
 
 OBSERVATION_SPACE: Final = Box(0.0, 1.0, (len(OBSERVED),), np.float32)
@@ -139,9 +138,9 @@ WATERING: Final[dict[Any, Definition]] = {
         observation_space_mapping=observe,
         action_space=ACTION_SPACE,
         action_space_mapping=to_litres,
-        rule_action_mapping=lambda litres: [litres / MOST_WATER],
+        rule_action_mapping=from_litres,
         reward_mapping=reward,
-        agent="waterer_0",
+        agent=WATERER,
     )
 }
 """The waterer's decision point."""
@@ -152,10 +151,9 @@ VENTILATION: Final[dict[Any, Definition]] = {
         observation_space_mapping=observe,
         action_space=ACTION_SPACE,
         apply=exchange_air,
-        # the rule is a fixed 20 %, which the model's function applies and does not return
-        rule_action_mapping=lambda nothing, greenhouse: [0.2],
+        rule_action_mapping=usual_exchange,
         reward_mapping=reward,
-        agent="ventilator_0",
+        agent=VENTILATOR,
     )
 }
 """The ventilator's decision point."""
@@ -216,76 +214,48 @@ class GreenhouseSim(SimulationInterface):
         return f"day {greenhouse.day} alive: {alive}, dead: {len(greenhouse.pots) - alive}"
 
 
-# -- environments ---------------------------------------------------------------------------------
+# -- environments: their options are those of the library's functions ------------------------------
 
 
 def watering_env(**options: Any) -> SimulationEnv:
-    """Make the environment of the waterer alone, while ventilation follows its rule.
-
-    Args:
-        **options: The options of ``simenv_marl.single_env``.
-    """
+    """Make the environment of the waterer alone, while ventilation follows its rule."""
     return single_env(GreenhouseSim, WATERING, **options)
 
 
 def ventilation_env(**options: Any) -> SimulationEnv:
-    """Make the environment of the ventilator alone, while watering follows its rule.
-
-    Args:
-        **options: The options of ``simenv_marl.single_env``.
-    """
+    """Make the environment of the ventilator alone, while watering follows its rule."""
     return single_env(GreenhouseSim, VENTILATION, **options)
 
 
 def raw_env(**options: Any) -> SimulationAECEnv:
-    """Make the environment of both agents.
-
-    Args:
-        **options: The options of ``simenv_marl.aec_env``.
-    """
+    """Make the environment of both agents."""
     return aec_env(GreenhouseSim, **options)
 
 
 def env(**options: Any) -> OrderEnforcingWrapper[str, Any, Any]:
-    """Make the environment of both agents in PettingZoo's wrappers, which report wrong use and clip actions.
-
-    Args:
-        **options: The options of ``simenv_marl.aec_env``.
-    """
+    """Make the environment of both agents in PettingZoo's wrappers, which report wrong use and clip actions."""
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(raw_env(**options)))
 
 
 def parallel_env(**options: Any) -> SimulationParallelEnv:
-    """Make the parallel environment, in which both agents decide each day without seeing each other's decision.
-
-    Args:
-        **options: The options of ``simenv_marl.parallel_env``.
-    """
+    """Make the parallel environment, in which both agents decide each day without seeing each other's decision."""
     return simenv_marl.parallel_env(GreenhouseSim, **options)
 
 
 def joint_env(**options: Any) -> SimulationJointEnv:
-    """Make the environment of one agent that takes both decisions; ``flatten=True`` makes them one vector.
-
-    Args:
-        **options: The options of ``simenv_marl.joint_env``.
-    """
+    """Make the environment of one agent that takes both decisions; ``flatten=True`` makes them one vector."""
     return simenv_marl.joint_env(GreenhouseSim, **options)
 
 
 def _register() -> None:
     """Register the environments with Gymnasium and PettingZoo, unless they are registered already."""
-    for name, entry_point in (
-        ("Watering", "watering_env"),
-        ("Ventilation", "ventilation_env"),
-        ("Joint", "joint_env"),
-    ):
+    for name in ("Watering", "Ventilation", "Joint"):
         if f"greenhouse_coop/{name}-v0" not in gymnasium.registry:
-            gymnasium.register(f"greenhouse_coop/{name}-v0", f"{__name__}:{entry_point}")
-    for kind, entry_point in (("aec", "env"), ("parallel", "parallel_env")):
+            gymnasium.register(f"greenhouse_coop/{name}-v0", f"{__name__}:{name.lower()}_env")
+    for kind, maker in (("aec", "env"), ("parallel", "parallel_env")):
         known = getattr(pettingzoo, f"{kind}_registry", None)  # missing in the oldest supported PettingZoo
         if known is not None and "greenhouse_coop/coop-v0" not in known:
-            pettingzoo.register(kind, "greenhouse_coop/coop_v0", f"{__name__}:{entry_point}")
+            pettingzoo.register(kind, "greenhouse_coop/coop_v0", f"{__name__}:{maker}")
 
 
 _register()

@@ -28,7 +28,7 @@ sheep eats, the others cannot.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import Any, Final
 
 import numpy as np
@@ -101,15 +101,25 @@ def go(action: Any, sheep: Any) -> None:
     sheep.cell = sheep.cell.connections[DIRECTIONS[action]]
 
 
+def turn(sheep: Any) -> float:
+    """Reward each turn of a life."""
+    return 1.0
+
+
+def name(sheep: Any) -> str:
+    """Name a sheep's agent."""
+    return f"sheep_{sheep.unique_id}"
+
+
 def sheep_moves(sight: int = SIGHT) -> Definition:
     """Define the decision of sheep that see ``sight`` steps far."""
     return make_step(
         observation_space=Box(-1.0, np.inf, (1 + 3 * len(cells(sight)),), np.float32),
-        observation_space_mapping=lambda sheep: look(sheep, sight),
+        observation_space_mapping=partial(look, sight=sight),
         action_space=Discrete(len(DIRECTIONS)),
         apply=go,
-        reward_mapping=lambda sheep: 1.0,
-        agent=lambda sheep: f"sheep_{sheep.unique_id}",
+        reward_mapping=turn,
+        agent=name,
         removed_by="mesa.agent.Agent.remove",  # called for sheep that starve or are eaten
     )
 

@@ -1,0 +1,1 @@
+"""Credit assignment, by branches and by returns."""

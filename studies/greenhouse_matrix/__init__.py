@@ -1,0 +1,1 @@
+"""The paper's matrix of experiments: policies that water, over plants, climates and plugins."""

@@ -1,0 +1,1 @@
+"""Policies that imitate: the model's rule, and a planner."""

@@ -1,0 +1,1 @@
+"""A sweep and a search over the hyperparameters of a learner."""

@@ -1,0 +1,1 @@
+"""Policies of the pension fund, in eight worlds."""

@@ -1,0 +1,1 @@
+"""What one policy for all sheep is worth."""

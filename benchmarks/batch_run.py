@@ -2,8 +2,7 @@
 
 The sweep measures the final inequality, depending on the number of people and on the space: a mean with its interval
 for each combination. The same seeds give the same numbers. A user would write the functions ``by_...``, whose lines are
-counted. Two processes are measured only if this is not pinned to one core: ``python -m benchmarks.core --only
-batch_run``.
+counted.
 """
 
 from __future__ import annotations
@@ -12,21 +11,22 @@ import gc
 import inspect
 import json
 import sys
-import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import partial
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
-from joblib import cpu_count  # type: ignore[import-untyped]
+from joblib.externals.loky import get_reusable_executor
 from mesa.agent import Agent
 from mesa.batchrunner import batch_run
 from mesa.examples.basic.boltzmann_wealth_model.model import BoltzmannWealth
 from pandas import DataFrame
 
-from benchmarks.measure import Contender, Section, alone, now, ratio, side_by_side
+from benchmarks.measure import Contender, Group, MissingError, Row, now, two_cores
 from simenv_marl import SteppedSimulation
 from simenv_marl.experiments import design, run_experiment
 
@@ -36,8 +36,6 @@ STEPS = 100
 
 ABLE = "n" in inspect.signature(BoltzmannWealth).parameters
 """Whether ``batch_run`` can run this model: it cannot in Mesa 3.5, where the model takes a scenario."""
-
-ROUNDS = 11
 
 
 def interval(values: Any) -> Any:
@@ -74,68 +72,54 @@ def by_batch_run_resumed(store: Path) -> Any:
 # -- lines and seconds ----------------------------------------------------------------------------
 
 
-def lines(*written: Any) -> int:
+def lines(*functions: Any) -> int:
     """Count the lines of functions, without empty ones."""
-    return sum(bool(line.strip()) for thing in written for line in inspect.getsource(thing).splitlines())
+    return sum(bool(line.strip()) for function in functions for line in inspect.getsource(function).splitlines())
 
 
-def stored(processes: int = 1) -> Any:
-    """Run the sweep with ``run_experiment``, in a temporary folder."""
-    with tempfile.TemporaryDirectory() as folder:
-        return by_run_experiment(Path(folder), 0 if processes == 1 else processes)
+def sweep(name: str, processes: int, *, start: bool = False) -> Contender:
+    """Make a contender: the seconds of a sweep, of the processor for one process, else of the wall clock.
 
-
-WAYS: dict[str, Callable[[int], Any]] = {"batch_run": by_batch_run, "run_experiment": stored}
-
-
-def taken(way: Callable[[int], Any], processes: int) -> Contender:
-    """Make a contender: the seconds of a sweep, of the processor for one process, else of the wall clock."""
+    With ``start``, joblib's workers of earlier sweeps are ended before, so that new ones have to start.
+    """
     clock = now if processes == 1 else time.perf_counter
 
     def run() -> float:
         Agent._ids.clear()  # where Mesa's agents keep all earlier models alive
         gc.collect()
-        start = clock()
-        way(processes)
-        return clock() - start
+        if start:
+            get_reusable_executor().shutdown(wait=True)
+        with TemporaryDirectory() as folder:
+            begin = clock()
+            if name == "batch_run":
+                by_batch_run(processes)
+            else:
+                by_run_experiment(Path(folder), 0 if processes == 1 else processes)
+            return clock() - begin
 
     return run
 
 
-def in_a_new_process(name: str) -> Contender:
-    """Make a contender: the seconds of two workers, started from a new process."""
-    return lambda: float(alone("batch_run", name))
-
-
-def measure(rounds: int, number: int) -> Section:
-    """Compare both ways.
-
-    Args:
-        rounds: The maximum number of rounds.
-        number: Not used.
-    """
-    section, rounds = Section("A sweep of Mesa's model of wealth", "seconds"), min(rounds, ROUNDS)
-    ours, theirs = lines(by_run_experiment), lines(by_batch_run)
-    section.ratio("lines: run_experiment / batch_run", ours / theirs, 1.0)
-    section.ratio("lines, where a kill loses one run", ours / lines(by_batch_run_resumed), 1.0)
+def groups(number: int) -> Iterator[Group]:
+    """Yield the rows; the number of decisions does not matter, but a smoke test has one seed."""
+    ours, theirs, resumable = map(lines, (by_run_experiment, by_batch_run, by_batch_run_resumed))
+    what = "run_experiment / batch_run"
+    yield Group(
+        [
+            Row(f"{what}, lines", lambda: ours, lambda: theirs, 1.0, unit="lines"),
+            Row(f"{what}, lines, where a kill loses one run", lambda: ours, lambda: resumable, 1.0, unit="lines"),
+        ],
+        most=1,
+    )
     if not ABLE:
-        section.remarks.append("A sweep: this version of Mesa's batch_run cannot run its model of wealth.")
-        return section
-    kinds = {"one process": {name: taken(way, 1) for name, way in WAYS.items()}}
-    if cpu_count() > 1:
-        kinds["two processes, the first sweep of a script"] = {name: in_a_new_process(name) for name in WAYS}
-        kinds["two processes, the next"] = {name: taken(way, 2) for name, way in WAYS.items()}
-    for title, contenders in kinds.items():
-        times = side_by_side(contenders, rounds)
-        section.ratio(f"seconds, {title}: run_experiment / batch_run", ratio(times, "run_experiment", "batch_run"), 1.0)
-        section.times({f"{name}, {title}": found for name, found in times.items()})
-    return section
+        raise MissingError("a version of Mesa whose batch_run can run its model of wealth")
 
+    def seconds(title: str, processes: int, *, start: bool = False) -> Group:
+        ours, theirs = (sweep(name, processes, start=start) for name in ("run_experiment", "batch_run"))
+        return Group([Row(f"{what}, {title}", ours, theirs, 1.0, unit="s")], most=11)
 
-def main() -> None:
-    """Run one way in two processes, and print its seconds."""
-    print(taken(WAYS[sys.argv[1]], 2)())
-
-
-if __name__ == "__main__":
-    main()
+    with patch.object(sys.modules[__name__], "SEEDS", SEEDS[: number // 200]):
+        yield seconds("one process", 1)
+        with two_cores():
+            yield seconds("two processes, first sweep", 2, start=True)
+            yield seconds("two processes, next sweep", 2)

@@ -1,138 +1,91 @@
-"""The cost of a decision in the AEC and the single view, beside their alternatives."""
+"""The cost of a decision in the AEC and the single view, and of a decision function that no environment answers."""
 
 from __future__ import annotations
 
-from statistics import median
+from collections.abc import Iterator
 from typing import Any
 
 from greenlet import getcurrent, greenlet
 from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, OrderEnforcingWrapper
 
-from benchmarks.hand_written import BareEnv, EventEnv, GeneratorEnv, LockEnv, TemplateAECEnv, TemplateEnv
-from benchmarks.measure import Contender, Section, Times, ratio, side_by_side, timed
+from benchmarks.hand_written import BareEnv, EventLock, GeneratorEnv, TemplateAECEnv, TemplateEnv, ThreadEnv, busy_lock
+from benchmarks.measure import Contender, Group, Row, both, calls, timer
 from benchmarks.noop import Alone, AloneBy, Crowd, CrowdBy, Entity, Model, Turns, TurnsBy, aec, single
 from simenv_marl import aec_env, single_env
 
+MANY = 10_000
 
-def measure(rounds: int, number: int) -> Section:
-    """Measure in a number of rounds, with a number of decisions of each contender."""
+
+def groups(number: int) -> Iterator[Group]:
+    """Yield the rows, with a number of decisions of each contender."""
     model = Model()
-    plain = Model.left.__wrapped__  # type: ignore[attr-defined]
-    outside = side_by_side(
-        {
-            "loop": timed(_nothing, number),
-            "plain": calls(plain, model, number),
-            "decision": calls(Model.left, model, number),
-        },
-        rounds,
+    plain = calls_alone(Model.left.__wrapped__, model, number)
+    decision = calls_alone(Model.left, model, number)
+    yield Group([Row("a decision function outside any environment / the plain function", decision, plain, 2.5, 2.1)])
+
+    env: Any = single_env(Alone, Model.left)
+    env.reset(seed=0)
+    yield Group([Row("the same on its caller's stack, while an environment is in an episode", decision, plain)])
+    env.close()
+
+    greenlets = calls(echo().switch, number, 1)
+    template, crossing = single(TemplateEnv(), number), "template + one greenlet round trip"
+    template_aec = aec(TemplateAECEnv(), number)
+    wrapped = aec(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(TemplateAECEnv())), number)
+    least, least_aec = both(template, greenlets), both(template_aec, greenlets)
+    bare, generator = both(single(BareEnv(), number), greenlets), single(GeneratorEnv(), number)
+    threads = [ThreadEnv(busy_lock), ThreadEnv(EventLock)]
+    by_lock, by_event = (single(thread, number // 10) for thread in threads)
+
+    turns = aec(aec_env(Turns, [Model.left, Model.right]), number)
+    turns_by = aec(aec_env(TurnsBy, [Model.left_by, Model.right_by]), number)
+    entities = aec(aec_env(Crowd(2), Entity.decide), number)
+    entities_by = aec(aec_env(CrowdBy(2), Entity.decide_by), number)
+    many = min(MANY, number)
+    of_many = aec(aec_env(Crowd(many), Entity.decide), number)
+    alone = single(single_env(Alone, Model.left), number)
+    alone_by = single(single_env(AloneBy, Model.left_by), number)
+    yield Group(
+        [
+            Row(f"AEC / {crossing}", turns, least_aec, 1.55, 1.45),
+            Row(f"AEC, another argument / {crossing}", turns_by, least_aec),
+            Row(f"AEC, entities / {crossing}", entities, least_aec),
+            Row(f"AEC, entities, another argument / {crossing}", entities_by, least_aec, 1.7, 1.55),
+            Row("AEC / template", turns, template_aec),
+            Row("AEC / template in two wrappers", turns, wrapped),
+            Row("AEC / one greenlet round trip", turns, greenlets),
+            Row(f"AEC, entities: {MANY:,} / 2", of_many, entities, 1.2, 1.1),
+            Row(f"single / {crossing}", alone, least, 2.6, 2.3),
+            Row(f"single, another argument / {crossing}", alone_by, least, 2.7, 2.3),
+            Row("single / bare + one greenlet round trip", alone, bare),
+            Row("single / template", alone, template),
+            Row("single / generator", alone, generator),
+            Row("single beside thread and Lock", alone, by_lock, faster=True),
+            Row("single beside thread and Event", alone, by_event, faster=True),
+        ]
     )
-    wrapped = OrderEnforcingWrapper(AssertOutOfBoundsWrapper(TemplateAECEnv()))
-    threads = {"thread + Event": EventEnv(), "thread + Lock": LockEnv()}
-    times = side_by_side(
-        {
-            "greenlet": round_trip(number),
-            "template AEC": aec(TemplateAECEnv(), number),
-            "template AEC, wrapped": aec(wrapped, number),
-            "AEC": aec(aec_env(Turns, [Model.left, Model.right]), number),
-            "AEC, with another argument": aec(aec_env(TurnsBy, [Model.left_by, Model.right_by]), number),
-            "AEC, entities, 2": aec(aec_env(Crowd(2), Entity.decide), number),
-            "AEC, entities, 2, with another argument": aec(aec_env(CrowdBy(2), Entity.decide_by), number),
-            "AEC, entities, 10,000": aec(aec_env(Crowd(10_000), Entity.decide), number),
-            "template": single(TemplateEnv(), number),
-            "bare": single(BareEnv(), number),
-            "single": single(single_env(Alone, Model.left), number),
-            "single, with another argument": single(single_env(AloneBy, Model.left_by), number),
-            "generator": single(GeneratorEnv(), number),
-            **{name: single(env, number // 10) for name, env in threads.items()},
-        },
-        rounds,
-    )
-    for env in threads.values():
-        env.close()
-    dead = side_by_side(
-        {str(agents): dead_steps(aec_env(Crowd(agents, rounds=1), Entity.decide), agents) for agents in (100, 10_000)},
-        max(3, rounds // 5),
-    )
-    return _tell(outside, times, dead)
+    for thread in threads:
+        thread.close()
+
+    few = min(100, many // 2)
+    dead_many = dead_steps(aec_env(Crowd(many, rounds=1), Entity.decide), many)
+    dead_few = dead_steps(aec_env(Crowd(few, rounds=1), Entity.decide), few)
+    yield Group([Row(f"AEC, a dead agent's step, entities: {MANY:,} / 100", dead_many, dead_few, 1.2, 1.1)], most=6)
 
 
-def _tell(outside: Times, times: Times, dead: Times) -> Section:
-    section = Section("Decisions", "microseconds per decision")
-    crossing = ("template AEC", "greenlet")
-    section.ratio(
-        "AEC, 2 agents: ours / (template + one greenlet round trip)", ratio(times, "AEC", *crossing), bar=1.55, aim=1.45
-    )
-    section.ratio(
-        "AEC, 2 agents, another argument, named by a callable: ours / (template + greenlet)",
-        ratio(times, "AEC, entities, 2, with another argument", *crossing),
-        bar=1.7,
-        aim=1.55,
-    )
-    section.ratio(
-        "AEC, 2 agents, another argument: ours / (template + greenlet)",
-        ratio(times, "AEC, with another argument", *crossing),
-    )
-    section.ratio(
-        "AEC, 2 agents, named by a callable: ours / (template + greenlet)",
-        ratio(times, "AEC, entities, 2", *crossing),
-    )
-    section.ratio(
-        "AEC: 10,000 agents / 2 agents (entity-level)",
-        ratio(times, "AEC, entities, 10,000", "AEC, entities, 2"),
-        bar=1.2,
-        aim=1.1,
-    )
-    section.ratio("AEC: a dead agent's step, 10,000 agents / 100 agents", ratio(dead, "10000", "100"), bar=1.2, aim=1.1)
-    section.ratio(
-        "single: ours / (template + one greenlet round trip)",
-        ratio(times, "single", "template", "greenlet"),
-        bar=2.6,
-        aim=2.3,
-    )
-    section.ratio(
-        "single, another argument: ours / (template + greenlet)",
-        ratio(times, "single, with another argument", "template", "greenlet"),
-        bar=2.7,
-        aim=2.3,
-    )
-    section.ratio(
-        "single: ours / (barest possible environment + one greenlet round trip)",
-        ratio(times, "single", "bare", "greenlet"),
-    )
-    section.ratio(
-        "a decision function outside any environment / the plain function",
-        ratio(_without_loop(outside), "decision", "plain"),
-        bar=2.5,
-        aim=2.1,
-    )
-    section.times(times)
-    section.time("AEC, a dead agent's step, of 100", median(dead["100"]))
-    section.time("AEC, a dead agent's step, of 10,000", median(dead["10000"]))
-    alone = _without_loop(outside)
-    section.time("plain function, without the loop around it", median(alone["plain"]))
-    section.time("decision function outside any environment", median(alone["decision"]))
-    return section
+def calls_alone(function: Any, argument: Any, number: int) -> Contender:
+    """Make a contender of calls with one argument, without the time of the loop around them."""
 
+    def idle(number: int) -> None:
+        for _ in range(number):
+            pass
 
-def _without_loop(outside: Times) -> Times:
-    return {
-        name: [time - loop for time, loop in zip(outside[name], outside["loop"], strict=True)]
-        for name in ("plain", "decision")
-    }
-
-
-# -- contenders -----------------------------------------------------------------------------------
+    loop_and_calls, loop = calls(function, number, argument), timer(idle, number)
+    return lambda: max(loop_and_calls() - loop(), 1e-6)
 
 
 def dead_steps(env: Any, agents: int) -> Contender:
     """Make a contender of ``last`` and ``step`` of agents whose episode has ended."""
-
-    def prepare_and_run() -> float:
-        env.reset(seed=0)
-        for _ in range(agents):
-            env.step(1)
-        assert all(env.terminations.values())
-        return timed(loop, agents)()
 
     def loop(number: int) -> None:
         last, step = env.last, env.step
@@ -140,44 +93,24 @@ def dead_steps(env: Any, agents: int) -> Contender:
             last()
             step(None)
 
-    return prepare_and_run
+    def run() -> float:
+        env.reset(seed=0)
+        for _ in range(agents):
+            env.step(1)
+        assert all(env.terminations.values())
+        return timer(loop, agents)()
+
+    return run
 
 
-def bare_greenlet() -> Any:
-    """Make a greenlet that only switches back; it waits for its first ``switch``."""
+def echo() -> Any:
+    """Make a greenlet that only switches back."""
 
-    def loop_in_greenlet() -> None:
+    def loop() -> None:
         back = getcurrent().parent.switch
         while True:
             back(1)
 
-    other = greenlet(loop_in_greenlet)
+    other = greenlet(loop)
     other.switch()
     return other
-
-
-def round_trip(number: int) -> Contender:
-    """Make a contender of switches to a bare greenlet and back."""
-    other = bare_greenlet()
-
-    def loop(number: int) -> None:
-        switch = other.switch
-        for _ in range(number):
-            switch(1)
-
-    return timed(loop, number)
-
-
-def _nothing(number: int) -> None:
-    for _ in range(number):
-        pass
-
-
-def calls(function: Any, argument: Any, number: int) -> Contender:
-    """Make a contender of calls of a function with one argument."""
-
-    def loop(number: int) -> None:
-        for _ in range(number):
-            function(argument)
-
-    return timed(loop, number)

@@ -1,84 +1,48 @@
 """The cost of a decision with a clock, with a plugin that is not called, and beside other objects in the process.
 
-Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only extras``. Each extra has a separate
-process: a ``difference`` stays once it is made, and the features of one environment may slow down its neighbours.
+Each figure comes from a process of its own: a ``difference`` stays once it is made, and the features of one environment
+may slow down its neighbours. The processes take turns.
 """
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
-from benchmarks.measure import Elsewhere, Section, Times, ratio, serve, side_by_side
-from benchmarks.noop import DEFINITION, Alone, Model, Turns, aec, single
+from benchmarks.measure import Contender, Group, Row, alone
+from benchmarks.noop import DEFINITION, Alone, Model, Turns, aec
 from simenv_marl import aec_env, difference, make_step, single_env
-from simenv_marl.plugins import expose_to_plugins
-
-GENERATIONS = 5
-"""How often the processes are restarted, because two equal processes differ by some per cent."""
 
 NEIGHBOURS = 1_000
 """The number of other environments or decision points."""
 
+REPEATS = 5
 
-class TimedTurns(Turns):
+
+class ClockTurns(Turns):
     """Two agents, whose simulation has a clock."""
 
     def time(self) -> float:
         return 1.0
 
 
-class TimedAlone(Alone):
-    """One agent, whose simulation has a clock."""
-
-    def time(self) -> float:
-        return 1.0
-
-
-@expose_to_plugins
-def idle() -> None:
-    """A function of the model that is not called during the measurement."""
-
-
-def nothing() -> None:
+def nothing(model: Model) -> None:
     """Handle nothing."""
 
 
-def plain() -> dict[str, Any]:
-    return views()
-
-
-def clock() -> dict[str, Any]:
-    return views(TimedTurns, TimedAlone)
-
-
-def plugin() -> dict[str, Any]:
-    return views(plugins=[(nothing, idle, "before")])
-
-
-def elsewhere() -> dict[str, Any]:
-    """Views beside a ``difference`` of another environment, which is in mid-episode."""
-    rewarded = make_step(**DEFINITION | {"reward_mapping": difference(lambda model: 1.0)})
-    other = single_env(Alone, {Model.left: rewarded})
-    other.reset(seed=0)
-    return {**views(), "others": other}
-
-
-def environments() -> dict[str, Any]:
-    """Views beside very many other environments in mid-episode."""
-    others = [single_env(Alone, Model.left) for _ in range(NEIGHBOURS)]
-    for env in others:
-        env.reset(seed=0)
-    return {**views(), "others": others}
-
-
-def points() -> dict[str, Any]:
-    """Views beside very many other decision points."""
-    return {**views(), "others": [other_point(number) for number in range(NEIGHBOURS)]}
+def other_environment(step: Any = Model.left) -> Any:
+    """Make an environment in mid-episode."""
+    env = single_env(Alone, step)
+    env.reset(seed=0)
+    return env
 
 
 def other_point(number: int) -> Any:
+    """Make a decision point."""
+
     def decide(model: Any) -> int:
         return 0
 
@@ -86,55 +50,52 @@ def other_point(number: int) -> Any:
     return make_step(**DEFINITION)(decide)
 
 
-def views(turns: type = Turns, alone: type = Alone, **options: Any) -> dict[str, Any]:
-    """Make an AEC and a single environment of the no-op simulation."""
-    return {
-        "AEC": aec_env(turns, [Model.left, Model.right], **options),
-        "single": single_env(alone, Model.left, **options),
-    }
-
-
-EXTRAS: dict[str, Callable[[], dict[str, Any]]] = {
-    "without": plain,
-    "with a clock": clock,
-    "with an idle plugin": plugin,
-    "with a difference elsewhere": elsewhere,
-    f"with {NEIGHBOURS:,} other environments": environments,
-    f"with {NEIGHBOURS:,} other decision points": points,
+POINTS = [Model.left, Model.right]
+EXTRAS: dict[str, Callable[[], tuple[Any, Any]]] = {
+    "without": lambda: (aec_env(Turns, POINTS), None),
+    "a clock": lambda: (aec_env(ClockTurns, POINTS), None),
+    "an idle plugin": lambda: (aec_env(Turns, POINTS, plugins=[(nothing, f"{__name__}.idle", "before")]), None),
+    "a difference elsewhere": lambda: (
+        aec_env(Turns, POINTS),
+        other_environment({Model.left: make_step(**DEFINITION | {"reward_mapping": difference(lambda model: 1.0)})}),
+    ),
+    f"{NEIGHBOURS:,} other environments": lambda: (
+        aec_env(Turns, POINTS),
+        [other_environment() for _ in range(NEIGHBOURS)],
+    ),
+    f"{NEIGHBOURS:,} other decision points": lambda: (
+        aec_env(Turns, POINTS),
+        [other_point(number) for number in range(NEIGHBOURS)],
+    ),
 }
-HELD = ("AEC, with a clock", "AEC, with an idle plugin", "AEC, with a difference elsewhere")
+"""Functions that make the environment to measure, and what stands beside it."""
+
+LIMITS = {"a clock": (1.08, 1.04), "an idle plugin": (1.08, 1.04), "a difference elsewhere": (1.08, 1.04)}
 
 
-def measure(rounds: int, number: int) -> Section:
-    """Measure in a number of rounds, with a number of decisions of each contender."""
-    times: Times = {}
-    generations = min(GENERATIONS, rounds)
-    for _ in range(generations):
-        processes = {extra: Elsewhere(__name__, extra, str(number)) for extra in EXTRAS}
-        contenders = {
-            f"{view}, {extra}": process.contender(view)
-            for view in ("AEC", "single")
-            for extra, process in processes.items()
-        }
-        for name, values in side_by_side(contenders, max(rounds // generations, 1)).items():
-            times.setdefault(name, []).extend(values)
-        for process in processes.values():
-            process.close()
-    section = Section("Additional features in use", "microseconds per decision")
-    for name in times:
-        view, _, extra = name.partition(", ")
-        if extra != "without":
-            limits = (1.08, 1.04) if name in HELD else ()
-            section.ratio(f"{name} / without", ratio(times, name, f"{view}, without"), *limits)
-    section.times(times)
-    return section
+def idle(model: Model) -> None:
+    """A function of the model that is not called during the measurement."""
 
 
-def main(extra: str, number: int) -> None:
-    """Measure one extra in this process, on request."""
-    made = EXTRAS[extra]()
-    serve({"AEC": aec(made["AEC"], number), "single": single(made["single"], number)})
+def groups(number: int) -> Iterator[Group]:
+    """Yield the rows, with a number of decisions of each contender."""
+    without, *others = ((extra, apart(extra, number)) for extra in EXTRAS)
+    yield Group(
+        [Row(f"AEC, {extra} / without", run, without[1], *LIMITS.get(extra, ())) for extra, run in others], most=9
+    )
+
+
+def apart(extra: str, number: int) -> Contender:
+    """Make a contender that measures an extra in a new process; for a smoke test, this one will do."""
+    return partial(measure, extra, number) if number < 1_000 else partial(alone, "extras", extra, str(number))
+
+
+def measure(extra: str, number: int) -> float:
+    """Measure the microseconds of a decision in this process, in the quickest of some repeats."""
+    env, _beside = EXTRAS[extra]()
+    run = aec(env, number)
+    return min(run() for _ in range(REPEATS))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    print(json.dumps(measure(sys.argv[1], int(sys.argv[2]))))

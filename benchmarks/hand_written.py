@@ -8,7 +8,7 @@ without an end, with an observation of four float32 and a reward of 1.0.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -149,72 +149,49 @@ class GeneratorEnv(TemplateEnv):
 
 
 class ThreadEnv(TemplateEnv):
-    """The simulation runs in a thread and alternates with its user."""
+    """The simulation runs in a thread and alternates with its user, by two locks."""
+
+    def __init__(self, lock: Callable[[], Any]) -> None:
+        super().__init__()
+        self.action_arrives, self.observation_arrives = lock(), lock()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.over = False
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
-        self._wait_for_simulation()
+        self.observation_arrives.acquire()
         return self.observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.action = action
-        self._wake_simulation()
-        self._wait_for_simulation()
+        self.action_arrives.release()
+        self.observation_arrives.acquire()
         return self.observation, 1.0, False, False, {}
 
     def _run(self) -> None:
         while not self.over:
             self.observation = self.model.observe()
-            self._wake_user()
-            self._wait_for_user()
+            self.observation_arrives.release()
+            self.action_arrives.acquire()
 
     def close(self) -> None:
         self.over = True
-        self._wake_simulation()
+        self.action_arrives.release()
         self.thread.join()
 
 
-class EventEnv(ThreadEnv):
-    """Alternation by two events, as in the original Sim-Env."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.decided, self.arisen = threading.Event(), threading.Event()
-
-    def _wake_simulation(self) -> None:
-        self.decided.set()
-
-    def _wait_for_simulation(self) -> None:
-        self.arisen.wait()
-        self.arisen.clear()
-
-    def _wake_user(self) -> None:
-        self.arisen.set()
-
-    def _wait_for_user(self) -> None:
-        self.decided.wait()
-        self.decided.clear()
+def busy_lock() -> threading.Lock:
+    """Make a lock that its next user has to wait for."""
+    lock = threading.Lock()
+    lock.acquire()
+    return lock
 
 
-class LockEnv(ThreadEnv):
-    """Alternation by two locks."""
+class EventLock(threading.Event):
+    """An event that is used like such a lock, as in the original Sim-Env."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.decided, self.arisen = threading.Lock(), threading.Lock()
-        self.decided.acquire()
-        self.arisen.acquire()
+    release = threading.Event.set
 
-    def _wake_simulation(self) -> None:
-        self.decided.release()
-
-    def _wait_for_simulation(self) -> None:
-        self.arisen.acquire()
-
-    def _wake_user(self) -> None:
-        self.arisen.release()
-
-    def _wait_for_user(self) -> None:
-        self.decided.acquire()
+    def acquire(self) -> None:
+        self.wait()
+        self.clear()

@@ -1,13 +1,14 @@
-"""Measuring side by side: all contenders in turn, many rounds, medians of the ratios within a round.
+"""Measuring side by side: all contenders of a group in turn, many rounds, medians of the ratios within a round.
 
 A machine that is slow for a while is slow for all contenders of a round, so ratios are reliable where times are not.
-Times are processor times of all threads of a process, or wall-clock times where processes share the work.
+Times are processor times of all threads of this process, or wall-clock times where processes share the work.
 """
 
 from __future__ import annotations
 
 import gc
 import json
+import os
 import platform
 import statistics
 import subprocess
@@ -20,25 +21,133 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 Contender = Callable[[], float]
-"""Runs once; returns microseconds per decision (or another quantity to compare)."""
+"""Runs once; returns microseconds per decision, or another quantity."""
 
-Times = dict[str, list[float]]
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("greenlet", "gymnasium", "pettingzoo", "mesa", "numpy")
+
+COLUMNS = {"section": 10, "row": 70, "unit": 5, "candidate": 9, "baseline": 9, "ratio": 20, "bar": 6, "aim": 6}
+"""The columns of the table but the last, and their widths on a terminal."""
 
 now = time.process_time
 """The clock of all contenders except those of several processes; it does not count other programs on the machine."""
 
-ROOT = Path(__file__).parent.parent
 
-COLUMNS = ["what", "ratio", "bar", "aim", "reached"]
+@dataclass(frozen=True)
+class Row:
+    """One comparison.
 
-PACKAGES = ("greenlet", "gymnasium", "pettingzoo", "mesa", "numpy")
+    Attributes:
+        name: What is compared with what.
+        candidate, baseline: The contenders. Without a baseline, the figure is the candidate's own.
+        bar, aim: The project's limit for the ratio, and its better target; None for neither.
+        faster: Whether the ratio is that of the speeds, where more is better; else it is that of the times.
+        unit: The unit of what the contenders return.
+    """
+
+    name: str
+    candidate: Contender
+    baseline: Contender | None = None
+    bar: float | None = None
+    aim: float | None = None
+    faster: bool = False
+    unit: str = "µs"
 
 
-def timed(loop: Callable[[int], None], number: int, clock: Callable[[], float] = now) -> Contender:
+@dataclass(frozen=True)
+class Group:
+    """Rows of a section that are measured in the same rounds.
+
+    Attributes:
+        rows: The rows. Contenders that several rows share run once in each round.
+        most: The largest number of rounds that is worth its time.
+    """
+
+    rows: list[Row]
+    most: int = 1_000
+
+
+class MissingError(Exception):
+    """The rest of a section cannot be measured here; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What was measured for a row: medians over the rounds of the ratio, of the candidate and of the baseline."""
+
+    row: Row
+    ratio: float
+    candidate: float
+    baseline: float | None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the ratio reaches the aim, the bar or neither."""
+        sign = -1 if self.row.faster else 1
+        for word, limit in (("aim", self.row.aim), ("bar", self.row.bar)):
+            if limit is not None and sign * self.ratio <= sign * limit:
+                return word
+        return "" if self.row.bar is None else "missed"
+
+    def cells(self) -> list[str]:
+        """Return the cells of the table's line."""
+        sign = "≥" if self.row.faster else "≤"
+        limits = ["" if limit is None else f"{sign} {limit:g}" for limit in (self.row.bar, self.row.aim)]
+        baseline = "" if self.baseline is None else _number(self.baseline)
+        ratio = f"{_number(self.ratio)} times as fast" if self.row.faster else _number(self.ratio)
+        return [self.row.name, self.row.unit, _number(self.candidate), baseline, ratio, *limits, self.verdict]
+
+
+def measure(group: Group, rounds: int, *, warm_up: bool = True) -> list[Figure]:
+    """Run all contenders of a group in turn for a number of rounds, after one that does not count."""
+    pairs = [contender for row in group.rows for contender in (row.baseline, row.candidate)]
+    values: dict[Contender, list[float]] = {contender: [] for contender in pairs if contender is not None}
+    with _without_collections():
+        for number in range(-warm_up, min(rounds, group.most)):
+            for contender, found in values.items():
+                value = contender()
+                if number >= 0:
+                    found.append(value)
+    return [_figure(row, values) for row in group.rows]
+
+
+def _figure(row: Row, values: Mapping[Contender, list[float]]) -> Figure:
+    ours = values[row.candidate]
+    theirs = [1.0] * len(ours) if row.baseline is None else values[row.baseline]
+    ratios = [base / own if row.faster else own / base for own, base in zip(ours, theirs, strict=True)]
+    ratio = statistics.median(ratios)
+    return Figure(
+        row,
+        round(ratio, _digits(ratio)),
+        statistics.median(ours),
+        None if row.baseline is None else statistics.median(theirs),
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:,.{_digits(value)}f}"
+
+
+def _digits(value: float) -> int:
+    return 2 if abs(value) >= 0.1 else 3
+
+
+@contextmanager
+def _without_collections() -> Iterator[None]:
+    """Disable garbage collection, which would hit some contenders and not others."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+# -- contenders -----------------------------------------------------------------------------------
+
+
+def timer(loop: Callable[[int], None], number: int, clock: Callable[[], float] = now) -> Contender:
     """Make a contender from a loop that takes the number of iterations."""
 
     def run() -> float:
@@ -49,234 +158,122 @@ def timed(loop: Callable[[int], None], number: int, clock: Callable[[], float] =
     return run
 
 
+def both(*contenders: Contender) -> Contender:
+    """Make a contender whose time is the sum of those of others."""
+    return lambda: sum(contender() for contender in contenders)
+
+
+def calls(function: Callable[..., Any], number: int, *args: Any) -> Contender:
+    """Make a contender of calls of a function with at most one argument."""
+
+    def loop(number: int) -> None:
+        for _ in range(number):
+            function()
+
+    def loop_of_one(number: int) -> None:
+        (arg,) = args
+        for _ in range(number):
+            function(arg)
+
+    return timer(loop_of_one if args else loop, number)
+
+
+def alone(section: str, *arguments: str) -> Any:
+    """Measure something in a new process, which runs a section's module and prints JSON."""
+    command = [sys.executable, "-m", f"benchmarks.{section}", *arguments]
+    return json.loads(subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout)
+
+
+# -- cores ----------------------------------------------------------------------------------------
+
+
+_cores: list[int] = []
+"""The cores that rows may use."""
+
+
+def pin(most: int) -> None:
+    """Keep this process and those that it starts on one core, and let some rows use more, where that is possible."""
+    if hasattr(os, "sched_getaffinity"):
+        _cores[:] = sorted(os.sched_getaffinity(0))[:most]
+        os.sched_setaffinity(0, _cores[:1])
+
+
 @contextmanager
-def without_collections() -> Iterator[None]:
-    """Disable garbage collection, which would hit some contenders and not others."""
-    gc.collect()
-    gc.disable()
+def two_cores() -> Iterator[None]:
+    """Let this process and those that it starts use two cores.
+
+    Raises:
+        MissingError: There are not two.
+    """
+    if len(_cores) < 2:
+        raise MissingError("two cores")
+    os.sched_setaffinity(0, _cores)
     try:
         yield
     finally:
-        gc.enable()
+        os.sched_setaffinity(0, _cores[:1])
 
 
-def side_by_side(contenders: Mapping[str, Contender], rounds: int) -> Times:
-    """Run all contenders in turn for a number of rounds, after one warm-up round."""
-    times: Times = {name: [] for name in contenders}
-    with without_collections():
-        for number in range(rounds + 1):
-            for name, contender in contenders.items():
-                figure = contender()
-                if number:
-                    times[name].append(figure)
-    return times
+# -- the table ------------------------------------------------------------------------------------
 
 
-def ratio(times: Times, over: str, *under: str) -> float:
-    """Compute the median over rounds of one contender's time divided by the sum of others' times."""
-    sums = zip(*(times[name] for name in under), strict=True)
-    return statistics.median(top / sum(bottom) for top, bottom in zip(times[over], sums, strict=True))
-
-
-class Elsewhere:
-    """Contenders in another process, which take turns like all others.
-
-    This is for effects on everything else in a process. The other process runs a module that calls ``serve``.
-    """
-
-    def __init__(self, module: str, *arguments: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-
-    def contender(self, name: str) -> Contender:
-        """Make a contender from the one of this name in the other process."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        asking, told = self._process.stdin, self._process.stdout
-
-        def run() -> float:
-            print(name, file=asking, flush=True)
-            return float(told.readline())
-
-        return run
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.communicate()
-
-
-def alone(section: str, *arguments: str, cores: str | None = None) -> Any:
-    """Measure something in a new process, which runs a section's module and prints JSON."""
-    command = [sys.executable, "-m", f"benchmarks.{section}", *arguments]
-    if cores is not None:
-        command = ["taskset", "-c", cores, *command]
-    done = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(done.stdout)
-
-
-def serve(contenders: Mapping[str, Contender]) -> None:
-    """Run the contenders whose names arrive on standard input: the other side of ``Elsewhere``."""
-    with without_collections():
-        for line in sys.stdin:
-            print(contenders[line.strip()](), flush=True)
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One ratio, or another quantity with a target.
+class Table:
+    """The one table of all figures: lines on the terminal as they are found, then Markdown and JSON.
 
     Attributes:
-        what: The description.
-        value: The value, rounded to ``digits``.
-        bar, aim: The project's limit, and its better target; None for neither.
-        digits: The number of decimals.
-        at_least: Whether higher values are better; else lower ones are.
+        figures: The figures of each section.
+        remarks: What was not measured, and why.
     """
 
-    what: str
-    value: float
-    bar: float | None
-    aim: float | None
-    digits: int
-    at_least: bool
-
-    @property
-    def verdict(self) -> str:
-        """Whether the value reaches the aim, the bar or neither."""
-        sign = -1 if self.at_least else 1
-        if self.bar is None:
-            return ""
-        if self.aim is not None and sign * self.value <= sign * self.aim:
-            return "aim"
-        return "bar" if sign * self.value <= sign * self.bar else "missed"
-
-    def row(self) -> list[str]:
-        """Return the row of a table."""
-        sign = "≥" if self.at_least else "≤"
-        limits = ["" if limit is None else f"{sign} {limit:g}" for limit in (self.bar, self.aim)]
-        return [self.what, f"{self.value:.{self.digits}f}", *limits, self.verdict]
-
-
-class Section:
-    """The results of one module: ratios, with the project's limits, and the times behind them.
-
-    Attributes:
-        title: The title.
-        unit: The unit of the times.
-        ratios: The rows of the first table.
-        medians: The rows of the second table: times by their description.
-        remarks: Additional remarks.
-    """
-
-    def __init__(self, title: str, unit: str) -> None:
-        self.title, self.unit = title, unit
-        self.ratios: list[Figure] = []
-        self.medians: dict[str, float] = {}
+    def __init__(self, rounds: int) -> None:
+        self.figures: dict[str, list[Figure]] = {}
         self.remarks: list[str] = []
-
-    def ratio(
-        self,
-        what: str,
-        value: float,
-        bar: float | None = None,
-        aim: float | None = None,
-        digits: int = 2,
-        *,
-        at_least: bool = False,
-    ) -> None:
-        """Add a ratio, with its bar (the limit) and its aim (the better target), if it has them."""
-        self.ratios.append(Figure(what, round(value, digits), bar, aim, digits, at_least))
-
-    def time(self, what: str, value: float) -> None:
-        """Add a time."""
-        self.medians[what] = value
-
-    def times(self, times: Times) -> None:
-        """Add the medians of measured times."""
-        for name, values in times.items():
-            self.time(name, statistics.median(values))
-
-
-class Report:
-    """The report: the same tables for the terminal and in Markdown, and JSON for programs."""
-
-    def __init__(self, title: str) -> None:
-        self._console = Console()
-        self._sections: list[Section] = []
         packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
-        self._made_with = (
-            f"Measured with CPython {platform.python_version()} on {platform.machine()} ({_processor()}), one core,"
-            f" {packages}."
+        self._heading = (
+            f"Measured with CPython {platform.python_version()} on {platform.machine()} ({_processor()}), {packages};"
+            f" rounds: {rounds} at most."
         )
-        self._console.rule(title)
-        self._console.print(self._made_with)
+        print(self._heading, *_lines([], list(COLUMNS.values())), sep="\n", flush=True)
 
-    @property
-    def times(self) -> dict[str, float]:
-        """All times so far, by their description."""
-        return {what: time for section in self._sections for what, time in section.medians.items()}
+    def add(self, section: str, figures: list[Figure]) -> None:
+        """Add figures, and print them."""
+        self.figures.setdefault(section, []).extend(figures)
+        for line in _lines([(section, figures)], list(COLUMNS.values()))[2:]:
+            print(line, flush=True)
 
-    def add(self, section: Section) -> None:
-        """Add a section, and print its results."""
-        self._sections.append(section)
-        for table in _tables(section):
-            self._print(*table)
-        for remark in section.remarks:
-            self._console.print(remark)
-
-    def conclude(self) -> None:
-        """Print all figures that have a bar."""
-        self._print(*self._held())
-
-    def _held(self) -> tuple[str, list[str], list[list[str]]]:
-        figures = [figure for section in self._sections for figure in section.ratios if figure.bar is not None]
-        return "Targets of the project", COLUMNS, [figure.row() for figure in figures]
-
-    def _print(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
-        table = Table(*columns, title=title)
-        for row in rows:
-            table.add_row(*row)
-        self._console.print(table)
+    def remark(self, text: str) -> None:
+        """Add a remark, and print it."""
+        self.remarks.append(text)
+        print(text, flush=True)
 
     def write(self, path: Path) -> None:
-        """Write the tables in Markdown."""
-        lines = [self._made_with, *_markdown(*self._held())]
-        for section in self._sections:
-            for table in _tables(section):
-                lines += _markdown(*table)
-            for remark in section.remarks:
-                lines += ["", remark]
+        """Write the table in Markdown."""
+        lines = [self._heading, "", *_lines(list(self.figures.items()), [0] * len(COLUMNS))]
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        path.write_text("\n".join([*lines, *(f"\n{remark}" for remark in self.remarks)]) + "\n", encoding="utf-8")
 
     def dump(self, path: Path) -> None:
-        """Write all ratios and times as JSON, by section and description."""
+        """Write all figures as JSON, by section and row."""
         figures = {
-            section.title: {
-                "ratios": {figure.what: figure.value for figure in section.ratios},
-                "times": section.medians,
+            section: {
+                figure.row.name: {
+                    "ratio": figure.ratio,
+                    "candidate": figure.candidate,
+                    "baseline": figure.baseline,
+                    "unit": figure.row.unit,
+                }
+                for figure in found
             }
-            for section in self._sections
+            for section, found in self.figures.items()
         }
         path.write_text(json.dumps(figures, indent=1), encoding="utf-8")
 
 
-def _tables(section: Section) -> Iterator[tuple[str, list[str], list[list[str]]]]:
-    """Yield title, columns and rows of a section's tables."""
-    if section.ratios:
-        yield f"{section.title}: ratios", COLUMNS, [figure.row() for figure in section.ratios]
-    rows = [[what, f"{value:.2f}" if value >= 0.1 else f"{value:.3f}"] for what, value in section.medians.items()]
-    yield f"{section.title}: {section.unit}", ["what", "time"], rows
-
-
-def _markdown(title: str, columns: list[str], rows: list[list[str]]) -> list[str]:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return ["", f"**{title}**", "", *(f"| {' | '.join(line)} |" for line in lines)]
+def _lines(sections: list[tuple[str, list[Figure]]], widths: list[int]) -> list[str]:
+    """Return the lines of a Markdown table, with columns at least as wide as given."""
+    rows = [[section, *figure.cells()] for section, figures in sections for figure in figures]
+    cells = [[*COLUMNS, "reached"], ["---"] * (len(COLUMNS) + 1), *rows]
+    return [f"| {' | '.join(map(str.ljust, row, [*widths, 0]))} |" for row in cells]
 
 
 def _processor() -> str:

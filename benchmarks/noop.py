@@ -1,14 +1,17 @@
-"""No-op simulations, so that only the overhead remains, and loops over their environments."""
+"""No-op simulations, so that only the overhead remains, and contenders that run their environments."""
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE, State
-from benchmarks.measure import Contender, timed
-from simenv_marl import make_step
+from benchmarks.measure import Contender, now, timer
+from simenv_marl import RULE, make_step
 
 DEFINITION: dict[str, Any] = {
     "observation_space": OBSERVATION_SPACE,
@@ -77,20 +80,6 @@ class Alone(Turns):
             model.left()
 
 
-class Busy(Alone):
-    """One agent, whose simulation takes processor time."""
-
-    nanoseconds = 0
-
-    def run(self) -> None:
-        model, clock = self.model, time.thread_time_ns
-        while True:
-            until = clock() + self.nanoseconds
-            while clock() < until:
-                pass
-            model.left()
-
-
 class AloneBy(Turns):
     """The same, with an argument."""
 
@@ -98,6 +87,25 @@ class AloneBy(Turns):
         model = self.model
         while True:
             model.left_by(1.0)
+
+
+class Busy(Alone):
+    """One agent, whose simulation takes processor time."""
+
+    seconds = 0.0
+
+    def run(self) -> None:
+        while True:
+            work(self.seconds)
+            self.model.left()
+
+
+def work(seconds: float) -> None:
+    """Take processor time."""
+    clock = time.thread_time
+    until = clock() + seconds
+    while clock() < until:
+        pass
 
 
 class Entity(State):
@@ -153,11 +161,11 @@ class ForetoldCrowd(Crowd):
         return [(entity,) for entity in self.entities]
 
 
-# -- contenders -----------------------------------------------------------------------------------
+# -- contenders: environments that do not end -----------------------------------------------------
 
 
-def last_and_step(env: Any) -> Callable[[int], None]:
-    """Make a loop of ``last`` and ``step`` of an AEC environment that does not end."""
+def aec(env: Any, number: int, clock: Callable[[], float] = now) -> Contender:
+    """Make a contender of ``last`` and ``step`` of an AEC environment."""
     env.reset(seed=0)
 
     def loop(number: int) -> None:
@@ -166,21 +174,83 @@ def last_and_step(env: Any) -> Callable[[int], None]:
             last()
             step(1)
 
-    return loop
-
-
-def aec(env: Any, number: int) -> Contender:
-    """Make a contender of this loop."""
-    return timed(last_and_step(env), number)
+    return timer(loop, number, clock)
 
 
 def single(env: Any, number: int) -> Contender:
-    """Make a contender of ``step`` of a Gymnasium environment that does not end."""
+    """Make a contender of ``step`` of a Gymnasium environment."""
     env.reset(seed=0)
+    return steps(env, 1, number)
+
+
+def parallel(env: Any, agents: int, number: int) -> Contender:
+    """Make a contender of steps of a parallel environment with actions of all agents: the time of each agent."""
+    env.reset(seed=0)
+    if len(env.agents) < agents:  # some agents have not appeared yet
+        for _ in range(agents):
+            env.step(dict.fromkeys(env.agents, 1))
+    assert len(env.agents) == agents
+    run = steps(env, dict.fromkeys(env.agents, 1), max(number // agents, 1))
+    return lambda: run() / agents
+
+
+def vector(env: Any, size: int, number: int, clock: Callable[[], float] = now) -> Contender:
+    """Make a contender of steps of a vector environment: the time of each simulation."""
+    env.reset(seed=0)
+    run = steps(env, np.ones(size, np.int64), max(number // size, 1), clock)
+    return lambda: run() / size
+
+
+def steps(env: Any, action: Any, number: int, clock: Callable[[], float] = now) -> Contender:
+    """Make a contender of ``step`` with the same action."""
 
     def loop(number: int) -> None:
         step = env.step
         for _ in range(number):
-            step(1)
+            step(action)
 
-    return timed(loop, number)
+    return timer(loop, number, clock)
+
+
+# -- contenders: whole runs of models, which the rule decides -------------------------------------
+
+
+def whole(prepare: Callable[[], tuple[Callable[[], Any], Callable[[], Any]]], number: int, outcome: Any) -> Contender:
+    """Make a contender of whole runs: the time of each of a number of decisions.
+
+    Args:
+        prepare: Returns a function that runs once, and one that returns the outcome.
+        number: The number of decisions of a run.
+        outcome: What each run must end with.
+    """
+
+    def run() -> float:
+        play, end = prepare()
+        start = now()
+        play()
+        microseconds = (now() - start) * 1e6
+        assert end() == outcome
+        gc.collect()  # the model's reference cycles, as automatic collection is off
+        return microseconds / number
+
+    return run
+
+
+def aec_by_rule(env: Any) -> int:
+    """Play the rest of an AEC episode, and count the decisions."""
+    decisions = 0
+    last, step = env.last, env.step
+    for _ in env.agent_iter():
+        _, _, terminated, truncated, _ = last()
+        over = terminated or truncated
+        step(None if over else RULE)
+        decisions += not over
+    env.close()
+    return decisions
+
+
+def parallel_by_rule(env: Any) -> None:
+    """Play the rest of a parallel episode."""
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, RULE))
+    env.close()

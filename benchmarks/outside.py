@@ -1,8 +1,6 @@
 """The cost of a decision for a simulator in another process, beside the minimum for a pipe and JSON.
 
-Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only outside``. It needs a C++ compiler.
-Times are processor times of both processes, which alternate on one core. The effect of two cores is measured as well,
-in wall-clock time.
+Times are processor times of both processes, which alternate on one core; on two cores, they are wall-clock times.
 """
 
 from __future__ import annotations
@@ -10,18 +8,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import statistics
 import subprocess
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.branches import on
 from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE
-from benchmarks.measure import ROOT, Section, Times, alone, ratio, side_by_side, timed
-from benchmarks.noop import Model, Turns, aec, last_and_step
+from benchmarks.measure import ROOT, Group, MissingError, Row, timer, two_cores
+from benchmarks.noop import aec
 from simenv_marl import aec_env, make_step
 from simenv_marl.remote import ProcessSimulation
 
@@ -36,8 +32,6 @@ TURN = make_step(
     agent=lambda call: call.entity,
 )
 
-OURS, BARE, PLAIN = "AEC, C++", "a JSON round trip", "the plain C++"
-
 
 class PingPong:
     """A process that answers each line with a line; both sides only read and write JSON."""
@@ -47,7 +41,6 @@ class PingPong:
         self._in, theirs_out = os.pipe()
         descriptors = (theirs_in, theirs_out)
         self._process = subprocess.Popen([str(program), *map(str, descriptors)], pass_fds=descriptors)
-        self.number = self._process.pid
         for descriptor in descriptors:
             os.close(descriptor)
 
@@ -65,7 +58,33 @@ class PingPong:
         self._process.wait(timeout=10)
 
 
-def compiled(name: str, folder: str) -> Path:
+def groups(number: int) -> Iterator[Group]:
+    """Yield the rows, with a tenth of the number of decisions of each contender."""
+    if COMPILER is None or not Path("/proc/self/task").exists():
+        raise MissingError("Linux and a compiler for C++")
+    number = max(number // 10, 100)
+    with TemporaryDirectory() as folder:
+        noop, echo = compiler(folder, "noop"), compiler(folder, "echo")
+        yield from compare(noop, echo, number, "")
+        with two_cores():
+            yield from compare(noop, echo, number, ", on two cores", time.perf_counter)
+
+
+def compare(noop: Path, echo: Path, number: int, where: str, *clock: Callable[[], float]) -> Iterator[Group]:
+    """Yield the row of the AEC view beside the bare process."""
+    with ExitStack() as stack:
+        env = stack.enter_context(closing(aec_env(ProcessSimulation([noop], {"noop.turn": TURN}))))
+        env.reset(seed=0)
+        asking = child(noop)
+        bare = stack.enter_context(closing(PingPong(echo)))
+        answering = child(echo)
+        ours = aec(env, number, *(clock or [processors(asking)]))
+        least = timer(bare.play, number, *(clock or [processors(answering)]))
+        row = Row(f"AEC, C++ / a JSON round trip{where}", ours, least, *(() if clock else (1.6, 1.3)))
+        yield Group([row], most=9 if clock else 1_000)
+
+
+def compiler(folder: str, name: str) -> Path:
     """Compile a program."""
     program = Path(folder) / name
     sources = [f"-I{ROOT / 'clients' / 'cpp'}", str(ROOT / "benchmarks" / "cpp" / f"{name}.cpp")]
@@ -73,69 +92,13 @@ def compiled(name: str, folder: str) -> Path:
     return program
 
 
-def children() -> set[int]:
-    """Return the child processes of this process."""
-    return {int(process) for process in Path(f"/proc/self/task/{os.getpid()}/children").read_text("ascii").split()}
+def child(program: Path) -> int:
+    """Return the child process of this process that runs a program."""
+    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text("ascii").split()
+    return next(int(process) for process in children if Path(f"/proc/{process}/exe").resolve() == program.resolve())
 
 
 def processors(process: int) -> Callable[[], float]:
     """Make a clock of the processor time of this process and another one."""
     clock = ~process << 3 | 2  # Linux's number of the clock of a process
     return lambda: time.process_time() + time.clock_gettime(clock)
-
-
-def compared(rounds: int, number: int, *, wall: bool = False) -> Times:
-    """Compare the AEC view of a simulator process with the bare process and with the same program alone."""
-    with TemporaryDirectory() as folder:
-        noop, bare = compiled("noop", folder), PingPong(compiled("echo", folder))
-        env = aec_env(ProcessSimulation([noop], {"noop.turn": TURN}))
-        here = aec_env(Turns, [Model.left, Model.right])
-        before = children()
-        loop = last_and_step(env)
-        (asking,) = children() - before
-        clocks = [time.perf_counter] * 2 if wall else [processors(asking), processors(bare.number)]
-        contenders = {
-            OURS: timed(loop, number, clocks[0]),
-            BARE: timed(bare.play, number, clocks[1]),
-            "AEC, in this process": aec(here, number),
-            PLAIN: lambda: float(subprocess.run([noop], check=True, capture_output=True, timeout=60).stdout.split()[0]),
-        }
-        times = side_by_side(contenders, rounds)
-        for each in (env, here, bare):
-            each.close()
-    return times
-
-
-def over_the_plain(times: Times) -> float:
-    """Compute the additional time of a decision in an environment, in units of a JSON round trip."""
-    over = [ours - plain for ours, plain in zip(times[OURS], times[PLAIN], strict=True)]
-    return ratio({OURS: over, BARE: times[BARE]}, OURS, BARE)
-
-
-def measure(rounds: int, number: int) -> Section:
-    """Measure in a number of rounds, with a number of decisions of each contender."""
-    section = Section("A simulator in another process", "microseconds per decision")
-    if COMPILER is None:
-        section.remarks.append("A simulator in another process: no compiler for C++, so that nothing was measured.")
-        return section
-    number = max(number // 10, 100)
-    with on({min(os.sched_getaffinity(0))}):
-        times = compared(rounds, number)
-    section.ratio("AEC, C++, over the plain C++ / a JSON round trip", over_the_plain(times), 1.6, 1.3)
-    if (os.cpu_count() or 1) > 1:
-        apart, ours, bare = alone("outside", str(min(rounds, 9)), str(number), cores="0,1")
-        section.ratio("the same on two cores, by the wall clock", apart)
-        section.time(f"{OURS}, on two cores", ours)
-        section.time(f"{BARE}, on two cores", bare)
-    section.times(times)
-    return section
-
-
-def main(rounds: int, number: int) -> None:
-    """Measure in wall-clock time, on all cores of this process."""
-    times = compared(rounds, number, wall=True)
-    print(json.dumps([over_the_plain(times), *(statistics.median(times[name]) for name in (OURS, BARE))]))
-
-
-if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))

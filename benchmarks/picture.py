@@ -6,36 +6,35 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Canvas
 
-COLOURS = {
-    "vector_env": "#1b6f5f",
-    "SyncVectorEnv, by hand": "#8c8c8c",
-    "SyncVectorEnv, our single view": "#d1812c",
-}
-OTHERS = {"a thread with queues for each, 64": ("a thread with queues for each", "#b3402e", 64)}
+from benchmarks.measure import Figure
 
 
-def draw(times: Mapping[str, float], path: Path) -> None:
-    """Draw the results of the sections on vector environments and on suspended simulations.
+def draw(figures: Mapping[str, list[Figure]], path: Path) -> None:
+    """Draw the figures of the sections ``vector`` and ``suspended``.
 
     Args:
-        times: The times of both sections, by their description.
+        figures: The figures of each section.
         path: The file to write.
     """
-    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
-    axes = figure.add_subplot()
-    for name, colour in COLOURS.items():
-        points = [
-            (int(number.replace(",", "")), value)
-            for what, value in times.items()
-            for title, _, number in [what.rpartition(", ")]
-            if title == name
-        ]
-        axes.plot(*zip(*points, strict=True), marker="o", color=colour, label=name)
-    for what, (title, colour, number) in OTHERS.items():
-        axes.plot([number], [times[what]], marker="s", linestyle="", color=colour, label=title)
+    by_name = {figure.row.name: figure for figure in figures["vector"]}
+    template, view = (
+        [(int(name.split()[0].replace(",", "")), figure) for name, figure in by_name.items() if name.endswith(end)]
+        for end in ("simulations / SyncVectorEnv of template", "of single_env")
+    )
+    threads = [(64, figure) for figure in figures["suspended"] if figure.row.name.endswith("beside a thread for each")]
+    lines = {
+        "vector_env": ("#1b6f5f", [(size, figure.candidate) for size, figure in template]),
+        "SyncVectorEnv of template": ("#8c8c8c", [(size, figure.baseline) for size, figure in template]),
+        "SyncVectorEnv of single_env": ("#d1812c", [(size, figure.baseline) for size, figure in view]),
+        "a thread for each": ("#b3402e", [(size, figure.baseline) for size, figure in threads]),
+    }
+    canvas = Canvas(figsize=(7.2, 4.2), layout="constrained")
+    FigureCanvasAgg(canvas)  # neither a window nor pyplot's global state
+    axes = canvas.add_subplot()
+    for label, (colour, points) in lines.items():
+        axes.plot(*zip(*points, strict=True), marker="o", color=colour, label=label)
     axes.set(
         xscale="log",
         yscale="log",
@@ -48,4 +47,4 @@ def draw(times: Mapping[str, float], path: Path) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    canvas.savefig(path, dpi=150)

@@ -13,7 +13,6 @@ import random
 import resource
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -26,8 +25,8 @@ from simenv_marl import RULE, aec_env, joint_env, make_step, parallel_env, singl
 DRIVERS = ("greenlet", "thread")
 WARM = 0.1
 """The share of episodes after which no figure may grow."""
-MEGABYTES = 8
-"""The allowed growth of memory, in megabytes: allocators keep some for later."""
+GROWTH = {"objects": 100, "KiB": 8 * 1024}
+"""The allowed growth of some figures: allocators keep memory for later."""
 
 
 class Failed(Exception):
@@ -176,18 +175,12 @@ def main() -> int:
     warm = int(chosen.episodes * WARM)
     play(chosen.driver, warm, draw)
     before = figures()
-    start = time.perf_counter()
     play(chosen.driver, chosen.episodes - warm, draw)
-    seconds = time.perf_counter() - start
     after = figures()
-    print(f"{chosen.driver}: {chosen.episodes} episodes, {(chosen.episodes - warm) / seconds:.0f} per second")
+    print(f"{chosen.driver}: {chosen.episodes} episodes")
     for name, value in after.items():
         print(f"  {name:12} {before[name]:>9} after {warm}, {value:>9} after all")
-    grown = [name for name in ("threads", "greenlets", "descriptors") if after[name] > before[name]]
-    if after["objects"] > before["objects"] + 100:
-        grown.append("objects")
-    if after["KiB"] > before["KiB"] + MEGABYTES * 1024:
-        grown.append("memory")
+    grown = [name for name, value in after.items() if value > before[name] + GROWTH.get(name, 0)]
     if grown:
         print(f"  left behind: {', '.join(grown)}")
     return bool(grown)

@@ -63,7 +63,6 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             SimEnvError: Something cannot work. The subclass tells what.
         """
         super().__init__()
-        self.closed = True  # until it is made: older versions of Gymnasium close half-made environments
         self.num_envs = _count(num_envs, "num_envs", 1)
         workers = _count(workers, "workers", 0)
         try:
@@ -318,6 +317,9 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 self.closed = self._guard.closed = self._simulations.idle
                 if self.closed:
                     self._finalizer.detach()
+
+    def __del__(self) -> None:  # that of Gymnasium before 1.3 closes and raises; the finalizer warns
+        """Leave the end to the finalizer."""
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled, since the stacks of simulations cannot be."""

@@ -28,7 +28,7 @@ from weakref import WeakSet, ref
 from greenlet import getcurrent, greenlet
 
 from ..errors import SimulationError, WrongThreadError, annotate
-from ..hooks.hook import Hook
+from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import LOCK, STACKS, Interceptor, spawner_of, stack_of
 from ..simulation import TRUNCATED, Sentinel
 
@@ -281,8 +281,8 @@ class Driver:
         rule = hook.rule
         if event.report is not None:
             report = _report if hook.kind == "function" else _report_later
-            rule = partial(report, rule, self._decider(None, event.report, away))
-        decide: Interceptor = self._decider(rule, event, away)
+            rule = partial(report, rule, self._decider(hook, None, event.report, away), hook)
+        decide: Interceptor = self._decider(hook, rule, event, away)
         return decide
 
     def refuse(self, hook: Hook, where: str, args: Any, kwargs: Any) -> Any:
@@ -305,17 +305,17 @@ class Driver:
         return error
 
 
-def _report(rule: Any, report: Interceptor, /, *args: Any, **kwargs: Any) -> Any:
-    """Run a rule, and pass its decision to an interceptor."""
+def _report(rule: Any, report: Interceptor, hook: Hook, /, *args: Any, **kwargs: Any) -> Any:
+    """Run a rule, and pass its decision and the bound call to an interceptor."""
     decision = rule(*args, **kwargs)
-    report((decision, args, kwargs), {})
+    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
     return decision
 
 
 @coroutine
-def _report_later(rule: Any, report: Interceptor, /, *args: Any, **kwargs: Any) -> Any:
+def _report_later(rule: Any, report: Interceptor, hook: Hook, /, *args: Any, **kwargs: Any) -> Any:
     decision = yield from rule(*args, **kwargs)
-    report((decision, args, kwargs), {})
+    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
     return decision
 
 

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any, Final
 from greenlet import getcurrent
 
 from ..errors import AgentError, InvalidActionError, NoDecisionError, UnknownAgentError, short_repr, warn_user
-from ..hooks.hook import Hook
+from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
@@ -185,7 +185,7 @@ class Episode(Run):
         in_rounds, expected = self.in_rounds, getattr(self.simulation, "expected_calls", None)
         for agent, call in () if expected is None else self.announced(expected).items():
             if agent is not following and (in_rounds or not agent.decided):
-                agent.keep(self, call, {})
+                agent.keep(self, *call)
         if truncated:
             self.finish(truncated=True)
             return
@@ -235,16 +235,16 @@ class Episode(Run):
         args = None if agent is None else agent.arguments()  # to exclude a freed entity that had the same id
         return agent.name if agent is not None and args and args[0] is entity else None
 
-    def announced(self, expected_calls: Any) -> dict[Agent, tuple[Any, ...]]:
-        """The live agents that ``expected_calls`` announces, with the arguments of the first call of each."""
-        announced: dict[Agent, tuple[Any, ...]] = {}
+    def announced(self, expected_calls: Any) -> dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]]:
+        """The live agents that ``expected_calls`` announces, with the bound arguments of the first call of each."""
+        announced: dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]] = {}
         for point in self.plan.active:
             for call in expected_calls(point.point.name):
-                args = call if type(call) is tuple else tuple(call)
-                name = point.agent or point.name_agent(*args)
+                args, kwargs = point.point.bind(call, BOUND) or (tuple(call), BOUND)
+                name = point.agent or point.name_agent(*args, **kwargs)
                 agent = None if name is None else self.agent_for(point, name)
                 if agent is not None and not agent.delegated:
-                    announced.setdefault(agent, args)
+                    announced.setdefault(agent, (args, kwargs))
         return announced
 
     def end_agent(self, agent: Agent) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Final
 from greenlet import GreenletExit, getcurrent, greenlet
 
 from ..errors import WrongThreadError
+from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import RULE
 from .driver import THREAD, Driver, Event, SimulationExit, is_exit
@@ -81,11 +82,17 @@ class GreenletDriver(Driver):
         finally:
             self._forget_stack()
 
-    def _decider(self, rule: Any, event: Any, away: bool) -> Interceptor:
+    def _decider(self, hook: Hook, rule: Any, event: Any, away: bool) -> Interceptor:
         """Make the function that sends an event for the calls of a hook, and carries out the replies."""
-        deliver, driver = event.deliver, self
+        deliver, bind, driver = event.deliver, hook.bind, self
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            bound, named = args, kwargs
+            if kwargs is not BOUND:
+                call = bind(args, kwargs)
+                if call is None:  # a handler has changed the arguments
+                    return rule(*args, **kwargs)
+                bound, named = call
             if away:
                 driver.resume = getcurrent().switch
             leave, running = driver._leave, driver._running_loop
@@ -95,7 +102,7 @@ class GreenletDriver(Driver):
             if looped:
                 driver._loop = _swap_loop(driver._users_loop)
             try:
-                reply = leave(event, args, kwargs)
+                reply = leave(event, bound, named)
             except BaseException:
                 if not driver.ended:  # once the driver has ended, the stack unwinds by itself
                     driver.resume = driver._body.switch
@@ -108,7 +115,7 @@ class GreenletDriver(Driver):
                 driver._enter_loop()
             if reply is RULE:
                 return rule(*args, **kwargs) if kwargs else rule(*args)
-            return reply if deliver is None else deliver(reply, *args, **kwargs)
+            return reply if deliver is None else deliver(reply, *bound, **named)
 
         return decide
 

@@ -56,7 +56,10 @@ class View:
             self._finalizer = weakref.finalize(self, self._session.abandon)
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
-        self._shows = self.render_mode == "human"  # render after every reset and step
+        self._mode = (self.render_mode or "").removesuffix("_list")
+        self._collects = self.render_mode not in (None, self._mode)
+        self._shows = self._collects or self._mode == "human"  # after every reset and step
+        self._frames: list[Any] = []
         self._roster: Mapping[str, Point] = self._session.plan.roster  # of agents that are known beforehand
         self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}  # of observations and of actions, by agent
         self._clear()
@@ -73,7 +76,9 @@ class View:
     @classmethod
     def metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": plan.render_fps}
+        chosen = [plan.options.render_mode] if plan.options.render_mode else []
+        modes = [*plan.render_modes, *(mode for mode in chosen if mode not in plan.render_modes)]
+        return {"name": f"{plan.name.lower()}_v0", "render_modes": modes, "render_fps": plan.render_fps}
 
     @property
     def simulation(self) -> Any:
@@ -167,7 +172,8 @@ class View:
     def render(self) -> Any:
         """Render the simulation in ``render_mode``. Without a render mode, warn and return None.
 
-        In the mode "human", every ``reset`` and ``step`` renders by itself.
+        In the mode "human", every ``reset`` and ``step`` renders by itself. With ``_list`` at the end of a mode, these
+        are collected; return the list of those since the last ``render`` or ``reset``.
         """
         if self.render_mode is None:
             warn_user(
@@ -175,8 +181,20 @@ class View:
                 f" {self._plan.render_modes}"
             )
             return None
+        if self._collects:
+            frames, self._frames = self._frames, []
+            return frames
         with self._session.context():
-            return self.simulation.render(self.render_mode)
+            return self.simulation.render(self._mode)
+
+    def show(self, *, begins: bool = False) -> None:
+        """Render after a step, or after the reset with which an episode ``begins``."""
+        if begins:
+            self._frames = []
+        with self._session.context():
+            frame = self.simulation.render(self._mode)
+        if self._collects:
+            self._frames.append(frame)
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.
@@ -200,7 +218,7 @@ class View:
             for agent in self._spaces:
                 self._seed_spaces(agent, seed)
             if self._shows:
-                self.render()
+                self.show(begins=True)
             return results
 
     def _step_alone(self, step: Callable[..., Any], action: Any) -> Any:

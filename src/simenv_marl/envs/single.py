@@ -76,7 +76,7 @@ class SimulationEnv(OneAgentView):
             return self._step_alone(SimulationEnv.step, action)  # type: ignore[no-any-return]
         episode.step(action)
         if self._shows:
-            self.render()
+            self.show()
         own: Agent = self._own
         if own.ended:
             return own.observation, own.reward, True, False, own.info

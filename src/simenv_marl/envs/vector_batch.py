@@ -75,7 +75,7 @@ class SimulationBatch:
         self.arguments = simulation, points, options, view, mode
         self._mode, self._part = mode, part
         self._agent = str(self.plan.one_agent)
-        self._shows = self.plan.options.render_mode == "human"
+        self._shows = (self.plan.options.render_mode or "").endswith(("human", "_list"))
         self._stack = stacker(self.observation_space, cast=True, other=concatenate)
         self._observations = create_empty_array(self.observation_space, len(part))
         self._observed: list[Any] = [None] * len(part)
@@ -172,7 +172,7 @@ class SimulationBatch:
             if info:
                 infos.append((self._part[number], info))
         for view in self.views if self._shows else ():
-            view.render()
+            view.show()
         return self._stacked(), rewards, terminations, truncations, ends, infos
 
     def _begin(self, number: int, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -181,7 +181,7 @@ class SimulationBatch:
         try:
             episode = session.start(seed, options, in_rounds=self.joint is not None)
             if self._shows:
-                self.views[number].render()
+                self.views[number].show(begins=True)
             (self._observed[number],), _, (info,) = self._read([episode])
         except BaseException as error:
             self._fail(number, error)

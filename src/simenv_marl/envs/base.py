@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..core.agent import Agent
 from ..core.episode import Episode
+from ..core.packing import pack, unpack
 from ..core.plan import Plan
 from ..core.point import Point
 from ..core.provenance import describe
@@ -269,13 +270,16 @@ class View:
         return made
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset."""
+        """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset.
+
+        Functions without names, such as lambdas, are pickled by value, also by the standard library's ``pickle``.
+        """
         view: Any = type(self)
         try:
             pickle.dumps(view)
         except Exception:  # a class that generate_env made and that its name does not lead to
             view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-        return object.__new__, (view,), self._state()
+        return _unpickled, (pack((view, self._state())),)
 
     def _state(self) -> dict[str, Any]:
         """Return what a copy takes over."""
@@ -310,6 +314,14 @@ class View:
 
     def begin_branch(self) -> None:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
+
+
+def _unpickled(parcel: bytes) -> View:
+    """Make the environment that ``View.__reduce_ex__`` has pickled."""
+    view, state = unpack(parcel)
+    made: View = object.__new__(view)
+    made.__setstate__(state)
+    return made
 
 
 class AgentsView(View):

@@ -34,6 +34,14 @@ class ByRng(Walk):
         super().__init__(seed=rng)
 
 
+class PassedOn(ByRng):
+    """Passes the seed on, as models of Mesa do."""
+
+    def __init__(self, drift=0.0, **kwargs):
+        super().__init__(**kwargs)
+        self.drift = drift
+
+
 class Unseeded(Walk):
     def __init__(self, drift=0.0):
         super().__init__(drift, seed=1)
@@ -92,6 +100,9 @@ def test_the_model_ends_the_episode_when_it_runs_no_more(steps):
 
 def test_the_seed_goes_where_the_model_takes_it():
     assert simulate(SteppedSimulation(ByRng, 5), seed=2).model.place == walked(2, 5)
+    assert simulate(SteppedSimulation(PassedOn, 5, drift=1.0), seed=2).model.place == walked(2, 5, drift=1.0)
+    assert simulate(SteppedSimulation(partial(PassedOn, 1.0), 5), seed=2).model.place == walked(2, 5, drift=1.0)
+    assert simulate(SteppedSimulation(lambda **given: Walk(**given), 5), seed=2).model.place == walked(2, 5)
     assert simulate(SteppedSimulation(Unseeded, 5), seed=2).model.place == walked(1, 5)
     assert simulate(SteppedSimulation(Walk, 5, seed=9), seed=2).model.place == walked(9, 5)  # by the user's own seed
 

@@ -43,7 +43,7 @@ from .actions import ILLEGAL
 from .agent import Agent
 from .driver import WAIT
 from .planner import two_arguments
-from .points import declared_agents
+from .points import declared_agents, overrides
 from .run import Run
 from .spaces import duplicate
 
@@ -316,7 +316,10 @@ class Episode(Run):
     def _without_decision(self) -> NoDecisionError:
         """Make the error for an episode that ended without a decision for the environment's user."""
         expected = ", ".join(point.point.name for point in self.plan.active)
+        overriding = [name for point in self.plan.active for name in overrides(point.point)]
         hint = "does the simulation call the decision functions as attributes of their class or module?"
+        if overriding:
+            hint = f"these override it and are called instead: {listed(overriding)}; name them as decision points"
         if self.others:
             expected = f"{self.plan.one_agent!r} at {expected}" if self.plan.one_agent else expected
             hint = f"these have decided: {listed(self.others)}"

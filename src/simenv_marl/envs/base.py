@@ -334,6 +334,14 @@ class AgentsView(View):
 
     agents: list[str]
 
+    def __getattr__(self, name: str) -> Any:
+        if name == "possible_agents":
+            raise AttributeError(
+                "there is no possible_agents, because not all agents are known beforehand; declare them with the option"
+                " possible_agents=, or name them by strings"
+            )
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
     def _set_up(self) -> None:
         if self._plan.possible_agents is not None:
             self.possible_agents = self._plan.possible_agents

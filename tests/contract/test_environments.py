@@ -244,7 +244,8 @@ WARM = f"{__name__}.Room.warm"
     ("policy", "answer"), [(lambda observation: 4, 4), (RULE, "rule"), (lambda observation: RULE, "rule")]
 )
 def test_what_policies_answer_is_no_agent(points, key, policy, answer):
-    env = aec_env(calling(Room().cool, Room().warm, Room().cool), points, policies={key: policy})
+    room = Room()
+    env = aec_env(calling(room.cool, room.warm, room.cool), points, policies={key: policy})
     assert env.possible_agents == ["cool_0"]
     env.reset()
     assert env.agents == ["cool_0"]

@@ -326,12 +326,11 @@ class Bound:
     def __init__(self, number):
         self.number, self.health, self.whole, self.hunt = number, 0, True, None
 
-    act, leave = (lambda self: "rule"), (lambda self: None)
+    def act(self):
+        return "rule"
 
-
-for _name in ("act", "leave"):
-    _function = vars(Bound)[_name]
-    _function.__name__, _function.__qualname__ = _name, f"Bound.{_name}"
+    def leave(self):
+        pass
 
 
 def if_whole(being):

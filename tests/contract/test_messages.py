@@ -29,7 +29,6 @@ from simenv_marl.errors import (
     OptionValueError,
     RewardError,
     SimulationError,
-    UnknownAgentError,
     UnknownPointError,
     annotate,
     describe_error,
@@ -183,19 +182,6 @@ def env_with(**options):
 def test_what_cannot_be_an_argument_is_refused_in_short(use, error, make):
     with refused(error):
         use(make())
-
-
-def test_names_of_agents_may_have_lone_surrogates():
-    decide = decision(agent="\ud800")
-    env = parallel_env(calling(decide, decide), decide)
-    env.reset(seed=1)
-    first = env.action_space("\ud800").sample()
-    env.reset(seed=1)
-    assert env.action_space("\ud800").sample() == first
-    env.step({"\ud800": 1})
-    with pytest.raises(UnknownAgentError):
-        env.step({"\udfff": 1})
-    env.close()
 
 
 # -- errors -----------------------------------------------------------------------------------------

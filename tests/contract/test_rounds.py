@@ -321,12 +321,11 @@ def test_what_is_returned_is_the_users_own():
     observations["ant_0"][:] = 7
     infos["ant_0"]["deciding"] = "me"
     env.agents.append("me")
-    results = env.step({"ant_0": 1, "bee_0": 1})
-    assert kept.tolist() == [1.0, 2.0]
-    assert results[0]["ant_0"].tolist() == [1.0, 2.0]
-    assert results[0]["ant_0"] is not results[0]["bee_0"]
+    observations, *_, infos = env.step({"ant_0": 1, "bee_0": 1})
+    assert kept.tolist() == observations["ant_0"].tolist() == [1.0, 2.0]
+    assert observations["ant_0"] is not observations["bee_0"]
     assert env.agents == ["ant_0", "bee_0"]
-    assert results[-1]["ant_0"]["deciding"] is True
+    assert infos["ant_0"]["deciding"] is True
 
 
 # -- the rule once more, literally ----------------------------------------------------------------
@@ -357,15 +356,7 @@ class World:
             self.calls += 1
             self.level = (self.level * 3 + value + 1) % 17
 
-    def rule(self):
-        return self.level % 4
-
-    ant, bee, cat, dog = (lambda self: self.rule() for _ in LETTERS)
-
-
-for _letter in LETTERS:
-    _function = World.__dict__[_letter]
-    _function.__name__, _function.__qualname__ = _letter, f"World.{_letter}"
+    ant, bee, cat, dog = (decision(lambda self: self.level % 4) for _ in LETTERS)
 
 
 class Rounds:
@@ -415,7 +406,7 @@ def allowed_now(world):
 def world_env(max_steps):
     """An environment of a world, whose program may be changed."""
     definitions = {
-        f"{__name__}.World.{letter}": define(
+        vars(World)[letter]: define(
             agent=f"{letter}_0",
             observation_space_mapping=lambda world: [world.level, world.calls],
             reward_mapping=lambda world: float(world.level),

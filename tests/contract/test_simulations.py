@@ -92,28 +92,17 @@ def test_anything_that_runs_and_resets_is_a_simulation():
         def run(self):
             self.log.append(Model().decide())
 
-    for source in (Duck, Duck(), lambda: Duck()):
+    class Derived(Duck, SimulationInterface):
+        pass
+
+    for source in (Duck, Duck(), lambda: Duck(), Derived):
         env = single_env(source, Model.decide)
         env.reset()
         env.reset()  # in mid-episode, without a stop
         env.step(3)
         assert env.unwrapped.simulation.log == [3]
-
-
-def test_the_interface_asks_for_run_and_reset_alone():
     with pytest.raises(TypeError):
         SimulationInterface()
-
-    class Least(SimulationInterface):
-        def reset(self):
-            pass
-
-        def run(self):
-            Model().decide()
-
-    env = single_env(Least, Model.decide)
-    env.reset()
-    env.close()
 
 
 class NoReset:

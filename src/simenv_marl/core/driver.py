@@ -14,9 +14,12 @@ that sends an event and carries out the reply. It also notes which threads, proc
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from contextvars import Context, copy_context
 from functools import partial, wraps
+from linecache import getlines
 from multiprocessing.process import BaseProcess
 from socket import socket
 from subprocess import Popen
@@ -27,7 +30,7 @@ from weakref import WeakSet, ref
 
 from greenlet import getcurrent, greenlet
 
-from ..errors import SimulationError, WrongThreadError, annotate
+from ..errors import SimulationError, WrongThreadError, annotate, error_text
 from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import LOCK, STACKS, Interceptor, spawner_of, stack_of
 from ..simulation import TRUNCATED, Sentinel
@@ -43,23 +46,54 @@ UNWINDING_TRIES: Final = 1000
 """How often ``SimulationExit`` is raised in a simulation. A SimPy model loses one of its processes at each try."""
 
 
-class SimulationExit(SystemExit):
+class SimulationExit(BaseException):
     """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it.
 
-    It is a ``SystemExit``, because event loops pass that on at once, and keep others for who awaits the task.
+    It is no ``SystemExit``: C code that prints what a callback raises would end the process.
     """
+
+    def __init__(self, text: str = "SimulationExit: the environment was closed, reset or dropped") -> None:
+        """Say what it is in its text, because some engines keep only the text of what they catch."""
+        super().__init__(text)
+
+
+class LoopExit(SimulationExit, KeyboardInterrupt):
+    """A ``SimulationExit`` for code in an event loop, which keeps all but exits and interrupts for who awaits it."""
 
 
 def is_exit(error: BaseException | None) -> bool:
-    """Whether an error is a ``SimulationExit``, was caused by one, or is an exception group of only such errors."""
+    """Whether an error is a ``SimulationExit``, or was raised in place of one.
+
+    In place of one: with an exit as its cause or in its text, by the code that has caught the exit, or, in a group,
+    all of them. An error that only arises while the exit passes, as in a ``finally``, is the model's.
+    """
     seen = set()  # causes may be cyclic
     while error is not None and id(error) not in seen:
-        if isinstance(error, SimulationExit):
+        if isinstance(error, SimulationExit) or SimulationExit.__name__ in error_text(error):
             return True
-        if isinstance(error, BaseExceptionGroup) and all(map(is_exit, error.exceptions)):
-            return True
+        if isinstance(error, BaseExceptionGroup):
+            return all(map(is_exit, error.exceptions))
         seen.add(id(error))
-        error = error.__cause__
+        error = error.__cause__ or (error.__context__ if _is_replacement(error) else None)
+    return False
+
+
+def _is_replacement(error: BaseException) -> bool:
+    """Whether an error was raised, or the process ended, by the ``except`` that has caught the error's context."""
+    raised, caught = error.__traceback__, error.__context__
+    while raised is not None and raised.tb_next is not None:
+        raised = raised.tb_next
+    if raised is None or caught is None or caught.__traceback__ is None:
+        return False
+    frame, line = raised.tb_frame, raised.tb_lineno
+    if caught.__traceback__.tb_frame is not frame:
+        return False
+    kind = ast.stmt if isinstance(error, SystemExit) else ast.Raise
+    with suppress(SyntaxError, ValueError):  # bytecode does not tell an ``except`` from a ``finally``
+        tree = ast.parse("".join(getlines(frame.f_code.co_filename, frame.f_globals)))
+        handlers = [node for node in ast.walk(tree) if isinstance(node, ast.ExceptHandler)]
+        inside = [node for handler in handlers for node in ast.walk(handler) if isinstance(node, kind)]
+        return any(node.lineno <= line <= (node.end_lineno or line) for node in inside)
     return False
 
 
@@ -233,7 +267,7 @@ class Driver:
             if isinstance(error, SimulationExit):
                 return self.refusal()
             annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
-        if type(error) is SimulationExit and not self._exiting:
+        if type(error) in (SimulationExit, LoopExit) and not self._exiting:
             stray = SimulationError(
                 "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of"
                 " that episode has kept; end all of these with their episode (cancel them in stop or in a finally)"

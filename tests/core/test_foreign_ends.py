@@ -2,6 +2,7 @@
 
 import asyncio
 import ctypes
+import gc
 import sys
 from pathlib import Path
 
@@ -91,3 +92,62 @@ def test_an_error_of_a_cleanup_is_the_models(driver):
     env.reset()
     with pytest.raises(EngineError, match="disk"):
         env.close()
+
+
+# -- event loops that end -------------------------------------------------------------------------
+
+
+async def numbers(log, cleanup=lambda: None):
+    try:
+        while True:
+            yield await asyncio.sleep(0)
+    finally:
+        cleanup()
+        await asyncio.sleep(0)
+        log.append("generator closed")
+
+
+async def stay(log, cleanup):
+    try:
+        await asyncio.sleep(3600)
+    finally:
+        cleanup()
+        await asyncio.sleep(0)
+        log.append("task cancelled")
+
+
+async def office(simulation, decide, cleanup):
+    """Decide while tasks and asynchronous generators of the model are left, of which some decide in their cleanup."""
+
+    def quietly():
+        cleanup.append("decides")
+        decide()
+
+    generators = [numbers(simulation.log, *args) for args in [(), (quietly,), ()]]
+    for generator in generators:
+        await anext(generator)
+    works = [lambda: None, quietly, lambda: None, quietly, lambda: None]
+    tasks = [asyncio.create_task(stay(simulation.log, work)) for work in works]
+    await asyncio.sleep(0)
+    decide()
+    await asyncio.wait(tasks)
+
+
+def run_in_a_runner(work):
+    with asyncio.Runner() as runner:
+        runner.run(work)
+
+
+@DRIVERS
+@pytest.mark.parametrize("run", [asyncio.run, run_in_a_runner])
+@pytest.mark.parametrize("end", ["close", "reset"])
+def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(driver, run, end):
+    decide, cleanup = decision(), []
+    env = single_env(script(lambda simulation: run(office(simulation, decide, cleanup))), decide, driver=driver)
+    env.reset()
+    log = env.simulation.log
+    getattr(env, end)()
+    assert sorted(log) == ["generator closed"] * 2 + ["task cancelled"] * 3
+    assert len(cleanup) == 3
+    env.close()
+    gc.collect()

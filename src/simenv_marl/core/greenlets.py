@@ -149,7 +149,10 @@ def _swap_loop(state: Any) -> Any:
 
 
 def make_exit() -> SimulationExit:
-    """Return the exit to raise here. The loop here will not report it, because no code awaits its tasks any more."""
+    """Return the exit to raise here. The loop here will not report it, because no code awaits its tasks any more.
+
+    A ``LoopExit`` ends a loop at once. But where asyncio closes its loop already, it must go on to the other tasks.
+    """
     hub: Any = getcurrent()
     while hub is not None and hub not in STACKS and not hasattr(hub, "NOT_ERROR"):
         hub = hub.parent
@@ -162,7 +165,10 @@ def make_exit() -> SimulationExit:
     before = loop.get_exception_handler()
     if not isinstance(before, partial):  # else it was silenced in an earlier episode
         loop.set_exception_handler(partial(_report_task, before or type(loop).default_exception_handler))
-    return LoopExit()
+    frame: Any = sys._getframe()
+    while frame is not None and frame.f_code is not modules["asyncio"].Runner.close.__code__:
+        frame = frame.f_back
+    return LoopExit() if frame is None else SimulationExit()
 
 
 def _report_task(report: Callable[..., Any], loop: Any, context: dict[str, Any]) -> None:

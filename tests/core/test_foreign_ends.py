@@ -4,11 +4,14 @@ import asyncio
 import ctypes
 import gc
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
 from simenv_marl import single_env
+from simenv_marl.core.run import Run
+from simenv_marl.errors import ReentrancyError
 from tests.conftest import DRIVERS
 from tests.processes import alone
 from tests.worlds.models import decision, script
@@ -151,3 +154,44 @@ def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(dr
     assert len(cleanup) == 3
     env.close()
     gc.collect()
+
+
+# -- threads that use one environment -------------------------------------------------------------
+
+
+@DRIVERS
+@pytest.mark.parametrize("use", ["close", "reset"])
+def test_a_thread_that_ends_an_episode_while_another_one_does_is_refused(driver, use, monkeypatch):
+    """The second thread is on its way while the first one, which waits in the model's cleanup, comes to the end."""
+    arrived, errors, explain = [threading.Event() for _ in range(3)], [], Run.refusal
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            arrived[0].set()
+            assert arrived[1].wait(60)
+
+    def late(run):
+        arrived[1].set()
+        assert arrived[2].wait(60)
+        return explain(run)
+
+    def use_it():
+        assert arrived[0].wait(60)
+        try:
+            getattr(env, use)()
+        except Exception as error:
+            errors.append(type(error))
+        arrived[1].set()
+
+    monkeypatch.setattr(Run, "refusal", late)
+    decide = decision()
+    env = single_env(script(main), decide, driver=driver)
+    env.reset()
+    thread = threading.Thread(target=use_it)
+    thread.start()
+    env.close()
+    arrived[2].set()
+    thread.join()
+    assert errors == [ReentrancyError]

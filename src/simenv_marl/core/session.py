@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from contextvars import Context, copy_context
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,17 @@ from .run import LONGEST_TAPE, refusal
 from .spaces import same
 
 
+def _exclusively(method: Any) -> Any:
+    """Make a method of a session that raises a ``ReentrancyError`` while another thread is in such a method."""
+
+    @wraps(method)
+    def call(self: Session, *args: Any, **kwargs: Any) -> Any:
+        with self.exclusive:
+            return method(self, *args, **kwargs)
+
+    return call
+
+
 class Session:
     """The simulation of one environment, and its episodes.
 
@@ -36,12 +47,13 @@ class Session:
         seed, options: The seed of the latest episode, and the options that the latest ``reset`` got.
         episode: The current or latest episode. None before the first one, and after it was closed.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
-        lock: The lock that lets one thread at a time use the environment. None if only one thread can use it.
+        exclusive: The lock that lets one thread at a time begin and end episodes.
+        lock: The same lock, if steps need it, too. None if only the thread that began an episode can step it.
     """
 
     __slots__ = (
         "__weakref__", "_close", "_driver", "_installed", "_np_random", "_reset", "_rng", "bound_plan", "episode",
-        "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state",
+        "exclusive", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state",
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:
@@ -55,7 +67,8 @@ class Session:
         self._np_random: np.random.Generator | None = None
         self._close: Callable[[bool], None] | None = None  # closes the simulation, if it was reset since the last time
         self._rng = GlobalRandom() if plan.options.global_rng else None
-        self.lock = ExclusiveLock() if plan.options.driver == "thread" else None
+        self.exclusive = ExclusiveLock()
+        self.lock = self.exclusive if plan.options.driver == "thread" else None
         self._installed: Installation | None = Installation(plan.patches)
         self._driver: Driver
         prototype = plan.claim_prototype()
@@ -117,6 +130,7 @@ class Session:
     def np_random(self, generator: np.random.Generator) -> None:
         self._np_random, self.np_random_seed = generator, -1
 
+    @_exclusively
     def start(
         self, seed: int | None, options: dict[str, Any] | None, *, in_rounds: bool = False, script: Any = None
     ) -> Episode:
@@ -205,6 +219,7 @@ class Session:
         """Make the error that says why no action can be taken now."""
         return refusal(self.state) if self.episode is None else self.episode.refusal()
 
+    @_exclusively
     def end(self) -> None:
         """End the current episode, if there is one. Raise a ``ReentrancyError`` if that is not possible here."""
         if self.state == "moving":
@@ -221,6 +236,7 @@ class Session:
         """Whether there is no episode to end and no patch to remove."""
         return self.episode is None and self._installed is None
 
+    @_exclusively
     def close(self) -> None:
         """Unwind the simulation and remove the patches. For errors, see ``end``."""
         try:

@@ -5,8 +5,10 @@ import ctypes
 import gc
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
+import greenlet
 import pytest
 
 from simenv_marl import single_env
@@ -154,6 +156,59 @@ def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(dr
     assert len(cleanup) == 3
     env.close()
     gc.collect()
+
+
+# -- greenlets that outlive their stack -----------------------------------------------------------
+
+
+class Engine:
+    """Makes its worker once, for all episodes."""
+
+    def __init__(self, decide, back):
+        self.worker, self.decide, self.back = greenlet.greenlet(self.work), decide, back
+
+    def reset(self, seed=None):
+        self.log, self.main = [], None
+
+    def work(self):
+        while True:
+            self.log.append(self.decide())
+            (self.main or greenlet.getcurrent().parent).switch()
+
+    def run(self):
+        self.main = greenlet.getcurrent() if self.back == "by name" else None
+        for _ in range(3):
+            self.worker.switch()
+
+
+@DRIVERS
+@pytest.mark.parametrize("steps", [0, 1, 3])
+@pytest.mark.parametrize("back", ["by name", "to the parent"])
+def test_greenlets_that_a_model_has_kept_do_not_decide_after_a_close(driver, steps, back):
+    decide = decision()
+    env = single_env(partial(Engine, decide, back), decide, driver=driver)
+    env.reset()
+    simulation = env.simulation
+    for number in range(steps):
+        env.step(number)
+    env.close()
+    for _ in range(2):
+        env.reset()
+        assert [env.step(number)[2] for number in range(3)] == [False, False, True]
+        assert env.simulation.log == [0, 1, 2]
+        env.close()
+    assert env.simulation is not simulation
+
+
+@DRIVERS
+def test_a_simulation_without_greenlets_stays_the_same_after_a_close(driver):
+    decide = decision()
+    env = single_env(script(lambda simulation: decide()), decide, driver=driver)
+    simulation = env.simulation
+    for _ in range(2):
+        env.reset()
+        env.close()
+        assert env.simulation is simulation
 
 
 # -- threads that use one environment -------------------------------------------------------------

@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import Context, copy_context
 from functools import partial, wraps
+from gc import collect
 from linecache import getlines
 from multiprocessing.process import BaseProcess
 from socket import socket
@@ -152,8 +153,8 @@ class Driver:
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_refused", "_stack", "caller", "ended",
-        "events", "forked", "given_up", "idle", "opened", "plugins",
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_past", "_refused", "_stack", "caller",
+        "ended", "events", "forked", "given_up", "idle", "opened", "plugins",
     )  # fmt: skip
 
     resume: Any
@@ -169,6 +170,7 @@ class Driver:
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.events: Mapping[Hook, Any] = {}
         self._stack: greenlet | None = None
+        self._past: Callable[[], greenlet | None] = lambda: None  # a weak reference to the stack, after its end
         self._home = ref(THREAD.identity)  # the thread of the stack
         self.caller: greenlet | None = None
         self.opened: WeakSet[Any] | None = None
@@ -197,6 +199,14 @@ class Driver:
     def lost(self) -> bool:
         """Whether the thread of the stack has ended, or does not exist in this forked process."""
         return self._home() is None
+
+    @property
+    def outlived(self) -> bool:
+        """Whether the model has kept greenlets that belong to the stack, which has ended: they can decide nowhere."""
+        if self._past() is not None:
+            collect()  # what only waits for the garbage collector was not kept
+        stack = self._past()
+        return stack is not None and stack.dead
 
     def run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
         """Run a job to its end, during which decision functions run their rule; return its result."""
@@ -280,6 +290,8 @@ class Driver:
         """Unregister the stack. From now on it takes no part in decisions."""
         self.ended = True
         stack, self._stack = self._stack, None
+        if stack is not None:
+            self._past = ref(stack)
         self.leave_hooks(stack)
         self.events = {}
         STACKS.pop(stack, None)  # type: ignore[arg-type]

@@ -151,7 +151,7 @@ class Session:
             else:
                 self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
             self.seed = seed
-            if self._driver.given_up is not None:
+            if self._driver.given_up is not None or self._driver.outlived:
                 self._make_simulation()  # code that still uses the old one must not meet another episode
                 self._driver.given_up = None
             return self._begin(seed, in_rounds, script)

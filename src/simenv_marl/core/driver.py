@@ -25,6 +25,7 @@ from multiprocessing.process import BaseProcess
 from socket import socket
 from subprocess import Popen
 from threading import Thread, local
+from traceback import walk_tb
 from types import coroutine
 from typing import Any, Final
 from weakref import WeakSet, ref
@@ -48,11 +49,9 @@ UNWINDING_TRIES: Final = 1000
 
 
 class SimulationExit(BaseException):
-    """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it.
+    """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it."""
 
-    It is no ``SystemExit``: C code that prints what a callback raises would end the process.
-    """
-
+    # It is no ``SystemExit``: C code that prints what a callback raises would end the process.
     def __init__(self, text: str = "SimulationExit: the environment was closed, reset or dropped") -> None:
         """Say what it is in its text, because some engines keep only the text of what they catch."""
         super().__init__(text)
@@ -63,10 +62,9 @@ class LoopExit(SimulationExit, KeyboardInterrupt):
 
 
 def is_exit(error: BaseException | None) -> bool:
-    """Whether an error is a ``SimulationExit``, or was raised in place of one.
+    """Whether an error is a ``SimulationExit``, has one as its cause or in its text, or was raised by its ``except``.
 
-    In place of one: with an exit as its cause or in its text, by the code that has caught the exit, or, in a group,
-    all of them. An error that only arises while the exit passes, as in a ``finally``, is the model's.
+    A group is one if all its errors are. What only arises while the exit passes (a ``finally``) is not.
     """
     seen = set()  # causes may be cyclic
     while error is not None and id(error) not in seen:
@@ -81,20 +79,16 @@ def is_exit(error: BaseException | None) -> bool:
 
 def _is_replacement(error: BaseException) -> bool:
     """Whether an error was raised, or the process ended, by the ``except`` that has caught the error's context."""
-    raised, caught = error.__traceback__, error.__context__
-    while raised is not None and raised.tb_next is not None:
-        raised = raised.tb_next
-    if raised is None or caught is None or caught.__traceback__ is None:
+    frames, caught = [*walk_tb(error.__traceback__)], getattr(error.__context__, "__traceback__", None)
+    if not frames or caught is None or caught.tb_frame is not frames[-1][0]:
         return False
-    frame, line = raised.tb_frame, raised.tb_lineno
-    if caught.__traceback__.tb_frame is not frame:
-        return False
+    frame, line = frames[-1]
     kind = ast.stmt if isinstance(error, SystemExit) else ast.Raise
     with suppress(SyntaxError, ValueError):  # bytecode does not tell an ``except`` from a ``finally``
         tree = ast.parse("".join(getlines(frame.f_code.co_filename, frame.f_globals)))
         handlers = [node for node in ast.walk(tree) if isinstance(node, ast.ExceptHandler)]
-        inside = [node for handler in handlers for node in ast.walk(handler) if isinstance(node, kind)]
-        return any(node.lineno <= line <= (node.end_lineno or line) for node in inside)
+        nodes = [node for handler in handlers for node in ast.walk(handler) if isinstance(node, kind)]
+        return any(node.lineno <= line <= (node.end_lineno or line) for node in nodes)
     return False
 
 

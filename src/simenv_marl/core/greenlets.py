@@ -156,7 +156,7 @@ def make_exit() -> SimulationExit:
     hub: Any = getcurrent()
     while hub is not None and hub not in STACKS and not hasattr(hub, "NOT_ERROR"):
         hub = hub.parent
-    if hasattr(hub, "NOT_ERROR"):  # a hub of gevent, on which this greenlet was spawned
+    if hasattr(hub, "NOT_ERROR"):  # of gevent, which has spawned this greenlet
         hub.NOT_ERROR = (*{*hub.NOT_ERROR, SimulationExit},)  # all others are printed
         return LoopExit()
     loop = modules[_ASYNCIO]._get_running_loop() if _ASYNCIO in modules else None

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from contextvars import Context, copy_context
-from functools import partial, wraps
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,17 +25,6 @@ from .plan import DRIVERS, Plan
 from .rng import ENVIRONMENT, draws_check, is_seed, seed_globals
 from .run import LONGEST_TAPE, refusal
 from .spaces import same
-
-
-def _exclusively(method: Any) -> Any:
-    """Make a method of a session that raises a ``ReentrancyError`` while another thread is in such a method."""
-
-    @wraps(method)
-    def call(self: Session, *args: Any, **kwargs: Any) -> Any:
-        with self.exclusive:
-            return method(self, *args, **kwargs)
-
-    return call
 
 
 class Session:
@@ -130,7 +119,6 @@ class Session:
     def np_random(self, generator: np.random.Generator) -> None:
         self._np_random, self.np_random_seed = generator, -1
 
-    @_exclusively
     def start(
         self, seed: int | None, options: dict[str, Any] | None, *, in_rounds: bool = False, script: Any = None
     ) -> Episode:
@@ -139,24 +127,25 @@ class Session:
         Without a seed, one is drawn. An episode ``in_rounds`` updates all agents when a step returns. ``script`` is the
         tape of another episode to replay; ordinary episodes have none.
         """
-        self.end()
-        self.state = "moving"
-        try:
-            self._close_simulation(last=False)
-            if self._installed is None or not self._installed.complete:
-                self._installed = Installation(self.plan.patches)
-            self.options = options
-            if seed is None:
-                seed = int(self.np_random.integers(2**31))
-            else:
-                self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
-            self.seed = seed
-            if self._driver.given_up is not None or self._driver.outlived:
-                self._make_simulation()  # code that still uses the old one must not meet another episode
-                self._driver.given_up = None
-            return self._begin(seed, in_rounds, script)
-        finally:
-            self.state = "new" if self.episode is None else "over"
+        with self.exclusive:
+            self.end()
+            self.state = "moving"
+            try:
+                self._close_simulation(last=False)
+                if self._installed is None or not self._installed.complete:
+                    self._installed = Installation(self.plan.patches)
+                self.options = options
+                if seed is None:
+                    seed = int(self.np_random.integers(2**31))
+                else:
+                    self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
+                self.seed = seed
+                if self._driver.given_up is not None or self._driver.outlived:
+                    self._make_simulation()  # code that still uses the old one must not meet another episode
+                    self._driver.given_up = None
+                return self._begin(seed, in_rounds, script)
+            finally:
+                self.state = "new" if self.episode is None else "over"
 
     def _begin(self, seed: int, in_rounds: bool, script: Any) -> Episode:
         """Reset the simulation, and run it to its first decision."""
@@ -219,36 +208,36 @@ class Session:
         """Make the error that says why no action can be taken now."""
         return refusal(self.state) if self.episode is None else self.episode.refusal()
 
-    @_exclusively
     def end(self) -> None:
         """End the current episode, if there is one. Raise a ``ReentrancyError`` if that is not possible here."""
-        if self.state == "moving":
-            raise refusal(self.state)
-        if self.episode is not None:
-            try:
-                self.episode.close()
-            finally:
-                if self.episode.over and not self.episode.running:
-                    self.episode = None
+        with self.exclusive:
+            if self.state == "moving":
+                raise refusal(self.state)
+            if self.episode is not None:
+                try:
+                    self.episode.close()
+                finally:
+                    if self.episode.over and not self.episode.running:
+                        self.episode = None
 
     @property
     def idle(self) -> bool:
         """Whether there is no episode to end and no patch to remove."""
         return self.episode is None and self._installed is None
 
-    @_exclusively
     def close(self) -> None:
         """Unwind the simulation and remove the patches. For errors, see ``end``."""
-        try:
-            self.end()
-        finally:
-            if self.episode is None and self.state != "moving":
-                self.state = "moving"
-                try:
-                    self._close_simulation(last=True)
-                finally:
-                    self.state = "closed"
-                    self._put_away()
+        with self.exclusive:
+            try:
+                self.end()
+            finally:
+                if self.episode is None and self.state != "moving":
+                    self.state = "moving"
+                    try:
+                        self._close_simulation(last=True)
+                    finally:
+                        self.state = "closed"
+                        self._put_away()
 
     def abandon(self) -> None:
         """Unwind the simulation and remove the patches, from a finalizer. Warn of errors instead of raising them."""

@@ -14,7 +14,7 @@ from ..errors import WrongThreadError
 from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import RULE
-from .driver import THREAD, Driver, Event, SimulationExit, is_exit
+from .driver import THREAD, Driver, Event, LoopExit, SimulationExit, is_exit
 
 
 class GreenletDriver(Driver):
@@ -103,11 +103,12 @@ class GreenletDriver(Driver):
                 driver._loop = _swap_loop(driver._users_loop)
             try:
                 reply = leave(event, bound, named)
-            except BaseException:
+            except BaseException as error:
                 if not driver.ended:  # once the driver has ended, the stack unwinds by itself
                     driver.resume = driver._body.switch
                     driver._enter_loop()
-                    silence_unwound_tasks()
+                    if isinstance(error, SimulationExit):
+                        raise make_exit() from None
                 raise
             if away:
                 driver.resume = driver._body.switch
@@ -147,12 +148,27 @@ def _swap_loop(state: Any) -> Any:
     return present
 
 
-def silence_unwound_tasks() -> None:
-    """Stop the running loop from reporting tasks that are unwound, because no code can await them any more."""
+def make_exit() -> SimulationExit:
+    """Return the exit to raise here. The loop here will not report it, because no code awaits its tasks any more.
+
+    A ``LoopExit`` ends a loop at once. But where asyncio closes its loop already, it must go on to the other tasks.
+    """
+    hub: Any = getcurrent()
+    while hub is not None and hub not in STACKS and not hasattr(hub, "NOT_ERROR"):
+        hub = hub.parent
+    if hasattr(hub, "NOT_ERROR"):  # of gevent, which has spawned this greenlet
+        hub.NOT_ERROR = (*{*hub.NOT_ERROR, SimulationExit},)  # all others are printed
+        return LoopExit()
     loop = modules[_ASYNCIO]._get_running_loop() if _ASYNCIO in modules else None
-    before = None if loop is None else loop.get_exception_handler()
-    if loop is not None and not isinstance(before, partial):  # else it was silenced in an earlier episode
+    if loop is None:
+        return SimulationExit()
+    before = loop.get_exception_handler()
+    if not isinstance(before, partial):  # else it was silenced in an earlier episode
         loop.set_exception_handler(partial(_report_task, before or type(loop).default_exception_handler))
+    frame: Any = sys._getframe()
+    while frame is not None and frame.f_code is not modules["asyncio"].Runner.close.__code__:
+        frame = frame.f_back
+    return LoopExit() if frame is None else SimulationExit()
 
 
 def _report_task(report: Callable[..., Any], loop: Any, context: dict[str, Any]) -> None:

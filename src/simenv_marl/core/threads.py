@@ -13,7 +13,7 @@ from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import SIMULATION, Interceptor
 from ..simulation import RULE, Sentinel
 from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event, SimulationExit
-from .greenlets import silence_unwound_tasks
+from .greenlets import make_exit
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
@@ -145,8 +145,7 @@ class ThreadDriver(Driver):
             if reply is RULE:
                 return rule(*args, **kwargs)
             if reply is _EXIT:
-                silence_unwound_tasks()
-                raise SimulationExit
+                raise make_exit()
             return reply if deliver is None else deliver(reply, *bound, **named)
 
         return decide

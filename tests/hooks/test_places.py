@@ -17,7 +17,7 @@ from simenv_marl import aec_env
 from simenv_marl.errors import PatchError, UnknownTargetError
 from simenv_marl.hooks.handlers import Installation
 from simenv_marl.hooks.hook import hook_of, unbind
-from simenv_marl.hooks.places import PlacedHook, find_hook, hook_at, places_of, resolve
+from simenv_marl.hooks.places import PlacedHook, find_hook, places_of, resolve
 from simenv_marl.plugins import (
     ChangedResult,
     attach_handler,
@@ -151,23 +151,6 @@ def test_an_interrupt_while_something_is_set_or_put_back_leaves_nothing(name, ag
         if where is None:
             break
     assert number > 10
-
-
-def test_a_function_of_a_module_is_set_under_all_its_names(make_module):
-    other = make_module("other_module")
-    other.alias = original = function
-    hook = hook_of_name("function")
-    assert hook_at("other_module.alias", other, "alias", UnknownTargetError) is hook
-    hook.install(1)
-    hook.install(2)
-    assert hook_of(other.alias) is hook_of(function) is hook
-    late = other.late = other.alias
-    hook.uninstall(2)
-    assert hook_of(other.alias) is hook
-    hook.uninstall(1)
-    assert other.alias is other.late is function is original
-    assert late() == "rule"
-    assert {owner.__name__ for owner, _ in places_of(function)} == {HERE, "other_module"}
 
 
 def test_a_function_is_found_by_what_its_module_calls_it(make_module):

@@ -15,7 +15,7 @@ import greenlet
 import pytest
 import simpy
 
-from simenv_marl import RULE, aec_env, generate_env, single_env
+from simenv_marl import RULE, aec_env, difference, generate_env, single_env
 from tests.worlds.models import (
     Script,
     calling,
@@ -77,7 +77,7 @@ def inner_env():
     return single_env(calling(*[INNER] * 3), INNER)
 
 
-INNER = decision(lambda: "inner rule", agent="inner_0", reward_mapping=lambda: 1)
+INNER = decision(lambda: "inner rule", agent="inner_0", reward_mapping=difference(lambda: 1))
 
 
 def run_inner(env, action):
@@ -184,7 +184,8 @@ def test_mappings_and_policies_may_run_an_environment_of_their_own(name):
         return value
 
     other = decision(agent="other_0")
-    outer = decision(**{"agent": "outer_0"} | ({} if name == "policy" else {name: nested}))
+    mapping = difference(nested) if name == "reward_mapping" else nested
+    outer = decision(**{"agent": "outer_0"} | ({} if name == "policy" else {name: mapping}))
     policies = {outer: nested} if name == "policy" else None
     env = aec_env(calling(outer, other, outer, INNER), [outer, other, INNER], policies=policies)
     play(env, 7)

@@ -501,10 +501,17 @@ def test_plugins_are_a_list(plugins):
             make(House, House.water, plugins=plugins)
 
 
-@pytest.mark.parametrize("kind", [Pool, int])
-def test_classes_are_no_iterables(kind):
-    with pytest.raises(PatchError, match="expose one of its functions"):
-        expose_to_plugins(kind)
+async def flow():
+    yield 1
+
+
+@pytest.mark.parametrize(
+    ("thing", "why"),
+    [(Pool, "expose one of its"), (int, "expose one of its"), (flow, "async generator"), (3, "neither")],
+)
+def test_what_cannot_be_extended_cannot_be_exposed(thing, why):
+    with pytest.raises(PatchError, match=why):
+        expose_to_plugins(thing)
 
 
 def test_whatever_can_be_called_with_the_arguments_is_accepted():
@@ -777,10 +784,11 @@ def test_calls_are_traced_in_the_order_in_which_they_begin():
     ]
     assert [target for target, *_ in shown[4:]] == ["function", "price"]
     assert shown[4][2].startswith("raised TypeError")
-    with trace() as everything:  # which is what is exposed
+    with handlers((nothing, BID, "before")), trace() as everything:  # which is what is exposed, or has handlers
         function(1)
         Trader().bid("tea")
-    assert [call.target for call in everything] == [f"{HERE}.local.<locals>.function"]
+        Trader.rounded(2.5)
+    assert [call.target for call in everything] == [f"{HERE}.local.<locals>.function", BID]
     assert len(calls) == 6
 
 

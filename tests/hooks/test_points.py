@@ -11,7 +11,7 @@ import pytest
 
 import simenv_marl
 from simenv_marl import RULE, SimEnvError, generate_env
-from simenv_marl.errors import AgentError, DefinitionError, PatchError, UnknownPointError
+from simenv_marl.errors import AgentError, DefinitionError, NoDecisionError, PatchError, UnknownPointError
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
@@ -325,6 +325,12 @@ def test_environments_of_a_base_class_and_of_a_subclass_get_along(first, second,
 def test_siblings_may_each_decorate_what_they_have_inherited(points, log):
     rooms = calling(*[lambda kind=kind: kind().dry() for kind in (Home, Kitchen, Cellar)])
     assert log_of(aec_env(rooms, points)) == log
+
+
+def test_a_point_that_is_never_called_is_named():
+    env = aec_env(calling(lambda: Trader().bid("tea")), SUB)
+    with pytest.raises(NoDecisionError, match=r"without a decision of .*Broker\.bid; does the simulation call"):
+        env.reset()
 
 
 # -- restoring ------------------------------------------------------------------------------------

@@ -10,13 +10,14 @@ from contextlib import nullcontext
 from itertools import count
 
 import pytest
+from greenlet import greenlet
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core import threads
 from simenv_marl.core.context import ExclusiveLock
 from simenv_marl.core.plan import Plan
 from simenv_marl.errors import ReentrancyError
-from tests.worlds.models import Script, calling, decision, notes, play, script, step
+from tests.worlds.models import Script, calling, decision, notes, play, script, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
 
@@ -197,6 +198,19 @@ def test_an_interrupt_leaves_an_environment_to_any_thread():
     in_a_thread(claim.__enter__)
     with pytest.raises(ReentrancyError), claim:
         pass
+
+
+def test_a_simulation_on_a_greenlet_that_another_thread_collects_unwinds_in_its_own():
+    def drop():
+        envs.clear()
+        gc.collect()
+
+    log, decide = [], decision()
+    envs = [single_env(unwinding(decide, log), decide, driver="greenlet")]
+    envs[0].reset()
+    in_a_thread(drop)
+    greenlet(decide).switch()
+    assert log == ["unwound"]
 
 
 # -- what is left behind --------------------------------------------------------------------------

@@ -109,7 +109,7 @@ def test_agents_that_nobody_knows_are_lookup_errors(method):
         *(({"max_steps": wrong}, OptionValueError, "max_steps") for wrong in (0, -1, 2.0, "3")),
         *(({"driver": wrong}, OptionValueError, "driver") for wrong in ("magic", None)),
         *(({"policies": wrong}, OptionValueError, "polic") for wrong in (3, [PUMP], {"pump_0": 3}, {"pump_0": None})),
-        ({"render_mode": "human"}, OptionValueError, "render_mode"),
+        ({"render_mode": 3}, OptionValueError, "render_mode"),
         *(
             ({"policies": {key: lambda observation: 1}}, UnknownPointError, "known are pump")
             for key in ("fan_0", "tests.contract.test_environments.Nobody.decides", "no.where", 3, None)

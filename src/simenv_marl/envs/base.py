@@ -192,10 +192,11 @@ class View:
         """Render after a step, or after the reset with which an episode ``begins``."""
         if begins:
             self._frames = []
+        if not self._collects:
+            self.render()
+            return
         with self._session.context():
-            frame = self.simulation.render(self._mode)
-        if self._collects:
-            self._frames.append(frame)
+            self._frames.append(self.simulation.render(self._mode))
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.

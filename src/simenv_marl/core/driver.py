@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import Context, copy_context
 from functools import partial, wraps
-from gc import collect
+from gc import collect, get_referrers
 from linecache import getlines
 from multiprocessing.process import BaseProcess
 from socket import socket
@@ -199,8 +199,9 @@ class Driver:
         """Whether the model has kept greenlets that belong to the stack, which has ended: they can decide nowhere."""
         if self._past() is not None:
             collect()  # what only waits for the garbage collector was not kept
-        stack = self._past()
-        return stack is not None and stack.dead
+        stack = self._past()  # of a thread that has just ended, greenlet may still hold it
+        kept = () if stack is None else get_referrers(stack)
+        return any(isinstance(other, greenlet) and other.parent is stack for other in kept)
 
     def run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
         """Run a job to its end, during which decision functions run their rule; return its result."""

@@ -1,5 +1,8 @@
 """Mistakes of users that are told when the environment is made, or with the remedy."""
 
+from queue import SimpleQueue
+from threading import Thread
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -93,3 +96,22 @@ def test_integers_are_clipped_without_wrapping_around(action, clipped, shape):
     env.reset()
     env.step(np.full(shape, action, np.uint64 if action > 7 else np.int64))
     assert env.unwrapped.simulation.decided.tolist() == [clipped] * shape[0]
+
+
+def test_an_episode_whose_decisions_fall_in_a_late_thread_names_the_thread_and_the_point():
+    calls, answers = SimpleQueue(), SimpleQueue()
+    middleware = Thread(target=lambda: [answers.put(call()) for call in iter(calls.get, None)], name="middleware")
+
+    class Served(Model):
+        def run(self):
+            calls.put(self.choose)
+            assert answers.get(timeout=10) == 0
+
+    middleware.start()
+    env = single_env(Served, {f"{__name__}.Model.choose": definition()})
+    try:
+        with pytest.raises(NoDecisionError, match=rf"{CHOOSE}; .*threads that are not the simulation's: middleware"):
+            env.reset()
+    finally:
+        calls.put(None)
+        middleware.join()

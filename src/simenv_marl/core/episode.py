@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from math import inf
+from threading import current_thread
 from typing import TYPE_CHECKING, Any, Final
 
 from greenlet import getcurrent
@@ -320,6 +321,12 @@ class Episode(Run):
         hint = "does the simulation call the decision functions as attributes of their class or module?"
         if overriding:
             hint = f"these override it and are called instead: {listed(overriding)}; name them as decision points"
+        threads = {name for point in self.plan.active for name in point.point.threads} - {current_thread().name}
+        if threads:
+            hint = (
+                f"the rule has decided in threads that are not the simulation's: {listed(sorted(threads))}; call it"
+                " where run() runs, and pass the decision on"
+            )
         if self.others:
             expected = f"{self.plan.one_agent!r} at {expected}" if self.plan.one_agent else expected
             hint = f"these have decided: {listed(self.others)}"

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial, update_wrapper
-from threading import local
+from threading import current_thread, local
 from types import FunctionType
 from typing import Any, Final
 from weakref import WeakValueDictionary, finalize
@@ -187,6 +187,7 @@ class Hook:
         slot: Its handlers, as ``slots`` returns them. Empty while it has none.
         stale: Whether another object has replaced it while nothing was set in its place.
         permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
+        threads: The names of threads that called it before anything else, and where its rule decides.
         definition: The latest definition of a decision function, which its name means; None for all other functions.
         removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
     """
@@ -218,6 +219,7 @@ class Hook:
         self.alone = self.bound and len(first) == len(parameters) == 1
         self._binder: Callable[..., tuple[tuple[Any, ...], dict[str, Any]]] | None = None  # made when it is needed
         self.interceptors = Interceptors(self)
+        self.threads: set[str] = set()
         self.definition: Any = None
         self.removed_by: dict[Any, Any] = {}
         self.slot: dict[Any, list[list[list[Handler]]]] = {}
@@ -279,6 +281,7 @@ class Hook:
                 _THREAD.mark = set()
                 finalize(_THREAD.mark, _ROOTS.discard, here)  # a root that outlives its thread makes greenlets crash
             _ROOTS.add(here)
+            self.threads.add(current_thread().name)
         return self.around(decide or self.run_rule, plugins)
 
     # -- who takes part ---------------------------------------------------------------------------

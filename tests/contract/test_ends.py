@@ -355,12 +355,6 @@ def swallow_exceptions(simulation):
             simulation.log.append("swallowed")
 
 
-def swallow_once(simulation):
-    with suppress(BaseException):
-        decide()
-    return "done"
-
-
 def swallow_a_few(simulation):
     for _ in range(4):
         with suppress(BaseException):
@@ -374,17 +368,9 @@ def translate(simulation):
         raise RuntimeError("translated") from error
 
 
-def stop_in_finally(simulation):
-    while True:
-        try:
-            decide()
-        finally:
-            break  # noqa: B012
-
-
 @VIEWS
 @TRIGGERS
-@pytest.mark.parametrize("main", [swallow_exceptions, swallow_once, swallow_a_few, translate, stop_in_finally])
+@pytest.mark.parametrize("main", [swallow_exceptions, swallow_a_few, translate])
 def test_models_that_resist_a_little_are_unwound(view, trigger, main):
     before = stacks()
     held = [view(script(main), decide)]

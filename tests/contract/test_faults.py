@@ -234,17 +234,9 @@ class FrozenError(Exception):
     value: int
 
 
-class SlottedError(Exception):
-    __slots__ = ()
-
-
 class UnannotatedError(Exception):
     def add_note(self, note):
         raise TypeError("no notes, please")
-
-
-class BaseError(BaseException):
-    pass
 
 
 def in_circles():
@@ -272,10 +264,8 @@ ERRORS = {
     "group": lambda: ExceptionGroup("several", [ValueError(), KeyError()]),
     "base group": lambda: BaseExceptionGroup("several", [KeyboardInterrupt()]),
     "frozen": lambda: FrozenError(1),
-    "slotted": SlottedError,
     "unannotated": UnannotatedError,
     "foreign notes": with_foreign_notes,
-    "base": BaseError,
     "circular": in_circles,
     "warning": lambda: UserWarning("as an error"),
 }

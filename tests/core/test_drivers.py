@@ -10,7 +10,6 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from queue import Queue
 from textwrap import dedent
 
 import greenlet
@@ -231,10 +230,7 @@ def test_unrelated_threads_run_their_rule_while_a_simulation_is_moving(driver):
 
 
 def by_thread(function):
-    """In a thread of its own: what it has returned there, or that it was refused."""
-    with suppress(WrongThreadError):
-        return in_a_thread(function)
-    return "refused"
+    return in_a_thread(lambda: refused_or(function))
 
 
 def by_pool(function):
@@ -299,23 +295,25 @@ def test_a_refusal_is_raised_once_or_told_of_by_another_error(driver):
     assert "a decision was refused" in notes(raised_by(followed_by_another, KeyError))
 
 
+def refused_or(function):
+    """What it has returned in this thread, or that it was refused."""
+    with suppress(WrongThreadError):
+        return function()
+    return "refused"
+
+
 @DRIVERS
 @pytest.mark.parametrize("how", ["step", "close", "reset"])
 def test_a_thread_that_runs_while_the_simulation_is_suspended_is_refused_too(driver, how):
     def work():
         assert ask.wait(10)
-        said.append(by_itself())
+        said.append(refused_or(decide))
 
     def main(simulation):
         simulation.thread = threading.Thread(target=work)
         simulation.thread.start()
         decide()
         decide()
-
-    def by_itself():
-        with suppress(WrongThreadError):
-            return decide()
-        return "refused"
 
     ask, said, decide = threading.Event(), [], decision()
     env = single_env(script(main), decide, driver=driver)
@@ -329,34 +327,12 @@ def test_a_thread_that_runs_while_the_simulation_is_suspended_is_refused_too(dri
     assert said == ["refused"] * 2
 
 
-class Pooled(Script):
-    """Has threads that are there before any episode, or that outlive some."""
-
-    def __init__(self, main):
-        super().__init__(main)
-        self.requests, self.answers = Queue(), Queue()
-        self.thread = None
-
-    def work(self):
-        for function in iter(self.requests.get, None):
-            try:
-                self.answers.put(function())
-            except WrongThreadError:
-                self.answers.put("refused")
-
-    def hire(self):
-        self.thread = threading.Thread(target=self.work, daemon=True)
-        self.thread.start()
-
-    def ask(self, function):
-        self.requests.put(function)
-        return self.answers.get(timeout=10)
-
-
 @DRIVERS
 @pytest.mark.parametrize("when", ["made", "reset", "episode before"])
 def test_threads_that_are_older_than_the_episode_are_refused_too(driver, when):
-    class Hiring(Pooled):
+    class Hiring(Script):
+        pool = None
+
         def __init__(self):
             super().__init__(main)
             if when == "made":
@@ -366,14 +342,21 @@ def test_threads_that_are_older_than_the_episode_are_refused_too(driver, when):
             super().reset()
             if when == "reset":
                 self.hire()
-                self.log.append(self.ask(decide))
+                self.log.append(self.ask())
+
+        def hire(self):
+            self.pool = ThreadPoolExecutor(1)
+            self.pool.submit(int).result()  # now its thread is there
+
+        def ask(self):
+            return self.pool.submit(refused_or, decide).result()
 
     def main(simulation):
         simulation.log.append(decide())
-        if simulation.thread is None:
+        if simulation.pool is None:
             simulation.hire()
             return
-        simulation.log.append(simulation.ask(decide))
+        simulation.log.append(simulation.ask())
         decide()
 
     decide = decision()
@@ -381,15 +364,14 @@ def test_threads_that_are_older_than_the_episode_are_refused_too(driver, when):
     env.reset()
     if when == "episode before":
         assert env.step(1)[2]
-        assert env.simulation.ask(decide) == "rule"  # between episodes nobody would be asked anyway
+        assert env.simulation.ask() == "rule"  # between episodes nobody would be asked anyway
         env.reset()
     with pytest.raises(WrongThreadError, match=REFUSED):
         env.step(1)
     assert env.simulation.log == [*(["rule"] if when == "reset" else []), 1, "refused"]
     env.close()
-    assert env.simulation.ask(decide) == "rule"
-    env.simulation.requests.put(None)
-    env.simulation.thread.join()
+    assert env.simulation.ask() == "rule"
+    env.simulation.pool.shutdown()
 
 
 @DRIVERS
@@ -427,8 +409,8 @@ needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="the platform ha
 def process(code):
     """Run code in a process of its own, with warnings as errors; one that hangs is ended."""
     preamble = """
-        import os, sys, threading
-        import random, signal, time
+        import os, random, signal, sys, threading, time
+        from contextlib import suppress
         from simenv_marl import aec_env, parallel_env, single_env
         from simenv_marl.errors import WrongThreadError
         from tests.worlds.models import calling, decision, script
@@ -590,10 +572,8 @@ def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
             for env in envs:
                 env.reset()
                 if where in ("over", "moving", "failed"):
-                    try:
+                    with suppress(ZeroDivisionError):
                         env.step(1)
-                    except ZeroDivisionError:
-                        pass
                 if where == "over":
                     env.step(1)
                 if where == "closed":

@@ -17,12 +17,11 @@ import random
 import sys
 
 from gymnasium import spaces
-
-from simenv_marl import make_step
+from tests.worlds.models import define
 
 
 def definition(observe):
-    return make_step(
+    return define(
         observation_space=spaces.Box(-100, 100, (1,)),
         observation_space_mapping=observe,
         action_space=spaces.Discrete(3),
@@ -159,7 +158,10 @@ def test_what_cannot_be_looked_at(command, target, told, capsys):
 
 @pytest.mark.parametrize(
     "arguments",
-    ["", "chek walking:Walk", "check", "check walking:Walk --time-limit never", "wire-check --options [1] s"],
+    [
+        *("", "chek walking:Walk", "check", "check walking:Walk --time-limit never", "wire-check --options [1] s"),
+        *("new", "new plain", "new netlogo tank"),
+    ],
 )
 def test_wrong_arguments(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
@@ -169,24 +171,19 @@ def test_wrong_arguments(arguments, capsys):
 
 
 @pytest.mark.parametrize(
-    ("command", "target", "option", "value"),
+    ("command", "options"),
     [
-        ("check", "walking:Walk", "seed", "-1"),
-        ("check", "walking:Walk", "episodes", "0"),
-        ("check", "walking:Walk", "max-steps", "0"),
-        ("check", "walking:Walk", "time-limit", "0"),
-        ("check", "walking:Walk", "time-limit", "inf"),
-        ("inspect", "walking:Walk", "seed", "-1"),
-        ("wire-check", "true", "seed", "-1"),
-        ("wire-check", "true", "seed", str(2**31)),
-        ("wire-check", "true", "decisions", "0"),
-        ("wire-check", "true", "timeout", "nan"),
-        ("wire-check", "true", "timeout", "inf"),
+        ("check walking:Walk", ["seed -1", "episodes 0", "max-steps 0", "time-limit 0", "time-limit inf"]),
+        ("inspect walking:Walk", ["seed -1"]),
+        ("wire-check true", ["seed -1", f"seed {2**31}", "decisions 0", "timeout nan", "timeout inf"]),
     ],
 )
-def test_numbers_that_cannot_be_used(command, target, option, value, capsys):
-    assert main([command, f"--{option}", value, target]) == 2
-    assert option.replace("-", "_") in capsys.readouterr().err
+def test_numbers_that_cannot_be_used(command, options, capsys):
+    command, target = command.split()
+    for each in options:
+        option, value = each.split()
+        assert main([command, f"--{option}", value, target]) == 2
+        assert option.replace("-", "_") in capsys.readouterr().err
 
 
 def test_less_than_a_second_is_a_limit_too(capsys):

@@ -62,8 +62,6 @@ def test_hints_name_what_is_close(name, known, hint):
 
 
 class Tank(simenv_marl.SimulationInterface):
-    level = 5.0
-
     def reset(self):
         self.level = 5.0
 

@@ -5,13 +5,13 @@ import pickle
 import random
 from functools import partial
 
-import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, SteppedSimulation, aec_env, evaluate, make_step, simulate, single_env
+from simenv_marl import RULE, SteppedSimulation, aec_env, evaluate, simulate, single_env
 from simenv_marl.errors import OptionValueError, SimulationError, UnknownPointError
 from simenv_marl.experiments import design, run_experiment
+from tests.worlds.models import define
 
 
 class Walk:
@@ -42,12 +42,10 @@ class Planned(Walk):
 
 
 STRIDE = {
-    f"{__name__}.Walk.stride": make_step(
-        observation_space=spaces.Box(-100, 100, (1,), np.float64),
-        observation_space_mapping=lambda walk: [walk.place],
+    f"{__name__}.Walk.stride": define(
+        observation_space_mapping=lambda walk: [walk.place, 0.0],
         action_space=spaces.Discrete(3),
         action_space_mapping=lambda action: action - 1.0,
-        reward_mapping=lambda walk: -abs(walk.place),
     )
 }
 
@@ -133,7 +131,7 @@ def test_points_are_those_that_are_named():
     others = []
     for package in ("one", "another"):
         decide.__module__ = f"{package}.model"
-        others.append(next(iter(STRIDE.values()))(decide))
+        others.append(define()(decide))
     with pytest.raises(UnknownPointError, match="points is empty"):
         aec_env(SteppedSimulation(Walk, 5))
     assert simulate(SteppedSimulation(Walk, 5), seed=2).model.place == walked(2, 5)

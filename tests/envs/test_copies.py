@@ -9,13 +9,11 @@ from functools import partial
 from pathlib import Path
 
 import cloudpickle
-import gymnasium
-import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from simenv_marl import RULE, aec_env, difference, generate_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, single_env
 from simenv_marl.envs import SimulationAECEnv
 from simenv_marl.errors import ClosedError, NotResetError
 from simenv_marl.experiments import Variant
@@ -161,29 +159,6 @@ def test_entities_and_their_roster_are_copied():
     env = parallel_env(Walk, beings(), possible_agents={point: names})
     for twin in (copy.deepcopy(env), cloudpickle.loads(cloudpickle.dumps(env))):
         assert twin.possible_agents == names
-
-
-def test_vectors_of_gymnasium_take_copies_to_other_processes():
-    env = single_env(Walk, Walk.choose)
-    vector = gymnasium.vector.AsyncVectorEnv([lambda: copy.deepcopy(env)] * 2)
-    observations, _ = vector.reset(seed=[1, 2])
-    assert observations.tolist() == [[0.0], [0.0]]
-    vector.step(np.array([1, 1]))
-    vector.close()
-
-
-def test_lambdas_and_differences_need_cloudpickle():
-    by_difference = difference(lambda walk: walk.place)
-    for mapping, expected in ((lambda walk: 1.0, 1.0), (by_difference, None)):
-        env = single_env(Walk, {Walk.choose: define(agent="walker_0", reward_mapping=mapping)})
-        with pytest.raises((AttributeError, pickle.PicklingError)):
-            pickle.dumps(env)
-        twin = cloudpickle.loads(cloudpickle.dumps(env))
-        env.reset(seed=1)
-        twin.reset(seed=1)
-        reward = twin.step(1)[1]
-        assert reward == env.step(1)[1]
-        assert expected in (None, reward)
 
 
 def run(code, given=None):

@@ -365,13 +365,9 @@ class Narrow(Walk):
         return 1
 
 
-@found(
-    "error",
-    "raises KeyError",
-    changes={"action_space": spaces.Discrete(4), "action_mask_mapping": lambda walk: [1, 1, 0, 1]},
+found("error", "raises KeyError", changes={"action_space": spaces.Discrete(4), MASK: lambda walk: [1, 1, 0, 1]})(
+    type("NarrowBehindAMask", (Narrow,), {"effects": {-1: 0.5, 0: 1.0, 1: 1.5}})
 )
-class NarrowBehindAMask(Narrow):
-    effects = {-1: 0.5, 0: 1.0, 1: 1.5}  # noqa: RUF012
 
 
 @found("error", "neither ends nor asks", "wait forever", time_limit=2)
@@ -423,10 +419,7 @@ class Seeding(Global):
 
 @found("note", "stopped before their end", "60 decisions")
 class Endless(Walk):
-    def run(self):
-        for number in itertools.count():
-            self.number = number
-            self.place = 0.9 * self.place + self.choose() + self.random.random()
+    steps = 10**9
 
 
 @found("warning", "agents do changes nothing")
@@ -460,9 +453,8 @@ def test_episodes_that_are_cut_are_counted_and_compared():
 
 
 def test_seeds_that_only_attributes_show():
-    report = checked(
-        variant("Marked", reset=lambda walk, seed=None: Walk.reset(walk, 7) or setattr(walk, "mark", seed))
-    )
+    marked = variant("Marked", reset=lambda walk, seed=None: Walk.reset(walk, 7) or setattr(walk, "mark", seed))
+    report = checked(marked)
     assert report.ok, str(report)
     assert not [title for title in titles(report) if "All seeds" in title]
 
@@ -493,6 +485,7 @@ def test_statistics_are_those_of_the_episodes():
     report = checked(Walk, changes, episodes=2, seeds=[0])
     statistics = report.statistics[0]
     assert statistics.decisions == 2 * Walk.steps
+    assert statistics.never_legal == ()
     assert [dataclasses.astuple(part) for part in statistics.observations] == [
         ("observation.still[0]", 0.5, 0.5, 0.5),
         ("observation.still[1]", 0.25, 0.25, 0.25),

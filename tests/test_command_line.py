@@ -13,43 +13,24 @@ from simenv_marl.__main__ import main
 MODELS = '''
 """Two walks, one of which limps."""
 
-import random
 import sys
 
-from gymnasium import spaces
-from tests.worlds.models import define
+from tests.worlds import copied
 
 
-def definition(observe):
-    return define(
-        observation_space=spaces.Box(-100, 100, (1,)),
-        observation_space_mapping=observe,
-        action_space=spaces.Discrete(3),
-        action_space_mapping=lambda action: action - 1,
-        reward_mapping=lambda walk: -abs(walk.place),
-        agent="walker_0",
-    )
+class Walk(copied.Walk):
+    points = [copied.Walk.choose]
+
+    def __init__(self):
+        super().__init__(10)
 
 
-class Walk:
-    def reset(self, seed=None):
-        self.random, self.place = random.Random(seed), 0.0
-
-    def run(self):
-        for _ in range(10):
-            self.place += self.choose() + self.random.random()
-
-    def choose(self):
-        return 0
-
-    points = {choose: definition(lambda walk: [walk.place])}
+def shaken(walk):
+    return [walk.place + walk.random.random()]
 
 
 class Limping(Walk):
-    def choose(self):
-        return 0
-
-    points = {choose: definition(lambda walk: [walk.place + walk.random.random()])}
+    points = {copied.Walk.choose: copied.define(observation_space_mapping=shaken)}
 
 
 class Boot:

@@ -119,6 +119,7 @@ def test_the_generators_of_the_process_are_seeded_for_each_future(method):
 
     found = branch(env, base, 3, method=method, seeds=[7, 8, 7])
     assert found[0] == found[2] != found[1]
+    assert found[0][2] != found[1][2]  # the simulation is reseeded, too
     assert found == branch(env, base, 3, seeds=[7, 8, 7])
     assert len({value for each in found[:2] for part in each[:2] for value in part}) == 16
     plain = [random.Random(7).random(), np.random.RandomState(7).random(), np.random.default_rng(7).random()]

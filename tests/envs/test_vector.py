@@ -18,15 +18,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    joint_env,
-    make_step,
-    register_simulation,
-    single_env,
-    vector_env,
-)
+from simenv_marl import RULE, TRUNCATED, joint_env, make_step, register_simulation, single_env, vector_env
 from simenv_marl.errors import (
     ClosedError,
     CopyError,
@@ -83,7 +75,6 @@ def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number):
 
 
 def amount(what, most, agent):
-    """A definition whose observation and reward are one attribute, and whose action is a number."""
     return make_step(
         observation_space=spaces.Box(-99, 99, (1,), np.float64),
         observation_space_mapping=lambda self: [getattr(self, what)],
@@ -142,9 +133,7 @@ def test_matches_sync_vector_env_over_joint_views(flatten, mode):
 
 
 def test_the_view_can_be_chosen():
-    envs = vector_env(Counter, Counter.decide, num_envs=2, view="joint")
-    assert isinstance(envs.single_action_space, spaces.Dict)
-    envs.close()
+    assert isinstance(vector_env(Counter, POINT, num_envs=2, view="joint").single_action_space, spaces.Dict)
     with pytest.raises(ViewError, match="needs one active decision point"):
         vector_env(Pair, PAIR, num_envs=2, view="single")
 
@@ -174,20 +163,17 @@ def seeds_of(envs: Any) -> list[int | None]:
 
 
 def test_seeds_are_one_for_all_or_one_for_each():
-    envs = vector_env(Counter, Counter.decide, num_envs=3)
-    envs.reset(seed=7)
-    assert seeds_of(envs) == [7, 8, 9]
-    assert envs.np_random_seed == (7, 8, 9)
-    envs.reset(seed=np.int64(4))
-    assert seeds_of(envs) == [4, 5, 6]
-    envs.reset(seed=[3, None, 1])
-    assert seeds_of(envs)[::2] == [3, 1]
-    assert seeds_of(envs)[1] != 5
-    envs.reset()
-    drawn = seeds_of(envs)
-    envs.reset(seed=[3, None, 1])
-    envs.reset()
-    assert seeds_of(envs)[::2] == drawn[::2]
+    envs, drawn = vector_env(Counter, Counter.decide, num_envs=3), []
+    for seed, told in ((7, [7, 8, 9]), (np.int64(4), [4, 5, 6])):
+        envs.reset(seed=seed)
+        assert seeds_of(envs) == list(envs.np_random_seed) == told
+    for _ in range(2):
+        envs.reset(seed=[3, None, 1])
+        assert seeds_of(envs)[::2] == [3, 1]
+        assert seeds_of(envs)[1] != 5
+        envs.reset()
+        drawn.append(seeds_of(envs)[::2])
+    assert drawn[0] == drawn[1]
     for wrong in ([1, 2], -1, [1, 2, -3], [1.0, 2, 3]):
         with pytest.raises(OptionValueError, match="seed"):
             envs.reset(seed=wrong)
@@ -234,14 +220,11 @@ def test_without_autoreset_an_ended_episode_must_be_reset(processes):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"num_envs": 0}, OptionValueError, "num_envs"),
-        ({"num_envs": "2"}, OptionValueError, "num_envs"),
-        ({"num_envs": True}, OptionValueError, "num_envs"),
+        *(({"num_envs": number}, OptionValueError, "num_envs") for number in (0, "2", True)),
         ({"workers": -1}, OptionValueError, "workers"),
         ({"autoreset_mode": "never"}, OptionValueError, "autoreset_mode"),
         ({"view": "aec"}, OptionValueError, "view must be"),
-        ({"workers": 1, "context": "magic"}, OptionValueError, "context must be"),
-        ({"workers": 1, "context": 3}, OptionValueError, "context must be"),
+        *(({"workers": 1, "context": context}, OptionValueError, "context must be") for context in ("magic", 3)),
         ({"max_step": 3}, UnknownOptionError, "max_steps"),
     ],
 )
@@ -346,76 +329,65 @@ def test_observations_are_copies_unless_told_otherwise(kind, copy, processes):
 # -- errors -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("culprit", [0, 1])
-def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(culprit):
+@pytest.mark.parametrize("where", ["run", "observation_space_mapping", "reward_mapping", "action_space_mapping"])
+@pytest.mark.parametrize("culprit", [0, 2])
+def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(where, culprit):
+    def fail(thing: Any) -> Any:
+        if thing == 3 or (isinstance(thing, Counter) and thing.seed == culprit and thing.count):
+            raise FuseError
+        return [0, 0] if where.startswith("obs") else 1
+
+    def made() -> Any:
+        return vector_env(Counter, {POINT: definition(**{where: fail} if where != "run" else {})}, num_envs=3)
+
     stacks_before = stacks()
-    envs = vector_env(Counter, Counter.decide, num_envs=3)
+    envs, fresh = made(), made()
     envs.reset(seed=0)
-    envs.envs[culprit].simulation.failing = True
+    envs.envs[culprit].simulation.failing = where == "run"
     with pytest.raises(FuseError) as caught:
-        envs.step([1, 1, 1])
+        envs.step(np.where(np.arange(3) == culprit, 3, 1))
     assert f"sub-environment {culprit}" in notes(caught.value)
     assert f"seed {culprit}" in notes(caught.value)
-    for _ in range(2):
-        with pytest.raises(EpisodeOverError, match="an error has ended"):
-            envs.step([1, 1, 1])
-    with pytest.raises(EpisodeOverError, match="without a reset_mask"):
-        envs.reset(options={"reset_mask": np.array([False, True, False])})
+    if (where, culprit) == ("action_space_mapping", 0):
+        envs.step([1, 1, 1])  # nothing had moved
+        assert counts(envs) == [1, 1, 1]
+    else:
+        for _ in range(2):
+            with pytest.raises(EpisodeOverError, match=r"an error has ended .*begin the next ones"):
+                envs.step([1, 1, 1])
+        with pytest.raises(EpisodeOverError, match="without a reset_mask"):
+            envs.reset(options={"reset_mask": np.array([False, True, False])})
     envs.envs[culprit].simulation.failing = False
-    fresh = vector_env(Counter, Counter.decide, num_envs=3)
-    agree(envs, fresh, 10, np.random.default_rng(0))
+    envs.reset(seed=5)
+    envs.step([1, 1, 1])
+    assert counts(envs) == [1, 1, 1]
+    if where == "run":
+        agree(envs, fresh, 10, np.random.default_rng(0))
     envs.close()
     fresh.close()
     assert stacks(stacks_before) == stacks_before
 
 
-@pytest.mark.parametrize("mapping", ["observation_space_mapping", "reward_mapping", "action_space_mapping"])
-@pytest.mark.parametrize("culprit", [0, 2])
-def test_an_error_in_a_mapping_says_where_it_was(mapping, culprit):
-    stacks_before = stacks()
-
-    def fail(thing: Any) -> Any:
-        if isinstance(thing, Counter):
-            if thing.seed == culprit and thing.count:
+def test_an_error_after_another_one_was_reset_or_in_a_reset_has_all_be_reset():
+    class Fragile(Counter):
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+            super().reset(seed, options)
+            if seed == 66:
                 raise FuseError
-            return [0, 0] if mapping.startswith("obs") else 0.0
-        if thing == 3:
-            raise FuseError
-        return 1
 
-    envs = vector_env(Counter, {POINT: definition(**{mapping: fail})}, num_envs=3)
-    envs.reset(seed=0)
-    actions = np.where(np.arange(3) == culprit, 3, 1)
+    envs = vector_env(Fragile, {POINT: definition(action_space_mapping=lambda action: {1: 1}[action])}, num_envs=2)
     with pytest.raises(FuseError) as caught:
-        envs.step(actions)
-    assert f"sub-environment {culprit}" in notes(caught.value)
-    if mapping == "action_space_mapping" and culprit == 0:
-        envs.step([1, 1, 1])  # nothing had moved
-        assert counts(envs) == [1, 1, 1]
-    else:
-        with pytest.raises(EpisodeOverError, match="begin the next ones"):
-            envs.step([1, 1, 1])
-    envs.reset(seed=5)
-    envs.step([1, 1, 1])
-    assert counts(envs) == [1, 1, 1]
-    envs.close()
-    assert stacks(stacks_before) == stacks_before
-
-
-def test_an_error_after_another_one_was_reset_has_all_be_reset():
-    def fail_at_three(action: int) -> int:
-        if action == 3:
-            raise FuseError
-        return 1
-
-    envs = vector_env(Counter, {POINT: definition(action_space_mapping=fail_at_three)}, num_envs=2)
+        envs.reset(seed=65)
+    assert "sub-environment 1" in notes(caught.value)
+    with pytest.raises(NotResetError, match="no episode yet"):
+        envs.step([1, 1])
     goals = {seed: int(np.random.default_rng(seed).integers(3, 12)) for seed in range(10)}
     envs.reset(seed=[max(goals, key=goals.__getitem__), min(goals, key=goals.__getitem__)])
     over = np.zeros(2, bool)
     while not over.any():
         over = np.logical_or(*envs.step([1, 1])[2:4])
     assert over.tolist() == [False, True]
-    with pytest.raises(FuseError) as caught:
+    with pytest.raises(KeyError) as caught:
         envs.step([3, 1])
     assert "sub-environment 0" in notes(caught.value)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
@@ -424,26 +396,8 @@ def test_an_error_after_another_one_was_reset_has_all_be_reset():
     envs.step([1, 1])
 
 
-def test_an_error_in_a_reset_says_where_it_was():
-    class Fragile(Counter):
-        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-            super().reset(seed, options)
-            if seed == 6:
-                raise FuseError
-
-    envs = vector_env(Fragile, {POINT: definition()}, num_envs=3)
-    with pytest.raises(FuseError) as caught:
-        envs.reset(seed=5)
-    assert "sub-environment 1" in notes(caught.value)
-    with pytest.raises(NotResetError, match="no episode yet"):
-        envs.step([1, 1, 1])
-    envs.reset(seed=0)
-    envs.step([1, 1, 1])
-
-
 def test_inside_another_simulation_it_works_all_the_same():
-    inner = vector_env(Counter, {POINT: definition()}, num_envs=2)
-    told = []
+    inner, told = vector_env(Counter, {POINT: definition()}, num_envs=2), []
 
     class Outer(Counter):
         def run(self) -> Any:
@@ -451,8 +405,7 @@ def test_inside_another_simulation_it_works_all_the_same():
             told.append(inner.step([1, 2])[0][:, 0].tolist())
             return super().run()
 
-    outer = vector_env(Outer, {POINT: definition()}, num_envs=2)
-    outer.reset(seed=0)
+    vector_env(Outer, {POINT: definition()}, num_envs=2).reset(seed=0)
     assert told == [[1, 2], [1, 2]]
 
 
@@ -518,11 +471,9 @@ def test_a_sub_environment_that_somebody_else_resets_is_stepped_where_it_then_st
     envs.reset(seed=[5, 6])
     for _ in range(2):
         envs.step([1, 1])
-    other = envs.envs[1]
-    observation, _ = other.reset(seed=6)
-    assert observation[0] == 0
+    assert envs.envs[1].reset(seed=6)[0][0] == 0
     assert envs.step([1, 1])[0][:, 0].tolist() == [3, 1]
-    other.close()
+    envs.envs[1].close()
     with pytest.raises(ResetNeededError, match="call reset"):
         envs.step([1, 1])
     envs.reset(seed=[5, 6])
@@ -641,10 +592,6 @@ def test_an_agent_that_is_removed_terminates_and_is_not_truncated(view, mode):
 
 
 def test_what_is_reset_to_ask_for_the_agents_is_unwound():
-    """Where no roster is declared, a simulation is reset when the environment is made."""
-
-    ended = []
-
     class Announcing(Counter):
         def run(self):
             try:
@@ -655,14 +602,12 @@ def test_what_is_reset_to_ask_for_the_agents_is_unwound():
         def expected_calls(self, point):
             return [(self,)]
 
-    point = definition(agent=lambda self: "counter_0")
-    vector_env(Announcing, {f"{__name__}.Counter.decide": point}, num_envs=2)
+    ended = []
+    vector_env(Announcing, {POINT: definition(agent=lambda self: "counter_0")}, num_envs=2)
     assert len(ended) == 1
 
 
-def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
-    """Neither the answers nor what comes from the simulations is held any longer than it is used."""
-
+def test_neither_answers_nor_results_are_held_longer_than_they_are_used():
     class Answer:
         pass
 
@@ -673,15 +618,9 @@ def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
         answers.add(made)
         return made
 
-    decide = decision(
-        agent="a_0", action_space_mapping=answer, reward_mapping=lambda: there.append(len(answers)) or 0.0
-    )
-
-    def main(simulation):
-        for _ in range(3):
-            decide()
-
-    envs = vector_env(script(main), decide, num_envs=4)
+    reward = lambda: there.append(len(answers)) or 0.0  # noqa: E731
+    decide = decision(agent="a_0", action_space_mapping=answer, reward_mapping=reward)
+    envs = vector_env(script(lambda simulation: [decide() and None for _ in range(3)]), decide, num_envs=4)
     envs.reset(seed=0)
     there.clear()
     envs.step(np.ones(4, np.int64))

@@ -72,9 +72,6 @@ def rest_of(env, number=0):
     return told, simulation.steps, simulation.place, simulation.random.random()
 
 
-# -- what a branch is -----------------------------------------------------------------------------
-
-
 @METHODS
 @VIEWS
 def test_branches_are_what_the_environment_would_have_done(make, method):
@@ -118,9 +115,6 @@ def test_wrappers_come_along(method):
     wrapped = OrderEnforcingWrapper(aec_env(lambda: Walk(3), Walk.choose))
     wrapped.reset(seed=1)
     assert branch(wrapped, lambda twin, number: (type(twin), twin.step(1)), 1, method=method) == [(type(wrapped), None)]
-
-
-# -- what goes wrong ------------------------------------------------------------------------------
 
 
 def going_on(model=Walk, length=6, steps=1, **options):
@@ -359,9 +353,6 @@ def test_what_was_decided_is_replayed_as_it_was_given():
         places = branch(env, lambda twin, number: twin.simulation.place, 2, method="replay")
         assert places == [env.simulation.place] * 2
         assert len(asked) == before
-
-
-# -- what a fork would share ----------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")

@@ -176,9 +176,6 @@ def test_some_agents_decide_by_their_policies_and_the_rest_by_their_rule(design,
         assert decisions(turns) == [agent for agent in plain.decisions if agent != "overseer_0"]
 
 
-# -- who answers for whom -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("of_point", "of_agent", "expected"),
     [

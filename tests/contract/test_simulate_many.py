@@ -63,9 +63,6 @@ class Going:
 going = {Going.decide: define(agent="going_0")}
 
 
-# -- it is what simulate does ---------------------------------------------------------------------
-
-
 def alike_one_by_one(source, many, one, seeds, **options):
     found = simulate_many(source, many, seeds=seeds, **options)
     del options["batch_size"]
@@ -116,9 +113,6 @@ def test_each_seed_has_a_simulation_of_its_own_and_its_results_stand_in_their_or
     (found,) = simulate_many(given_simulation, {Going.decide: ones}, points=going, seeds=[1])
     assert found is not given_simulation  # it is copied
     assert not hasattr(given_simulation, "log")
-
-
-# -- what policies are asked ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -251,9 +245,6 @@ def test_simulations_are_collected_as_soon_as_they_end():
     assert ended == [1, 3, 2]
 
 
-# -- what policies answer -------------------------------------------------------------------------
-
-
 class Tensor:
     """What only becomes an array, as tensors do."""
 
@@ -302,9 +293,6 @@ def test_a_wrong_number_of_actions(answer):
     with pytest.raises(InvalidActionError, match=r"2 decisions|not in its action space") as caught:
         simulate_many(calling(ant), {ant: lambda observations: answer}, seeds=[3, 4])
     assert "3" in notes(caught.value)
-
-
-# -- errors ---------------------------------------------------------------------------------------
 
 
 class Delicate(Going):
@@ -426,9 +414,6 @@ def test_arguments_that_cannot_be(wrong):
     words = {"policies": "polic", "seeds": "seed", "speed": "there is no option"}.get(name, f"{name} must be")
     with pytest.raises((OptionValueError, UnknownPointError, UnknownOptionError), match=words):
         simulate_many(Going, **{"seeds": range(3), "points": going} | wrong)
-
-
-# -- other things around --------------------------------------------------------------------------
 
 
 def test_seeds_may_be_an_array_and_workers_as_many_as_there_are():

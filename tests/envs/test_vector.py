@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, TRUNCATED, joint_env, make_step, register_simulation, single_env, vector_env
+from simenv_marl import RULE, TRUNCATED, joint_env, register_simulation, single_env, vector_env
 from simenv_marl.errors import (
     ClosedError,
     CopyError,
@@ -40,9 +40,6 @@ from tests.worlds.worlds import FuseError, designs, seeds
 
 pytestmark = FORKS
 PROCESSES = pytest.mark.parametrize("processes", [0, 2])
-
-
-# -- what is told -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -75,7 +72,7 @@ def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number):
 
 
 def amount(what, most, agent):
-    return make_step(
+    return definition(
         observation_space=spaces.Box(-99, 99, (1,), np.float64),
         observation_space_mapping=lambda self: [getattr(self, what)],
         action_space=spaces.Box(-most, most, (1,), np.float64),
@@ -86,37 +83,27 @@ def amount(what, most, agent):
 
 
 class Pair:
-    """Two decisions, one of an agent with a name of its own and one of entities that are born and die."""
+    """Two who decide, each with a space of its own."""
 
     def reset(self, seed: int | None = None) -> None:
         self.random = np.random.default_rng(seed)
-        self.entities = [Entity(number) for number in range(2)]
-        self.level = 0
-
-    def expected_calls(self, point: str) -> list[Any]:
-        return [(entity,) for entity in self.entities] if point.endswith("grow") else [(self,)]
+        self.level = self.size = 0
 
     def run(self) -> None:
         for _ in range(int(self.random.integers(2, 5))):
             self.level += self.steer()
-            for entity in self.entities:
-                entity.size += entity.grow()
+            self.size += self.grow()
 
     @amount("level", 1, "steerer")
     def steer(self) -> float:
         return 0.0
 
-
-class Entity:
-    def __init__(self, number: int) -> None:
-        self.number, self.size = number, 0.0
-
-    @amount("size", 2, lambda self: f"entity_{self.number}")
+    @amount("size", 2, "grower")
     def grow(self) -> float:
         return 0.0
 
 
-PAIR = [Pair.steer, Entity.grow]
+PAIR = [Pair.steer, Pair.grow]
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -153,9 +140,6 @@ def test_options_mean_what_they_mean_to_one_environment(options):
     agree(ours, theirs, 20, np.random.default_rng(0))
     ours.close()
     theirs.close()
-
-
-# -- seeds and resets -------------------------------------------------------------------------------
 
 
 def seeds_of(envs: Any) -> list[int | None]:
@@ -233,9 +217,6 @@ def test_options_that_cannot_be_are_refused(options, error, match):
         vector_env(Counter, Counter.decide, **{"num_envs": 2} | options)
 
 
-# -- actions ----------------------------------------------------------------------------------------
-
-
 def counts(envs: Any) -> list[int]:
     return [simulation.count for simulation in envs.get_attr("simulation")]
 
@@ -272,7 +253,7 @@ def test_one_illegal_action_in_a_joint_view_moves_nobody():
     legal = {agent: np.zeros((2, 1)) for agent in observations}
     for illegal in (
         {**legal, "steerer": np.array([[0.0], [3.0]])},
-        {**legal, "entity_1": np.array([[0.0], [np.nan]])},
+        {**legal, "grower": np.array([[0.0], [np.nan]])},
         {**legal, "steerer": [np.zeros(1), RULE]},
         {"steerer": np.zeros((2, 1))},
         {agent: np.zeros((1, 1)) for agent in observations},
@@ -324,9 +305,6 @@ def test_observations_are_copies_unless_told_otherwise(kind, copy, processes):
     assert not any(np.shares_memory(a, b) for a, b in zip(told[1][1:4], told[2][1:4], strict=True))
     envs.close()
     assert image.sum() > 0  # it can be read still
-
-
-# -- errors -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("where", ["run", "observation_space_mapping", "reward_mapping", "action_space_mapping"])
@@ -434,9 +412,6 @@ def test_another_thread_may_use_it_with_the_thread_driver_alone(driver):
     envs.close()
 
 
-# -- the simulations themselves -----------------------------------------------------------------------
-
-
 @PROCESSES
 def test_sub_environments_can_be_asked_and_told(processes):
     points = {POINT: VARIETY["goal"][1]}
@@ -541,27 +516,24 @@ def test_one_that_is_dropped_unwinds_all():
     assert stacks(stacks_before) == stacks_before
 
 
-# -- beside Gymnasium ---------------------------------------------------------------------------------
-
-
 def test_gymnasium_makes_it_of_registered_ids():
-    ids = register_simulation(Pair, PAIR, name="vectors")
+    ids = [identity for identity in register_simulation(Pair, PAIR, name="vectors") if identity in gymnasium.registry]
+    given = {"num_envs": 3, "max_steps": 3}
     try:
-        for identity in ids[:2]:
-            ours = gymnasium.make_vec(identity, num_envs=3, vectorization_mode="vector_entry_point", max_steps=3)
+        for identity in ids:
+            ours = gymnasium.make_vec(identity, vectorization_mode="vector_entry_point", **given)
             assert type(ours).__name__ == "SimulationVectorEnv"
             assert ours.spec.id == identity
             ours.spec.to_json()
-            theirs = gymnasium.make_vec(identity, num_envs=3, vectorization_mode="sync", max_steps=3)
+            theirs = gymnasium.make_vec(identity, vectorization_mode="sync", **given)
             agree(ours, theirs, 12, np.random.default_rng(0))
-            ours.close()
-            theirs.close()
+        assert len(ids) == 3
         envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
         assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         envs.reset(seed=0)
         envs.close()
     finally:
-        for identity in ids[:2]:
+        for identity in ids:
             gymnasium.registry.pop(identity)
 
 

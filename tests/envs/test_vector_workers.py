@@ -115,9 +115,6 @@ def goes_on(envs: Any, seed: int = 0) -> None:
     assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
 
 
-# -- the same -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("kind", "mode", "context"),
     [
@@ -182,9 +179,6 @@ def test_what_cannot_be_sent_is_refused():
     lock = threading.Lock()
     with pytest.raises(OptionValueError, match="cannot be sent to another process"):
         vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
-
-
-# -- errors ---------------------------------------------------------------------------------------------
 
 
 def test_errors_come_back_as_themselves_and_the_next_reset_works():
@@ -262,9 +256,6 @@ def test_workers_that_are_killed_between_steps_are_noticed(use):
         goes_on(envs)
     envs.close()
     assert envs.closed
-
-
-# -- the end --------------------------------------------------------------------------------------------
 
 
 def test_errors_while_closing_surface_and_the_workers_end():

@@ -318,9 +318,6 @@ def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
         assert list(map(repr, told[column])) == list(map(repr, things))
 
 
-# -- what cannot be -------------------------------------------------------------------------------
-
-
 def one_argument(days):
     return Shop(days)
 
@@ -486,8 +483,6 @@ def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
     assert frame["status"].tolist() == ["ok"] * len(frame)
     assert len(list((tmp_path / "shared").glob("*.jsonl"))) == 2
 
-
-# -- killed ---------------------------------------------------------------------------------------
 
 SCRIPT = """
     import sys

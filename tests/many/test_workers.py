@@ -10,7 +10,6 @@ import textwrap
 import time
 
 import joblib
-import numpy as np
 import pytest
 from joblib._parallel_backends import ThreadingBackend
 
@@ -20,6 +19,7 @@ from simenv_marl.errors import InvalidActionError, WorkerError
 from simenv_marl.experiments import Variant
 from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
+from tests.contract.test_simulate_many import ones
 from tests.processes import alone, descriptors
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
@@ -43,10 +43,6 @@ def _workers_end():
 
 def policy(observations):
     return [RULE if number == 5 else number for number in (observations.sum(axis=1) % 6).astype(int).tolist()]
-
-
-def ones(observations):
-    return np.ones(len(observations), np.int64)
 
 
 def traces(**arguments):

@@ -239,9 +239,6 @@ def test_agents_that_die_and_stay_for_the_learner(view):
     assert told.returns == pytest.approx(expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2}))
 
 
-# -- common futures -------------------------------------------------------------------------------
-
-
 @METHODS
 def test_a_candidate_that_changes_nothing_has_the_same_values(method):
     env = made("single")
@@ -323,9 +320,6 @@ def test_one_exact_future_and_a_warning(view, method):
     assert told.returns == pytest.approx(np.array([[worth("left", action, None)] for action in range(3)]))
 
 
-# -- wrappers -------------------------------------------------------------------------------------
-
-
 class Doubled(BaseParallelWrapper):
     def step(self, actions):
         observations, rewards, *rest = self.env.step(dict(actions))
@@ -357,9 +351,6 @@ def test_wrappers_of_pettingzoo(method):
     env.reset(seed=5)
     told = action_values(env, [RULE, 2], futures=3, method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
-
-
-# -- what cannot be -------------------------------------------------------------------------------
 
 
 WRONG = [

@@ -70,9 +70,6 @@ def test_one_future_is_tried_once():
     assert told.best == 2
 
 
-# -- sequential halving ---------------------------------------------------------------------------
-
-
 class Wide:
     """Eight candidates, of which the last is the best."""
 
@@ -161,9 +158,6 @@ def test_masked_candidates_are_left_out():
 def test_what_cannot_be(given, match):
     with pytest.raises(OptionValueError, match=match):
         RolloutPolicy(**given).choose(made("single"))
-
-
-# -- all places where it serves -------------------------------------------------------------------
 
 
 @METHODS
@@ -267,9 +261,6 @@ def test_a_vector_environment():
 def test_a_mixture_cannot_ask_it():
     with pytest.raises(OptionValueError, match="asks for the environment"):
         Mixture({RULE: 1, planner(): 1})
-
-
-# -- what a policy gets ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("view", ["simulate", "aec", "parallel", "collect"])

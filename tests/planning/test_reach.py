@@ -133,7 +133,8 @@ def test_candidates_that_are_clipped():
 
 @pytest.mark.filterwarnings("ignore:.*draws from the global generator", "ignore:.*cannot draw new random numbers")
 def test_replays_leave_the_generators_of_the_process_alone():
-    env = made("single", Global)
+    unlucky = points(observation_space_mapping=lambda duel: [duel.turn, 0])[LEFT]
+    env = begun(single_env(Global, {LEFT: unlucky}))
     env.step(1)
     before = random.getstate()
     found = action_values(env, [1, 1, 1], futures=1, method="replay").returns.ravel().tolist()

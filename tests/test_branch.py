@@ -51,6 +51,11 @@ POINTS = {
 }
 
 
+def begun(env, seed=3):
+    env.reset(seed=seed)
+    return env
+
+
 def move(env, number=0):
     """One step of an environment of any view with random actions; what it tells."""
     if hasattr(env.unwrapped, "agent_iter"):
@@ -78,8 +83,7 @@ def test_branches_are_what_the_environment_would_have_done(make, method):
     """At every point of an episode, and the environment itself has not moved."""
     points = Walk.choose if make is single_env else POINTS
     for taken in range(5):
-        env = make(lambda: Walk(6), points)
-        env.reset(seed=3)
+        env = begun(make(lambda: Walk(6), points))
         for _ in range(taken):
             move(env)
         same, other, different = branch(env, lambda twin, number: rest_of(twin, max(0, number - 1)), 3, method=method)
@@ -100,8 +104,7 @@ def test_branches_of_branches(method):
 
 @METHODS
 def test_wrappers_come_along(method):
-    env = TimeLimit(going_on(steps=0, length=9), 4)
-    env.reset(seed=1)
+    env = begun(TimeLimit(going_on(steps=0, length=9), 4), 1)
     env.step(1)
 
     def count(twin, number):
@@ -112,14 +115,12 @@ def test_wrappers_come_along(method):
 
     assert branch(env, count, 2, method=method) == [(TimeLimit, 3)] * 2
     assert env.step(1)[3] is False
-    wrapped = OrderEnforcingWrapper(aec_env(lambda: Walk(3), Walk.choose))
-    wrapped.reset(seed=1)
+    wrapped = begun(OrderEnforcingWrapper(aec_env(lambda: Walk(3), Walk.choose)), 1)
     assert branch(wrapped, lambda twin, number: (type(twin), twin.step(1)), 1, method=method) == [(type(wrapped), None)]
 
 
 def going_on(model=Walk, length=6, steps=1, **options):
-    env = single_env(lambda: model(length), Walk.choose, **options)
-    env.reset(seed=3)
+    env = begun(single_env(lambda: model(length), Walk.choose, **options))
     for _ in range(steps):
         env.step(1)
     return env
@@ -276,8 +277,7 @@ def test_not_from_inside_its_own_mappings():
         return [0, 0]
 
     ant = decision(agent="ant_0", observation_space_mapping=observe)
-    env = aec_env(script(lambda simulation: [ant(), ant()]), ant)
-    env.reset()
+    env = begun(aec_env(script(lambda simulation: [ant(), ant()]), ant))
     envs.append(env)
     with pytest.raises(ReentrancyError, match="was used from"):
         env.step(1)
@@ -344,8 +344,7 @@ def test_what_was_decided_is_replayed_as_it_was_given():
 
     for policies, own in (({"wind_0": policy}, 1), (None, action)):
         points = {f"{Walk.__module__}.Walk.drift": define(agent="wind_0", **amount)}
-        env = aec_env(lambda: Walk(6), points | ({Walk.choose: None} if policies else {}), policies=policies)
-        env.reset(seed=3)
+        env = begun(aec_env(lambda: Walk(6), points | ({Walk.choose: None} if policies else {}), policies=policies))
         for _ in range(3):
             action[0] += 0.5
             env.step(own)
@@ -412,8 +411,7 @@ def a_worker(model):
     [(a_socket, "a socket"), (a_child, "a child process"), (a_worker, "a child process"), (a_thread, "a thread")],
 )
 def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(held, name):
-    env = single_env(type("Model", (Holding,), {"open": held}), filing.choose)
-    env.reset(seed=4)
+    env = begun(single_env(type("Model", (Holding,), {"open": held}), filing.choose), 4)
     env.step(1)
     with pytest.raises(BranchError, match=f"{name}.*replay"):
         branch(env, filing.left, method="fork")
@@ -478,12 +476,10 @@ class Listening(Clerks):
 
 
 def test_event_loops_of_asyncio_go_on_in_a_fork():
-    env = single_env(Listening, filing.choose)
-    env.reset()
+    env = begun(single_env(Listening, filing.choose))
     env.step(1)
     assert branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
-    env = single_env(Clerks, filing.choose)
-    env.reset(seed=4)
+    env = begun(single_env(Clerks, filing.choose), 4)
     for _ in range(3):
         found = branch(env, filing.left, 2, method="fork")
         env.step(3)
@@ -515,8 +511,7 @@ def test_copies_of_files_are_what_they_were(tmp_path, modes):
             for file in files:
                 file.close()
 
-    env = single_env(Model, filing.choose)
-    env.reset()
+    env = begun(single_env(Model, filing.choose))
     for _ in range(3):
         before = path.read_text()
         found = branch(env, filing.left, 2, method="fork")

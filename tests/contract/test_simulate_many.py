@@ -21,7 +21,6 @@ from simenv_marl.errors import (
     UnknownOptionError,
     UnknownPointError,
 )
-from simenv_marl.experiments import Variant
 from tests.worlds import worlds
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, colony_points, designs
@@ -431,18 +430,6 @@ def test_plugins_are_for_these_simulations_alone():
     assert sorted(called) == [1, 2, 2, 3, 3, 3]
     simulate_many(Going, {Going.decide: ones}, points=going, seeds=[2])
     assert len(called) == 6
-
-
-def test_variants_whose_own_policies_are_asked_one_by_one():
-    ant, bee = decision(agent="ant_0", **PAIRS), decision(agent="bee_0", **PAIRS)
-
-    def of_one(observation):
-        assert observation.shape == (2,)
-        return 5
-
-    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: of_one})
-    found = simulate_many(variant, {ant: ones}, seeds=range(3))
-    assert [simulation.log for simulation in found] == [[1, 5]] * 3
 
 
 def test_simulations_within_policies_and_rules():

@@ -8,7 +8,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, aec_env
+from simenv_marl import RULE, aec_env, simulate_many
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
@@ -342,10 +342,17 @@ def test_one_name_at_points_whose_spaces_differ():
 def test_whom_no_policy_of_the_call_decides_for_is_no_agent():
     asked = []
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0)
-    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: lambda observation: 5})
-    found = collect_episodes(variant, {ant: ones}, seeds=range(2))
+
+    def of_one(observation):
+        assert observation.shape == (2,)  # and not a row of many
+        return 5
+
+    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: of_one})
+    found = collect_episodes(variant, {ant: ones}, seeds=range(2), collect=lambda simulation: simulation.log)
     assert list(found) == [ant]
     assert found[ant].turns.tolist() == [0, 0]
+    logs = simulate_many(variant, {ant: ones}, seeds=range(2), collect=lambda simulation: simulation.log)
+    assert list(found[ant].collected) == logs == [[1, 5]] * 2
     found = collect_episodes(calling(ant, bee, ant), {"ant_0": ones}, points=[ant, bee], seeds=[1])
     assert found["ant_0"].turns.tolist() == [0, 1]
     assert asked == []

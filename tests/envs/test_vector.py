@@ -71,6 +71,11 @@ def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number):
     assert [s.trace for s in ours.get_attr("simulation")] == [s.trace for s in theirs.get_attr("simulation")]
 
 
+def begun(envs, seed=0):
+    envs.reset(seed=seed)
+    return envs
+
+
 def amount(what, most, agent):
     return definition(
         observation_space=spaces.Box(-99, 99, (1,), np.float64),
@@ -223,8 +228,7 @@ def counts(envs: Any) -> list[int]:
 
 @PROCESSES
 def test_one_illegal_action_moves_nobody(processes):
-    envs = vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK))
     for actions, number in (
         ([1, 1, 9], 2),
         ([1, 0, 1], 1),
@@ -266,8 +270,7 @@ def test_one_illegal_action_in_a_joint_view_moves_nobody():
 
 
 def test_the_action_of_one_that_is_reset_is_not_looked_at():
-    envs = vector_env(Counter, Counter.decide, num_envs=2, max_steps=2)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, Counter.decide, num_envs=2, max_steps=2))
     envs.step([1, 1])
     *_, truncations, _ = envs.step([1, 1])
     assert truncations.all()
@@ -279,8 +282,7 @@ def test_the_action_of_one_that_is_reset_is_not_looked_at():
 
 
 def test_boxes_take_actions_in_other_dtypes():
-    envs = vector_env(Counter, {POINT: VARIETY["box"][1]}, num_envs=2)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, {POINT: VARIETY["box"][1]}, num_envs=2))
     for batch in (np.ones((2, 2)), np.ones((2, 2), int), [[1.0, 1.0], [1, 1]]):
         envs.reset(seed=0)
         envs.step(batch)
@@ -389,8 +391,7 @@ def test_inside_another_simulation_it_works_all_the_same():
 
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_another_thread_may_use_it_with_the_thread_driver_alone(driver):
-    envs = vector_env(Counter, Counter.decide, num_envs=2, driver=driver)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, Counter.decide, num_envs=2, driver=driver))
     errors = []
 
     def use() -> None:
@@ -415,8 +416,7 @@ def test_another_thread_may_use_it_with_the_thread_driver_alone(driver):
 @PROCESSES
 def test_sub_environments_can_be_asked_and_told(processes):
     points = {POINT: VARIETY["goal"][1]}
-    envs = vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK)
-    envs.reset(seed=3)
+    envs = begun(vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK), 3)
     envs.step([1, 2, 3])
     assert envs.render() == ("ansi 1", "ansi 2", "ansi 3")
     assert envs.call("compute_reward", np.ones(1), np.zeros(1), {}) == (-1.0,) * 3
@@ -493,8 +493,7 @@ def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
                     raise LookupError("it would not go") from None
                 raise
 
-    envs = vector_env(Stubborn, {POINT: definition()}, num_envs=3)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Stubborn, {POINT: definition()}, num_envs=3))
     simulations = envs.get_attr("simulation")
     with pytest.raises(LookupError) as caught:
         envs.close()
@@ -507,8 +506,7 @@ def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
 
 def test_one_that_is_dropped_unwinds_all():
     stacks_before = stacks()
-    envs = vector_env(Counter, Counter.decide, num_envs=2)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, Counter.decide, num_envs=2))
     simulations = envs.get_attr("simulation")
     del envs
     gc.collect()
@@ -592,8 +590,7 @@ def test_neither_answers_nor_results_are_held_longer_than_they_are_used():
 
     reward = lambda: there.append(len(answers)) or 0.0  # noqa: E731
     decide = decision(agent="a_0", action_space_mapping=answer, reward_mapping=reward)
-    envs = vector_env(script(lambda simulation: [decide() and None for _ in range(3)]), decide, num_envs=4)
-    envs.reset(seed=0)
+    envs = begun(vector_env(script(lambda simulation: [decide() and None for _ in range(3)]), decide, num_envs=4))
     there.clear()
     envs.step(np.ones(4, np.int64))
     assert there == [0] * 4

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 
 from simenv_marl import vector_env
 from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
+from tests.envs.test_vector import begun
 from tests.processes import alone, descriptors, gone
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
 from tests.worlds.models import notes
@@ -242,8 +243,7 @@ def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, c
 @KILLED
 @pytest.mark.parametrize("use", ["step", "call", "close"])
 def test_workers_that_are_killed_between_steps_are_noticed(use):
-    envs = workers(Failing)
-    envs.reset(seed=0)
+    envs = begun(workers(Failing))
     there = set(processes_of(envs)) if use != "call" else processes_of(envs)[:1]
     for process in there:
         os.kill(process, signal.SIGKILL)
@@ -355,8 +355,7 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
 
 @pytest.mark.skipif(FORK != "fork", reason="there is no fork")
 def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
-    envs = workers()
-    envs.reset(seed=0)
+    envs = begun(workers())
     child = os.fork()
     if child == 0:
         code = 1

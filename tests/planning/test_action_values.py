@@ -29,13 +29,16 @@ METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
 VIEWS = ("aec", "parallel", "single", "agent")
 
 
+def begun(env, seed=5):
+    env.reset(seed=seed)
+    return env
+
+
 def made(view, model=Duel, **options):
     """An environment whose pending decision is that of the one on the left, reset."""
     given = {LEFT: points()[LEFT]} if view == "single" else points()
     make = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env}.get(view, single_env)
-    env = make(model, given, **options, **{"agent": "left"} if view == "agent" else {})
-    env.reset(seed=5)
-    return env
+    return begun(make(model, given, **options, **{"agent": "left"} if view == "agent" else {}))
 
 
 def futures_of(env, number, seed=None):
@@ -159,8 +162,7 @@ def test_joint_views_sum_up_and_have_joint_bases(method):
     assert whole.returns == pytest.approx(parts.returns)
     with pytest.raises(OptionValueError, match="without flatten"):
         action_values(made("joint", flatten=True), [[1, 1]], base=BASES)
-    env = TransformReward(env, lambda reward: -reward)
-    env.reset(seed=5)
+    env = begun(TransformReward(env, lambda reward: -reward))
     with pytest.raises(InvalidActionError, match="not in"):
         action_values(env, [{"left": 3, "right": RULE}])
     assert action_values(env, actions, futures=3, method=method).returns == pytest.approx(-table)
@@ -202,15 +204,13 @@ GRAZING = {
 
 @METHODS
 def test_others_of_a_single_view_follow_the_base_by_agent(method):
-    env = single_env(Herd, GRAZING, agent="one")
-    env.reset(seed=1)
+    env = begun(single_env(Herd, GRAZING, agent="one"), 1)
     assert action_values(env, [0, 3], futures=1, method=method).means.tolist() == [5.0, 8.0]
     told = action_values(env, [0, 3], futures=1, method=method, base={"other": lambda seen: int(seen[0])})
     assert told.means.tolist() == [2 + 1 + 3 + 5, 2 + 4 + 3 + 5]
     with pytest.raises(UnknownAgentError, match="'right'"):  # at a point that is not the environment's
         action_values(made("agent"), base={"right": RULE})
-    declared = single_env(Herd, GRAZING, agent="one", possible_agents=["one", "other"])
-    declared.reset(seed=1)
+    declared = begun(single_env(Herd, GRAZING, agent="one", possible_agents=["one", "other"]), 1)
     with pytest.raises(UnknownAgentError, match="'third'"):
         action_values(declared, base={"third": RULE})
 
@@ -233,8 +233,7 @@ def test_agents_that_die_on_the_way(view, method):
 
 @pytest.mark.parametrize("view", ["aec", "parallel"])
 def test_agents_that_die_and_stay_for_the_learner(view):
-    env = pad_agents(made(view, Mortal))
-    env.reset(seed=5)
+    env = begun(pad_agents(made(view, Mortal)))
     told = action_values(env, futures=8, base=lambda observation: 2)
     assert told.returns == pytest.approx(expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2}))
 
@@ -329,8 +328,7 @@ class Doubled(BaseParallelWrapper):
 def test_wrappers_of_single_views():
     env = made("single")
     table = expected(env, "left", horizon=3)
-    limited = TimeLimit(OrderEnforcing(PassiveEnvChecker(env)), 3)  # as gymnasium.make does
-    limited.reset(seed=5)
+    limited = begun(TimeLimit(OrderEnforcing(PassiveEnvChecker(env)), 3))  # as gymnasium.make does
     assert action_values(limited, futures=3, terminal_value=lambda env: 1e6).returns == pytest.approx(table)
     wrapped = TransformReward(TransformAction(env, lambda action: 2 - action, spaces.Discrete(3)), lambda r: 10 * r)
     wrapped.reset(seed=5)
@@ -343,12 +341,10 @@ def test_wrappers_of_single_views():
 
 @METHODS
 def test_wrappers_of_pettingzoo(method):
-    env = OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec")))
-    env.reset(seed=5)
+    env = begun(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec"))))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(expected(env, "left"))
-    env = Doubled(made("parallel"))
-    env.reset(seed=5)
+    env = begun(Doubled(made("parallel")))
     told = action_values(env, [RULE, 2], futures=3, method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
 
@@ -404,8 +400,7 @@ def test_no_decision_is_pending():
 
 def test_candidates_must_be_listed_unless_they_are_discrete():
     amount = points(action_space=spaces.Box(0, 2, (1,), np.float64), action_space_mapping=np.sum)
-    env = single_env(Duel, {LEFT: amount[LEFT]})
-    env.reset(seed=5)
+    env = begun(single_env(Duel, {LEFT: amount[LEFT]}))
     for other in (env, made("joint")):
         with pytest.raises(OptionValueError, match="Discrete"):
             action_values(other)
@@ -415,8 +410,7 @@ def test_candidates_must_be_listed_unless_they_are_discrete():
 @pytest.mark.parametrize("wrapper", [lambda env: env, lambda env: TransformReward(env, float)])
 def test_masked_candidates(wrapper):
     given = points(action_mask_mapping=lambda duel: [1, 1, duel.turn % 2])
-    env = wrapper(single_env(Duel, {LEFT: given[LEFT]}))
-    env.reset(seed=5)
+    env = begun(wrapper(single_env(Duel, {LEFT: given[LEFT]})))
     assert action_values(env, futures=2).actions == (0, 1)
     with pytest.raises(InvalidActionError, match="masked"):
         action_values(env, [1, 2])
@@ -432,8 +426,7 @@ class Timeless(Duel):
 
 def test_time_needs_a_clock():
     point = points(action_space=spaces.Discrete(3, start=1))[LEFT]
-    env = single_env(Timeless, {LEFT: point})
-    env.reset(seed=1)
+    env = begun(single_env(Timeless, {LEFT: point}), 1)
     told = action_values(env, futures=2)
     assert told.actions == (1, 2, 3)
     assert told.means.tolist() == [3.0, 4.0, 5.0]
@@ -473,8 +466,7 @@ def test_branches_are_not_shown():
         def render(self, mode):
             self.pictures += 1
 
-    env = single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human")
-    env.reset(seed=5)
+    env = begun(single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human"))
 
     def pictures(env):
         return float(env.unwrapped.simulation.pictures)

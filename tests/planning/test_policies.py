@@ -20,7 +20,7 @@ from simenv_marl.envs import pad_agents
 from simenv_marl.errors import BranchError, CopyError, InvalidActionError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, action_values
 from tests.conftest import DRIVERS
-from tests.planning.test_action_values import GRAZING, METHODS, Global, Herd, Mortal, greedy, made
+from tests.planning.test_action_values import GRAZING, METHODS, Global, Herd, Mortal, begun, greedy, made
 from tests.worlds.duels import LEFT, RIGHT, Duel, Unseeded, points, worth
 from tests.worlds.models import define, step
 
@@ -47,8 +47,7 @@ def tame(**changes):
 
 def by_hand(seed=5):
     """What a planner does in a single view whose user asks it: its actions, and what the model has come to."""
-    env = single_env(Duel, tame(), agent="left")
-    env.reset(seed=seed)
+    env = begun(single_env(Duel, tame(), agent="left"), seed)
     actions, over = [], False
     while not over:
         actions.append(planner().choose(env).best)
@@ -90,9 +89,7 @@ class Wide:
 
 @pytest.fixture
 def wide():
-    env = single_env(Wide, Wide.choose)
-    env.reset(seed=1)
-    return env
+    return begun(single_env(Wide, Wide.choose), 1)
 
 
 def test_the_budget_is_divided_among_rounds(wide):
@@ -134,8 +131,7 @@ def test_candidates_of_a_round_meet_the_same_futures(wide):
 
 def test_masked_candidates_are_left_out():
     given = points(action_mask_mapping=lambda duel: [duel.turn % 2, 1, 1])
-    env = single_env(Duel, {LEFT: given[LEFT]})
-    env.reset(seed=5)
+    env = begun(single_env(Duel, {LEFT: given[LEFT]}))
     told = RolloutPolicy([0, 1], futures=2).choose(env)
     assert told.actions == (1,)
     with pytest.raises(InvalidActionError, match="all candidates"):
@@ -183,8 +179,7 @@ def test_simulate(driver, key, method):
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
 def test_policies_of_environments(make, method):
     noted = Noted(planner(method=method))
-    env = make(Duel, tame(), policies={"left": noted})
-    env.reset(seed=5)
+    env = begun(make(Duel, tame(), policies={"left": noted}))
     while not step(env, 1, "right"):
         pass
     assert noted.answers == by_hand()[0]
@@ -250,8 +245,7 @@ def test_data_sets_are_recorded_of_planners(monkeypatch):
 
 
 def test_a_vector_environment():
-    envs = vector_env(Duel, tame(), num_envs=2, policies={"right": planner()})
-    envs.reset(seed=5)
+    envs = begun(vector_env(Duel, tame(), num_envs=2, policies={"right": planner()}))
     for _ in range(3):
         envs.step(np.array([1, 1]))
     assert [env.unwrapped.simulation.turn for env in envs.envs] == [3, 3]
@@ -290,8 +284,7 @@ def test_the_environment_of_a_policy(view):
     elif view == "collect":
         collect_episodes(Duel, {"left": left}, points=points(), seeds=[5])
     else:
-        env = (aec_env if view == "aec" else parallel_env)(Duel, points(), policies={"left": left})
-        env.reset(seed=5)
+        env = begun((aec_env if view == "aec" else parallel_env)(Duel, points(), policies={"left": left}))
         while not step(env, 1, "right"):
             pass
     assert len(seen) == 12
@@ -379,8 +372,7 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
 
     simulate(Duel, {"left": plan, "right": plan}, points=points(), seed=5)
     assert [told.counts.tolist() for told in plans] == [[2, 2, 2]] * 12
-    env = aec_env(Duel, points(), policies={"right": plan})
-    env.reset(seed=5)
+    env = begun(aec_env(Duel, points(), policies={"right": plan}))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(action_values(made("aec"), futures=3, method=method).returns)
     assert len(plans) == 12
@@ -388,8 +380,7 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
 
 def test_the_users_own_branches_are_exact():
     """There a planner plans as it would."""
-    env = aec_env(Duel, tame(), policies={"left": planner()})
-    env.reset(seed=5)
+    env = begun(aec_env(Duel, tame(), policies={"left": planner()}))
     env.step(1)
 
     def ahead(twin, number):
@@ -446,8 +437,7 @@ def test_both_methods_do_alike_with_all_options(make, options):
     for method in ("fork", "replay"):
         noted = Noted(RolloutPolicy(futures=2, horizon=2, method=method))
         env = make(Duel, given, policies={"left": noted}, **options)
-        env = env if options else pad_agents(env)
-        env.reset(seed=5)
+        env = begun(env if options else pad_agents(env))
         for _ in range(3):
             env.step(1 if make is aec_env else {"right": 1})
         found.append((noted.answers, env.unwrapped.simulation.value))
@@ -467,8 +457,7 @@ def test_max_steps_end_the_futures_of_the_one_agent_that_is_asked():
     collect_episodes(Duel, {"left": left}, points=points(), seeds=[5], max_steps=2)
     env = made("single", max_steps=2)
     assert told[0] == pytest.approx(action_values(env, [1], futures=1).means[0])
-    env = aec_env(Duel, points(), policies={"left": left}, max_steps=2)
-    env.reset(seed=5)
+    env = begun(aec_env(Duel, points(), policies={"left": left}, max_steps=2))
     assert told[-1] == pytest.approx(action_values(made("single"), [1], futures=1).means[0])
 
 

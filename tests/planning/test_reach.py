@@ -15,7 +15,7 @@ from simenv_marl import aec_env, branch, difference, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import BranchError, OptionValueError
 from simenv_marl.planning import RolloutPolicy, action_values
-from tests.planning.test_action_values import METHODS, Global, expected, made
+from tests.planning.test_action_values import METHODS, Global, begun, expected, made
 from tests.processes import gone
 from tests.worlds.duels import LEFT, RIGHT, SPACE, Duel, observe, points
 from tests.worlds.models import define
@@ -47,11 +47,6 @@ class Births:
     )
     def act(self, number):
         return 1
-
-
-def begun(env):
-    env.reset(seed=5)
-    return env
 
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env])

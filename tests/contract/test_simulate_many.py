@@ -254,6 +254,7 @@ class Tensor:
         return np.array(self.values, dtype)
 
 
+PAIRED = np.array([[1.0, 2], [3, 4]])
 BOTH = spaces.Dict(a=spaces.Discrete(9), b=spaces.Box(0, 9, (2,), np.float64))
 
 
@@ -270,8 +271,8 @@ BOTH = spaces.Dict(a=spaces.Discrete(9), b=spaces.Box(0, 9, (2,), np.float64))
         (spaces.Discrete(10), [3, RULE], [3, "rule"]),
         (spaces.Discrete(10), np.array([RULE, 4], object), ["rule", 4]),
         (spaces.Discrete(10), RULE, ["rule", "rule"]),
-        (spaces.Box(0, 9, (2,), np.float32), np.array([[1.0, 2], [3, 4]]), np.float32([[1, 2], [3, 4]])),
-        (BOTH, {"a": np.array([5]), "b": np.array([[1.0, 2]])}, [{"a": 5, "b": np.array([1.0, 2])}]),
+        (spaces.Box(0, 9, (2,), np.float32), PAIRED, PAIRED.astype(np.float32)),
+        (BOTH, {"a": np.array([5, 6]), "b": PAIRED}, [{"a": 5, "b": PAIRED[0]}, {"a": 6, "b": PAIRED[1]}]),
         (spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9)]), [(1, 2), (3, 4)], [(1, 2), (3, 4)]),
     ],
     ids=lambda value: type(value).__name__,

@@ -57,7 +57,6 @@ def begun(env, seed=3):
 
 
 def move(env, number=0):
-    """One step of an environment of any view with random actions; what it tells."""
     if hasattr(env.unwrapped, "agent_iter"):
         observation, *rest = env.last()
         agent = env.agent_selection
@@ -69,7 +68,6 @@ def move(env, number=0):
 
 
 def rest_of(env, number=0):
-    """What all that is left of an episode tells, with the simulation's state."""
     told = []
     while getattr(env.unwrapped, "agents", True) and not (told and "True" in told[-1] and not hasattr(env, "agents")):
         told.append(move(env, number))
@@ -80,7 +78,6 @@ def rest_of(env, number=0):
 @METHODS
 @VIEWS
 def test_branches_are_what_the_environment_would_have_done(make, method):
-    """At every point of an episode, and the environment itself has not moved."""
     points = Walk.choose if make is single_env else POINTS
     for taken in range(5):
         env = begun(make(lambda: Walk(6), points))
@@ -142,7 +139,6 @@ def test_options_hold_in_branches(options):
 
 
 def children():
-    """The processes that this one has started and not yet seen the end of."""
     return {line for path in Path("/proc/self/task").glob("*/children") for line in path.read_text().split()}
 
 
@@ -362,8 +358,6 @@ def test_branches_of_random_worlds_are_exact():
 
 
 class Holding:
-    """Has something open while it runs."""
-
     def reset(self, seed=None):
         self.chance, self.log = random.Random(seed), []
 
@@ -443,8 +437,6 @@ def test_what_the_user_has_opened_is_no_obstacle():
 
 
 class Clerks(Holding):
-    """Tasks of asyncio, woken by time and by each other."""
-
     async def clerk(self, number):
         for _ in range(3):
             await asyncio.sleep(0)
@@ -460,8 +452,6 @@ class Clerks(Holding):
 
 
 class Listening(Clerks):
-    """A task that is woken by what arrives in a pipe."""
-
     async def all(self):
         loop, (reading, writing) = asyncio.get_running_loop(), os.pipe()
         for number in range(3):
@@ -493,7 +483,6 @@ def test_where_asyncio_is_not_imported_there_are_no_event_loops(monkeypatch):
 
 @pytest.mark.parametrize("modes", [["w"], ["a", "w"], ["r+"], ["a", "r"]])
 def test_copies_of_files_are_what_they_were(tmp_path, modes):
-    """In size, place and contents; and the file itself stays what it is."""
     path = tmp_path / "letters"
 
     class Model(Holding):

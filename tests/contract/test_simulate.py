@@ -200,8 +200,6 @@ def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent,
 
 @pytest.mark.parametrize("action", [1, RULE])
 def test_policies_keep_nobody_alive(action):
-    """What the model lets go of after a decision is gone at once."""
-
     def main(simulation):
         for number in range(3):
             being = Being(number)

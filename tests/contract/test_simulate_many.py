@@ -33,8 +33,6 @@ PAIRS = {"observation_space": spaces.Box(-9, 9, (2,), np.float32), "observation_
 
 
 def by_row(policy):
-    """The policy of many that answers each row as another one answers it alone."""
-
     def of_many(observations, infos):
         return [policy(observation, info) for observation, info in zip(observations, infos, strict=True)]
 
@@ -245,8 +243,6 @@ def test_simulations_are_collected_as_soon_as_they_end():
 
 
 class Tensor:
-    """What only becomes an array, as tensors do."""
-
     def __init__(self, values):
         self.values = values
 
@@ -296,8 +292,6 @@ def test_a_wrong_number_of_actions(answer):
 
 
 class Delicate(Going):
-    """Notes in ``ended`` what has been unwound or has ended."""
-
     ended: ClassVar[list] = []
 
     def run(self):
@@ -313,7 +307,6 @@ delicate = {Delicate.decide: define(agent="going_0")}
 
 
 def raising(kind):
-    """A policy that raises at every fifth question."""
     answered = []
 
     def policy(observations):

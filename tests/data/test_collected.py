@@ -22,13 +22,7 @@ sizes = st.integers(1, 8)
 
 
 def played(env, policies, seed):
-    """What each agent lives through in one episode of an AEC environment: by agent its rows, and its last observation.
-
-    Args:
-        env: The environment.
-        policies: By agent, a policy of observation and info.
-        seed: Of the episode.
-    """
+    """What each agent lives through in an episode of an AEC environment: by agent its rows, and its last observation."""
     rows, last, turn = defaultdict(list), {}, 0
     try:
         turns = play(env, lambda agent, env: policies(agent)(*env.last()[::4]), seed=seed)
@@ -49,13 +43,7 @@ def played(env, policies, seed):
 
 
 def check(found, episodes, chosen):
-    """Compare what was collected under one key with what was played by the chosen agents.
-
-    Args:
-        found: What was collected.
-        episodes: Of each episode what ``played`` has returned.
-        chosen: Whether an agent belongs to the key.
-    """
+    """Compare what was collected under one key with what was ``played`` by the agents that belong to it."""
     trajectory = row = 0
     following = found.next_observations
     for number, (agents, last) in enumerate(episodes):
@@ -91,8 +79,6 @@ def check(found, episodes, chosen):
 @given(designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
 @settings(max_examples=60)
 def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, most):
-    """Births and deaths, agents that are announced, limits of steps; some left to the rule now and then."""
-
     def policy(observation, info):
         number = int(observation.sum()) % 6
         return RULE if number == 5 else number

@@ -184,7 +184,6 @@ TOLD = beings(rule_action_mapping=lambda decided, being: being.health)
 
 
 def crowd(simulation):
-    """Beings whose rule corresponds to 0, 1, 2, one after the other."""
     simulation.crowd = [Being(number) for number in range(3)]
     for step in range(3):
         for being in simulation.crowd:

@@ -36,8 +36,6 @@ SPACED = {"how": np.array([0.5, 0.25], np.float32), "what": 2, "say": "hello"}
 
 
 def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **definition):
-    """What was collected of beings that act in turns; some are banished after their first step."""
-
     def main(simulation):
         simulation.crowd = [Being(place) for place in range(number)]
         for step in range(steps):
@@ -53,7 +51,6 @@ def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **d
 
 
 def asked(*functions, answers=None, seeds=(1,), **options):
-    """What was collected of decisions that are made one after the other, by answers or always by one."""
     given = iter([]) if answers is None else iter(answers)
     policy = lambda seen: next(given, ones(seen))  # noqa: E731
     return collect_episodes(calling(*functions), dict.fromkeys(functions, policy), seeds=seeds, **options)
@@ -64,7 +61,6 @@ def of(axes, kind):
 
 
 def dots(axes):
-    """Of each collection of dots that is not empty: where they are, and whether they are filled."""
     drawn = [own for own in of(axes, PathCollection) if len(own.get_offsets())]
     return [(np.asarray(own.get_offsets()).tolist(), to_hex(own.get_facecolor()[0]) != "#ffffff") for own in drawn]
 
@@ -330,8 +326,6 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch, draw):
 
 
 def paid_by_seed(number, factor=1.0):
-    """Beings each of which is paid the seed and its own number, twice."""
-
     def main(simulation):
         simulation.crowd = [Being(place) for place in range(number)]
         for being in simulation.crowd:

@@ -18,14 +18,11 @@ DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
 
 def counting() -> Any:
-    """A rule that decides 10, 20, 30, ..."""
     tens = iter(range(10, 100, 10))
     return lambda: next(tens)
 
 
 def four(function: Any) -> Any:
-    """A simulation that asks four times."""
-
     def main(simulation: Any) -> None:
         simulation.log += [function() for _ in range(4)]
 
@@ -306,7 +303,6 @@ def test_entities_that_were_collected(workers):
     ("actions", "told"), [(RULE, [0, 1, 0, 1]), ({"sheep_0": RULE, "sheep_1": 3}, [0, None, 0, None])]
 )
 def test_entities_are_told_each_their_own(actions, told):
-    """Also where the point has no name of its own, and the others follow the policy."""
     turns = play(aec_env(lambda: Herd(2), SHEEP), actions, seed=0)
     found = [(turn.agent, turn.info.get("rule_action")) for turn in turns]
     assert found == list(zip(["sheep_0", "sheep_1"] * 3, [None, None, *told], strict=True))

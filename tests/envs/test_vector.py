@@ -88,8 +88,6 @@ def amount(what, most, agent):
 
 
 class Pair:
-    """Two who decide, each with a space of its own."""
-
     def reset(self, seed: int | None = None) -> None:
         self.random = np.random.default_rng(seed)
         self.level = self.size = 0

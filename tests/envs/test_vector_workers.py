@@ -34,7 +34,6 @@ pytestmark = FORKS
 
 
 def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
-    """A vector environment of four counters in two workers."""
     options = {"num_envs": 4, "workers": 2, "context": FORK, **options}
     return vector_env(model, {POINT: decision or definition()}, **options)
 
@@ -48,16 +47,12 @@ def _nothing_is_left():
 
 
 class Odd(Exception):
-    """An error that is not made of its arguments."""
-
     def __init__(self, *, count: int) -> None:
         super().__init__("it is odd")
         self.count = count
 
 
 class Failing(Counter):
-    """Does something terrible at a count that its options tell, or when it is unwound."""
-
     def __init__(self) -> None:
         self.process = os.getpid()
 
@@ -124,7 +119,6 @@ def goes_on(envs: Any, seed: int = 0) -> None:
     ],
 )
 def test_workers_tell_what_one_process_tells(kind, mode, context):
-    """However they are started, in all modes of resets and of all kinds of spaces."""
     model, decision = VARIETY[kind]
     with_workers = workers(model, decision, num_envs=5, autoreset_mode=mode, context=context)
     without = vector_env(model, {POINT: decision}, num_envs=5, autoreset_mode=mode)
@@ -385,7 +379,6 @@ def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error, what):
 
 
 def start_in_vain(error: str, what: str, number: int = 0, ends: bool = False) -> None:
-    """Start workers of which one cannot be started, or cannot work, and look for what is left open."""
     context = multiprocessing.get_context(FORK)
     workers().close()  # multiprocessing keeps its shared memory for the next time
     gc.collect()

@@ -73,7 +73,6 @@ def test_a_full_factorial_has_all_combinations():
     [(3, 4, 0), (4, 8, 1), (5, 8, 0), (5, 16, 1), (6, 16, 1), (7, 8, 0), (8, 16, 1), (15, 16, 0), (9, 128, 1)],
 )
 def test_a_fraction_is_balanced_and_orthogonal(number, n, clear):
-    """And main effects are not mixed with interactions where that can be."""
     table = design({f"x{place}": (-1, 1) for place in range(number)}, "fractional_factorial", n)
     matrix = table.to_numpy()
     assert len(table) == n
@@ -110,7 +109,6 @@ def test_one_at_a_time_changes_one_factor():
 
 
 def test_a_central_composite_design_is_there_for_each_combination_of_levels():
-    """Within its ranges."""
     alone = design({"a": (0.0, 2.0), "b": (-4.0, 4.0)}, "central_composite")
     assert len(alone) == 9
     assert (alone.min().tolist(), alone.max().tolist()) == ([0.0, -4.0], [2.0, 4.0])

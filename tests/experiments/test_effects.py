@@ -14,8 +14,6 @@ from tests.worlds.shops import POINTS
 
 
 class Sum:
-    """A model that decides nothing, and of which all effects are known."""
-
     def __init__(self, a, b, c="x", noise=0.0):
         self.a, self.b, self.c, self.noise = a, b, c, noise
 
@@ -115,7 +113,6 @@ def test_what_cannot_be_is_refused(tmp_path):
 
 
 def row(a, seed, **more):
-    """A row of a table of results."""
     told = {"contender": "rule", "seed": seed, "agent": "team", "length": 1, "status": "ok", "error": None}
     return {"a": a, **told, **more}
 

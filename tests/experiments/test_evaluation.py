@@ -25,7 +25,6 @@ CONTENDERS = {"rule": {}, "much": {"keeper": much}}
 
 
 def returns_by_hand(policies, seed, make=Shop, points=POINTS, **options):
-    """The returns of an AEC environment that is played with the same policies."""
     env = aec_env(make, points, **options)
     env.reset(seed=seed)
     found = {}

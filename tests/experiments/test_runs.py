@@ -42,7 +42,6 @@ def run(store, design=DESIGN, make=Shop, **arguments):
 
 
 def lines(store):
-    """All whole lines of a store."""
     whole = (line for path in store.glob("*.jsonl") for line in path.read_bytes().split(b"\n")[:-1])
     return [json.loads(line) for line in whole]
 

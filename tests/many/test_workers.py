@@ -151,8 +151,6 @@ LocalError, raising = local_error()
 
 
 class PickyError(Exception):
-    """Cannot be pickled, nor made again."""
-
     def __init__(self, one, two):
         super().__init__(one)
         self.held = (number for number in ())
@@ -285,8 +283,6 @@ def test_what_is_collected_of_lots_in_which_nobody_decides(seeds, workers):
 
 
 class Ending:
-    """A factory of simulations that ends all other processes."""
-
     def __init__(self):
         self.process = os.getpid()
 
@@ -301,7 +297,6 @@ def test_a_worker_that_cannot_work_leaves_no_descriptors(what):
 
 
 def work_in_vain(what: str) -> None:
-    """Simulate with workers that cannot work, again and again, and look for what is left open."""
     loky = joblib.externals.loky
 
     def refuse(process):

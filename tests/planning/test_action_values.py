@@ -46,7 +46,6 @@ def futures_of(env, number, seed=None):
 
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):
-    """Of each action what it is worth in each future."""
     seeds = futures_of(env, number)
     return np.array([[worth(agent, action, future, **given) for future in seeds] for action in actions])
 
@@ -116,7 +115,6 @@ def test_the_environment_does_not_move(view):
 )
 @pytest.mark.parametrize("view", [*VIEWS, "joint"])
 def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, told):
-    """At a horizon the state has its value, unless the episode is over."""
     env, joint = made(view), view == "joint"
     actions = [{"left": action, "right": 1} for action in range(3)] if joint else None
     value = {"terminal_value": lambda env: 10 + env.unwrapped.simulation.value}
@@ -265,8 +263,6 @@ def test_futures_are_those_of_the_decision():
 
 
 class Global(Duel):
-    """Its chance is that of Python's global generator."""
-
     reseed = None
 
     def reset(self, seed=None):
@@ -288,8 +284,6 @@ def test_global_generators_are_common_too(method):
 @pytest.mark.parametrize("model", [Duel, Unseeded])
 @pytest.mark.filterwarnings("ignore:Unseeded cannot draw")
 def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
-    """In each of many futures, and in the one exact one."""
-
     def draws(observation):
         return random.randrange(3) if observation[0] % 2 else int(np.random.randint(3))
 

@@ -26,8 +26,6 @@ from tests.worlds.models import define, step
 
 
 class Noted:
-    """A policy that notes what another one answers."""
-
     def __init__(self, policy):
         self.policy, self.answers, self.base = policy, [], policy.base
 
@@ -112,7 +110,6 @@ def test_the_budget_is_divided_among_rounds(wide):
     ids=str,
 )
 def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
-    """By default it is that of all candidates in all futures."""
     counts = RolloutPolicy(**given).choose(wide).counts
     assert budget - 1 <= counts.sum() <= budget
     assert counts.min() >= 1
@@ -312,7 +309,6 @@ def test_agents_that_die_while_their_policy_plans(method):
 
 
 def test_entities_plan_each_for_itself():
-    """Who is called on has a policy by its point; the others of the point plan as well, and not in branches."""
     point = f"{Herd.__module__}.Herd.graze"
     told = simulate(Herd, {point: RolloutPolicy(futures=1)}, points=GRAZING, seed=1)
     assert told.sum == 6 * 9
@@ -331,7 +327,6 @@ def test_entities_plan_each_for_itself():
 
 @METHODS
 def test_two_planners_at_once(method):
-    """In the branches of the one the other follows its base."""
     values = []
 
     def noting(observation, info, *, _environment):
@@ -379,7 +374,6 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
 
 
 def test_the_users_own_branches_are_exact():
-    """There a planner plans as it would."""
     env = begun(aec_env(Duel, tame(), policies={"left": planner()}))
     env.step(1)
 
@@ -432,7 +426,6 @@ def test_global_generators_of_their_own():
 )
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_both_methods_do_alike_with_all_options(make, options):
-    """By either method a planner finds the same, and what it does is what comes of it."""
     given, found = points(action_mask_mapping=lambda duel: [1, duel.turn % 2, duel.turn % 2]), []
     for method in ("fork", "replay"):
         noted = Noted(RolloutPolicy(futures=2, horizon=2, method=method))
@@ -462,7 +455,6 @@ def test_max_steps_end_the_futures_of_the_one_agent_that_is_asked():
 
 
 def test_a_simulation_without_environments_has_planners():
-    """No view is imported before the planner is asked."""
     code = """
         from simenv_marl import simulate
         from simenv_marl.planning import RolloutPolicy

@@ -40,7 +40,6 @@ def locked(**changes):
 
 
 def choice(planner, model=Lock, given=None, **options):
-    """What a planner chooses at the first decision of a model."""
     env = single_env(model, given or locked(), **options)
     env.reset(seed=1)
     return planner.choose(env)

@@ -570,9 +570,11 @@ def test_what_is_reset_to_ask_for_the_agents_is_unwound():
         def expected_calls(self, point):
             return [(self,)]
 
-    ended = []
-    vector_env(Announcing, {POINT: definition(agent=lambda self: "counter_0")}, num_envs=2)
+    ended, points = [], {POINT: definition(agent=lambda self: "counter_0")}
+    ours = vector_env(Announcing, points, num_envs=2)
     assert len(ended) == 1
+    theirs = SyncVectorEnv([lambda: joint_env(Announcing, points)] * 2)
+    agree(ours, theirs, 20, np.random.default_rng(0))
 
 
 def test_neither_answers_nor_results_are_held_longer_than_they_are_used():

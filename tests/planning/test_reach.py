@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TransformAction, TransformObservation, TransformReward
 from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 
-from simenv_marl import aec_env, branch, difference, parallel_env, single_env
+from simenv_marl import SimulationInterface, aec_env, branch, difference, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import BranchError, OptionValueError
 from simenv_marl.planning import RolloutPolicy, action_values
@@ -21,7 +21,7 @@ from tests.worlds.duels import LEFT, RIGHT, SPACE, Duel, observe, points
 from tests.worlds.models import define
 
 
-class Births:
+class Births(SimulationInterface):
     """One decides; a second one is born in the first round and decides at once; both are paid at its end."""
 
     def reset(self, seed=None):
@@ -66,7 +66,11 @@ def test_what_an_action_is_worth_reaches_to_the_next_decision(view):
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
 def test_the_first_of_padded_rounds(wrapper):
-    env = begun(wrapper(parallel_env(Duel, points(), possible_agents=["left", "right"])))
+    class Unannounced(Duel):
+        def expected_calls(self, point):
+            return []
+
+    env = begun(wrapper(parallel_env(Unannounced, points(), possible_agents=["left", "right"])))
     assert action_values(env, futures=3, horizon=1).returns == pytest.approx(expected(env, "left", horizon=1))
     planner = RolloutPolicy((number for number in range(3)), futures=1, horizon=1)
     assert [planner.choose(env).best for _ in range(2)] == [2, 2]

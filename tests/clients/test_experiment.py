@@ -12,8 +12,6 @@ pytest.importorskip("pandas")
 
 from examples.greenhouse_coop.train import play
 from studies.greenhouse_experiment import back_in_the_model, baselines, results
-from studies.greenhouse_experiment.questions import FINAL, judge
-from studies.greenhouse_experiment.runs import Run
 
 from simenv_marl import simulate
 
@@ -93,25 +91,6 @@ def test_every_question_is_answered_and_judged_on_the_way(library, made):
         assert run["days"] == 1024
         assert run["curve"][0] != run["curve"][1]
         assert np.isfinite(run["final"]["value"])
-
-
-def test_what_is_loaded_is_what_was_judged(library, made):
-    for question in QUESTIONS[library]:
-        team = script(library).load(Run(library, question, 3, 1024, made))
-        verdict = judge(team, FINAL)
-        run = found(made, f"{library}-{question}-3")["final"]
-        assert (verdict.value, verdict.alive, verdict.litres) == pytest.approx(tuple(run.values()), rel=1e-5)
-
-
-def test_runs_that_are_there_are_not_done_again(library, made, capsys):
-    first, *others = QUESTIONS[library]
-    before = {path: path.stat().st_mtime_ns for path in made.glob("*.json")}
-    again = made / f"{library}-{first}-3.json"
-    again.unlink()
-    carry_out(library, made, questions=QUESTIONS[library])
-    changed = {path for path in made.glob("*.json") if path.stat().st_mtime_ns != before[path]}
-    assert changed == {again}
-    assert capsys.readouterr().out.count("is there already") == len(others)
 
 
 def test_the_same_seed_comes_to_the_same_in_whatever_process(library, made, tmp_path):

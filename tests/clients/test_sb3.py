@@ -10,7 +10,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from simenv_marl import joint_env, single_env, vector_env
+from simenv_marl import joint_env, single_env
 
 from . import page
 from .returns import single_return
@@ -61,11 +61,6 @@ def test_joint_actions_by_agent_are_refused():
     """Observations may be dicts; actions may not, and are flattened."""
     with pytest.raises(AssertionError, match="only supports"):
         PPO("MultiInputPolicy", joint_env(ShopSim))
-
-
-def test_it_takes_no_vector_environments_of_gymnasium():
-    with pytest.raises(ValueError, match="not a Gymnasium environment"):
-        PPO("MlpPolicy", vector_env(ReservoirSim, num_envs=2))
 
 
 # -- training -------------------------------------------------------------------------------------

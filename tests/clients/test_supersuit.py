@@ -10,7 +10,6 @@ from pettingzoo.test import api_test, seed_test
 from stable_baselines3 import PPO
 
 from simenv_marl import TRUNCATED, aec_env, parallel_env
-from simenv_marl.envs import pad_agents
 from tests.worlds.counters import alike
 from tests.worlds.dials import ACTIONS, SEEN, Dial, DialEnv, dial_env, points, turned_by
 
@@ -202,11 +201,6 @@ def test_the_dead_go_on_as_black_death_has_it():
     assert black == [(paid, rounds + 1) for paid, rounds in plain]
 
 
-def test_turns_are_no_rounds():
-    with pytest.raises(AssertionError, match="is_parallelizable"):
-        suit["black_death_v3"](aec_env(HerdSim, possible_agents=FORAGERS))
-
-
 # -- many at once -----------------------------------------------------------------------------------
 
 
@@ -232,18 +226,6 @@ def test_environments_of_many_hands(processes):
     theirs = story_of(vectors_of(HandsEnv(), processes), 6)
     for env in (hands(parallel_env), begun):
         assert alike(story_of(vectors_of(env, processes), 6), theirs)
-
-
-@pytest.mark.parametrize("wrapper", [pad_agents, suit["black_death_v3"]])
-def test_environments_in_which_agents_are_born_and_die(wrapper):
-    envs = vectors_of(wrapper(parallel_env(HerdSim, possible_agents=FORAGERS)), 0)
-    observations, _ = envs.reset(seed=1)
-    ends = 0
-    for _ in range(40):
-        assert observations.shape == (3 * len(FORAGERS), 2)
-        observations, _, terminated, truncated, _ = envs.step(np.ones(3 * len(FORAGERS), np.int64))
-        ends += (terminated | truncated).reshape(3, -1).all(axis=1).sum()
-    assert ends >= 3
 
 
 @pytest.mark.parametrize(

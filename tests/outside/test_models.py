@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 from collections.abc import Callable
@@ -15,11 +14,8 @@ import numpy as np
 import pytest
 from examples.jvm_market import build as building
 from examples.jvm_market import env as town
-from examples.jvm_market.compare import CONTENDERS, METRICS, by_the_granary
-from examples.jvm_market.compare import compare as compare_farmers
-from examples.jvm_market.env import PRICE, PRICES, SOW
 from examples.ns3_senders import env as network
-from examples.ns3_senders.train import POINT, Linear, compare, learn
+from examples.ns3_senders.train import POINT, Linear, compare
 from pettingzoo import test as kit
 
 from simenv_marl import RULE, branch, simulate, simulate_many
@@ -201,67 +197,6 @@ def test_lives_begin_and_end_in_mid_episode(model, env):
     assert not any(turn.truncated for turn in play(env, seed=EMPTY))
 
 
-@of_the_town
-def test_rewards_are_what_was_earned_and_lost(model, env):
-    """A farm that sows nothing has its upkeep to pay, four weeks at a time, until its money is gone."""
-    turns = play(env, lambda agent, env: 0 if agent in FARMS else RULE, seed=3)
-    lost = set()
-    for farm in FARMS:
-        _, *rewards = [turn.reward for turn in turns if turn.agent == farm]
-        assert rewards[1:-1] == pytest.approx([-16.0] * (len(rewards) - 2))  # the first has the harvest of before
-        lost.add(round(rewards[-1], 6))
-    assert {-4.0, -8.0} & lost <= lost <= {0.0, -4.0, -8.0, -12.0}  # some give up in the week in which they decide
-
-
-@of_the_town
-def test_the_last_reward_is_of_the_last_week(model):
-    """Shops that ask too much sell nothing: they pay their rent, and what they have baked."""
-    dearly = np.array([PRICES[1]], np.float32)
-    with closing(town.env(weeks=2, possible_agents={SOW: FARMS, PRICE: SHOPS}, undeclared="rule")) as env:
-        turns = play(env, lambda agent, env: dearly if agent in SHOPS else RULE, seed=3)
-        assert env.possible_agents == FARMS + SHOPS
-        assert env.action_space("farm_1").n == 21
-        assert env.action_space("shop_9").contains(dearly)
-    for shop in SHOPS:
-        *_, last = [turn for turn in turns if turn.agent == shop]
-        _, price, baked, sold, wheat_price, _ = last.observation
-        assert (price, sold) == (4.0, 0)
-        assert last.reward == pytest.approx(-8 - baked * wheat_price)
-    assert turns[-1].truncated
-
-
-@pytest.mark.greenlet("what is compared is tested with both")
-@of_the_town
-def test_other_farmers_are_compared_with_the_rule(model):
-    found = compare_farmers(range(3), weeks=30)
-    assert list(found.values().columns) == list(CONTENDERS)
-    assert found.values("loaves")["by the granary"].mean() > found.values("loaves")["rule"].mean()
-    assert set(METRICS) < set(found.frame.columns)
-    assert by_the_granary([0, 0, 0, 0.0, 0]) == 20
-    assert by_the_granary([0, 0, 0, 1e4, 0]) == 0
-
-
-@pytest.mark.greenlet("no environment takes part")
-@of_the_town
-def test_errors_of_the_compiler_are_told_and_what_is_compiled_is_kept(model, tmp_path):
-    source = tmp_path / "Town.java"
-    out = tmp_path / "out"
-
-    def built(houses, time):
-        source.write_text(f"class Town {{ int houses() {{ return {houses}; }} }}")
-        os.utime(source, (time, time))
-        building.build(out, [source])
-        return (out / "Town.class").stat().st_mtime_ns
-
-    first = built("1", 1e9)
-    assert built("1", 1e9) == first
-    second = built("2", 3e9)
-    assert second > first
-    with pytest.raises(RuntimeError, match="cannot find symbol"):
-        built("none", 4e9)
-    assert (out / "Town.class").stat().st_mtime_ns == second
-
-
 # -- the network ----------------------------------------------------------------------------------
 
 
@@ -281,15 +216,6 @@ def test_who_leaves_terminates_and_who_is_there_in_the_end_is_truncated(model, e
 
 
 @of_the_network
-def test_observations_and_rewards_are_numbers_in_their_spaces(model, env):
-    for turn in play(env, lambda agent, env: env.action_space(agent).sample(), seed=9):
-        assert env.observation_space(turn.agent).contains(turn.observation)
-        assert np.isfinite(turn.observation).all()
-        assert np.isfinite(turn.reward)
-        assert 0 <= turn.info["time"] <= 30
-
-
-@of_the_network
 def test_many_at_once_as_one_by_one(model):
     seeds = range(6)
     alone = compare({"watchful": {POINT: WATCHFUL}}, seeds, workers=0)
@@ -304,9 +230,3 @@ def test_who_watches_its_queue_does_better_than_the_rule(model):
     found = compare({"rule": {}, "watchful": {POINT: WATCHFUL}}, range(12), workers=0, baseline="rule")
     assert found.summary().loc["watchful", "difference_low"] > 0
     assert found.summary("queueing").loc["watchful", "difference_high"] < 0
-
-
-@of_the_network
-def test_it_learns(model):
-    policy = learn(1, workers=0, episodes=1)
-    assert len(policy.weights) == 1 + network.POINTS[POINT].observation_space.shape[0]

@@ -80,9 +80,6 @@ def made(runs, tmp_path):
     return shutil.copytree(runs, tmp_path / "runs")
 
 
-# -- scripts --------------------------------------------------------------------------------------
-
-
 def test_every_question_is_answered_and_judged_on_the_way(library, made):
     for question in QUESTIONS[library]:
         run = found(made, f"{library}-{question}-3")
@@ -101,9 +98,6 @@ def test_the_same_seed_comes_to_the_same_in_whatever_process(library, made, tmp_
     assert found(made, f"{library}-{question}-4")["final"] != found(made, name)["final"]
 
 
-# -- back in the model ----------------------------------------------------------------------------
-
-
 def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library, made):
     question = QUESTIONS[library][-1]
     _, team = back_in_the_model.load(policy(made, library, question))
@@ -111,9 +105,6 @@ def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library
     played = play(team, 11)
     assert greenhouse.water_use == pytest.approx(sum(played.poured))
     assert greenhouse.alive == played.alive[-1]
-
-
-# -- results --------------------------------------------------------------------------------------
 
 
 def test_figures_and_table_are_made_of_whatever_runs_there_are(library, made, tmp_path, capsys):

@@ -56,9 +56,6 @@ def _also_without_torch():
     np.random.seed(0)
 
 
-# -- its wrappers and its checker -----------------------------------------------------------------
-
-
 @pytest.mark.parametrize("make", GREENHOUSES.values(), ids=GREENHOUSES)
 def test_its_checker_finds_nothing_in_the_greenhouse(make):
     check_multiagent_environments(make())
@@ -98,9 +95,6 @@ def test_its_roster_is_ours_and_its_episodes_end_when_ours_do(view):
         assert episode.get_return() == pytest.approx(total)
         ends.add(truncateds["__all__"])
     assert ends == {True, False}
-
-
-# -- training -------------------------------------------------------------------------------------
 
 
 def config(name, make, **environment):
@@ -247,9 +241,6 @@ def test_masks_are_read_from_observations():
     )
     algorithm.train()  # an illegal action of the one who decides would be an error
     algorithm.stop()
-
-
-# -- coming from its ExternalEnv ------------------------------------------------------------------
 
 
 class Stopped(Exception):

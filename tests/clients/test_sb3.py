@@ -35,9 +35,6 @@ def rescaled(env):
     return gymnasium.wrappers.RescaleAction(env, -1, 1)
 
 
-# -- its checker ----------------------------------------------------------------------------------
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     "make",
@@ -61,9 +58,6 @@ def test_joint_actions_by_agent_are_refused():
     """Observations may be dicts; actions may not, and are flattened."""
     with pytest.raises(AssertionError, match="only supports"):
         PPO("MultiInputPolicy", joint_env(ShopSim))
-
-
-# -- training -------------------------------------------------------------------------------------
 
 
 def test_one_continuous_decision():
@@ -125,9 +119,6 @@ def test_a_goal_with_hindsight():
     assert after > -3
 
 
-# -- masks ----------------------------------------------------------------------------------------
-
-
 def test_masked_decisions():
     """A masked action would be an error, so that none has been taken where training comes to its end."""
     env = single_env(WorkbenchSim)
@@ -158,9 +149,6 @@ def test_masked_decisions_of_a_joint_view():
     model = MaskablePPO("MlpPolicy", env, n_steps=100, batch_size=50, seed=0)
     model.learn(200)
     assert get_action_masks(env).tolist() == [True] * 4
-
-
-# -- the page -------------------------------------------------------------------------------------
 
 
 def test_the_page(monkeypatch):

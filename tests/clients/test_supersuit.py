@@ -175,9 +175,6 @@ def test_around_one(name):
     assert alike(*told)
 
 
-# -- births and deaths ------------------------------------------------------------------------------
-
-
 def herds(env, all_there):
     """A few episodes, in which all go out every day: what they were paid, and in how many rounds."""
     told = []
@@ -199,9 +196,6 @@ def test_the_dead_go_on_as_black_death_has_it():
     black = herds(suit["black_death_v3"](parallel_env(HerdSim, possible_agents=FORAGERS)), all_there=True)
     # It notices the end a step later: by an environment that has nothing more to tell.
     assert black == [(paid, rounds + 1) for paid, rounds in plain]
-
-
-# -- many at once -----------------------------------------------------------------------------------
 
 
 def vectors_of(env, processes):
@@ -258,9 +252,6 @@ def test_many_environments_of_turns():
         turned[agent] += observations[0, 1] == turned[agent]
         envs.step(np.full((3, 2), 0.5, np.float32))
     assert min(turned.values()) == 5
-
-
-# -- and trained ------------------------------------------------------------------------------------
 
 
 def test_one_policy_of_stable_baselines3_for_all_agents():

@@ -48,9 +48,6 @@ def small(years=12):
     return FundSim(years, SMALL)
 
 
-# -- the model ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("module", [blocks, company, economy, law, pension, people])
 def test_the_model_knows_nothing_of_environments(module):
     imported = set()
@@ -70,8 +67,6 @@ def test_it_runs_on_its_own():
     assert done.returncode == 0, done.stderr
     assert "years a second" in done.stdout
 
-
-# -- the environments -----------------------------------------------------------------------------
 
 VIEWS = {
     "aec": (aec_env, TEAM | PREMIUMS),

@@ -68,9 +68,6 @@ def pair():
     environment.close()
 
 
-# -- the model ------------------------------------------------------------------------------------
-
-
 def test_a_day_in_the_papers_order():
     greenhouse = Greenhouse(5)
     greenhouse.update_temperature = lambda: None  # 20 degrees
@@ -107,9 +104,6 @@ def test_the_model_tells_its_days_as_in_the_paper(start):
     assert alive[:2] == [200, 200]
     assert alive == sorted(alive, reverse=True)
     assert alive[-1] == 0  # the rule means too well
-
-
-# -- the environments -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", [raw_env, parallel_env, joint_env, watering_env, ventilation_env])
@@ -245,9 +239,6 @@ def test_the_weather_that_lies_ahead_can_be_drawn_anew():
     assert forked == replayed
     assert forked[0] == forked[2] != forked[1] != branch(env, ten_days)[0]
     assert forked[0][2] == forked[1][2]  # the plants are what they are
-
-
-# -- training and planning ------------------------------------------------------------------------
 
 
 def test_trains_end_to_end(tmp_path, capsys):

@@ -54,9 +54,6 @@ def code_of_the_page():
     return names, printed.getvalue()
 
 
-# -- the page -------------------------------------------------------------------------------------
-
-
 def test_the_pages_code_prints_what_the_model_prints_by_itself(program):
     plain = subprocess.run([program, "7"], check=True, capture_output=True, text=True, timeout=20).stdout
     assert code_of_the_page()[1] == plain
@@ -91,9 +88,6 @@ def test_the_page_names_all_that_a_client_has():
     names = set(re.findall(r"^    (?:[\w:<>]+ )+(\w+)\(", public, re.MULTILINE)) - {"Client"}
     assert {"run", "next_episode", "ask", "update", "error", "connected"} <= names
     assert {name for name in names if not re.search(rf"client\.{name}[(<]", PAGE)} == set()
-
-
-# -- what goes wrong ------------------------------------------------------------------------------
 
 
 @pytest.fixture

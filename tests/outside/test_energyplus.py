@@ -112,9 +112,6 @@ def test_interleaved_runs_are_what_they_are_alone(plain):
         env.close()
 
 
-# -- ends -----------------------------------------------------------------------------------------
-
-
 @DRIVERS
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
 def test_an_end_in_mid_episode_and_a_new_one(trigger, driver, plain):
@@ -173,9 +170,6 @@ def test_an_error_of_a_mapping_surfaces_from_step(driver, plain):
     play(env, RULE, seed=3)
     assert outcome(env) == plain(3)
     env.close()
-
-
-# -- what builds on episodes ----------------------------------------------------------------------
 
 
 def test_branches_go_on_exactly():

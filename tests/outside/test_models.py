@@ -122,9 +122,6 @@ def finished(env, number=0):
     return env.simulation.result
 
 
-# -- the models stay what they are ----------------------------------------------------------------
-
-
 def test_by_its_rule_each_episode_is_the_plain_model(model, env):
     for seed, options in model.episodes:  # in one process
         assert exactly(by_rule(env, seed, **options)) == exactly(model.plain(seed, **options))
@@ -171,9 +168,6 @@ def test_the_kit_of_pettingzoo(model):
     kit.parallel_seed_test(parallel_env, num_cycles=50)
 
 
-# -- the town -------------------------------------------------------------------------------------
-
-
 @of_the_town
 def test_towns_differ_and_one_of_them_is_empty_in_the_end(model):
     found = [plain_town(seed) for seed in (3, 4, 5)]
@@ -195,9 +189,6 @@ def test_lives_begin_and_end_in_mid_episode(model, env):
     assert sum(terminated for terminated, _ in ends.values()) == result["closed"] < len(ends)
     assert all(terminated != truncated for terminated, truncated in ends.values())
     assert not any(turn.truncated for turn in play(env, seed=EMPTY))
-
-
-# -- the network ----------------------------------------------------------------------------------
 
 
 @of_the_network

@@ -56,13 +56,9 @@ def _also_without_torch():
     np.random.seed(0)
 
 
-@pytest.mark.parametrize("make", GREENHOUSES.values(), ids=GREENHOUSES)
-def test_its_checker_finds_nothing_in_the_greenhouse(make):
-    check_multiagent_environments(make())
-
-
 @pytest.mark.parametrize("view", HIVES)
-def test_its_checker_finds_nothing_in_the_hive(view):
+def test_its_checker_finds_nothing(view):
+    check_multiagent_environments(GREENHOUSES[view]())
     check_multiagent_environments(hive(view))
 
 

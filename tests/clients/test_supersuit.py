@@ -3,6 +3,7 @@
 import copy
 import importlib
 
+import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
@@ -143,36 +144,33 @@ def test_around_turns(name):
     seed_test(make, num_cycles=20)
 
 
+def story_around(name, env):
+    """Its spaces, and what it tells in some episodes of sampled actions."""
+    env = suit[name](env, **WRAPPERS[name][0])
+    if one := isinstance(env, gymnasium.Env):
+        found = [env.observation_space, env.action_space]
+    else:
+        found = [env.observation_space(agent) for agent in HANDS] + [env.action_space(agent) for agent in HANDS]
+    sampled = copy.deepcopy(found[-1] if one else env.action_space("hand_0"))
+    sampled.seed(1)
+    told = [found, env.reset(seed=3)]
+    for number in range(14):
+        told.append(env.step(sampled.sample() if one else {agent: sampled.sample() for agent in env.agents}))
+        if any(told[-1][2:4]) if one else not env.agents:
+            told.append(env.reset(seed=number))
+    return told
+
+
 @EVERY_WRAPPER
 def test_around_rounds(name):
-    arguments, seen = WRAPPERS[name]
-    told = []
-    for bare in (hands(parallel_env, seen), HandsEnv(seen)):
-        env = suit[name](bare, **arguments)
-        sampled = copy.deepcopy(env.action_space("hand_0"))
-        sampled.seed(1)
-        told.append([[(env.observation_space(agent), env.action_space(agent)) for agent in HANDS], env.reset(seed=3)])
-        for number in range(14):
-            told[-1].append(env.step({agent: sampled.sample() for agent in env.agents}))
-            if not env.agents:
-                told[-1].append(env.reset(seed=number))
-    assert alike(*told)
+    seen = WRAPPERS[name][1]
+    assert alike(story_around(name, hands(parallel_env, seen)), story_around(name, HandsEnv(seen)))
 
 
 @pytest.mark.parametrize("name", WRAPPERS.keys() - OF_AGENTS)
 def test_around_one(name):
-    arguments, seen = WRAPPERS[name]
-    told = []
-    for make in (dial_env, DialEnv):
-        env = suit[name](make(seen), **arguments)
-        sampled = copy.deepcopy(env.action_space)
-        sampled.seed(1)
-        told.append([env.observation_space, env.action_space, env.reset(seed=3)])
-        for number in range(14):
-            told[-1].append(env.step(sampled.sample()))
-            if any(told[-1][-1][2:4]):
-                told[-1].append(env.reset(seed=number))
-    assert alike(*told)
+    seen = WRAPPERS[name][1]
+    assert alike(story_around(name, dial_env(seen)), story_around(name, DialEnv(seen)))
 
 
 def herds(env, all_there):

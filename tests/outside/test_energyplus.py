@@ -5,10 +5,8 @@ import random
 
 import numpy as np
 import pytest
-from pettingzoo import test as kit
 
 from simenv_marl import RULE, branch, parallel_env, simulate
-from simenv_marl.testing import check_simulation
 from tests.conftest import DRIVERS
 from tests.worlds.models import culprits, notes, play
 
@@ -76,24 +74,6 @@ def test_by_the_rule_it_is_the_plain_run(driver, plain):
     assert total == pytest.approx(-plain(3)[1])
     assert outcome(rounds) == plain(3)
     rounds.close()
-
-
-def test_nothing_is_found_by_the_checks():
-    report = check_simulation(
-        zones.BuildingSim, episodes=1, seeds=[3], fingerprint=lambda simulation: simulation.results
-    )
-    assert [str(finding) for finding in report.findings] == []
-
-
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # of PettingZoo's own
-def test_the_kit_of_pettingzoo(capfd):
-    env = zones.raw_env(max_steps=60)
-    kit.api_test(env, num_cycles=200)
-    env.close()
-    kit.parallel_api_test(zones.parallel_env(max_steps=30), num_cycles=100)
-    kit.seed_test(lambda: zones.raw_env(max_steps=30), num_cycles=40)
-    kit.parallel_seed_test(lambda: zones.parallel_env(max_steps=20), num_cycles=30)
-    capfd.readouterr()  # it tells that all has passed
 
 
 def test_interleaved_runs_are_what_they_are_alone(plain):

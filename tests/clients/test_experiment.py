@@ -34,19 +34,8 @@ def line(out, *, questions, seeds=(3,), budget=1024, workers=1):
             "--out", str(out)]  # fmt: skip
 
 
-def carry_out(library, out, **options):
-    script(library).main(line(out, **options))
-
-
-def carry_out_elsewhere(library, out, *, hashes, **options):
-    """In a process of its own, as ``make experiment`` does, where sets of strings are in another order than in others.
-
-    Args:
-        library: Whose script.
-        out: The folder of all runs.
-        hashes: Determines the order.
-        **options: Of the command line.
-    """
+def carry_out(library, out, *, hashes, **options):
+    """In a process of its own, as ``make experiment`` does; by ``hashes`` its sets of strings are in another order."""
     commands.module(f"studies.greenhouse_experiment.{library}", *line(out, **options), PYTHONHASHSEED=hashes)
 
 
@@ -70,7 +59,7 @@ def library(request):
 @pytest.fixture(scope="module")
 def runs(library, tmp_path_factory):
     out = tmp_path_factory.mktemp(library)
-    carry_out_elsewhere(library, out, hashes="0", questions=QUESTIONS[library], seeds=(3, 4), workers=2)
+    carry_out(library, out, hashes="0", questions=QUESTIONS[library], seeds=(3, 4), workers=2)
     return out
 
 
@@ -92,7 +81,7 @@ def test_every_question_is_answered_and_judged_on_the_way(library, made):
 
 def test_the_same_seed_comes_to_the_same_in_whatever_process(library, made, tmp_path):
     question = QUESTIONS[library][0]
-    carry_out_elsewhere(library, tmp_path, hashes="2", questions=[question])
+    carry_out(library, tmp_path, hashes="2", questions=[question])
     name = f"{library}-{question}-3"
     assert found(tmp_path, name) == found(made, name)
     assert found(made, f"{library}-{question}-4")["final"] != found(made, name)["final"]

@@ -105,19 +105,6 @@ def config(name, make, **environment):
     )
 
 
-def in_the_greenhouse(policies):
-    """What policies are worth: the days' shares of living plants, less the water, over seeds that none has seen."""
-    env = parallel_greenhouse()
-    gained = 0.0
-    for seed in HELD_OUT:
-        observations, _ = env.reset(seed=seed)
-        while env.agents:
-            actions = {agent: policies[agent](observation) for agent, observation in observations.items()}
-            observations, rewards, _, _, _ = env.step(actions)
-            gained += rewards["ventilator_0"]
-    return gained / len(HELD_OUT)
-
-
 def in_the_hive(policy):
     """The nectar that bees bring home when a policy decides for each."""
     env = parallel_env(HiveSim, points(DEFINITION), possible_agents=BEES)
@@ -177,20 +164,6 @@ def policy_of():
     names = {"__name__": "__main__"}
     exec(blocks("_clients_rllib.md")[4], names)
     return names["policy_of"]
-
-
-def test_training_in_turns(policy_of):
-    agents = ("waterer_0", "ventilator_0")
-    settings = config("greenhouse in turns", GREENHOUSES["aec"])
-    algorithm = settings.multi_agent(
-        policies=set(agents), policy_mapping_fn=lambda agent, episode, **_: agent
-    ).build_algo()
-    before = in_the_greenhouse({agent: policy_of(algorithm.get_module(agent)) for agent in agents})
-    for _ in range(8):
-        algorithm.train()
-    after = in_the_greenhouse({agent: policy_of(algorithm.get_module(agent)) for agent in agents})
-    algorithm.stop()
-    assert after > before + 5
 
 
 def test_training_a_single_agent(policy_of):

@@ -514,7 +514,6 @@ ANSWERS = {
     b'{"act": 1, "value": "\xed\xa0\x80"}': "MalformedInput",
     b'{"act": 1, "value": "\xe2\x82"}': "MalformedInput",
     b'{"act": 1, "value": ' + b"[" * 100_000: "it is nested too deeply",
-    b" " * LONGEST: "a line has more than 16 MiB",
 }
 
 
@@ -535,6 +534,14 @@ def test_what_is_no_answer_ends_the_child_with_an_error(child, client, line):
         assert ANSWERS[line] in error["text"]
     assert child.receive() is None
     assert child.ended() == (1, client.said, client.unwound), "the model was unwound, though it catches errors"
+
+
+def test_a_line_without_an_end_is_given_up(child, client):
+    child.begin(play="count")
+    child.send(b" " * LONGEST)
+    text = {"C++": "a line of more than 16 MiB", "Java": "a line has more than 16 MiB"}[client.name]
+    assert child.receive()["error"]["text"] == text
+    assert has_given_up(child)
 
 
 def test_an_answer_between_episodes_is_an_error_and_the_end(child, client):

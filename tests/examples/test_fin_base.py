@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pettingzoo
 import pytest
 from examples.fin_base import blocks, company, economy, law, pension, people, train
@@ -17,6 +18,7 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
+from simenv_marl.errors import InvalidActionError
 from simenv_marl.testing import check_simulation
 from tests.worlds.models import follow_the_rule
 
@@ -85,6 +87,48 @@ def test_the_rule_through_every_view_is_the_plain_run(view):
     simulation.run()
     environment = pickle.loads(pickle.dumps(make(small(), points)))
     assert state(follow_the_rule(environment, 4).fund) == state(simulation.fund)
+
+
+def test_no_cent_is_lost_by_random_legal_actions_and_others_are_refused():
+    environment = aec_env(small(), TEAM | PREMIUMS)
+    refused = 0
+    for seed in range(10):
+        environment.reset(seed=seed)
+        generator = np.random.default_rng(seed)
+        for _ in environment.agent_iter():
+            _, _, terminated, truncated, info = environment.last()
+            mask = info.get("action_mask", np.ones(5))
+            if not mask.all():
+                refused += 1
+                with pytest.raises(InvalidActionError):
+                    environment.step(int(np.argmin(mask)))
+            action = int(generator.choice(np.flatnonzero(mask)))
+            environment.step(None if terminated or truncated else action)
+        environment.simulation.fund.world.check()
+    assert refused
+
+
+def test_the_agent_of_a_client_ends_when_the_client_retires_leaves_or_dies(monkeypatch):
+    gone = []
+    for name in ("retire", "vanish"):
+        original = getattr(Client, name)
+
+        def noted(client, *rest, original=original):
+            if client.status in ("working", "away"):
+                gone.append(client.name)
+            return original(client, *rest)
+
+        monkeypatch.setattr(Client, name, noted)
+    environment = premium_env(small())
+    environment.reset(seed=4)
+    decided, ended = set(), []
+    for agent in environment.agent_iter():
+        _, _, terminated, truncated, _ = environment.last()
+        ended += [agent] * terminated
+        decided.add(agent)
+        environment.step(None if terminated or truncated else RULE)
+    assert len(ended) == len(set(ended)) > 10
+    assert set(ended) == set(gone) & decided
 
 
 @pytest.mark.parametrize("points", [TEAM, MANAGER])

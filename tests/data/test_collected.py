@@ -22,7 +22,7 @@ sizes = st.integers(1, 8)
 
 
 def played(env, policies, seed):
-    """What each agent lives through in an episode of an AEC environment: by agent its rows, and its last observation."""
+    """What each agent lives through in an episode: by agent its rows, and its last observation."""
     rows, last, turn = defaultdict(list), {}, 0
     try:
         turns = play(env, lambda agent, env: policies(agent)(*env.last()[::4]), seed=seed)

@@ -209,7 +209,7 @@ class View:
     def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
         """Begin another episode, which ends if the environment is abandoned. Return the results of the reset."""
         session = self._session
-        with session.lock or nullcontext():
+        with session.exclusive:
             seed = checked_seed(seed)
             self._end(session.end)
             if self._finalizer is not None and not self._finalizer.alive:
@@ -232,15 +232,16 @@ class View:
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode, and forget its records unless that was refused."""
-        try:
-            end()
-        finally:
-            episode = self._session.episode
-            if episode is None or episode.over:
-                self._clear()
-            if self._finalizer is not None and self._session.idle:
-                # It would keep the session alive, and with it an environment that its own parts refer to.
-                self._finalizer.detach()
+        with self._session.exclusive:
+            try:
+                end()
+            finally:
+                episode = self._session.episode
+                if episode is None or episode.over:
+                    self._clear()
+                if self._finalizer is not None and self._session.idle:
+                    # It would keep the session alive, and with it an environment that its own parts refer to.
+                    self._finalizer.detach()
 
     def _clear(self) -> None:
         """Forget the records of the episode."""

@@ -229,7 +229,7 @@ SMALL = spaces.Box(0, 10, (2,), np.uint8)
         (TREE, [3]),
         (Choking((), np.int8), [3]),
     ],
-    ids=str,
+    ids=lambda given: type(given).__name__,
 )
 def test_what_is_no_action_is_illegal(space, actions):
     check = action_check(space)

@@ -298,23 +298,23 @@ def test_only_functions_can_be_decided(function):
 @pytest.mark.parametrize(
     ("name", "call", "args", "kwargs"),
     [
-        ("flow", lambda pump: pump.flow(1), ("self", 1), {}),
-        ("flow", lambda pump: pump.flow(1, "m"), ("self", 1, "m"), {}),
-        ("flow", lambda pump: pump.flow(1, fast=True), ("self", 1), {"fast": True}),
-        ("flow", lambda pump: pump.flow(1, fast=True, unit=None), ("self", 1), {"fast": True, "unit": None}),
-        ("flow", lambda pump: type(pump).flow(pump, 3), ("self", 3), {}),
+        ("flow", lambda pump: pump.flow(1), ("self", 1, "l"), {"fast": False}),
+        ("flow", lambda pump: pump.flow(1, "m"), ("self", 1, "m"), {"fast": False}),
+        ("flow", lambda pump: pump.flow(1, fast=True), ("self", 1, "l"), {"fast": True}),
+        ("flow", lambda pump: pump.flow(1, fast=True, unit=None), ("self", 1, None), {"fast": True}),
+        ("flow", lambda pump: type(pump).flow(pump, 3), ("self", 3, "l"), {"fast": False}),
         ("rounded", lambda pump: pump.rounded(1), (1,), {}),
-        ("rounded", lambda pump: type(pump).rounded(amount=1), (), {"amount": 1}),
+        ("rounded", lambda pump: type(pump).rounded(amount=1), (1,), {}),
         ("halved", lambda pump: pump.halved(1), (1,), {}),
-        ("strongest", lambda pump: type(pump).strongest(), ("class",), {}),
+        ("strongest", lambda pump: type(pump).strongest(), ("class",), {"factor": 1}),
         ("strongest", lambda pump: pump.strongest(factor=2), ("class",), {"factor": 2}),
         ("anything", lambda pump: pump.anything(), ("self",), {}),
         ("anything", lambda pump: pump.anything(1, 2, x=3), ("self", 1, 2), {"x": 3}),
-        ("named", lambda pump: pump.named(), (), {}),
+        ("named", lambda pump: pump.named(), (), {"amount": 1}),
         ("named", lambda pump: pump.named(amount=2), (), {"amount": 2}),
     ],
 )
-def test_mappings_receive_the_arguments_as_they_were_passed(name, call, args, kwargs):
+def test_mappings_receive_the_arguments_bound_to_the_signature(name, call, args, kwargs):
     seen = {"observation": [], "reward": [], "mask": [], "agent": []}
 
     def mapping(kind, value):
@@ -338,7 +338,7 @@ def test_mappings_receive_the_arguments_as_they_were_passed(name, call, args, kw
     env = aec_env(calling(lambda: call(copy), lambda: call(copy)), getattr(Copy, name))
     play(env, 3)
     named = {"self": copy, "class": Copy}
-    expected = (tuple(named.get(value, value) if isinstance(value, str) else value for value in args), kwargs)
+    expected = (tuple(named.get(value, value) for value in args), kwargs)
     # Twice at a decision; reward and observation once more at the end.
     assert seen["agent"] == [expected] * 2
     assert seen["mask"][:2] == [expected] * 2
@@ -360,7 +360,7 @@ def test_apply_receives_the_action_and_then_the_arguments():
 
     fill = define(apply=lambda *args, **kwargs: (args, kwargs))(fill)
     env = single_env(calling(lambda: fill("tank", 5), lambda: fill("tank", amount=6, fast=True)), fill)
-    assert told_by(env, 1, 2) == [((1, "tank", 5), {}), ((2, "tank"), {"amount": 6, "fast": True})]
+    assert told_by(env, 1, 2) == [((1, "tank", 5, "l"), {"fast": False}), ((2, "tank", 6, "l"), {"fast": True})]
 
 
 def test_choices_receive_the_arguments():

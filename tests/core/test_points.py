@@ -62,6 +62,16 @@ def test_an_undecorated_function_is_one_point_however_it_is_named_set_or_handled
     assert locate(Base.plain) is point
 
 
+def test_a_function_of_a_class_inside_a_function_is_found_as_itself():
+    class Inside:
+        def decide(self):
+            return "rule"
+
+    point, _ = find_point(Inside.decide, define())
+    assert point.rule is vars(Inside)["decide"]
+    assert point.name == f"{HERE}.{Inside.decide.__qualname__}"
+
+
 def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_base_class():
     inherited, definition = find_point(f"{HERE}.Sub.decorated")
     assert inherited is not point_of(Base.decorated)[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import SimulationInterface, aec_env, make_step, parallel_env, single_env
+from simenv_marl import SimulationInterface, aec_env, envs, make_step, parallel_env, single_env
 from simenv_marl.errors import DefinitionError, NoDecisionError, UnknownPointError
 
 
@@ -115,3 +115,22 @@ def test_an_episode_whose_decisions_fall_in_a_late_thread_names_the_thread_and_t
     finally:
         calls.put(None)
         middleware.join()
+
+
+def test_tab_completion_shows_what_users_call():
+    own = ["driver", "episode", "plugins", "provenance", "simulation", "state_space"]
+    for view, of_its_own in (
+        ("SimulationAECEnv", []),
+        ("SimulationParallelEnv", []),
+        ("SimulationJointEnv", ["action_masks"]),
+    ):
+        kind = getattr(envs, view)
+        theirs = {name for base in kind.__mro__ if not base.__module__.startswith("simenv_marl") for name in dir(base)}
+        shown = {name for name in dir(kind) if not name.startswith("_")} - theirs
+        standard = {
+            "np_random",
+            "np_random_seed",
+            *(f"{what}_space{s}" for what in ("action", "observation") for s in ("", "s")),
+            "state",
+        }
+        assert sorted(shown - standard) == sorted(own + of_its_own)

@@ -49,13 +49,13 @@ class View:
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the view of a plan, of a session that its owner closes, or else of a new session."""
-        adapted = self.adapt(plan)
+        adapted = self._adapt(plan)
         super().__init__()
         self._plan = plan
         self._session = Session(adapted) if session is None else session
         if session is None:
             self._finalizer = weakref.finalize(self, self._session.abandon)
-        self.metadata = self.metadata_of(plan)
+        self.metadata = self._metadata_of(plan)
         self.render_mode = plan.options.render_mode
         self._mode = (self.render_mode or "").removesuffix("_list")
         self._collects = self.render_mode not in (None, self._mode)
@@ -67,7 +67,7 @@ class View:
         self._set_up()
 
     @classmethod
-    def adapt(cls, plan: Plan) -> Plan:
+    def _adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
         for option, view in (("flatten", "joint"), ("agent", "single")):
             if getattr(plan.options, option) and option != cls._option:
@@ -75,7 +75,7 @@ class View:
         return plan
 
     @classmethod
-    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
+    def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
         chosen = [plan.options.render_mode] if plan.options.render_mode else []
         modes = [*plan.render_modes, *(mode for mode in chosen if mode not in plan.render_modes)]
@@ -188,7 +188,7 @@ class View:
         with self._session.context():
             return self.simulation.render(self._mode)
 
-    def show(self, *, begins: bool = False) -> None:
+    def _show(self, *, begins: bool = False) -> None:
         """Render after a step, or after the reset with which an episode ``begins``."""
         if begins:
             self._frames = []
@@ -220,7 +220,7 @@ class View:
             for agent in self._spaces:
                 self._seed_spaces(agent, seed)
             if self._shows:
-                self.show(begins=True)
+                self._show(begins=True)
             return results
 
     def _step_alone(self, step: Callable[..., Any], action: Any) -> Any:
@@ -303,18 +303,18 @@ class View:
 
     # -- branches and planners --------------------------------------------------------------------
 
-    def check_pending(self) -> None:
+    def _check_pending(self) -> None:
         """Check that a decision is pending, or raise ``ResetNeededError`` or ``ReentrancyError``."""
         if self.episode.pending is None:
             raise self._session.refusal()
 
-    def replayed(self) -> Any:
+    def _replayed(self) -> Any:
         """Make an environment in exactly the same state in mid-episode, or raise as ``Session.replay``."""
         made = type(self).__new__(type(self))
         made.__setstate__(copy.deepcopy(self._state()), self._session)
         return made
 
-    def begin_branch(self) -> None:
+    def _begin_branch(self) -> None:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
 
 
@@ -353,9 +353,9 @@ class AgentsView(View):
             )
 
     @classmethod
-    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
+    def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments. The order of agents is an order of rounds only in rounds."""
-        return super().metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
+        return super()._metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The observation space of an agent. It is always the same object, and no other environment shares it.

@@ -59,7 +59,7 @@ class SimulationBatch:
         self.joint: Joint | None = None
         self.view: type[OneAgentView] = SimulationJointEnv
         if view == "single":
-            self.view, self.view_plan, self.plan = SimulationEnv, plan, SimulationEnv.adapt(plan)
+            self.view, self.view_plan, self.plan = SimulationEnv, plan, SimulationEnv._adapt(plan)
             definition = self.plan.active[0].definition
             self.observation_space = deepcopy(definition.observation_space)
             self.action_space = deepcopy(definition.action_space)
@@ -172,7 +172,7 @@ class SimulationBatch:
             if info:
                 infos.append((self._part[number], info))
         for view in self.views if self._shows else ():
-            view.show()
+            view._show()
         return self._stacked(), rewards, terminations, truncations, ends, infos
 
     def _begin(self, number: int, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -181,7 +181,7 @@ class SimulationBatch:
         try:
             episode = session.start(seed, options, in_rounds=self.joint is not None)
             if self._shows:
-                self.views[number].show(begins=True)
+                self.views[number]._show(begins=True)
             (self._observed[number],), _, (info,) = self._read([episode])
         except BaseException as error:
             self._fail(number, error)

@@ -12,9 +12,10 @@ from scipy import stats
 
 from simenv_marl import RULE, aec_env, evaluate, make_step, simulate
 from simenv_marl.data import Mixture
+from simenv_marl.data.plots import interval
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
-from simenv_marl.experiments.evaluation import interval, seeds_needed
+from simenv_marl.experiments.evaluation import seeds_needed
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy
 from simenv_marl.plugins import ChangedResult
 from tests.conftest import DRIVERS

@@ -80,7 +80,8 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
     contenders = {"rule": {}, "some": dict.fromkeys(policies, by_number_of_many) if batched else policies}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # not all are born in each episode
-        found = evaluate(make, contenders, seeds=seeds, points=points, baseline="rule", batched=batched, **options)
+        given = {"points": points, "possible_agents": ["creature_4"], "batched": batched, **options}
+        found = evaluate(make, contenders, seeds=seeds, baseline="rule", **given)
         for name, own in (("rule", {}), ("some", policies)):
             for seed in seeds:
                 rows = found.frame[(found.frame["contender"] == name) & (found.frame["seed"] == seed)]

@@ -166,18 +166,12 @@ def _factor(name: Any, values: Any) -> Factor:
     levels = tuple(value.item() if isinstance(value, np.generic) else value for value in values)
     if not levels:
         raise OptionValueError(f"the factor {name!r} has no levels")
-    hashed: set[Any] = set()
-    others: list[Any] = []  # that have no hash
+    alike: dict[Any, list[Any]] = {}  # so that only few levels are compared
     for level in levels:
-        key = type(level), level
-        try:
-            twice = key in hashed
-            hashed.add(key)
-        except TypeError:
-            twice = any(_is_same(level, other) for other in others)
-            others.append(level)
-        if twice:
+        others = alike.setdefault((type(level), level if isinstance(level, (str, int, float)) else None), [])
+        if any(_is_same(level, other) for other in others):
             raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
+        others.append(level)
     return Factor(name, levels)
 
 

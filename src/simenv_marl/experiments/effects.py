@@ -140,7 +140,8 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    labels = {name: _labels(own) for name, own in levels.items()}
+    # Texts, if some levels are equal although their types differ.
+    labels = {name: own if len(set(own)) == len(own) else list(map(repr, own)) for name, own in levels.items()}
     seeds = table["seed"].to_numpy()
     zero_or_one = is_proportion(table[metric].to_numpy())
     whole = _over_seeds(values, seeds)[0].mean()
@@ -171,11 +172,6 @@ def _over_seeds(values: Any, seeds: NDArray[Any]) -> tuple[NDArray[np.float64], 
     """Return the mean of each seed, or all values of a single seed, and whether each of them is one run's value."""
     means = values.groupby(seeds).mean()
     return (means if len(means) > 1 else values).to_numpy(), len(means) in (1, len(values))
-
-
-def _labels(levels: list[Any]) -> list[Any]:
-    """Return the levels for an index: their texts if some of them are equal although their types differ."""
-    return levels if len(set(levels)) == len(levels) else list(map(repr, levels))
 
 
 def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) -> "tuple[DataFrame, list[str]]":
@@ -209,7 +205,6 @@ def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
         _, bounds = pandas.qcut(column.drop_duplicates(), 4, retbins=True)
         column = pandas.cut(column, bounds, include_lowest=True)
-    # A missing value is nan.
     keys: list[Any] = [(type(value), value) if value == value else nan for value in column.tolist()]
     levels = [key[1] for key in dict.fromkeys(keys) if key is not nan]
     if all(type(level) in (int, float, pandas.Interval) for level in levels):

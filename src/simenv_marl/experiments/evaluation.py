@@ -262,6 +262,7 @@ def evaluate(
 
     Raises:
         OptionValueError: An argument has an invalid value. No simulation has run.
+        AgentError: A contender names an agent that no episode had, and that ``possible_agents`` does not declare.
         MissingExtraError: pandas, SciPy, joblib or tqdm is missing.
         SimEnvError: Something else cannot work. The subclass tells what.
         BaseException: Any exception of a model, a mapping, a policy, a metric or ``team``, with notes that name the
@@ -302,7 +303,11 @@ def evaluate(
             evaluation = Evaluation(make_table((*RUN_COLUMNS, *runner.metrics), rows), baseline, float(confidence))
             done = end
             if done == number or (width is not None and done >= FIRST and evaluation._widest() <= width):
-                return evaluation
+                break
+    for name, plan in plans.items():
+        present = {agent: None for contender, _, agent, *_ in rows if contender == name and agent != TEAM}
+        runner.check_agents(name, runner.unproven_agents(plan, name), present)
+    return evaluation
 
 
 def _run(

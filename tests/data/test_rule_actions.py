@@ -53,7 +53,7 @@ def test_the_next_info_tells_the_rules_action_and_only_that_of_the_latest_decisi
     assert env.simulation.log == [10, 7, 20, 30]
 
 
-def test_a_mapping_may_take_the_arguments_of_the_call_as_they_were_passed():
+def test_a_mapping_may_take_the_bound_arguments_of_the_call():
     seen = []
 
     def mapping(decided, *args, **kwargs):
@@ -64,7 +64,7 @@ def test_a_mapping_may_take_the_arguments_of_the_call_as_they_were_passed():
     env = begun(script(lambda simulation: [function(5), function(step=7), function()].clear()), function)
     for _ in range(3):
         env.step(RULE)
-    assert seen == [(6, (5,), {}), (8, (), {"step": 7}), (11, (), {})]
+    assert seen == [(6, (5,), {}), (8, (7,), {}), (11, (10,), {})]
 
 
 @pytest.mark.parametrize(

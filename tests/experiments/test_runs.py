@@ -92,6 +92,7 @@ def test_the_table_is_the_same_whoever_is_born_and_dies(tmp_path):
 
     contenders = {"one": {"creature_4": lambda observation: 5}, "all": {Creature.act: lambda observation: 3}}
     given = {"contenders": contenders, "seeds": range(5), "points": colony_points(overseen=False)}
+    given["possible_agents"] = ["creature_4"]  # is not born in short episodes
     alone, one, two = (
         run_experiment(make, {"ticks": [1, 5]}, store=tmp_path / str(workers), workers=workers, **given)
         for workers in (0, 1, 2)

@@ -1,4 +1,4 @@
-"""Plots of the trajectories from ``collect_episodes``: the style of all plots, and the returns of many episodes.
+"""Plots of the trajectories from ``collect_episodes``: the style of all plots, intervals, and the returns of episodes.
 
 Matplotlib is imported only when something is drawn. Figures are made without pyplot: no window opens, and a figure is
 freed when its user drops it.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
+from math import nan
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -87,15 +88,31 @@ def write_beside(axes: Axes, text: str, height: float, at: Any) -> None:
     axes.annotate(text, (1.0, height), (6, 0), at, "offset points", va="center", fontsize=8.5, annotation_clip=False)
 
 
-def label_below(axes: Any, names: list[str]) -> None:
-    """Write names below the axes, slanted if they would overlap, and draw a grid."""
-    axes.grid(axis="y", color=ABSENT, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.set_xticks(range(len(names)), names)
-    inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
-    if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter
-        for label in axes.get_xticklabels():
-            label.set(rotation=30, ha="right", rotation_mode="anchor")
+# -- intervals ------------------------------------------------------------------------------------
+
+
+def is_proportion(values: NDArray[Any]) -> bool:
+    """Return whether values are bools, or 0 and 1 alone, of which both occur. None and nan do not count."""
+    return values.dtype == np.bool_ or {v for v in values.ravel() if v is not None and v == v} == {0, 1}
+
+
+def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool = False) -> tuple[float, float, str]:
+    """Return a confidence interval of the mean: by Student's t or, of a proportion, by Wilson's score.
+
+    Bounds of which nothing is known are nan. Then the third value says why; otherwise it is empty.
+    """
+    stats, number = import_extra("scipy.stats", "an interval"), len(values)
+    if number < 2:
+        return nan, nan, "a single value"
+    if not np.isfinite(values).all():
+        return nan, nan, "a value is missing or not finite"
+    if proportion:
+        bounds = stats.binomtest(round(values.sum()), number).proportion_ci(confidence, method="wilson")
+        return float(bounds.low), float(bounds.high), ""
+    if np.ptp(values) <= 1e-12 * np.abs(values).max():  # they differ by rounding errors at most
+        return nan, nan, "all are equal"
+    low, high = stats.t.interval(confidence, number - 1, values.mean(), stats.sem(values))
+    return float(low), float(high), ""
 
 
 # -- many episodes --------------------------------------------------------------------------------
@@ -111,8 +128,7 @@ def plot_returns(
 
     The return of an agent is the undiscounted sum of its rewards in an episode. Each point is an episode. The bar goes
     from the lower to the upper quartile, and its notch is the median. The dot is the mean, and the line through it is
-    its 95 % confidence interval (of 2000 bootstrap samples of the episodes, always the same ones). The numbers of both
-    stand beside the bar.
+    its 95 % confidence interval, by the rule of ``Evaluation.summary``. The numbers of both stand beside the bar.
 
     Args:
         collected: The result of ``collect_episodes``, its value for one key, or a dict from labels to such values:
@@ -128,7 +144,7 @@ def plot_returns(
     Raises:
         OptionValueError: There is nothing to draw, an argument has an invalid value, or there would be more than 60
             rows, as with hundreds of agents.
-        MissingExtraError: Matplotlib is missing.
+        MissingExtraError: Matplotlib or SciPy is missing.
     """
     if per not in ("policy", "agent", "team"):
         raise OptionValueError(f'per must be "policy", "agent" or "team", not {short_repr(per)}')
@@ -139,6 +155,7 @@ def plot_returns(
     if number > LISTED:
         raise OptionValueError(f"per={per!r} would draw {number} rows, more than {LISTED}; per='policy' draws fewer")
     labels = list(dict.fromkeys(label for rows in groups.values() for label in rows))
+    proportion = is_proportion(np.concatenate([returns for rows in groups.values() for returns in rows.values()]))
     with style("plot_returns") as new_figure:
         if ax is None:
             ax = new_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
@@ -149,7 +166,8 @@ def plot_returns(
                 ticks[height] = (title, "bold")
                 height += 0.8
             for label, returns in rows.items():
-                _draw_returns(ax, height, returns, COLOURS[labels.index(label) % len(COLOURS)])
+                colour = COLOURS[labels.index(label) % len(COLOURS)]
+                _draw_returns(ax, height, returns, colour, proportion=proportion)
                 ticks[height] = (label or title, "normal")
                 height += 1.0
         ax.set_yticks(list(ticks), [text for text, _ in ticks.values()])
@@ -191,7 +209,7 @@ def _returns(collected: Any, per: str) -> dict[str, dict[str, NDArray[Any]]]:
     return groups
 
 
-def _draw_returns(axes: Axes, height: float, returns: NDArray[np.float64], colour: str) -> None:
+def _draw_returns(axes: Axes, height: float, returns: NDArray[np.float64], colour: str, *, proportion: bool) -> None:
     """Draw the episodes of a row, their quartiles and median, and their mean with its interval."""
     number, mean = len(returns), float(returns.mean())
     low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
@@ -200,11 +218,9 @@ def _draw_returns(axes: Axes, height: float, returns: NDArray[np.float64], colou
     axes.scatter(returns, heights, size, color=colour, alpha=0.45, linewidths=0, zorder=2)
     axes.barh(height, high - low, left=low, height=0.62, color=colour, alpha=0.16, zorder=1)
     axes.vlines(median, height - 0.31, height + 0.31, color=colour, linewidth=1.4, zorder=3)
-    text, interval = f"{mean:.4g}", None
-    if number > 1:
-        generator = np.random.default_rng(0)
-        draws = [returns[generator.integers(number, size=number)].mean() for _ in range(2000)]
-        below, above = np.quantile(draws, (0.025, 0.975))
-        text, interval = f"{mean:.4g}  [{below:.4g}, {above:.4g}]", [[mean - below], [above - mean]]
-    axes.errorbar([mean], [height], xerr=interval, fmt="o", color=INK, markersize=4, elinewidth=1.6, zorder=5)
+    below, above, _ = interval(returns, 0.95, proportion=proportion)
+    text, bars = f"{mean:.4g}", None
+    if below == below:  # otherwise nothing is known of the interval
+        text, bars = f"{mean:.4g}  [{below:.4g}, {above:.4g}]", [[mean - below], [above - mean]]
+    axes.errorbar([mean], [height], xerr=bars, fmt="o", color=INK, markersize=4, elinewidth=1.6, zorder=5)
     write_beside(axes, text, height, axes.get_yaxis_transform())

@@ -3,9 +3,11 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import product
-from math import ceil, floor, isfinite, prod
+from math import ceil, floor, prod
 from string import ascii_lowercase
+from sys import float_info
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
 
 MOST_ROWS: Final = 10_000_000
 """The largest number of rows. A larger design is considered a mistake."""
+
+EXACT: Final = 2**53
+"""The integers below this are exact as floats. Larger ones are computed as integers."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +47,16 @@ class Factor:
         if self.levels is None and not self.is_whole:
             return self.scale(unit)
         number = self.high - self.low + 1 if self.levels is None else len(self.levels)
-        places = [min(floor(u * number), number - 1) for u in unit.tolist()]
+        if number < EXACT:
+            places = [min(floor(u * number), number - 1) for u in unit.tolist()]
+        else:
+            places = [int(u * EXACT) * number // EXACT for u in unit.tolist()]
         return [self.low + place if self.levels is None else self.levels[place] for place in places]
 
     def scale(self, unit: NDArray[np.float64]) -> list[Any]:
         """Map numbers in [0, 1], inclusive, to values of a range."""
+        if self.is_whole and max(-self.low, self.high) >= EXACT:
+            return [self.low + round(Fraction(u) * (self.high - self.low)) for u in unit.tolist()]
         values = [self.low * (1 - u) + self.high * u for u in unit.tolist()]  # this form cannot overflow
         values = [float(min(max(value, self.low), self.high)) for value in values]
         return [round(value) for value in values] if self.is_whole else values
@@ -57,7 +67,7 @@ class Factor:
             raise OptionValueError("this method takes n values of each range; n must be at least 2")
         if self.levels is not None:
             return list(self.levels)
-        return list(dict.fromkeys(self.scale(np.linspace(0.0, 1.0, number or 2))))
+        return list(dict.fromkeys(self.scale(np.linspace(0.0, 1.0, _rows(number or 2)))))
 
     def ends(self) -> tuple[Any, ...]:
         """Return the two values for a two-level design."""
@@ -132,10 +142,11 @@ def _factor(name: Any, values: Any) -> Factor:
         raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
     if isinstance(values, tuple):
         numbers = [value.item() if isinstance(value, np.generic) else value for value in values]
-        if len(numbers) != 2 or not all(type(value) in (int, float) and isfinite(value) for value in numbers):
+        finite = (type(value) in (int, float) and abs(value) <= float_info.max for value in numbers)
+        if len(numbers) != 2 or not all(finite):
             raise OptionValueError(
-                f"the factor {name!r} is {short_repr(values)}: a tuple is a range (low, high) of two finite numbers;"
-                " levels come as a list"
+                f"the factor {name!r} is {short_repr(values)}: a tuple is a range (low, high) of two finite numbers"
+                " that a float can hold; levels come as a list"
             )
         low, high = numbers
         if not low < high:
@@ -155,9 +166,12 @@ def _factor(name: Any, values: Any) -> Factor:
     levels = tuple(value.item() if isinstance(value, np.generic) else value for value in values)
     if not levels:
         raise OptionValueError(f"the factor {name!r} has no levels")
-    for place, level in enumerate(levels):
-        if any(_is_same(level, other) for other in levels[:place]):
+    alike: dict[Any, list[Any]] = {}  # so that only few levels are compared
+    for level in levels:
+        others = alike.setdefault((type(level), level if isinstance(level, (str, int, float)) else None), [])
+        if any(_is_same(level, other) for other in others):
             raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
+        others.append(level)
     return Factor(name, levels)
 
 

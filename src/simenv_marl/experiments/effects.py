@@ -1,6 +1,6 @@
 """Effects of factors: main effects, interactions, and shares of the variance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from math import ceil, nan
 from typing import TYPE_CHECKING, Any
@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.plots import COLOURS, label_below, style
+from ..data.plots import COLOURS, interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
-from .evaluation import check_metric, check_probability, interval, is_proportion, numbers
+from .evaluation import check_metric, check_probability, label_below, numbers
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -24,20 +24,21 @@ class Effects:
     """The effects of factors on a value. Made by ``effects``.
 
     Attributes:
-        main: One row for each level of each factor, the index: ``mean`` (of the value at this level), the bounds of its
-            interval ``low`` and ``high`` (as ``Evaluation.summary`` has them, nan where nothing is known), ``effect``
-            (the mean minus the mean of all), and ``count``.
+        main: One row for each level of each factor, the index: ``mean`` (of the seeds' means at this level), the bounds
+            of its interval ``low`` and ``high`` (as ``Evaluation.summary`` has them, nan where nothing is known),
+            ``effect`` (the mean minus the same mean of all levels), and ``count``.
         interactions: One row for each pair of factors, the strongest first. ``strength`` is the standard deviation of
             the differences between the means of their combinations and the sum of both main effects.
         metric: The name of the value.
-        levels: The levels of each factor with their types. An index cannot distinguish 1, True and 1.0.
+        levels: The levels of each factor with their types. An index cannot distinguish 1, True and 1.0, so it has texts
+            for the levels of a factor among which there are equal ones.
     """
 
     main: "DataFrame"
     interactions: "DataFrame"
     metric: str
     levels: dict[str, list[Any]]
-    _cells: "dict[tuple[str, str], DataFrame]"
+    _cells: "dict[tuple[str, str], DataFrame]" = field(repr=False)
 
     def cells(self, one: str, other: str) -> "DataFrame":
         """Return the mean of the value for each combination of two factors: one row for each level of the first.
@@ -111,9 +112,9 @@ def effects(
 ) -> Effects:
     """Estimate the effects of an experiment's factors.
 
-    Numeric factors with many values are grouped into quarters. Failed runs are left out. Intervals are over the seeds,
-    for the given rows: the effects of other factors at a level do not widen its interval. With a single seed, intervals
-    are over the rows.
+    Numeric factors with more than eight values are grouped into quarters of their values. Failed runs are left out.
+    Means and intervals are over the seeds, for the given rows: the effects of other factors at a level do not widen its
+    interval. With a single seed, they are over the rows.
 
     Args:
         frame: The result of ``run_experiment``.
@@ -139,16 +140,17 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
+    # Texts, if some levels are equal although their types differ.
+    labels = {name: own if len(set(own)) == len(own) else list(map(repr, own)) for name, own in levels.items()}
+    seeds = table["seed"].to_numpy()
+    zero_or_one = is_proportion(table[metric].to_numpy())
+    whole = _over_seeds(values, seeds)[0].mean()
     main: dict[tuple[str, Any], list[float]] = {}
-    zero_or_one = is_proportion(table[metric])
-    for name, (codes, own) in coded.items():
-        for code, level in enumerate(own):
-            here = values[codes == code]
-            by_seed = here.groupby(table["seed"].to_numpy()[codes == code]).mean()
-            sample = by_seed if len(by_seed) > 1 else here
-            proportion = zero_or_one and len(sample) == len(here)  # not means of several runs
-            low, high, _ = interval(sample.to_numpy(), confidence, proportion=proportion)
-            main[name, level] = [here.mean(), low, high, here.mean() - values.mean(), len(here)]
+    for name, (codes, _) in coded.items():
+        for code, here in values.groupby(codes):
+            sample, single = _over_seeds(here, seeds[here.index])
+            low, high, _ = interval(sample, confidence, proportion=zero_or_one and single)
+            main[name, labels[name][code]] = [sample.mean(), low, high, sample.mean() - whole, len(here)]
     index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
     columns = ["mean", "low", "high", "effect", "count"]
     rows = pandas.DataFrame(list(main.values()), index, columns).astype({"count": int})
@@ -157,13 +159,19 @@ def effects(
     for one, other in combinations(levels, 2):
         means = values.groupby([coded[one][0], coded[other][0]]).mean().unstack()
         means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
-        means.index, means.columns = pandas.Index(levels[one], name=one), pandas.Index(levels[other], name=other)
+        means.index, means.columns = pandas.Index(labels[one], name=one), pandas.Index(labels[other], name=other)
         cells |= {(one, other): means, (other, one): means.T}
         grid = means.to_numpy(np.float64)
         rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0, keepdims=True) + grid.mean()
         strengths.append([one, other, float(np.sqrt((rest**2).mean()))])  # nan if a combination is missing
     interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(["factor", "other"])
     return Effects(rows, interactions.sort_values("strength", ascending=False), metric, levels, cells)
+
+
+def _over_seeds(values: Any, seeds: NDArray[Any]) -> tuple[NDArray[np.float64], bool]:
+    """Return the mean of each seed, or all values of a single seed, and whether each of them is one run's value."""
+    means = values.groupby(seeds).mean()
+    return (means if len(means) > 1 else values).to_numpy(), len(means) in (1, len(values))
 
 
 def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) -> "tuple[DataFrame, list[str]]":
@@ -191,19 +199,20 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
 def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     """Return the place of each row's level, and the levels: numbers sorted, others as they appear, missing ones last.
 
-    Numeric factors with more than eight values are grouped into quarters.
+    Numeric factors with more than eight values are grouped into quarters of these values, however often each occurs.
     """
     pandas = import_extra("pandas", "effects")
     if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
-        column = pandas.qcut(column, 4, duplicates="drop")
-    values = column.tolist()
-    levels = [level for level in dict.fromkeys(values) if level == level]
+        _, bounds = pandas.qcut(column.drop_duplicates(), 4, retbins=True)
+        column = pandas.cut(column, bounds, include_lowest=True)
+    keys: list[Any] = [(type(value), value) if value == value else nan for value in column.tolist()]
+    levels = [key[1] for key in dict.fromkeys(keys) if key is not nan]
     if all(type(level) in (int, float, pandas.Interval) for level in levels):
         levels.sort()
-    places = {level: place for place, level in enumerate(levels)}
-    if any(level != level for level in values):  # nan
+    places = {(type(level), level): place for place, level in enumerate(levels)}
+    if nan in keys:
         levels.append(nan)
-    return np.array([places.get(level, len(levels) - 1) for level in values]), levels
+    return np.array([places.get(key, len(levels) - 1) for key in keys]), levels
 
 
 # -- shares of the variance -----------------------------------------------------------------------
@@ -233,7 +242,8 @@ def sobol_indices(
         ``total_error``.
 
     Raises:
-        OptionValueError: The frame has another design, runs have failed, or the value is not a number or does not vary.
+        OptionValueError: The frame has another design or a single sample, runs have failed, or the value is not a
+            number or does not vary.
         MissingExtraError: SALib is missing.
     """
     pandas = import_extra("pandas", "sobol_indices")
@@ -249,6 +259,8 @@ def sobol_indices(
     if len(values) % seeds or not _is_saltelli(rows[::seeds]):
         raise OptionValueError("shares of the variance need all rows of design(..., method='saltelli'), in their order")
     means = values.reshape(-1, seeds).mean(axis=1)
+    if len(means) == 2 * len(names) + 2:
+        raise OptionValueError("one sample tells nothing of shares of the variance; give design n=64 or more samples")
     if (means == means[0]).all():
         raise OptionValueError(f"{metric!r} is {means[0]:g} in all rows, so it has no variance")
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}

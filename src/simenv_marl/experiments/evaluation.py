@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, product
-from math import inf, isfinite, nan
+from math import inf, isfinite, nan, sqrt
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
@@ -17,7 +17,7 @@ from ..core.options import EpisodeOptions
 from ..core.packing import pack
 from ..core.plan import Plan
 from ..core.points import Points
-from ..data.plots import COLOURS, INK, PALE, label_below, style
+from ..data.plots import ABSENT, COLOURS, INK, PALE, interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Outcome, Returns, Runner, distinct_seeds, make_table, noting
@@ -84,7 +84,7 @@ class Evaluation:
         """
         values = self.values(metric)
         columns, rows, notes = ["mean", "low", "high"], {}, {}
-        proportion = is_proportion(values)
+        proportion = is_proportion(values.to_numpy())
         for name, own in numbers(values, metric).items():
             sample = own.to_numpy()
             low, high, notes[name] = interval(sample, self.confidence, proportion=proportion)
@@ -199,6 +199,17 @@ def _draw_dots(axes: Any, values: "DataFrame", names: list[str], marks: "DataFra
     label_below(axes, list(values.columns))
 
 
+def label_below(axes: Any, names: list[str]) -> None:
+    """Write names below the axes, slanted if they would overlap, and draw a grid."""
+    axes.grid(axis="y", color=ABSENT, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.set_xticks(range(len(names)), names)
+    inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
+    if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter
+        for label in axes.get_xticklabels():
+            label.set(rotation=30, ha="right", rotation_mode="anchor")
+
+
 def _by_contender(rows: Mapping[str, Iterable[float]], columns: list[str]) -> "DataFrame":
     pandas = import_extra("pandas", "a table")
     table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=columns, dtype=float)
@@ -251,6 +262,7 @@ def evaluate(
 
     Raises:
         OptionValueError: An argument has an invalid value. No simulation has run.
+        AgentError: A contender names an agent that no episode had, and that ``possible_agents`` does not declare.
         MissingExtraError: pandas, SciPy, joblib or tqdm is missing.
         SimEnvError: Something else cannot work. The subclass tells what.
         BaseException: Any exception of a model, a mapping, a policy, a metric or ``team``, with notes that name the
@@ -291,7 +303,11 @@ def evaluate(
             evaluation = Evaluation(make_table((*RUN_COLUMNS, *runner.metrics), rows), baseline, float(confidence))
             done = end
             if done == number or (width is not None and done >= FIRST and evaluation._widest() <= width):
-                return evaluation
+                break
+    for name, plan in plans.items():
+        present = {agent: None for contender, _, agent, *_ in rows if contender == name and agent != TEAM}
+        runner.check_agents(name, runner.unproven_agents(plan, name), present)
+    return evaluation
 
 
 def _run(
@@ -328,34 +344,8 @@ def numbers(values: Any, metric: str) -> Any:
     """Return a ``DataFrame`` or ``Series`` as floats; nan where a value is missing."""
     try:
         return values.astype(np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # the last of integers that no float can hold
         raise OptionValueError(f"metric={short_repr(metric)} is not a column of numbers") from None
-
-
-def is_proportion(values: Any) -> bool:
-    """Return whether the values of a ``DataFrame`` or ``Series`` are bools, or 0 and 1 alone, of which both occur."""
-    if values.to_numpy().dtype == np.bool_:
-        return True
-    return set(np.unique(values.dropna())) == {0, 1}
-
-
-def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool = False) -> tuple[float, float, str]:
-    """Return a confidence interval of the mean: by Student's t or, of a proportion, by Wilson's score.
-
-    Bounds of which nothing is known are nan. Then the third value says why; otherwise it is empty.
-    """
-    stats, number = import_extra("scipy.stats", "an interval"), len(values)
-    if number < 2:
-        return nan, nan, "a single value"
-    if not np.isfinite(values).all():
-        return nan, nan, "a value is missing or not finite"
-    if proportion:
-        bounds = stats.binomtest(round(values.sum()), number).proportion_ci(confidence, method="wilson")
-        return float(bounds.low), float(bounds.high), ""
-    if np.ptp(values) <= 1e-12 * np.abs(values).max():  # they differ by rounding errors at most
-        return nan, nan, "all are equal"
-    low, high = stats.t.interval(confidence, number - 1, values.mean(), stats.sem(values))
-    return float(low), float(high), ""
 
 
 def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
@@ -364,11 +354,12 @@ def seeds_needed(differences: NDArray[np.float64], difference: float, confidence
     *_, note = interval(differences, confidence)
     if note:
         return nan
-    ratio = float(np.std(differences, ddof=1)) / abs(difference)
+    size = abs(difference) / float(np.std(differences, ddof=1))
 
     def is_enough(number: int) -> bool:
-        quantiles: Any = stats.t.ppf([1 - (1 - confidence) / 2, power], number - 1)
-        return bool(number >= (quantiles.sum() * ratio) ** 2)
+        critical = stats.t.ppf(1 - (1 - confidence) / 2, number - 1)
+        shift = min(size * sqrt(number), 1e4)  # SciPy has no values for much larger ones
+        return bool(stats.nct.sf(critical, number - 1, [shift, -shift]).sum() >= power)  # on either side
 
     number = 2 + bisect_left(range(2, MOST_SEEDS + 1), True, key=is_enough)
     return float(number) if number <= MOST_SEEDS else inf

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -14,10 +14,20 @@ from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.planner import PlannerPolicy
+from ..core.points import declared_agents
 from ..core.session import Session
 from ..data.collect import learners_plan
 from ..decision import decision_points
-from ..errors import AgentError, OptionValueError, UnknownPointError, annotate, close_after, short_repr, warn_user
+from ..errors import (
+    AgentError,
+    OptionValueError,
+    UnknownPointError,
+    annotate,
+    close_after,
+    did_you_mean,
+    short_repr,
+    warn_user,
+)  # fmt: skip
 from ..hooks.stacks import outside_simulation
 from ..many.batch import Group, run, takes_identities
 from ..many.parallel import import_extra
@@ -90,18 +100,9 @@ class Runner:
     """
 
     def __init__(
-        self,
-        contenders: Any,
-        points: Any,
-        options: Mapping[str, Any],
-        metric: Any,
-        team: Any,
-        *,
-        batched: bool,
-        batch_size: int,
-        workers: int,
-        factors: Sequence[str] = (),
-    ) -> None:
+        self, contenders: Any, points: Any, options: Mapping[str, Any], metric: Any, team: Any, *, batched: bool,
+        batch_size: int, workers: int, factors: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         """Check the arguments. ``factors`` are the columns of the design, whose names metrics must not have."""
         check_options(batch_size, workers)
         if not isinstance(contenders, Mapping):
@@ -161,6 +162,20 @@ class Runner:
                         warn_user(f"returns are not counted, because the decision points are not known: {error}")
                     return plan
                 raise
+
+    def unproven_agents(self, plan: Plan, contender: str) -> set[str]:
+        """Return the names in a contender of which only episodes tell whether they are agents'."""
+        known = {point.agent for point in plan.points}.union(declared_agents(plan.options.possible_agents))
+        return {name for name in self.contenders[contender] if name in plan.policies and name not in known}
+
+    def check_agents(self, contender: str, names: set[str], present: Collection[str]) -> None:
+        """Check that agents of these names have decided."""
+        for name in sorted(names.difference(present)):
+            raise AgentError(
+                f"the contender {contender!r} has a policy for {name!r}, but no agent of that name has decided; declare"
+                f" it in possible_agents= if it may appear later; these have decided: {', '.join(present) or 'none'}"
+                f"{did_you_mean(name, present)}"
+            )
 
     def run(self, plan: Plan, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
         """Run one episode for each seed. ``report`` gets the seed and its results when the simulation is closed."""
@@ -274,8 +289,10 @@ def plain_value(what: str, value: Any, advice: str = "") -> Any:
     """Return a number, a string, a bool or None as an object of Python; refuse any other value."""
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
         value = value.item()
-    if value is not None and type(value) not in (bool, int, float, str):
-        raise OptionValueError(f"{what} must be a number, a string or None, not {short_repr(value)}{advice}")
+    plain = type(value) in (bool, float, str) or (type(value) is int and value.bit_length() < 14_000)  # 4,214 digits
+    if value is not None and not plain:
+        what += " must be a number of no more than 4,200 digits, a string or None"
+        raise OptionValueError(f"{what}, not {short_repr(value)}{advice}")
     return value
 
 

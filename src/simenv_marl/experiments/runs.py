@@ -1,21 +1,18 @@
-"""Experiments: every row of a design with every contender on every seed; stored as they run, and resumed.
-
-A variant has a name for all changes of an experiment on a model: parameters of the model, plugins, definitions of
-decision points, and policies that decide instead of agents. A variant can be given wherever a simulation is expected.
-Further arguments there add to those of the variant.
-"""
+"""Experiments: every row of a design with every contender on every seed, stored and resumed; variants of a model."""
 
 import inspect
 import json
 import os
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from concurrent.futures import BrokenExecutor
+from contextlib import closing, suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial, wraps
 from itertools import groupby, product
 from math import nan
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import time_ns
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Unpack
@@ -28,7 +25,8 @@ from ..core.plan import Plan, source_name
 from ..core.points import Points, portable
 from ..core.provenance import as_json, describe
 from ..errors import OptionValueError, SimEnvError, SimulationError, StoreError, describe_error, short_repr
-from ..many.parallel import import_extra, progress_bar, spread
+from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
+from ..simulation import make_simulation
 from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Returns, Runner, distinct_seeds, make_table, plain_value
 from .store import Provenance, Result, Run, Store, Writer, to_json
 
@@ -115,20 +113,30 @@ def run_experiment(
     storage.read(keys)
     storage.check_rows(keys)
     session = f"{time_ns():016x}{uuid4().hex[:8]}"  # of all processes that do runs now; later ones sort after it
-    work = make, runner, folder, session
     if workers:
-        pack(work)  # errors of pickling come before any run, and so do those of contenders
-    row, provenances = _try_contenders(make, runner, sorted(keys, key=lambda key: key != storage.sample))
+        pack((make, runner))  # errors of pickling come before any run, and so do those of contenders
+    row, prepared = _try_contenders(make, runner, sorted(keys, key=lambda key: key != storage.sample))
     storage.create()
-    storage.warn_of_changes(row, provenances)
+    storage.warn_of_changes(row, {contender: provenance for contender, (_, provenance) in prepared.items()})
     finished = {run for run, result in storage.runs.items() if not (retry_errors and isinstance(result, str))}
     # A row that occurs twice has the same results.
     runs = list(product(dict.fromkeys(keys), runner.contenders, all_seeds))
     missing = [run for run in runs if run not in finished]
-    with progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar:
-        if missing:
-            least, share = len(all_seeds) if batched else 1, 16  # few parts cost nothing, many end together
-            list(spread(_run_part, work, missing, workers, least, bar, share))
+    with progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar, TemporaryDirectory() as notes:
+        work = make, runner, folder, session, notes if workers else ""
+        firsts = []  # for each contender whose agents are not known: these, and the runs of its first row
+        for contender, (names, _) in prepared.items():
+            own = [run for run in missing if run[1] == contender]
+            unseen = {name for name in names if (contender, name) not in storage.seen}
+            if own and unseen:
+                firsts.append((unseen, [run for run in own if run[0] == own[0][0]]))
+        if firsts:
+            with suppress(BrokenExecutor):  # a run that has killed its worker does so again below
+                list(spread(_run_first, work, firsts, workers, 1, NO_BAR))
+            storage.read(keys, session)
+            missing = [run for run in missing if run not in storage.runs]
+            bar.update(len(storage.runs))
+        _run_all(work, missing, workers, len(all_seeds) if batched else 1, bar, storage, keys)
     storage.read(keys)
     return _make_frame(table, keys, all_seeds, storage.runs, runner)
 
@@ -160,14 +168,17 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
     return table, [{name: levels[name][place] for name in names} for place in range(len(table))]
 
 
-def _try_contenders(make: Any, runner: Runner, keys: Sequence[str]) -> tuple[str, dict[str, Provenance]]:
-    """Check that all contenders can be set up; return a row, as JSON, and the provenance of its runs by contender.
+def _try_contenders(
+    make: Any, runner: Runner, keys: Sequence[str]
+) -> tuple[str, dict[str, tuple[set[str], Provenance]]]:
+    """Check that all contenders can be set up; return a row, as JSON, and their unproven agents and provenance.
 
     Both are empty if the simulations of the first ten rows cannot be made: the runs of all rows tell why.
     """
     for key in keys[:10]:
         try:
-            return key, {contender: _prepare(make, runner, key, contender)[1] for contender in runner.contenders}
+            prepared = {contender: _prepare(make, runner, key, contender) for contender in runner.contenders}
+            return key, {name: (runner.unproven_agents(plan, name), made) for name, (plan, made) in prepared.items()}
         except SimEnvError:
             raise
         except Exception:  # this row fails; another may not
@@ -191,7 +202,10 @@ def _source(make: Any, row: Mapping[str, Any]) -> Any:
 
     @wraps(type(first), updated=())  # provenance names it after the class that it makes
     def factory() -> Any:
-        return ready.pop() if ready else make(**row)
+        if ready:
+            return ready.pop()
+        made = make(**row)
+        return make_simulation(first) if made is first else made  # each run has a simulation of its own
 
     return factory
 
@@ -205,21 +219,79 @@ def _prepare(make: Any, runner: Runner, key: str, contender: str) -> tuple[Plan,
     return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
 
 
-def _run_part(make: Any, runner: Runner, folder: Path, session: str, runs: Sequence[Run], bar: Any) -> None:
+def _run_all(
+    work: tuple[Any, ...], missing: list[Run], workers: int, least: int, bar: Any, storage: Store, keys: Sequence[str]
+) -> None:
+    """Do all runs. A run that has killed its worker, and does so again while nothing else runs, becomes an error."""
+    _, runner, folder, session, notes = work
+    while missing:
+        try:
+            list(spread(_run_part, work, missing, workers, least, bar, share=16))  # few parts cost nothing
+            return
+        except BrokenExecutor:  # a worker has died, and joblib has ended all others
+            suspects: list[Run] = []
+            storage.read(keys, session)
+            for path in sorted(Path(notes).iterdir()):
+                with suppress(ValueError):  # its process was killed while it wrote
+                    left = [run for run in map(tuple, json.loads(path.read_bytes())) if run not in storage.runs]
+                    suspects += left[: max(runner.batch_size, 1)]
+                path.unlink()
+            if not suspects:
+                raise
+        for run in suspects:
+            try:
+                list(spread(_run_part, work, [run], max(workers, 2), 1, bar))
+            except BrokenExecutor:
+                with closing(Writer(folder, session)) as writer:
+                    died = "WorkerError: the worker died in this run, twice; retry_errors=True repeats the run"
+                    writer.write(run, died, {})
+        storage.read(keys, session)
+        missing = [run for run in missing if run not in storage.runs]
+
+
+def _note(notes: str, runs: Sequence[Run]) -> None:
+    """Note the runs that a worker does next, for the case that it dies."""
+    if notes:
+        with suppress(OSError):  # another machine does not see the folder
+            Path(notes, uuid4().hex).write_text(to_json(runs), encoding="ascii")
+
+
+def _run_first(make: Any, runner: Runner, folder: Path, session: str, notes: str, firsts: list[Any], bar: Any) -> None:
+    """Run the first row of contenders, until the agents that they name have appeared; only then store the results.
+
+    Each item consists of these names and of the runs of the row. An agent that has not appeared is an ``AgentError``.
+    """
+    for names, runs in firsts:
+        _note(notes, runs)
+        held: list[Any] = []
+        present: dict[str, float] = {}
+        for key, contender, seed in runs:
+            _run_seeds(make, runner, lambda *entry, held=held: held.append(entry), key, contender, [seed], bar)
+            result = held[-1][1]
+            present |= {} if isinstance(result, str) else result.returns
+            if present.keys() >= names:
+                break
+        if not all(isinstance(result, str) for _, result, *_ in held):
+            runner.check_agents(runs[0][1], names, present)
+        with closing(Writer(folder, session)) as writer:
+            for entry in held:
+                writer.write(*entry)
+
+
+def _run_part(make: Any, runner: Runner, folder: Path, session: str, notes: str, runs: Sequence[Run], bar: Any) -> None:
     """Do runs and store their results."""
+    _note(notes, runs)
     with closing(Writer(folder, session)) as writer, reuse_resources():
         for (key, contender), group in groupby(runs, lambda run: run[:2]):
-            _run_seeds(make, runner, writer, key, contender, [seed for *_, seed in group], bar)
+            _run_seeds(make, runner, writer.write, key, contender, [seed for *_, seed in group], bar)
 
 
-def _run_seeds(
-    make: Any, runner: Runner, writer: Writer, key: str, contender: str, seeds: Sequence[int], bar: Any
-) -> None:
-    """Run seeds of a row with a contender, and store the result of each. An error is a result, too."""
+def _run_seeds(make: Any, runner: Runner, write: Any, key: str, contender: str, seeds: Sequence[int], bar: Any) -> None:
+    """Run seeds of a row with a contender, and ``write`` the result of each. An error is a result, too."""
     remaining = dict.fromkeys(seeds)
 
     def report(seed: int, result: Result, trace: str | None = None) -> None:
-        writer.write((key, contender, seed), result, {**provenance, "seed": seed}, trace)
+        write((key, contender, seed), result, {**provenance, "seed": seed}, trace)
         del remaining[seed]
         bar.update()
 
@@ -233,7 +305,7 @@ def _run_seeds(
         except BaseException as error:
             if runner.batch_size > 1 and len(remaining) > 1:  # running them one by one shows which of them failed
                 for seed in list(remaining):
-                    _run_seeds(make, runner, writer, key, contender, [seed], bar)
+                    _run_seeds(make, runner, write, key, contender, [seed], bar)
                 return
             trace = "".join(traceback.format_exception(error))[-4000:]
             report(next(iter(remaining)), describe_error(error), trace)

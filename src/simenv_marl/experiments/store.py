@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any, Final
 from uuid import uuid4
 
-from ..errors import LONGEST, OptionValueError, StoreError, warn_user
-from .runner import Outcome
+from ..errors import LONGEST, OptionValueError, StoreError, short_repr, warn_user
+from .runner import Outcome, plain_value
 
 VERSION: Final = 1
 HEADER: Final = "experiment.json"
@@ -46,7 +46,10 @@ Provenance = Mapping[str, Any]
 
 def to_json(value: Any) -> str:
     """Return a value as JSON, on one line."""
-    return json.dumps(value, separators=(",", ":"))
+    try:
+        return json.dumps(value, separators=(",", ":"))
+    except (ValueError, RecursionError) as error:  # for example of an integer of 5,000 digits
+        raise OptionValueError(f"{short_repr(value)} cannot be stored as JSON ({error}); use other values") from error
 
 
 @contextmanager
@@ -84,8 +87,8 @@ class Store:
             text = header.read_bytes()
         try:
             content = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise StoreError(f"{header} cannot be read: {error}") from error
+        except (ValueError, RecursionError) as error:
+            raise StoreError(f"{header} cannot be read: {error}; restore the file, or pass another folder") from error
         if not isinstance(content, dict) or content.get("simenv_marl") != VERSION:
             raise OptionValueError(f"{header} was not written by this version of simenv_marl")
         for what in ("factors", "metrics"):
@@ -105,37 +108,47 @@ class Store:
                 fresh.write_text(json.dumps(self._header) + "\n", encoding="ascii")
                 os.replace(fresh, self.folder / HEADER)
 
-    def read(self, keys: Iterable[str]) -> None:
-        """Read all runs, after a check with ``exists``. ``keys`` are the rows of the design, as JSON."""
+    def read(self, keys: Iterable[str], session: str = "") -> None:
+        """Read all runs, or those of a session, after ``exists``. ``keys`` are the rows of the design, as JSON."""
         self.exists()
         self.runs: dict[Run, Result] = {}
         self.sample = ""
+        self.seen: set[tuple[str, str]] = set()  # contenders with agents that have decided
         self._versions: set[tuple[str, Any]] = set()
-        self._provenances: dict[str, Provenance] = {}  # by contender, of the first success of the sample
+        self._parts: dict[str, dict[str, str]] = {}  # by contender, of the first success of the sample
         texts = {key: key for key in keys}
-        for path in sorted(self.folder.glob("runs-*.jsonl")):  # in the order in which they were begun
+        for path in sorted(self.folder.glob(f"runs-{session}*.jsonl")):  # in the order in which they were begun
             with _explain(f"{path} cannot be read"), path.open("rb") as file:
                 for number, line in enumerate(file, 1):
                     if not line.endswith(b"\n"):
                         break  # its process was killed, or is still writing
                     try:
                         self._add(json.loads(line), texts)
-                    except (ValueError, TypeError, LookupError, AttributeError):  # not JSON, or not a run
+                    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
                         warn_user(f"line {number} of {path} cannot be read, so its run counts as missing")
 
     def _add(self, entry: Any, texts: dict[str, str]) -> None:
-        """Add the run of a line. If that is not a run, it raises TypeError, LookupError or AttributeError."""
+        """Add the run of a line. If that is not a run, it raises an error and adds nothing."""
         row = to_json({name: entry["factors"][name] for name in self._factors})
-        run = texts.get(row, row), entry["contender"], entry["seed"]  # so that a text is in memory once, for all runs
+        run = texts.get(row, row), str(entry["contender"]), int(entry["seed"])  # so that a text is in memory once
+        provenance, parts = entry["provenance"], {}
+        versions = set(_versions_in(provenance).items())
         result: Result = str(entry["error"])
         if entry["status"] == "ok":
-            result = Outcome(*(dict(entry[part].items()) for part in Outcome._fields))
-        self._versions.update(_versions_in(entry["provenance"]).items())
+            returns = {name: float(value) for name, value in entry["returns"].items()}
+            lengths = {name: int(entry["lengths"][name]) for name in returns}
+            metrics = {name: plain_value(name, value) for name, value in entry["metrics"].items()}
+            result = Outcome(returns, lengths, metrics)
+            if row in texts and self.sample in ("", row) and run[1] not in self._parts:
+                parts = {run[1]: _parts_of(provenance)}
+        self._versions |= versions
         if isinstance(self.runs.get(run, ""), str):
             self.runs[run] = result
-        if not isinstance(result, str) and row in texts and self.sample in ("", row):
+        if not isinstance(result, str):
+            self.seen.update((run[1], name) for name in result.returns)
+        if parts:
             self.sample = row
-            self._provenances.setdefault(entry["contender"], entry["provenance"])
+            self._parts |= parts
 
     # -- what has changed since the runs were stored ----------------------------------------------
 
@@ -161,8 +174,7 @@ class Store:
         if changes:
             warn_user(f"the store {self.folder} holds runs that were made with other versions: {changes}")
         for contender, provenance in provenances.items() if row == self.sample else ():
-            then = self._provenances.get(contender, {})
-            changes = _changes(_parts_of(then).items(), _parts_of(provenance))
+            changes = _changes(self._parts.get(contender, {}).items(), _parts_of(provenance))
             if changes:
                 warn_user(
                     f"the store {self.folder} holds runs of {contender!r} that were made differently: {changes}; they"

@@ -13,7 +13,7 @@ from ..core.points import Points
 from ..core.session import Session, checked_seed
 from ..errors import OptionValueError, close_after, short_repr
 from .batch import policy_keys, run
-from .parallel import progress_bar, spread
+from .parallel import import_extra, progress_bar, spread
 
 
 def simulate(
@@ -162,3 +162,9 @@ def check_options(batch_size: Any, workers: Any, collect: Any = None) -> None:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"
             raise OptionValueError(f"{name} must be {what}, not {short_repr(value)}")
+    if workers:
+        backend, _ = import_extra("joblib.parallel", f"workers={workers}").get_active_backend()
+        if type(backend).__name__ == "MultiprocessingBackend":
+            raise OptionValueError(
+                "joblib's backend 'multiprocessing' waits for ever for a worker that has died; use 'loky'"
+            )

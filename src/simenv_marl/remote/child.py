@@ -65,7 +65,10 @@ class Child:
         state: "idle" between episodes, "running" its model, "waiting" for the answer to a call, or "stopped".
         number: The number of its latest call in the episode; 0 before the first one.
         time: Its latest time in the episode; None if it sent none.
+        origin: What it was started with, and in; equal for processes that can replace each other.
     """
+
+    origin: Any = None
 
     def __init__(
         self, command: Sequence[str], timeout: float, env: Mapping[str, str] | None = None, cwd: Any = None

@@ -117,7 +117,8 @@ class ProcessSimulation(SimulationInterface):
         start = encode({"start": {"seed": seed, "options": options or {}}})
         self.result = None
         self._clear()
-        child = self._child or acquire(self._key())
+        origin = self._origin()
+        child = self._child or acquire(origin)
         if child is not None:
             child.break_off()
             try:
@@ -127,12 +128,14 @@ class ProcessSimulation(SimulationInterface):
             except ProcessDiedError:
                 if child.exit_code() != 0:
                     raise
-        self._begin(Child(self.command, self.timeout, self.env, self.cwd), start)
+        child = Child(self.command, self.timeout, self.env, self.cwd)
+        child.origin = origin
+        self._begin(child, start)
 
-    def _key(self) -> tuple[Any, ...]:
-        """Return a value that is equal for processes that can replace each other."""
-        env = None if self.env is None else tuple(sorted(self.env.items()))
-        return tuple(self.command), self.timeout, env, self.cwd
+    def _origin(self) -> tuple[Any, ...]:
+        """Return a value that is equal for processes that can replace each other, if they are started now."""
+        env = dict(os.environ if self.env is None else self.env)
+        return self.command, self.timeout, env, os.path.abspath(self.cwd or "")
 
     def _use(self, child: Child | None) -> None:
         """Use a process, or none, from now on."""
@@ -196,7 +199,7 @@ class ProcessSimulation(SimulationInterface):
         if last and child is not None:
             self._use(None)
             child.break_off()
-            if not release(self._key(), child):
+            if not release(child.origin, child):
                 child.close()
 
     @property

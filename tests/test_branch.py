@@ -51,22 +51,23 @@ POINTS = {
 }
 
 
+def begun(env, seed=3):
+    env.reset(seed=seed)
+    return env
+
+
 def move(env, number=0):
-    """One step of an environment of any view with random actions; what it tells."""
-    unwrapped = env.unwrapped
-    if hasattr(unwrapped, "agent_iter"):
+    if hasattr(env.unwrapped, "agent_iter"):
         observation, *rest = env.last()
         agent = env.agent_selection
-        ended = rest[1] or rest[2]
-        env.step(None if ended else (env.action_space(agent).sample() + number) % 3)
+        env.step(None if rest[1] or rest[2] else (env.action_space(agent).sample() + number) % 3)
         return repr((agent, observation, rest, env.rewards, env.infos, env.agents))
-    if hasattr(unwrapped, "agents"):
+    if hasattr(env.unwrapped, "agents"):
         return repr(env.step({agent: (env.action_space(agent).sample() + number) % 3 for agent in env.agents}))
     return repr(env.step(env.action_space.sample()))
 
 
 def rest_of(env, number=0):
-    """What all that is left of an episode tells, with the simulation's state."""
     told = []
     while getattr(env.unwrapped, "agents", True) and not (told and "True" in told[-1] and not hasattr(env, "agents")):
         told.append(move(env, number))
@@ -74,21 +75,12 @@ def rest_of(env, number=0):
     return told, simulation.steps, simulation.place, simulation.random.random()
 
 
-def short(env, number=0):
-    return rest_of(env)
-
-
-# -- what a branch is -----------------------------------------------------------------------------
-
-
 @METHODS
 @VIEWS
 def test_branches_are_what_the_environment_would_have_done(make, method):
-    """At every point of an episode, and the environment itself has not moved."""
     points = Walk.choose if make is single_env else POINTS
     for taken in range(5):
-        env = make(lambda: Walk(6), points)
-        env.reset(seed=3)
+        env = begun(make(lambda: Walk(6), points))
         for _ in range(taken):
             move(env)
         same, other, different = branch(env, lambda twin, number: rest_of(twin, max(0, number - 1)), 3, method=method)
@@ -98,36 +90,41 @@ def test_branches_are_what_the_environment_would_have_done(make, method):
 
 @METHODS
 def test_branches_of_branches(method):
-    env = single_env(lambda: Walk(6), Walk.choose)
-    env.reset(seed=3)
-
     def plan(twin, number):
         twin.step(number)
         return branch(twin, lambda deeper, second: (deeper.step(second)[0].tolist(), number, second), 2, method=method)
 
-    found = branch(env, plan, 2, method=method)
+    found = branch(going_on(steps=0), plan, 2, method=method)
     assert [[entry[1:] for entry in each] for each in found] == [[(0, 0), (0, 1)], [(1, 0), (1, 1)]]
     assert len({repr(entry[0]) for each in found for entry in each}) > 2
 
 
 @METHODS
 def test_wrappers_come_along(method):
-    env = TimeLimit(single_env(lambda: Walk(9), Walk.choose), 4)
-    env.reset(seed=1)
+    env = begun(TimeLimit(going_on(steps=0, length=9), 4), 1)
     env.step(1)
 
     def count(twin, number):
-        assert isinstance(twin, TimeLimit)
         steps = 1
         while not twin.step(1)[3]:
             steps += 1
-        return steps
+        return type(twin), steps
 
-    assert branch(env, count, 2, method=method) == [3, 3]
+    assert branch(env, count, 2, method=method) == [(TimeLimit, 3)] * 2
     assert env.step(1)[3] is False
-    wrapped = OrderEnforcingWrapper(aec_env(lambda: Walk(3), Walk.choose))
-    wrapped.reset(seed=1)
+    wrapped = begun(OrderEnforcingWrapper(aec_env(lambda: Walk(3), Walk.choose)), 1)
     assert branch(wrapped, lambda twin, number: (type(twin), twin.step(1)), 1, method=method) == [(type(wrapped), None)]
+
+
+def going_on(model=Walk, length=6, steps=1, **options):
+    env = begun(single_env(lambda: model(length), Walk.choose, **options))
+    for _ in range(steps):
+        env.step(1)
+    return env
+
+
+def short(env, number=0):
+    return rest_of(env)
 
 
 @pytest.mark.parametrize("options", [{"global_rng": True}, {"driver": "thread"}, {"max_steps": 3}])
@@ -136,25 +133,12 @@ def test_options_hold_in_branches(options):
         def drift(self):
             return random.random() if options.get("global_rng") else 0.0
 
-    env = single_env(lambda: Drawing(6), Walk.choose, **options)
-    env.reset(seed=3)
-    move(env)
+    env = going_on(Drawing, **options)
     found = branch(env, short, 2)
     assert found[0] == found[1] == branch(env, short, 1, method="replay")[0] == rest_of(env)
 
 
-# -- what goes wrong ------------------------------------------------------------------------------
-
-
-def going_on():
-    env = single_env(lambda: Walk(6), Walk.choose)
-    env.reset(seed=3)
-    env.step(1)
-    return env
-
-
 def children():
-    """The processes that this one has started and not yet seen the end of."""
     return {line for path in Path("/proc/self/task").glob("*/children") for line in path.read_text().split()}
 
 
@@ -224,9 +208,7 @@ def test_simulations_that_are_random_for_themselves():
         def reset(self, seed=None):
             super().reset()
 
-    env = single_env(lambda: Dice(6), Walk.choose)
-    env.reset(seed=3)
-    env.step(1)
+    env = going_on(Dice)
     with pytest.raises(BranchError, match=r"the same seed and the same actions[\s\S]*fork"):
         branch(env, short, 1, method="replay")
     found = branch(env, short, 2, method="fork")
@@ -247,8 +229,7 @@ def test_too_many_decisions_to_be_kept(make, monkeypatch):
             branch(env, short, 1, method="replay")
         found = branch(env, short, 1)
     assert found == [rest_of(env)]
-    env = single_env(lambda: Walk(9), Walk.choose, max_steps=4)
-    env.reset(seed=3)
+    env = going_on(length=9, steps=0, max_steps=4)
     assert [env.step(1)[3] for _ in range(4)] == [False, False, False, True]
 
 
@@ -277,8 +258,7 @@ def test_what_cannot_be_continued(method):
 
 
 def test_threads_are_not_forked():
-    env = single_env(lambda: Walk(1), Walk.choose, driver="thread")
-    env.reset()
+    env = going_on(steps=0, driver="thread")
     with pytest.raises(OptionValueError, match="replay"):
         branch(env, short, method="fork")
     env.close()
@@ -293,8 +273,7 @@ def test_not_from_inside_its_own_mappings():
         return [0, 0]
 
     ant = decision(agent="ant_0", observation_space_mapping=observe)
-    env = aec_env(script(lambda simulation: [ant(), ant()]), ant)
-    env.reset()
+    env = begun(aec_env(script(lambda simulation: [ant(), ant()]), ant))
     envs.append(env)
     with pytest.raises(ReentrancyError, match="was used from"):
         env.step(1)
@@ -302,8 +281,7 @@ def test_not_from_inside_its_own_mappings():
 
 
 def test_branches_are_closed_when_their_function_has_returned():
-    env, twins = single_env(lambda: Walk(3), Walk.choose), []
-    env.reset()
+    env, twins = going_on(), []
 
     def keep(twin, number):
         twins.append(twin.unwrapped)
@@ -320,8 +298,7 @@ def test_branches_are_closed_when_their_function_has_returned():
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the number of cores cannot be set")
 def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
-    env = single_env(lambda: Walk(3), Walk.choose)
-    env.reset()
+    env = going_on()
 
     def alone(twin, number):
         (tmp_path / str(number)).touch()
@@ -343,9 +320,7 @@ def test_forked_branches_leave_torchs_threads_behind(monkeypatch):
     torch = types.ModuleType("torch")
     torch.set_num_threads = told.append
     monkeypatch.setitem(sys.modules, "torch", torch)
-    env = single_env(lambda: Walk(3), Walk.choose)
-    env.reset()
-    assert branch(env, lambda twin, number: told, 1, method="fork") == [[1]]
+    assert branch(going_on(), lambda twin, number: told, 1, method="fork") == [[1]]
     assert told == []
 
 
@@ -365,8 +340,7 @@ def test_what_was_decided_is_replayed_as_it_was_given():
 
     for policies, own in (({"wind_0": policy}, 1), (None, action)):
         points = {f"{Walk.__module__}.Walk.drift": define(agent="wind_0", **amount)}
-        env = aec_env(lambda: Walk(6), points | ({Walk.choose: None} if policies else {}), policies=policies)
-        env.reset(seed=3)
+        env = begun(aec_env(lambda: Walk(6), points | ({Walk.choose: None} if policies else {}), policies=policies))
         for _ in range(3):
             action[0] += 0.5
             env.step(own)
@@ -374,9 +348,6 @@ def test_what_was_decided_is_replayed_as_it_was_given():
         places = branch(env, lambda twin, number: twin.simulation.place, 2, method="replay")
         assert places == [env.simulation.place] * 2
         assert len(asked) == before
-
-
-# -- what a fork would share ----------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
@@ -387,8 +358,6 @@ def test_branches_of_random_worlds_are_exact():
 
 
 class Holding:
-    """Has something open while it runs."""
-
     def reset(self, seed=None):
         self.chance, self.log = random.Random(seed), []
 
@@ -398,57 +367,47 @@ class Holding:
                 self.log.append((filing.choose(), self.chance.random()))
 
 
-class WithSocket(Holding):
-    what = "a socket"
-
-    @contextmanager
-    def open(self):
-        one, other = socket.socketpair()
-        with one, other:
-            yield
-
-
-class WithChild(Holding):
-    what = "a child process"
-
-    @contextmanager
-    def open(self):
-        with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
-            yield
-            child.communicate(b"\n")
-
-
-class WithThread(Holding):
-    what = "a thread"
-
-    @contextmanager
-    def open(self):
-        over = threading.Event()
-        thread = threading.Thread(target=over.wait)
-        thread.start()
+@contextmanager
+def a_socket(model):
+    one, other = socket.socketpair()
+    with one, other:
         yield
-        over.set()
-        thread.join()
 
 
-class WithWorker(Holding):
-    what = "a child process"
-
-    @contextmanager
-    def open(self):
-        worker = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
-        worker.start()
+@contextmanager
+def a_child(model):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         yield
-        worker.kill()
-        worker.join()
+        child.communicate(b"\n")
 
 
-@pytest.mark.parametrize("model", [WithSocket, WithChild, WithWorker, WithThread])
-def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(model):
-    env = single_env(model, filing.choose)
-    env.reset(seed=4)
+@contextmanager
+def a_thread(model):
+    over = threading.Event()
+    thread = threading.Thread(target=over.wait)
+    thread.start()
+    yield
+    over.set()
+    thread.join()
+
+
+@contextmanager
+def a_worker(model):
+    worker = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+    worker.start()
+    yield
+    worker.kill()
+    worker.join()
+
+
+@pytest.mark.parametrize(
+    ("held", "name"),
+    [(a_socket, "a socket"), (a_child, "a child process"), (a_worker, "a child process"), (a_thread, "a thread")],
+)
+def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(held, name):
+    env = begun(single_env(type("Model", (Holding,), {"open": held}), filing.choose), 4)
     env.step(1)
-    with pytest.raises(BranchError, match=f"{model.what}.*replay"):
+    with pytest.raises(BranchError, match=f"{name}.*replay"):
         branch(env, filing.left, method="fork")
     found = branch(env, filing.left, 2)
     assert found[0] == found[1] == filing.left(env)
@@ -478,8 +437,6 @@ def test_what_the_user_has_opened_is_no_obstacle():
 
 
 class Clerks(Holding):
-    """Tasks of asyncio, woken by time and by each other."""
-
     async def clerk(self, number):
         for _ in range(3):
             await asyncio.sleep(0)
@@ -494,10 +451,8 @@ class Clerks(Holding):
         asyncio.run(self.all())
 
 
-class Listening(Holding):
-    """A task that is woken by what arrives in a pipe."""
-
-    async def hear(self):
+class Listening(Clerks):
+    async def all(self):
         loop, (reading, writing) = asyncio.get_running_loop(), os.pipe()
         for number in range(3):
             heard = loop.create_future()
@@ -509,17 +464,12 @@ class Listening(Holding):
         os.close(reading)
         os.close(writing)
 
-    def run(self):
-        asyncio.run(self.hear())
-
 
 def test_event_loops_of_asyncio_go_on_in_a_fork():
-    env = single_env(Listening, filing.choose)
-    env.reset()
+    env = begun(single_env(Listening, filing.choose))
     env.step(1)
     assert branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
-    env = single_env(Clerks, filing.choose)
-    env.reset(seed=4)
+    env = begun(single_env(Clerks, filing.choose), 4)
     for _ in range(3):
         found = branch(env, filing.left, 2, method="fork")
         env.step(3)
@@ -533,7 +483,6 @@ def test_where_asyncio_is_not_imported_there_are_no_event_loops(monkeypatch):
 
 @pytest.mark.parametrize("modes", [["w"], ["a", "w"], ["r+"], ["a", "r"]])
 def test_copies_of_files_are_what_they_were(tmp_path, modes):
-    """In size, place and contents; and the file itself stays what it is."""
     path = tmp_path / "letters"
 
     class Model(Holding):
@@ -551,8 +500,7 @@ def test_copies_of_files_are_what_they_were(tmp_path, modes):
             for file in files:
                 file.close()
 
-    env = single_env(Model, filing.choose)
-    env.reset()
+    env = begun(single_env(Model, filing.choose))
     for _ in range(3):
         before = path.read_text()
         found = branch(env, filing.left, 2, method="fork")

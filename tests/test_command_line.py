@@ -13,44 +13,24 @@ from simenv_marl.__main__ import main
 MODELS = '''
 """Two walks, one of which limps."""
 
-import random
 import sys
 
-from gymnasium import spaces
-
-from simenv_marl import make_step
+from tests.worlds import copied
 
 
-def definition(observe):
-    return make_step(
-        observation_space=spaces.Box(-100, 100, (1,)),
-        observation_space_mapping=observe,
-        action_space=spaces.Discrete(3),
-        action_space_mapping=lambda action: action - 1,
-        reward_mapping=lambda walk: -abs(walk.place),
-        agent="walker_0",
-    )
+class Walk(copied.Walk):
+    points = [copied.Walk.choose]
+
+    def __init__(self):
+        super().__init__(10)
 
 
-class Walk:
-    def reset(self, seed=None):
-        self.random, self.place = random.Random(seed), 0.0
-
-    def run(self):
-        for _ in range(10):
-            self.place += self.choose() + self.random.random()
-
-    def choose(self):
-        return 0
-
-    points = {choose: definition(lambda walk: [walk.place])}
+def shaken(walk):
+    return [walk.place + walk.random.random()]
 
 
 class Limping(Walk):
-    def choose(self):
-        return 0
-
-    points = {choose: definition(lambda walk: [walk.place + walk.random.random()])}
+    points = {copied.Walk.choose: copied.define(observation_space_mapping=shaken)}
 
 
 class Boot:
@@ -159,7 +139,10 @@ def test_what_cannot_be_looked_at(command, target, told, capsys):
 
 @pytest.mark.parametrize(
     "arguments",
-    ["", "chek walking:Walk", "check", "check walking:Walk --time-limit never", "wire-check --options [1] s"],
+    [
+        *("", "chek walking:Walk", "check", "check walking:Walk --time-limit never", "wire-check --options [1] s"),
+        *("new", "new plain", "new netlogo tank"),
+    ],
 )
 def test_wrong_arguments(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
@@ -169,24 +152,19 @@ def test_wrong_arguments(arguments, capsys):
 
 
 @pytest.mark.parametrize(
-    ("command", "target", "option", "value"),
+    ("command", "options"),
     [
-        ("check", "walking:Walk", "seed", "-1"),
-        ("check", "walking:Walk", "episodes", "0"),
-        ("check", "walking:Walk", "max-steps", "0"),
-        ("check", "walking:Walk", "time-limit", "0"),
-        ("check", "walking:Walk", "time-limit", "inf"),
-        ("inspect", "walking:Walk", "seed", "-1"),
-        ("wire-check", "true", "seed", "-1"),
-        ("wire-check", "true", "seed", str(2**31)),
-        ("wire-check", "true", "decisions", "0"),
-        ("wire-check", "true", "timeout", "nan"),
-        ("wire-check", "true", "timeout", "inf"),
+        ("check walking:Walk", ["seed -1", "episodes 0", "max-steps 0", "time-limit 0", "time-limit inf"]),
+        ("inspect walking:Walk", ["seed -1"]),
+        ("wire-check true", ["seed -1", f"seed {2**31}", "decisions 0", "timeout nan", "timeout inf"]),
     ],
 )
-def test_numbers_that_cannot_be_used(command, target, option, value, capsys):
-    assert main([command, f"--{option}", value, target]) == 2
-    assert option.replace("-", "_") in capsys.readouterr().err
+def test_numbers_that_cannot_be_used(command, options, capsys):
+    command, target = command.split()
+    for each in options:
+        option, value = each.split()
+        assert main([command, f"--{option}", value, target]) == 2
+        assert option.replace("-", "_") in capsys.readouterr().err
 
 
 def test_less_than_a_second_is_a_limit_too(capsys):

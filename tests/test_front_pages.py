@@ -41,9 +41,6 @@ def test_the_front_page(run):
     assert rewards == [-1.0, -2.0, -1.0, -2.0, -3.0]
 
 
-# -- coming from elsewhere ------------------------------------------------------------------------
-
-
 def turns(env, seed):
     """What is told in an episode of random actions, turn by turn."""
     actions, told = random.Random(seed), []
@@ -71,9 +68,6 @@ def test_the_environment_of_the_paper_in_todays_words(run, monkeypatch):
     assert -1 <= names["reward"] <= 1
 
 
-# -- errors by their text -------------------------------------------------------------------------
-
-
 def messages():
     """The texts in the sources, with an ellipsis in place of what is filled in."""
     texts = []
@@ -98,8 +92,6 @@ def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are()
     named = set(re.findall(r"`([A-Z]\w+Error)`", text))
     assert {name for name in named if not hasattr(builtins, name)} <= set(simenv_marl.errors.__all__)
 
-
-# -- the terms of the field -----------------------------------------------------------------------
 
 TERMS = (
     "parameter sharing", "centralised training", "CTDE", "self-play", "black death", "discrete-event simulation",

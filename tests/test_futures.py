@@ -16,6 +16,7 @@ from tests.core.test_global_rng import world
 from tests.test_branch import METHODS, POINTS, move, rest_of, short
 from tests.worlds.copied import Walk
 from tests.worlds.exactness import advance, is_over, rest_of_yard
+from tests.worlds.models import notes
 from tests.worlds.random_worlds import POINTS as POINTS_OF_YARD
 from tests.worlds.random_worlds import Yard, designs
 from tests.worlds.random_worlds import seeds as yard_seeds
@@ -59,9 +60,6 @@ def drawn(env, number):
     return random.random(), random.gauss(0, 1), np.random.random(), np.random.standard_normal()
 
 
-# -- what lies ahead ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("simulation", "options"), [(Reseeded, {}), (Gambling, {"global_rng": True})])
 @VIEWS
 def test_the_same_seeds_are_the_same_futures(make, points, simulation, options):
@@ -79,20 +77,19 @@ def test_the_same_seeds_are_the_same_futures(make, points, simulation, options):
     threaded.close()
 
 
+def present(twin, number):
+    """Who decides, seeing what, where."""
+    pending = twin.unwrapped._session.episode.pending
+    simulation = twin.unwrapped.simulation
+    return pending.name, pending.observation.tolist(), simulation.steps, simulation.place
+
+
 @METHODS
 @VIEWS
 def test_the_present_stays_what_it_is(make, points, method):
-    """A decision is pending for the same agent, who sees the same."""
-
-    def look(twin, number):
-        view = twin.unwrapped
-        episode = view._session.episode
-        return episode.pending.name, episode.pending.observation.tolist(), view.simulation.steps, view.simulation.place
-
     env = going_on(make, points)
-    (now,) = branch(env, look, 1, method=method)
-    name, observation, steps, place = now
-    assert branch(env, look, 2, method=method, seeds=[1, 2]) == [(name, observation, steps, place + 1000)] * 2
+    *seen, place = present(env, 0)
+    assert branch(env, present, 2, method=method, seeds=[1, 2]) == [(*seen, place + 1000)] * 2
 
 
 @METHODS
@@ -122,6 +119,7 @@ def test_the_generators_of_the_process_are_seeded_for_each_future(method):
 
     found = branch(env, base, 3, method=method, seeds=[7, 8, 7])
     assert found[0] == found[2] != found[1]
+    assert found[0][2] != found[1][2]  # the simulation is reseeded, too
     assert found == branch(env, base, 3, seeds=[7, 8, 7])
     assert len({value for each in found[:2] for part in each[:2] for value in part}) == 16
     plain = [random.Random(7).random(), np.random.RandomState(7).random(), np.random.default_rng(7).random()]
@@ -147,46 +145,36 @@ def test_another_kind_of_generator_behind_numpys_functions(method):
 
 @METHODS
 def test_torchs_generator_is_seeded_too(monkeypatch, method):
-    class Generator:
-        state = 0
-
-        def get_state(self):
-            return self.state
-
-        def set_state(self, state):
-            self.state = state
-
-        manual_seed = set_state
-
+    generator = types.SimpleNamespace(state=0, get_state=lambda: generator.state)
+    generator.set_state = generator.manual_seed = lambda state: setattr(generator, "state", state)
     torch = types.ModuleType("torch")
-    torch.set_num_threads, torch.default_generator = (lambda number: None), Generator()
+    torch.set_num_threads, torch.default_generator = (lambda number: None), generator
     monkeypatch.setitem(sys.modules, "torch", torch)
     found = branch(going_on(), lambda *_: torch.default_generator.state, 3, method=method, seeds=[1, 2, 1])
     assert 0 != found[0] == found[2] != found[1] != 0
-    assert torch.default_generator.state == 0
+    assert generator.state == 0
 
 
 @METHODS
 def test_branches_of_branches_have_futures_of_their_own(method):
-    env = going_on()
-
     def deeper(twin, number):
         before = random.getstate()
         found = branch(twin, short, 2, method=method, seeds=[number, 9])
         assert random.getstate() == before
         return found
 
-    found = branch(env, deeper, 2, method=method, seeds=[1, 2])
+    found = branch(going_on(), deeper, 2, method=method, seeds=[1, 2])
     assert found[0][1] != found[0][0] != found[1][0]
+
+
+class Deciding(Reseeded):
+    def reseed(self, seed):
+        super().reseed(seed)
+        self.chosen = self.choose()
 
 
 @METHODS
 def test_decisions_of_reseed_are_the_rules(method):
-    class Deciding(Reseeded):
-        def reseed(self, seed):
-            super().reseed(seed)
-            self.chosen = self.choose()
-
     env = going_on(simulation=Deciding)
     found = branch(env, lambda twin, number: twin.simulation.chosen, 8, method=method, seeds=range(8))
     assert found == [random.Random(seed).choice([-1, 1]) for seed in range(8)]
@@ -213,9 +201,6 @@ def test_random_worlds_have_the_same_futures_by_either_method_and_driver(design,
     threaded.close()
 
 
-# -- what goes wrong ------------------------------------------------------------------------------
-
-
 @METHODS
 def test_who_cannot_draw_anew_is_told_what_to_do(monkeypatch, method):
     env = going_on(simulation=Walk)
@@ -239,17 +224,17 @@ def test_seeds_are_one_integer_for_each_branch(seeds):
         branch(single_env(lambda: Reseeded(6), Walk.choose), short, 1, seeds=[1])
 
 
+class Failing(Walk):
+    def reseed(self, seed):
+        return 1 / (1 - seed)
+
+
 @METHODS
 def test_an_error_of_reseed_surfaces_as_itself(method):
-    class Failing(Walk):
-        def reseed(self, seed):
-            return 1 / (1 - seed)
-
     env, before = going_on(simulation=Failing), random.getstate()
     with pytest.raises(ZeroDivisionError) as caught:
         branch(env, short, 2, method=method, seeds=[0, 1])
-    notes = "\n".join(caught.value.__notes__)
-    assert "reseeded; seed 1" in notes
-    assert "in branch 1" in notes
+    assert "reseeded; seed 1" in notes(caught.value)
+    assert "in branch 1" in notes(caught.value)
     assert random.getstate() == before
     env.step(1)

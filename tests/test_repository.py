@@ -33,24 +33,6 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
     assert paper["identifiers"][0]["value"].removeprefix("arXiv:") in paper["url"]
 
 
-@pytest.mark.parametrize("form", ["bug", "feature", "question"])
-def test_forms_for_issues_can_be_shown(form):
-    form = loaded(f".github/ISSUE_TEMPLATE/{form}.yml")
-    assert form["name"]
-    assert form["description"]
-    parts = {part["id"]: part["attributes"]["label"] for part in form["body"]}
-    assert len(parts) == len(form["body"])
-    assert all(part["type"] in {"dropdown", "input", "textarea"} for part in form["body"])
-
-
-def test_hooks_need_nothing_but_the_environment_of_make_check():
-    (repository,) = loaded(".pre-commit-config.yaml")["repos"]
-    assert repository["repo"] == "local"
-    for hook in repository["hooks"]:
-        assert hook["language"] == "system"
-        assert hook["entry"].startswith(".venv/bin/")
-
-
 def test_read_the_docs_builds_what_make_docs_builds():
     config = loaded(".readthedocs.yaml")
     assert (ROOT / config["sphinx"]["configuration"]).is_file()

@@ -5,11 +5,11 @@ import pydoc
 from dataclasses import fields
 
 import pytest
-from gymnasium import spaces
 
 import simenv_marl
 from simenv_marl.core.options import CheckOptions, EpisodeOptions, Options, ViewOptions
 from simenv_marl.errors import did_you_mean
+from tests.worlds.copied import Walk
 
 MAKERS = ("aec_env", "parallel_env", "single_env", "joint_env", "vector_env", "generate_env")
 OPTIONS = {field.name for field in fields(Options)}
@@ -61,37 +61,13 @@ def test_hints_name_what_is_close(name, known, hint):
     assert did_you_mean(name, known) == hint
 
 
-class Tank(simenv_marl.SimulationInterface):
-    level = 5.0
-
-    def reset(self):
-        self.level = 5.0
-
-    def choose(self):
-        return 1.0
-
-    def run(self):
-        for _ in range(3):
-            self.level += self.choose() - 1.0
-
-
-CHOOSE = simenv_marl.make_step(
-    observation_space=spaces.Box(0, 10, (1,)),
-    observation_space_mapping=lambda tank: [tank.level],
-    action_space=spaces.Discrete(2),
-    action_space_mapping={0: 0.0, 1: 2.0},
-    reward_mapping=lambda tank: 0.0,
-    agent="pump_0",
-)
-
-
 def evaluation(**options):
     pytest.importorskip("scipy")
-    return simenv_marl.evaluate(Tank, {"rule": {}}, seeds=range(2), points={Tank.choose: CHOOSE}, **options)
+    return simenv_marl.evaluate(Walk, {"rule": {}}, seeds=range(2), points=Walk.choose, **options)
 
 
 def environment():
-    made = simenv_marl.aec_env(Tank, {Tank.choose: CHOOSE})
+    made = simenv_marl.aec_env(Walk, Walk.choose)
     made.reset(seed=1)
     return made
 
@@ -99,16 +75,16 @@ def environment():
 @pytest.mark.parametrize(
     ("wrong", "hint"),
     [
-        (lambda: simenv_marl.aec_env(Tank, {Tank.choose: CHOOSE}, max_step=3), "max_steps"),
-        (lambda: simenv_marl.single_env(Tank, {Tank.choose: CHOOSE}, agent="pump"), "pump_0"),
-        (lambda: simenv_marl.generate_env(Tank, {Tank.choose: CHOOSE}, view="paralel"), "parallel"),
-        (lambda: environment().observe("pump_1"), "pump_0"),
+        (lambda: simenv_marl.aec_env(Walk, Walk.choose, max_step=3), "max_steps"),
+        (lambda: simenv_marl.single_env(Walk, Walk.choose, agent="walker"), "walker_0"),
+        (lambda: simenv_marl.generate_env(Walk, Walk.choose, view="paralel"), "parallel"),
+        (lambda: environment().observe("walker_1"), "walker_0"),
         (lambda: simenv_marl.branch(environment(), 1, method="frok"), "fork"),
         (lambda: simenv_marl.experiments.design({"a": [1, 2]}, "full_factorail"), "full_factorial"),
         (lambda: evaluation().summary("retrun"), "return"),
         (lambda: evaluation(baseline="rul"), "rule"),
     ],
-)  # fmt: skip
+)
 def test_messages_hint_at_the_name_that_was_meant(wrong, hint):
     with pytest.raises(simenv_marl.SimEnvError, match=f"did you mean {hint}"):
         wrong()

@@ -5,13 +5,13 @@ import pickle
 import random
 from functools import partial
 
-import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, SteppedSimulation, aec_env, evaluate, make_step, simulate, single_env
+from simenv_marl import RULE, SteppedSimulation, aec_env, evaluate, simulate, single_env
 from simenv_marl.errors import OptionValueError, SimulationError, UnknownPointError
 from simenv_marl.experiments import design, run_experiment
+from tests.worlds.models import define
 
 
 class Walk:
@@ -34,9 +34,12 @@ class ByRng(Walk):
         super().__init__(seed=rng)
 
 
-class Unseeded(Walk):
-    def __init__(self, drift=0.0):
-        super().__init__(drift, seed=1)
+class PassedOn(ByRng):
+    """Passes the seed on, as models of Mesa do."""
+
+    def __init__(self, drift=0.0, **kwargs):
+        super().__init__(**kwargs)
+        self.drift = drift
 
 
 class Planned(Walk):
@@ -47,12 +50,10 @@ class Planned(Walk):
 
 
 STRIDE = {
-    f"{__name__}.Walk.stride": make_step(
-        observation_space=spaces.Box(-100, 100, (1,), np.float64),
-        observation_space_mapping=lambda walk: [walk.place],
+    f"{__name__}.Walk.stride": define(
+        observation_space_mapping=lambda walk: [walk.place, 0.0],
         action_space=spaces.Discrete(3),
         action_space_mapping=lambda action: action - 1.0,
-        reward_mapping=lambda walk: -abs(walk.place),
     )
 }
 
@@ -92,7 +93,10 @@ def test_the_model_ends_the_episode_when_it_runs_no_more(steps):
 
 def test_the_seed_goes_where_the_model_takes_it():
     assert simulate(SteppedSimulation(ByRng, 5), seed=2).model.place == walked(2, 5)
-    assert simulate(SteppedSimulation(Unseeded, 5), seed=2).model.place == walked(1, 5)
+    assert simulate(SteppedSimulation(PassedOn, 5, drift=1.0), seed=2).model.place == walked(2, 5, drift=1.0)
+    assert simulate(SteppedSimulation(partial(PassedOn, 1.0), 5), seed=2).model.place == walked(2, 5, drift=1.0)
+    assert simulate(SteppedSimulation(lambda **given: Walk(**given), 5), seed=2).model.place == walked(2, 5)
+    assert simulate(SteppedSimulation(lambda: Walk(seed=1), 5), seed=2).model.place == walked(1, 5)
     assert simulate(SteppedSimulation(Walk, 5, seed=9), seed=2).model.place == walked(9, 5)  # by the user's own seed
 
 
@@ -126,7 +130,7 @@ def test_models_steps_and_parameters_that_cannot_be_are_refused():
         with pytest.raises(OptionValueError, match="steps"):
             SteppedSimulation(Walk, steps)
     with pytest.raises(SimulationError, match="no method step"):
-        simulate(SteppedSimulation(lambda: object(), 3))
+        simulate(SteppedSimulation(object, 3))
     with pytest.raises(TypeError, match="length"):
         simulate(SteppedSimulation(Walk, 3, length=1))
 
@@ -138,7 +142,7 @@ def test_points_are_those_that_are_named():
     others = []
     for package in ("one", "another"):
         decide.__module__ = f"{package}.model"
-        others.append(next(iter(STRIDE.values()))(decide))
+        others.append(define()(decide))
     with pytest.raises(UnknownPointError, match="points is empty"):
         aec_env(SteppedSimulation(Walk, 5))
     assert simulate(SteppedSimulation(Walk, 5), seed=2).model.place == walked(2, 5)

@@ -22,7 +22,7 @@ from .hooks.places import permanent_hook
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
 Mapped = Callable[..., Any]
-"""A mapping: a callable of the decision call's arguments, as they were passed."""
+"""A mapping: a callable of the decision call's arguments, bound to the signature of the function that decides."""
 
 
 # -- definitions ----------------------------------------------------------------------------------
@@ -117,8 +117,9 @@ def make_step(
 
     Args:
         observation_space: The space of the agent's observations.
-        observation_space_mapping: A callable of the decision call's arguments as they were passed (``self`` first for a
-            method). It returns the observation, which is cast to the dtype of the space.
+        observation_space_mapping: A callable of the decision call's arguments (``self`` first for a method). However
+            the model writes the call, it gets all arguments that can be passed by position so, the others by keyword,
+            and defaults for those left out. It returns the observation, which is cast to the dtype of the space.
         action_space: The space of the agent's actions.
         action_space_mapping: The decision for an action: a callable of the action, or a dict with an entry for each
             action of a ``Discrete`` space. Its value is what the decision function returns.

@@ -7,7 +7,7 @@ from typing import Any, Unpack
 
 import gymnasium
 import pettingzoo
-from gymnasium.wrappers import HumanRendering, RenderCollection
+from gymnasium.wrappers import HumanRendering
 
 from .core.options import ViewOptions
 from .core.plan import Plan
@@ -98,20 +98,14 @@ def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
     """Make an environment of a registered simulation.
 
     Gymnasium reads render modes from the metadata of a class, which an entry point for many simulations lacks.
-    Therefore this applies the wrapper by which Gymnasium supplies a render mode that the simulation lacks.
+    Therefore this applies the wrapper by which Gymnasium shows the pictures of a simulation without the mode "human".
     """
     simulation, points, options = _recall(recipe, module, view, options)
-    mode = options.pop("render_mode", None)
-    plan = Plan(simulation, points, options)
-    modes = plan.render_modes
-    wrapper: Any = None
-    if view in ("single", "joint") and isinstance(mode, str) and mode not in modes:
-        if mode.endswith("_list") and mode.removesuffix("_list") in modes:
-            mode, wrapper = mode.removesuffix("_list"), RenderCollection
-        elif mode == "human" and "rgb_array" in modes:
-            mode, wrapper = "rgb_array", HumanRendering
-    env = view_class(plan, view)(plan.amended({"render_mode": mode}))
-    return env if wrapper is None else wrapper(env)
+    plan = Plan(simulation, points, {**options, "render_mode": None})
+    mode, modes = options.get("render_mode"), plan.render_modes
+    if view in ("single", "joint") and mode == "human" and mode not in modes and "rgb_array" in modes:
+        return HumanRendering(view_class(plan, view)(plan.amended({"render_mode": "rgb_array"})))
+    return view_class(plan, view)(plan.amended({"render_mode": mode}))
 
 
 def make_vector_view(recipe: str, module: str, view: str, **options: Any) -> Any:

@@ -12,8 +12,6 @@ pytest.importorskip("pandas")
 
 from examples.greenhouse_coop.train import play
 from studies.greenhouse_experiment import back_in_the_model, baselines, results
-from studies.greenhouse_experiment.questions import FINAL, judge
-from studies.greenhouse_experiment.runs import Run
 
 from simenv_marl import simulate
 
@@ -36,19 +34,8 @@ def line(out, *, questions, seeds=(3,), budget=1024, workers=1):
             "--out", str(out)]  # fmt: skip
 
 
-def carry_out(library, out, **options):
-    script(library).main(line(out, **options))
-
-
-def carry_out_elsewhere(library, out, *, hashes, **options):
-    """In a process of its own, as ``make experiment`` does, where sets of strings are in another order than in others.
-
-    Args:
-        library: Whose script.
-        out: The folder of all runs.
-        hashes: Determines the order.
-        **options: Of the command line.
-    """
+def carry_out(library, out, *, hashes, **options):
+    """In a process of its own, as ``make experiment`` does; by ``hashes`` its sets of strings are in another order."""
     commands.module(f"studies.greenhouse_experiment.{library}", *line(out, **options), PYTHONHASHSEED=hashes)
 
 
@@ -72,7 +59,7 @@ def library(request):
 @pytest.fixture(scope="module")
 def runs(library, tmp_path_factory):
     out = tmp_path_factory.mktemp(library)
-    carry_out_elsewhere(library, out, hashes="0", questions=QUESTIONS[library], seeds=(3, 4), workers=2)
+    carry_out(library, out, hashes="0", questions=QUESTIONS[library], seeds=(3, 4), workers=2)
     return out
 
 
@@ -80,9 +67,6 @@ def runs(library, tmp_path_factory):
 def made(runs, tmp_path):
     """All runs of a library, for a test to do with as it likes."""
     return shutil.copytree(runs, tmp_path / "runs")
-
-
-# -- scripts --------------------------------------------------------------------------------------
 
 
 def test_every_question_is_answered_and_judged_on_the_way(library, made):
@@ -95,34 +79,12 @@ def test_every_question_is_answered_and_judged_on_the_way(library, made):
         assert np.isfinite(run["final"]["value"])
 
 
-def test_what_is_loaded_is_what_was_judged(library, made):
-    for question in QUESTIONS[library]:
-        team = script(library).load(Run(library, question, 3, 1024, made))
-        verdict = judge(team, FINAL)
-        run = found(made, f"{library}-{question}-3")["final"]
-        assert (verdict.value, verdict.alive, verdict.litres) == pytest.approx(tuple(run.values()), rel=1e-5)
-
-
-def test_runs_that_are_there_are_not_done_again(library, made, capsys):
-    first, *others = QUESTIONS[library]
-    before = {path: path.stat().st_mtime_ns for path in made.glob("*.json")}
-    again = made / f"{library}-{first}-3.json"
-    again.unlink()
-    carry_out(library, made, questions=QUESTIONS[library])
-    changed = {path for path in made.glob("*.json") if path.stat().st_mtime_ns != before[path]}
-    assert changed == {again}
-    assert capsys.readouterr().out.count("is there already") == len(others)
-
-
 def test_the_same_seed_comes_to_the_same_in_whatever_process(library, made, tmp_path):
     question = QUESTIONS[library][0]
-    carry_out_elsewhere(library, tmp_path, hashes="2", questions=[question])
+    carry_out(library, tmp_path, hashes="2", questions=[question])
     name = f"{library}-{question}-3"
     assert found(tmp_path, name) == found(made, name)
     assert found(made, f"{library}-{question}-4")["final"] != found(made, name)["final"]
-
-
-# -- back in the model ----------------------------------------------------------------------------
 
 
 def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library, made):
@@ -132,9 +94,6 @@ def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library
     played = play(team, 11)
     assert greenhouse.water_use == pytest.approx(sum(played.poured))
     assert greenhouse.alive == played.alive[-1]
-
-
-# -- results --------------------------------------------------------------------------------------
 
 
 def test_figures_and_table_are_made_of_whatever_runs_there_are(library, made, tmp_path, capsys):

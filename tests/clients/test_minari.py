@@ -20,6 +20,7 @@ from simenv_marl.data import (
     save_dataset,
 )
 from simenv_marl.errors import DefinitionError, OptionValueError
+from tests.worlds.counters import same
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script
 from tests.worlds.undone import models_of_pages_forgotten
@@ -37,17 +38,6 @@ def _where_data_sets_lie(monkeypatch, tmp_path):
 
 def ones(observations):
     return np.ones(len(observations), np.int64)
-
-
-def same(one, other):
-    """Whether two stacks are equal, values, dtypes and all."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(part, other[key]) for key, part in one.items())
-    if isinstance(one, tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, list):
-        return one == other
-    return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 
 def part(stack, rows):

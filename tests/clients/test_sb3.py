@@ -10,7 +10,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from simenv_marl import joint_env, single_env, vector_env
+from simenv_marl import joint_env, single_env
 
 from . import page
 from .returns import single_return
@@ -33,9 +33,6 @@ def gain(model, env, steps):
 def rescaled(env):
     """With actions from -1 to 1, as Stable-Baselines3 recommends."""
     return gymnasium.wrappers.RescaleAction(env, -1, 1)
-
-
-# -- its checker ----------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("error")
@@ -61,14 +58,6 @@ def test_joint_actions_by_agent_are_refused():
     """Observations may be dicts; actions may not, and are flattened."""
     with pytest.raises(AssertionError, match="only supports"):
         PPO("MultiInputPolicy", joint_env(ShopSim))
-
-
-def test_it_takes_no_vector_environments_of_gymnasium():
-    with pytest.raises(ValueError, match="not a Gymnasium environment"):
-        PPO("MlpPolicy", vector_env(ReservoirSim, num_envs=2))
-
-
-# -- training -------------------------------------------------------------------------------------
 
 
 def test_one_continuous_decision():
@@ -130,9 +119,6 @@ def test_a_goal_with_hindsight():
     assert after > -3
 
 
-# -- masks ----------------------------------------------------------------------------------------
-
-
 def test_masked_decisions():
     """A masked action would be an error, so that none has been taken where training comes to its end."""
     env = single_env(WorkbenchSim)
@@ -163,9 +149,6 @@ def test_masked_decisions_of_a_joint_view():
     model = MaskablePPO("MlpPolicy", env, n_steps=100, batch_size=50, seed=0)
     model.learn(200)
     assert get_action_masks(env).tolist() == [True] * 4
-
-
-# -- the page -------------------------------------------------------------------------------------
 
 
 def test_the_page(monkeypatch):

@@ -40,32 +40,6 @@ def test_trajectories_as_tensors():
     assert torch.equal(rows["next", "observation"][ends], torch.from_numpy(found.last_observations))
 
 
-def test_actions_are_drawn_with_the_chances_that_they_are_said_to_have():
-    herd, found = lived()
-    chances = herd.logits(torch.from_numpy(found.observations)).log_softmax(-1)
-    expected = chances.gather(1, torch.from_numpy(found.actions)[:, None])[:, 0]
-    assert torch.allclose(torch.from_numpy(found.extras["log_prob"]), expected, atol=1e-5)
-    assert len(set(found.actions.tolist())) == 4
-
-
-def test_whoever_dies_is_worth_no_more_and_whoever_is_cut_off_is():
-    """The advantages of last rows, from TorchRL, beside what they must be."""
-    herd, found = lived()
-    with torch.no_grad():
-        herd.values[-1].bias += 0.5  # a life to come that is worth something
-    rows = train.tensors(found)
-    learner = train.Learner(herd, 0)
-    with torch.no_grad():
-        learner._advantage(rows)
-        now = herd.values(torch.from_numpy(found.observations))[:, 0]
-        later = herd.values(torch.from_numpy(found.next_observations))[:, 0]
-    paid = 1 - train.DISCOUNT
-    for ended, to_come in ((found.terminations, 0 * later), (found.truncations, train.DISCOUNT * later)):
-        at = torch.from_numpy(ended)
-        assert at.any()
-        assert torch.allclose(rows["advantage"][at, 0], (paid + to_come - now)[at], atol=1e-5)
-
-
 def test_a_seed_determines_everything():
     def run(seed):
         herd, course = train.train(2, seed, decisions=5000, each=1000, ticks=20, **SMALL)
@@ -76,14 +50,6 @@ def test_a_seed_determines_everything():
     assert course == again
     assert same(one, another)
     assert not same(one, other)
-
-
-def test_saved_and_loaded_it_decides_alike(tmp_path):
-    herd, found = lived()
-    herd.save(tmp_path / "deep" / "herd.pt")
-    loaded = train.Herd.load(tmp_path / "deep" / "herd.pt", 2)
-    assert torch.equal(herd.decide(found.observations), loaded.decide(found.observations))
-    assert same(weights(herd), weights(loaded))
 
 
 def test_sheep_learn_to_live_longer():

@@ -12,7 +12,7 @@ from skrl.trainers.torch import SequentialTrainer
 from skrl.utils import set_seed
 from torch import nn
 
-from simenv_marl import generate_env, parallel_env, single_env, vector_env
+from simenv_marl import parallel_env, single_env, vector_env
 from simenv_marl.envs import pad_agents
 
 from . import page
@@ -141,17 +141,6 @@ def test_the_page(monkeypatch):
     before = worth()
     names = next(steps)
     assert worth() > before + 150
-    env.close()
-
-
-def test_generated_classes_are_wrapped_as_parallel_views():
-    env = wrap_env(generate_env(ShopSim, view="parallel")(), wrapper="pettingzoo", verbose=False)
-    observations, _ = env.reset()
-    assert observations["baker_0"].shape == (1, 4)
-    actions = {agent: torch.tensor([[1]]) for agent in env.possible_agents}
-    observations, rewards, terminated, _, _ = env.step(actions)
-    assert rewards["seller_0"].shape == terminated["seller_0"].shape == (1, 1)
-    assert env.state()["baker_0"] is None
     env.close()
 
 

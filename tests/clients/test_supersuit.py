@@ -3,6 +3,7 @@
 import copy
 import importlib
 
+import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
@@ -10,7 +11,6 @@ from pettingzoo.test import api_test, seed_test
 from stable_baselines3 import PPO
 
 from simenv_marl import TRUNCATED, aec_env, parallel_env
-from simenv_marl.envs import pad_agents
 from tests.worlds.counters import alike
 from tests.worlds.dials import ACTIONS, SEEN, Dial, DialEnv, dial_env, points, turned_by
 
@@ -144,39 +144,33 @@ def test_around_turns(name):
     seed_test(make, num_cycles=20)
 
 
+def story_around(name, env):
+    """Its spaces, and what it tells in some episodes of sampled actions."""
+    env = suit[name](env, **WRAPPERS[name][0])
+    if one := isinstance(env, gymnasium.Env):
+        found = [env.observation_space, env.action_space]
+    else:
+        found = [env.observation_space(agent) for agent in HANDS] + [env.action_space(agent) for agent in HANDS]
+    sampled = copy.deepcopy(found[-1] if one else env.action_space("hand_0"))
+    sampled.seed(1)
+    told = [found, env.reset(seed=3)]
+    for number in range(14):
+        told.append(env.step(sampled.sample() if one else {agent: sampled.sample() for agent in env.agents}))
+        if any(told[-1][2:4]) if one else not env.agents:
+            told.append(env.reset(seed=number))
+    return told
+
+
 @EVERY_WRAPPER
 def test_around_rounds(name):
-    arguments, seen = WRAPPERS[name]
-    told = []
-    for bare in (hands(parallel_env, seen), HandsEnv(seen)):
-        env = suit[name](bare, **arguments)
-        sampled = copy.deepcopy(env.action_space("hand_0"))
-        sampled.seed(1)
-        told.append([[(env.observation_space(agent), env.action_space(agent)) for agent in HANDS], env.reset(seed=3)])
-        for number in range(14):
-            told[-1].append(env.step({agent: sampled.sample() for agent in env.agents}))
-            if not env.agents:
-                told[-1].append(env.reset(seed=number))
-    assert alike(*told)
+    seen = WRAPPERS[name][1]
+    assert alike(story_around(name, hands(parallel_env, seen)), story_around(name, HandsEnv(seen)))
 
 
 @pytest.mark.parametrize("name", WRAPPERS.keys() - OF_AGENTS)
 def test_around_one(name):
-    arguments, seen = WRAPPERS[name]
-    told = []
-    for make in (dial_env, DialEnv):
-        env = suit[name](make(seen), **arguments)
-        sampled = copy.deepcopy(env.action_space)
-        sampled.seed(1)
-        told.append([env.observation_space, env.action_space, env.reset(seed=3)])
-        for number in range(14):
-            told[-1].append(env.step(sampled.sample()))
-            if any(told[-1][-1][2:4]):
-                told[-1].append(env.reset(seed=number))
-    assert alike(*told)
-
-
-# -- births and deaths ------------------------------------------------------------------------------
+    seen = WRAPPERS[name][1]
+    assert alike(story_around(name, dial_env(seen)), story_around(name, DialEnv(seen)))
 
 
 def herds(env, all_there):
@@ -202,14 +196,6 @@ def test_the_dead_go_on_as_black_death_has_it():
     assert black == [(paid, rounds + 1) for paid, rounds in plain]
 
 
-def test_turns_are_no_rounds():
-    with pytest.raises(AssertionError, match="is_parallelizable"):
-        suit["black_death_v3"](aec_env(HerdSim, possible_agents=FORAGERS))
-
-
-# -- many at once -----------------------------------------------------------------------------------
-
-
 def vectors_of(env, processes):
     return suit["concat_vec_envs_v1"](suit["pettingzoo_env_to_vec_env_v1"](env), 3, num_cpus=processes)
 
@@ -232,18 +218,6 @@ def test_environments_of_many_hands(processes):
     theirs = story_of(vectors_of(HandsEnv(), processes), 6)
     for env in (hands(parallel_env), begun):
         assert alike(story_of(vectors_of(env, processes), 6), theirs)
-
-
-@pytest.mark.parametrize("wrapper", [pad_agents, suit["black_death_v3"]])
-def test_environments_in_which_agents_are_born_and_die(wrapper):
-    envs = vectors_of(wrapper(parallel_env(HerdSim, possible_agents=FORAGERS)), 0)
-    observations, _ = envs.reset(seed=1)
-    ends = 0
-    for _ in range(40):
-        assert observations.shape == (3 * len(FORAGERS), 2)
-        observations, _, terminated, truncated, _ = envs.step(np.ones(3 * len(FORAGERS), np.int64))
-        ends += (terminated | truncated).reshape(3, -1).all(axis=1).sum()
-    assert ends >= 3
 
 
 @pytest.mark.parametrize(
@@ -276,9 +250,6 @@ def test_many_environments_of_turns():
         turned[agent] += observations[0, 1] == turned[agent]
         envs.step(np.full((3, 2), 0.5, np.float32))
     assert min(turned.values()) == 5
-
-
-# -- and trained ------------------------------------------------------------------------------------
 
 
 def test_one_policy_of_stable_baselines3_for_all_agents():

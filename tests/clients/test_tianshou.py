@@ -1,7 +1,6 @@
 """Tianshou: the AEC view, with an algorithm for each agent."""
 
 import numpy as np
-import pytest
 import torch
 from gymnasium import spaces
 from tianshou.algorithm import DQN
@@ -120,22 +119,6 @@ def test_training_of_agents_that_are_born_and_die():
     collector = collector_of(algorithm, make)
     train(algorithm, collector, 160)
     assert set(collector.buffer.obs.agent_id[: collector.buffer.maxsize]) >= set(FORAGERS[:2])
-
-
-def test_spaces_that_differ_are_refused():
-    def choice(agent, number):
-        return make_step(
-            observation_space=spaces.Box(0, 1, (4,), np.float32),
-            observation_space_mapping=Shop.observed,
-            action_space=spaces.Discrete(number),
-            action_space_mapping=int,
-            reward_mapping=lambda shop: shop.profit,
-            agent=agent,
-        )
-
-    points = {Shop.choose_batch: choice("baker_0", 9), Shop.choose_display: choice("seller_0", 4)}
-    with pytest.raises(AssertionError, match="identical"):
-        PettingZooEnv(aec_env(ShopSim, points))
 
 
 def test_the_page(monkeypatch):

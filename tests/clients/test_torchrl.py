@@ -18,9 +18,6 @@ VIEWS = {"parallel": parallel_env, "aec": aec_env}
 EVERY_VIEW = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
 
 
-# -- its wrappers and its checker -----------------------------------------------------------------
-
-
 def test_the_pages_checks():
     exec(blocks("_clients_torchrl.md")[0], {})
 
@@ -97,9 +94,6 @@ def test_its_state(view):
     env = PettingZooWrapper(pad_agents(view(HiveSim, points(), **options)), use_mask=True, return_state=True)
     check_env_specs(env)
     assert env.rollout(5)["state"].shape == (5, 4)
-
-
-# -- training -------------------------------------------------------------------------------------
 
 
 def worth(env, policy):

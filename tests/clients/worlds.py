@@ -14,8 +14,6 @@ from gymnasium import spaces
 
 from simenv_marl import TRUNCATED, SimulationInterface, make_step
 
-# -- one continuous decision ----------------------------------------------------------------------
-
 
 class Reservoir:
     """A reservoir that is to be kept half full, whatever flows in."""
@@ -36,11 +34,9 @@ class Reservoir:
         agent="keeper_0",
     )
     def choose_release(self) -> float:
-        """Decide how much is let out today."""
         return 1.5
 
     def update_day(self) -> None:
-        """Let a day go by."""
         self.level = min(max(self.level + self.inflow - self.choose_release(), 0.0), 10.0)
         self.inflow = self.random.uniform(0, 3)
         self.day += 1
@@ -58,9 +54,6 @@ class ReservoirSim(SimulationInterface):
         while self.reservoir.day < 20:
             self.reservoir.update_day()
         return TRUNCATED
-
-
-# -- two decisions that belong together -----------------------------------------------------------
 
 
 NUMBER: dict[str, Any] = {
@@ -85,21 +78,17 @@ class Shop:
 
     # Worth learning, for both: as many as are wanted. Neither is of any use without the other.
     def observed(self) -> list[float]:
-        """What both see."""
         return [float(number == self.wanted) for number in range(4)]
 
     @make_step(agent="baker_0", **NUMBER)
     def choose_batch(self) -> int:
-        """Decide how many loaves are baked."""
         return 2
 
     @make_step(agent="seller_0", **NUMBER)
     def choose_display(self) -> int:
-        """Decide how many of them are put on the shelf."""
         return self.stock
 
     def update_day(self) -> None:
-        """Let a day go by; what has not been sold is given away."""
         self.stock = self.choose_batch()
         shelf = min(self.choose_display(), self.stock)
         sold = min(shelf, self.wanted)
@@ -131,9 +120,6 @@ class ShopSim(SimulationInterface):
 SHOP_STATE = spaces.Box(0, 1, (5,), np.float32)
 
 
-# -- a decision whose answers are not always legal ------------------------------------------------
-
-
 class Workbench:
     """Five jobs lie on a bench, and whoever brought one waits for it."""
 
@@ -153,11 +139,9 @@ class Workbench:
         agent="joiner_0",
     )
     def choose_job(self) -> int:
-        """Decide which job is next."""
         return next(number for number, job in enumerate(self.jobs) if job > 0)
 
     def work(self) -> None:
-        """Do the jobs one after the other."""
         while any(self.jobs):
             chosen = self.choose_job()
             self.waiting = self.jobs[chosen] * sum(job > 0 for job in self.jobs)
@@ -174,9 +158,6 @@ class WorkbenchSim(SimulationInterface):
 
     def run(self) -> Any:
         self.bench.work()
-
-
-# -- a goal ---------------------------------------------------------------------------------------
 
 
 class Crane:
@@ -201,11 +182,9 @@ class Crane:
         compute_reward=lambda achieved, desired, info: _above(achieved, desired, info),
     )
     def choose_move(self) -> Any:
-        """Decide where the hook moves."""
         return np.zeros(2)
 
     def update(self) -> None:
-        """Move."""
         self.hook = np.clip(self.hook + self.choose_move(), -1, 1)
         self.moves += 1
 
@@ -228,9 +207,6 @@ class CraneSim(SimulationInterface):
         return TRUNCATED
 
 
-# -- some that are born and die -------------------------------------------------------------------
-
-
 class Forager:
     """Lives on what it finds."""
 
@@ -249,18 +225,15 @@ class Forager:
         removed_by="tests.clients.worlds.Forager.die",
     )
     def choose_to_go(self) -> bool:
-        """Decide whether to go out today."""
         return True
 
     def update_day(self) -> None:
-        """Let a day go by."""
         self.gained = self.herd.food - 1.5 if self.choose_to_go() else 0.0
         self.energy = min(self.energy + round(self.gained), 10)
         if self.energy <= 0:
             self.die()
 
     def die(self) -> None:
-        """Leave the herd."""
         self.herd.foragers.remove(self)
 
 
@@ -274,7 +247,6 @@ class Herd:
         self.foragers: list[Forager] = []
 
     def update_day(self) -> None:
-        """Let a day go by."""
         if self.day % 3 == 0 and self.born < len(FORAGERS):
             self.foragers.append(Forager(self, self.born))
             self.born += 1

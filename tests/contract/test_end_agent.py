@@ -1,22 +1,10 @@
 """Agents whose episode the simulation itself says to be over."""
 
-import numpy as np
 import pytest
-from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    SimulationInterface,
-    aec_env,
-    make_step,
-    parallel_env,
-    simulate,
-    single_env,
-)
+from simenv_marl import RULE, SimulationInterface, aec_env, parallel_env, simulate, single_env
 from simenv_marl.errors import AgentError, UnknownAgentError
-from tests.worlds.models import play
-
-MOVE = f"{__name__}.Seat.move"
+from tests.worlds.models import define, play
 
 
 class Seat:
@@ -46,24 +34,21 @@ class Table(SimulationInterface):
                 self.seats = [seat for seat in self.seats if seat.name != self.out]
 
 
-def points(**changes):
-    given = {
-        "observation_space": spaces.Box(0, 100, (1,), np.float64),
-        "observation_space_mapping": lambda seat: [seat.points],
-        "action_space": spaces.Discrete(5),
-        "action_space_mapping": lambda action: action,
-        "reward_mapping": lambda seat: seat.points,
-        "agent": lambda seat: seat.name,
+def points(agent=lambda seat: seat.name):
+    return {
+        f"{__name__}.Seat.move": define(
+            agent=agent,
+            observation_space_mapping=lambda seat: [seat.points, 0],
+            reward_mapping=lambda seat: seat.points,
+        )
     }
-    return {MOVE: make_step(**given | changes)}
 
 
 def told(env):
-    turns = play(env, 2)
-    return [(turn.agent, turn.observation.item(), turn.reward, turn.terminated) for turn in turns]
+    return [(turn.agent, turn.observation[0], turn.reward, turn.terminated) for turn in play(env, 2)]
 
 
-def test_the_agent_is_rewarded_and_observed_for_the_last_time_and_leaves() -> None:
+def test_the_agent_is_rewarded_and_observed_for_the_last_time_and_leaves():
     class Named(Table):
         def end_agent(self, name):
             self.said = name
@@ -86,17 +71,14 @@ def test_the_agent_is_rewarded_and_observed_for_the_last_time_and_leaves() -> No
 
 
 @pytest.mark.parametrize("out", ["seat_7", None, 3])
-def test_names_of_no_live_agent_are_left_alone(out) -> None:
-    class Other(Table):
-        pass
-
-    Other.out = out
-    ends = [agent for agent, *_, terminated in told(aec_env(Other, points())) if terminated]
+def test_names_of_no_live_agent_are_left_alone(out):
+    other = type("Other", (Table,), {"out": out})
+    ends = [agent for agent, *_, terminated in told(aec_env(other, points())) if terminated]
     assert ends == ["seat_0", "seat_1", "seat_2"]
 
 
 @pytest.mark.parametrize("early", [False, True])
-def test_in_rounds_an_agent_ends_in_the_round_in_which_it_is_out_or_else_in_the_first(early) -> None:
+def test_in_rounds_an_agent_ends_in_the_round_in_which_it_is_out_or_else_in_the_first(early):
     class Early(Table):
         def run(self):
             self.end_agent(self.out)
@@ -114,32 +96,33 @@ def test_in_rounds_an_agent_ends_in_the_round_in_which_it_is_out_or_else_in_the_
         env.step({"seat_1": 3})
 
 
-def test_the_single_view_ends_with_its_agent() -> None:
+def test_the_single_view_ends_with_its_agent():
     class Alone(Table):
         def run(self):
             self.seats[0].points += self.seats[0].move()
             self.end_agent("one")
 
-    for env in (single_env(Table, points(), agent="seat_1"), single_env(Alone, points(agent="one"))):
+    for env in (single_env(Table, points(), agent="seat_1"), single_env(Alone, points("one"))):
         env.reset()
         assert env.step(4)[1:4] == (4.0, True, False)
 
 
-def test_outside_an_environment_end_agent_does_nothing() -> None:
-    table = Table()
-    table.reset()
-    table.run()
-    assert [seat.points for seat in table.seats] == [3, 3]
+def test_outside_an_environment_end_agent_does_nothing():
+    def is_plain():
+        table = Table()
+        table.reset()
+        table.run()
+        return [seat.points for seat in table.seats] == [3, 3]
+
+    assert is_plain()
     assert [seat.points for seat in simulate(Table, points=points()).seats] == [3, 3]
-    environments = aec_env(Table, points())
-    told(environments)
-    assert [seat.points for seat in environments.unwrapped.simulation.seats] == [6, 6]
-    table.reset()
-    table.run()  # while an environment is in use, too
-    assert [seat.points for seat in table.seats] == [3, 3]
+    env = aec_env(Table, points())
+    env.reset()
+    assert is_plain()  # while an environment is in use, too
+    assert told(env)[-1] == ("seat_2", 6, 6, True)
 
 
-def test_an_agent_that_decides_after_its_end_is_an_error() -> None:
+def test_an_agent_that_decides_after_its_end_is_an_error():
     class Undead(Table):
         def run(self):
             self.end_agent("seat_0")
@@ -150,9 +133,7 @@ def test_an_agent_that_decides_after_its_end_is_an_error() -> None:
 
     env = aec_env(Undead, points())
     env.reset()
-    env.step(RULE)
-    env.step(None)
-    env.step(RULE)
-    env.step(None)
+    for action in (RULE, None, RULE, None):
+        env.step(action)
     with pytest.raises(AgentError, match="after its end"):
         env.step(RULE)

@@ -1,96 +1,133 @@
-"""Ends: of episodes, environments, threads and processes. Nothing is left of any of them, and none of them hangs."""
+"""Section 5.9 of the contract: what ends in mid-episode is unwound, and nothing of it is left."""
 
 import gc
 import random
-import signal
-import subprocess
 import sys
+import threading
 import warnings
+import weakref
 from contextlib import suppress
-from textwrap import dedent
 
+import greenlet
 import pytest
 from benchmarks import soak
 
-from simenv_marl import single_env
+from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core.options import Options
-from tests.worlds.models import decision, define, script
+from simenv_marl.errors import ClosedError, InvalidActionError, ReentrancyError
+from tests.core.test_threads import in_a_thread
+from tests.worlds.models import (
+    Script,
+    alive,
+    calling,
+    decision,
+    define,
+    nobody_is_asked,
+    notes,
+    script,
+    stacks,
+    step,
+    unwinding,
+)
 
-SECONDS = 60
-"""What a process may take at most: far more than it needs, so that only one that hangs is ended."""
-
-needs_signals = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="this platform has no timers that signal")
-
-PRELUDE = """
-    import os, random, signal, sys, threading, time
-    from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
-    from simenv_marl.core.options import Options
-    from tests.worlds.models import calling, decision, script
-    Options.__init__.__kwdefaults__["driver"] = {driver!r}
-"""
-
-
-def driver():
-    """The driver that environments of this test have."""
-    return Options.__init__.__kwdefaults__["driver"]
-
-
-def process(code):
-    """Run a program in a process of its own, with warnings as errors."""
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-c", dedent(PRELUDE.format(driver=driver())) + dedent(code)],
-        capture_output=True, text=True, check=False, timeout=SECONDS,
-    )  # fmt: skip
+VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
+ALL_VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
+TRIGGERS = pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
+decide = decision()
 
 
-# -- many episodes --------------------------------------------------------------------------------
-
-
-def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
-    draw = random.Random(5)
-    soak.play(driver(), 200, draw)
-    before = soak.figures()
-    soak.play(driver(), 1500, draw)
-    after = soak.figures()
-    for name in ("threads", "greenlets", "descriptors", "objects"):
-        assert after[name] <= before[name] + soak.GROWTH.get(name, 0), name
-
-
-# -- environments ---------------------------------------------------------------------------------
-
-
-class Patched:
-    """A model whose ``act`` is a decision point for some environments alone."""
-
-    refuses = True
-
-    def reset(self):
-        pass
-
-    def run(self):
-        while self.refuses:
-            with suppress(BaseException):
-                self.act()
-
-    def act(self):
-        return 0
-
-
-ACT = Patched.act
-
-
-def test_what_was_patched_is_put_back_though_an_abandoned_model_refuses_to_end(monkeypatch):
-    env = single_env(Patched, {f"{__name__}.Patched.act": define()})
-    env.reset()
-    assert Patched.act is not ACT
-    printed = []
-    monkeypatch.setattr(sys, "unraisablehook", lambda error: printed.append(error.exc_type))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # what is raised in a finalizer is printed
-        del env
+def ended_by(trigger, held):
+    """End the episode of the one environment of a list, which nobody else holds."""
+    if trigger == "collect":
+        held.clear()
         gc.collect()
-    assert printed == [ResourceWarning]
-    assert Patched.act is ACT
+    else:
+        getattr(held[0], trigger)()
+
+
+# -- ends in mid-episode --------------------------------------------------------------------------
+
+
+@ALL_VIEWS
+@TRIGGERS
+def test_an_end_in_mid_episode_unwinds_the_simulation(view, trigger):
+    log = []
+
+    class Managed:
+        def __enter__(self):
+            log.append("enter")
+
+        def __exit__(self, *error):
+            log.append("exit")
+
+    def main(simulation):
+        try:
+            with Managed():
+                try:
+                    decide()
+                    decide()
+                finally:
+                    log.append("inner")
+            log.append("never")
+        finally:
+            log.append("outer")
+
+    decide = decision(agent="a_0")
+    held = [view(script(main), decide)]
+    held[0].reset()
+    step(held[0], 1, "a_0")
+    assert log == ["enter"]
+    ended_by(trigger, held)
+    assert log == ["enter", "inner", "exit", "outer", *(["enter"] if trigger == "reset" else [])]
+
+
+@VIEWS
+@TRIGGERS
+def test_decisions_while_unwinding_are_not_answered(view, trigger):
+    log, asked = [], []
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            log.append("finally")
+            try:
+                log.append(decide())
+            finally:
+                log.append("inner finally")
+                log.append(other())
+                log.append("never")
+
+    decide = decision(lambda: log.append("rule"), agent="a_0", reward_mapping=lambda: asked.append(1) or 0)
+    other = decision(agent="b_0")
+    held = [view(script(main), [decide, other], policies={other: RULE} if view is single_env else None)]
+    held[0].reset()
+    asked.clear()
+    ended_by(trigger, held)
+    expected = ["finally", "inner finally"]
+    # A point that nobody asked for is nothing but its rule.
+    assert log == (expected if view is aec_env else [*expected, "rule", "never"])
+    assert len(asked) == (1 if trigger == "reset" else 0)  # 1: the next episode's
+
+
+@VIEWS
+@TRIGGERS
+def test_an_end_by_max_steps_is_unwound_by_what_comes_next(view, trigger):
+    def main(simulation):
+        try:
+            while True:
+                decide()
+        finally:
+            log.append("unwound")
+
+    log = []
+    held = [view(script(main), decide, max_steps=2)]
+    held[0].reset()
+    held[0].step(1)
+    held[0].step(1)
+    assert log == []
+    ended_by(trigger, held)
+    assert log == ["unwound"]
 
 
 def test_an_exit_in_a_group_is_an_exit_and_what_is_with_it_is_an_error():
@@ -103,7 +140,6 @@ def test_an_exit_in_a_group_is_an_exit_and_what_is_with_it_is_an_error():
             nested = BaseExceptionGroup("inner", [error])
             raise BaseExceptionGroup("tasks", [nested, *others]) from None
 
-    decide = decision()
     env = single_env(script(main), decide)
     env.reset()
     env.close()
@@ -113,71 +149,393 @@ def test_an_exit_in_a_group_is_an_exit_and_what_is_with_it_is_an_error():
         env.close()
 
 
-# -- processes ------------------------------------------------------------------------------------
+# -- what is left ---------------------------------------------------------------------------------
 
 
-def test_a_model_may_end_the_process():
-    code = """
-        def main(simulation):
-            decide()
-            END
-        decide = decision()
-        env = aec_env(script(main), decide)
+class Witness:
+    """What must not be left."""
+
+
+def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
+    draw = random.Random(5)
+    driver = Options.__init__.__kwdefaults__["driver"]
+    soak.play(driver, 200, draw)
+    before = soak.figures()
+    soak.play(driver, 1500, draw)
+    after = soak.figures()
+    for name in ("threads", "greenlets", "descriptors", "objects"):
+        assert after[name] <= before[name] + soak.GROWTH.get(name, 0), name
+
+
+@ALL_VIEWS
+@pytest.mark.parametrize(
+    "how",
+    [
+        "never reset", "suspended", "ended", "truncated", "closed", "action refused", "model failed", "mapping failed",
+        "first reset failed", "reset failed", "closing failed",
+    ],
+)  # fmt: skip
+def test_environments_are_collected_and_take_everything_along(view, how):
+    armed = []
+
+    def burn(place):
+        if place in armed:
+            raise ZeroDivisionError
+
+    class Watched(Script):
+        def __init__(self):
+            super().__init__(None)
+            self.witness = Witness()
+
+        def reset(self, seed=None, options=None):
+            super().reset(seed, options)
+            burn("first reset failed")
+            burn("reset failed")
+
+        def run(self):
+            local = Witness()
+            try:
+                for _ in range(3):
+                    decide(local)
+                    burn("model failed")
+            finally:
+                burn("closing failed")
+
+    def observe(witness):
+        burn("mapping failed")
+        return [0, 0]
+
+    def fail(env):
+        env.close() if how == "closing failed" else env.reset() if "reset" in how else step(env, 1, "a_0")
+
+    before = stacks()
+    decide = decision(lambda witness: 0, agent="a_0", observation_space_mapping=observe)
+    env = view(Watched, decide, max_steps=2 if how == "truncated" else None)
+    if how not in ("never reset", "first reset failed"):
+        env.reset()
+        step(env, 1, "a_0")
+    armed.append(how)
+    if "failed" in how:
+        with pytest.raises(ZeroDivisionError):
+            fail(env)
+    elif how == "action refused":
+        with pytest.raises(InvalidActionError):
+            step(env, "nonsense", "a_0")
+    elif how in ("ended", "truncated"):
+        for _ in range(2 if how == "ended" else 1):
+            step(env, 1, "a_0")
+    elif how == "closed":
+        env.close()
+    armed.clear()
+    references = [weakref.ref(env), weakref.ref(env.unwrapped), weakref.ref(env.unwrapped.simulation)]
+    if how == "closing failed":
+        env.unwrapped.simulation.env = env
+    del env
+    gc.collect()
+    assert [reference() for reference in references] == [None, None, None]
+    assert alive(Witness) == 0
+    assert stacks(before) == before
+
+
+@VIEWS
+@pytest.mark.parametrize("held_by", ["mapping", "policy", "simulation"])
+def test_closed_environments_are_collected_though_their_own_parts_refer_to_them(view, held_by):
+    def closed():
+        one = decision(agent="one_0", **({"reward_mapping": lambda: env.max} if held_by == "mapping" else {}))
+        two = decision(agent="two_0")
+        policy = (lambda observation: env.max) if held_by == "policy" else RULE
+        env = view(calling(one, two, one), [one, two], policies={two: policy})
+        env.max = 1
         env.reset()
         env.step(1)
-        print("went on")
-    """
-    assert process(code.replace("END", "sys.exit(3)")).returncode == 3
-    assert process(code.replace("END", "os._exit(4)")).returncode == 4
-    said = process(code.replace("END", "raise KeyboardInterrupt"))
-    assert "KeyboardInterrupt" in said.stderr
-    assert "went on" not in said.stdout
+        if held_by == "simulation":
+            env.unwrapped.simulation.environment = env
+        env.close()
+        return weakref.ref(env)
+
+    reference = closed()
+    gc.collect()
+    assert reference() is None
 
 
-@needs_signals
-def test_signals_at_any_time_never_spoil_an_environment():
-    result = process("""
-        class Alarm(BaseException):
-            pass
-        def ring(*_):
-            raise Alarm
-        signal.signal(signal.SIGALRM, ring)
-        decide = decision()
-        def main(simulation):
-            for _ in range(5):
+def test_a_simulation_that_refers_to_itself_and_to_its_frames_is_collected():
+    def main(simulation):
+        simulation.generator = (simulation for _ in [1])
+        simulation.me = simulation
+        frames = [simulation]
+        frames.append(frames)
+        decide()
+
+    env = single_env(script(main), decide)
+    env.reset()
+    reference = weakref.ref(env.unwrapped.simulation)
+    del env
+    gc.collect()
+    assert reference() is None
+
+
+@pytest.mark.usefixtures("_collected")
+@VIEWS
+@pytest.mark.parametrize("when", ["between", "amid", "never reset"])
+@pytest.mark.parametrize("where", ["here", "elsewhere"])
+def test_an_environment_that_is_dropped_unwinds_and_takes_its_stack_along_without_the_collector(view, when, where):
+    before, log = stacks(), []
+    held = [view(unwinding(decide, log), decide)]
+    simulation = weakref.ref(held[0].unwrapped.simulation)
+    if when != "never reset":
+        held[0].reset()
+    if when == "between":
+        held[0].step(1)
+    if where == "here":
+        held.clear()
+    else:
+        in_a_thread(held.clear)
+    greenlet.greenlet(lambda: None).switch()  # a stack of another thread unwinds when something switches
+    assert log == ([] if when == "never reset" else ["unwound"])
+    gc.collect()
+    assert simulation() is None
+    assert stacks(before) == before
+
+
+class RaisedError(Exception):
+    pass
+
+
+def left(kind):
+    """How many objects of a type there are, without the help of the collector."""
+    return sum(type(thing) is kind for thing in gc.get_objects())
+
+
+@pytest.mark.usefixtures("_collected")
+@VIEWS
+@pytest.mark.parametrize("how", ["returns", "raises", "observation_space_mapping", "reward_mapping"])
+def test_what_an_episode_returns_or_raises_or_was_called_with_is_not_kept(view, how):
+    def fail(*arguments):
+        if armed:
+            raise RaisedError
+        return 0.0 if how == "reward_mapping" else [0, 0]
+
+    def main(simulation):
+        witness = Witness()
+        decide(witness)
+        if how == "raises":
+            raise RaisedError(witness)
+        decide(witness)
+        return witness
+
+    armed, changes = [], {how: fail} if how.endswith("mapping") else {}
+    decide = decision(lambda witness: 0, agent="a_0", **changes)
+    before = stacks()
+    env = view(script(main), decide)
+    env.reset()
+    assert left(Witness) == 1
+    armed.append(True)
+    if how == "returns":
+        env.step(1)
+        env.step(1)
+    else:
+        with suppress(RaisedError):  # pytest.raises would keep it
+            env.step(1)
+            pytest.fail("nothing was raised")
+        assert left(RaisedError) == 0
+        env.close()
+    assert left(Witness) == 0
+    env.close()
+    assert stacks(before) == before
+
+
+# -- models that resist ---------------------------------------------------------------------------
+
+
+def swallow_exceptions(simulation):
+    while True:
+        try:
+            decide()
+        except Exception:
+            simulation.log.append("swallowed")
+
+
+def swallow_a_few(simulation):
+    for _ in range(4):
+        with suppress(BaseException):
+            decide()
+
+
+def translate(simulation):
+    try:
+        decide()
+    except BaseException as error:
+        raise RuntimeError("translated") from error
+
+
+@VIEWS
+@TRIGGERS
+@pytest.mark.parametrize("main", [swallow_exceptions, swallow_a_few, translate])
+def test_models_that_resist_a_little_are_unwound(view, trigger, main):
+    before = stacks()
+    held = [view(script(main), decide)]
+    held[0].reset()
+    log = held[0].unwrapped.simulation.log
+    ended_by(trigger, held)
+    assert log == []
+    if trigger != "reset":
+        assert stacks(before) == before
+
+
+@VIEWS
+@pytest.mark.parametrize("trigger", ["close", "reset"])
+def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger):
+    stop = [False]
+
+    def refuse(simulation):
+        while not stop[0]:
+            with suppress(BaseException):
                 simulation.log.append(decide())
-        draw, rung = random.Random(3), 0
-        envs = [view(script(main), decide) for view in (aec_env, single_env, parallel_env)]
-        def use(env):
-            env.reset()
-            for _ in range(5):
-                env.step({"choose_0": 2} if env is envs[2] else 2)
-        for env in envs:
-            use(env)
-        begun = time.perf_counter()
-        for env in envs:
-            use(env)
-        usual = (time.perf_counter() - begun) / 3
-        for number in range(6000):
-            if number > 600 and rung > 20:
-                break
-            env = envs[number % 3]
-            try:
-                signal.setitimer(signal.ITIMER_REAL, draw.uniform(0.1, 1.5) * min(usual, 0.0005))
-                try:
-                    use(env)
-                finally:
-                    signal.setitimer(signal.ITIMER_REAL, 0)
-            except Alarm:
-                rung += 1
-            except RuntimeError as error:  # Python itself starts threads with a lock that gives way to signals
-                assert isinstance(error.__context__, Alarm)
-            use(env)
-            assert env.unwrapped.simulation.log == [2] * 5
-        for env in envs:
+
+    env = view(script(refuse), decide)
+    env.reset()
+    env.step(1)
+    refusing = env.unwrapped.simulation
+    with pytest.warns(ResourceWarning, match="Script refuses to end") as caught:
+        getattr(env, trigger)()
+    assert caught[0].filename == __file__
+    assert refusing.log == [1]  # none of its decisions was answered
+    if trigger == "close":
+        with pytest.raises(ClosedError, match="call reset"):
+            env.step(1)
+        env.reset()
+    assert env.unwrapped.simulation is not refusing
+    env.step(2)
+    assert (refusing.log, env.unwrapped.simulation.log) == ([1], [2])
+    stop[0] = True
+    env.step(3)
+
+
+class Patched:
+    """A model that refuses to end, and whose ``act`` is a decision point for some environments alone."""
+
+    def reset(self):
+        pass
+
+    def run(self):
+        while True:
+            with suppress(BaseException):
+                self.act()
+
+    def act(self):
+        return 0
+
+
+ACT = Patched.act
+
+
+@VIEWS
+def test_a_model_that_refuses_to_unwind_when_it_is_collected_is_warned_of_and_no_longer_patched(view, monkeypatch):
+    held = [view(Patched, {f"{__name__}.Patched.act": define()})]
+    held[0].reset()
+    assert Patched.act is not ACT
+    printed = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda error: printed.append(error.exc_type))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # what is raised in a finalizer is printed
+        ended_by("collect", held)
+    assert printed == [ResourceWarning]
+    assert Patched.act is ACT
+
+
+def test_errors_while_a_collected_simulation_unwinds_are_not_lost():
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            raise KeyError("while unwinding")
+
+    held = [single_env(script(main), decide)]
+    held[0].reset()
+    with pytest.warns(ResourceWarning, match="while unwinding"):
+        ended_by("collect", held)
+
+
+# -- threads --------------------------------------------------------------------------------------
+
+
+def test_an_environment_whose_thread_has_ended_can_be_reset_or_dropped():
+    env = single_env(unwinding(decide, []), decide)
+    in_a_thread(env.reset)
+    env.reset()
+    assert env.step(1)[2]
+    in_a_thread(env.reset)
+    reference = weakref.ref(env)
+    del env
+    gc.collect()
+    assert reference() is None
+
+
+@pytest.mark.greenlet("threads of their own unwind at once, wherever their environment is dropped")
+def test_an_environment_that_is_dropped_in_another_thread_unwinds_in_its_own():
+    log = []
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            log.append(threading.get_ident())
+            decide()
+            log.append("nobody was asked")
+
+    held = [single_env(script(main), decide)]
+    held[0].reset()
+    in_a_thread(held.clear)
+    gc.collect()
+    greenlet.greenlet(lambda: None).switch()  # whatever switches next
+    assert log == [threading.get_ident(), "nobody was asked"]
+    assert nobody_is_asked()
+
+
+# -- from inside ----------------------------------------------------------------------------------
+
+
+@ALL_VIEWS
+@pytest.mark.parametrize("where", ["stop", "finally", "close"])
+@pytest.mark.parametrize("use", ["close", "reset", "step"])
+def test_an_environment_that_is_used_while_it_unwinds_its_simulation_says_so(view, where, use):
+    def use_it(place):
+        if place == where:
+            with pytest.raises(ReentrancyError) as caught:
+                step(env, 1, "choose_0") if use == "step" else getattr(env, use)()
+            used.append(use)
+            if where == passed_on:
+                raise caught.value
+
+    class Model(Script):
+        def stop(self):
+            use_it("stop")
+
+        def close(self):
+            use_it("close")
+
+    def main(simulation):
+        try:
+            decide()
+            decide()
+        finally:
+            use_it("finally")
+
+    used, passed_on = [], None
+    env = view(lambda: Model(main), decide)
+    env.reset()
+    env.close()
+    env.reset()
+    env.reset()
+    env.close()
+    assert used == [use] * 3
+    with pytest.raises(ClosedError):
+        step(env, 1, "choose_0")
+    env.reset()
+    passed_on = "stop"
+    if where == passed_on:
+        with pytest.raises(ReentrancyError) as raised:
             env.close()
-        assert sum(thread.is_alive() for thread in threading.enumerate()) == 1
-        print(rung > 20)
-    """)
-    # Whether an alarm rang in the midst of Python's own cleaning up is printed, but of no consequence.
-    assert (result.returncode, result.stdout) == (0, "True\n"), result.stderr
+        assert "decision 1" in notes(raised.value)
+    env.close()
+    env.reset()

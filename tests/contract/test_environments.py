@@ -27,15 +27,6 @@ BOTH = calling(PUMP, FAN, PUMP)
 # -- what is made ---------------------------------------------------------------------------------
 
 
-def test_generate_env_returns_a_class():
-    env_class = generate_env(BOTH, PUMP)
-    assert isinstance(env_class, type)
-    assert issubclass(env_class, gymnasium.Env)
-    one, two = env_class(), env_class()
-    assert isinstance(one, env_class)
-    assert one.unwrapped.simulation is not two.unwrapped.simulation
-
-
 @pytest.mark.parametrize(
     ("points", "options", "base"),
     [
@@ -48,75 +39,51 @@ def test_generate_env_returns_a_class():
         ([PUMP, NAMED], {"policies": {NAMED: lambda observation: 1}}, gymnasium.Env),
         (PUMP, {"view": "aec"}, pettingzoo.AECEnv),
         (PUMP, {"view": "single"}, gymnasium.Env),
-        ([PUMP, FAN], {"view": "aec"}, pettingzoo.AECEnv),
         ([PUMP, FAN], {"view": "single", "policies": {"fan_0": RULE}}, gymnasium.Env),
     ],
 )
-def test_views(points, options, base):
+def test_generate_env_returns_a_class_of_a_view(points, options, base):
     env_class = generate_env(BOTH, points, **options)
+    assert isinstance(env_class, type)
     assert issubclass(env_class, base)
-    assert isinstance(env_class(), base)
+    one, two = env_class(), env_class()
+    assert type(one) is type(two) is env_class
+    assert one.unwrapped.simulation is not two.unwrapped.simulation
 
 
-def test_the_functions_return_what_they_say():
-    assert isinstance(aec_env(BOTH, PUMP), pettingzoo.AECEnv)
-    assert isinstance(single_env(BOTH, PUMP), gymnasium.Env)
+@pytest.mark.parametrize(
+    ("make", "wrapper"),
+    [
+        (aec_env, pettingzoo.utils.wrappers.OrderEnforcingWrapper),
+        (parallel_env, pettingzoo.utils.BaseParallelWrapper),
+        (single_env, gymnasium.wrappers.OrderEnforcing),
+        (joint_env, gymnasium.wrappers.OrderEnforcing),
+    ],
+)
+def test_what_environments_say_about_themselves(make, wrapper):
+    seeing, acting = spaces.Box(0, 1, (3,), np.float32), spaces.Discrete(4)
+    pump = decision(observation_space=seeing, action_space=acting, agent="pump_0")
+    env, other = (make(calling(pump), pump) for _ in range(2))
+    assert env.unwrapped is env
+    assert wrapper(env).unwrapped.simulation is env.simulation
+    assert isinstance(env.simulation, Script)
+    assert isinstance(env.metadata["name"], str)
+    assert list(env.metadata["render_modes"]) == []
+    assert env.render_mode is None
+    assert str(env)
+    assert repr(env)
 
+    def spaces_of(env):
+        if make is single_env:
+            return env.observation_space, env.action_space
+        if make is joint_env:
+            return env.observation_space["pump_0"], env.action_space["pump_0"]
+        return env.observation_space("pump_0"), env.action_space("pump_0")
 
-@pytest.mark.parametrize("points", [[PUMP, FAN], NAMED], ids=["two", "callable"])
-def test_the_single_view_is_refused_where_there_is_not_one_agent(points):
-    with pytest.raises(ViewError, match="needs one active decision point"):
-        single_env(BOTH, points)
-    with pytest.raises(ViewError, match="needs one active decision point"):
-        generate_env(BOTH, points, view="single")
-
-
-@pytest.mark.parametrize("view", ["", "AEC", "dual", 3], ids=repr)
-def test_unknown_views_are_refused(view):
-    with pytest.raises(OptionValueError, match="view must be None"):
-        generate_env(BOTH, PUMP, view=view)
-
-
-def test_unwrapped_and_simulation():
-    for env in (aec_env(BOTH, PUMP), single_env(BOTH, PUMP), generate_env(BOTH, PUMP)()):
-        assert env.unwrapped is env
-        assert isinstance(env.unwrapped.simulation, Script)
-    wrapped = pettingzoo.utils.wrappers.OrderEnforcingWrapper(aec_env(BOTH, PUMP))
-    assert isinstance(wrapped.unwrapped.simulation, Script)
-    wrapped = gymnasium.wrappers.OrderEnforcing(single_env(BOTH, PUMP))
-    assert isinstance(wrapped.unwrapped.simulation, Script)
-
-
-def test_what_environments_say_about_themselves():
-    for env in (aec_env(BOTH, PUMP), single_env(BOTH, PUMP), generate_env(BOTH, PUMP)()):
-        assert isinstance(env.metadata["name"], str)
-        assert list(env.metadata["render_modes"]) == []
-        assert env.render_mode is None
-        assert str(env)
-        assert repr(env)
-
-
-def test_spaces():
-    space = spaces.Box(0, 1, (3,), np.float32)
-    pump = decision(observation_space=space, action_space=spaces.Discrete(4), agent="pump_0")
-    env = aec_env(calling(pump), pump)
-    assert env.observation_space("pump_0") == space
-    assert env.action_space("pump_0") == spaces.Discrete(4)
-    env = single_env(calling(pump), pump)
-    assert (env.observation_space, env.action_space) == (space, spaces.Discrete(4))
-
-
-def test_spaces_of_agents_that_are_named_by_a_callable():
-    env = aec_env(calling(lambda: NAMED("a"), lambda: NAMED("b")), NAMED)
-    env.reset()
-    space = env.action_space("a")
-    assert space == spaces.Discrete(10)
-    with pytest.raises(LookupError, match="there is no agent"):
-        env.action_space("b")
-    env.step(1)
-    assert env.action_space("a") is space
-    assert env.action_space("b") == spaces.Discrete(10)
-    assert env.action_space("b") is not space
+    # The spaces are the environment's own.
+    assert spaces_of(env) == (seeing, acting)
+    assert [space is again for space, again in zip(spaces_of(env), spaces_of(env), strict=True)] == [True, True]
+    assert len({id(space) for space in (*spaces_of(env), *spaces_of(other), seeing, acting)}) == 6
 
 
 @pytest.mark.parametrize("method", ["action_space", "observation_space", "observe"])
@@ -132,46 +99,43 @@ def test_agents_that_nobody_knows_are_lookup_errors(method):
 
 
 @pytest.mark.parametrize("make", [aec_env, single_env, generate_env])
-@pytest.mark.parametrize("options", [{"max_step": 3}, {"seed": 1}, {"max_steps": 3, "colour": "red"}])
-def test_unknown_options_are_refused(make, options):
-    with pytest.raises(UnknownOptionError, match=list(options)[-1]) as caught:
-        make(BOTH, PUMP, **options)
-    assert isinstance(caught.value, TypeError)
-
-
-def test_unknown_options_of_instances_are_refused():
-    with pytest.raises(UnknownOptionError, match="there is no option"):
-        generate_env(BOTH, PUMP)(colour="red")
-
-
-@pytest.mark.parametrize("make", [aec_env, single_env, generate_env])
 @pytest.mark.parametrize(
-    "options",
+    ("options", "error", "match"),
     [
-        {"max_steps": 0},
-        {"max_steps": -1},
-        {"max_steps": 2.0},
-        {"max_steps": "3"},
-        {"driver": "magic"},
-        {"driver": None},
-        {"policies": 3},
-        {"policies": [PUMP]},
-        {"policies": {"pump_0": 3}},
-        {"policies": {"pump_0": None}},
-        {"render_mode": "human"},
+        *(
+            (given, UnknownOptionError, list(given)[-1])
+            for given in ({"max_step": 3}, {"seed": 1}, {"max_steps": 3, "colour": "red"})
+        ),
+        *(({"max_steps": wrong}, OptionValueError, "max_steps") for wrong in (0, -1, 2.0, "3")),
+        *(({"driver": wrong}, OptionValueError, "driver") for wrong in ("magic", None)),
+        *(({"policies": wrong}, OptionValueError, "polic") for wrong in (3, [PUMP], {"pump_0": 3}, {"pump_0": None})),
+        ({"render_mode": 3}, OptionValueError, "render_mode"),
+        *(
+            ({"policies": {key: lambda observation: 1}}, UnknownPointError, "known are pump")
+            for key in ("fan_0", "tests.contract.test_environments.Nobody.decides", "no.where", 3, None)
+        ),
+        ({"policies": {PUMP: RULE}}, UnknownPointError, "no decision point is left"),
     ],
     ids=plainly,
 )
-def test_options_that_cannot_be_are_refused(make, options):
-    with pytest.raises(OptionValueError) as caught:
+def test_options_that_cannot_be_are_refused(make, options, error, match):
+    with pytest.raises(error, match=match) as caught:
         make(BOTH, PUMP, **options)
-    assert isinstance(caught.value, ValueError)
+    builtin = {UnknownOptionError: TypeError, OptionValueError: ValueError, UnknownPointError: LookupError}[error]
+    assert isinstance(caught.value, builtin)
 
 
-def test_the_default_driver_has_a_name():
-    env = single_env(BOTH, PUMP, driver="greenlet")
-    env.reset()
-    env.step(1)
+@pytest.mark.parametrize(
+    ("points", "view", "error", "match"),
+    [
+        *((points, "single", ViewError, "needs one active decision point") for points in ([PUMP, FAN], NAMED)),
+        *((PUMP, view, OptionValueError, "view must be None") for view in ("", "AEC", "dual", 3)),
+    ],
+    ids=plainly,
+)
+def test_views_that_cannot_be_are_refused(points, view, error, match):
+    with pytest.raises(error, match=match):
+        generate_env(BOTH, points, view=view)
 
 
 def test_instances_may_change_the_options_of_their_class():
@@ -180,6 +144,8 @@ def test_instances_may_change_the_options_of_their_class():
     assert len(decisions(play(env_class(max_steps=2)))) == 2
     assert len(decisions(play(env_class(max_steps=None)))) == 3
     assert decisions(play(env_class(max_steps=None, policies={"pump_0": RULE}))) == ["fan_0"]
+    with pytest.raises(UnknownOptionError, match="there is no option"):
+        env_class(colour="red")
 
 
 # -- max_steps ------------------------------------------------------------------------------------
@@ -209,22 +175,12 @@ def test_max_steps_runs_on_to_the_next_decision_and_truncates(actions):
     env.close()
 
 
-def test_max_steps_that_the_episode_reaches_by_itself_terminate_it():
-    env = single_env(calling(PUMP, PUMP), PUMP, max_steps=2)
+@pytest.mark.parametrize(("ends", "flags"), [(None, (True, False)), (TRUNCATED, (False, True))])
+def test_max_steps_that_the_episode_reaches_by_itself_are_no_limit(ends, flags):
+    env = single_env(calling(PUMP, PUMP, ends=ends), PUMP, max_steps=2 if ends is None else 20)
     env.reset()
     env.step(1)
-    assert env.step(1)[2:4] == (True, False)
-    env = single_env(calling(PUMP, PUMP, ends=TRUNCATED), PUMP, max_steps=20)
-    env.reset()
-    env.step(1)
-    assert env.step(1)[2:4] == (False, True)
-
-
-def test_max_steps_truncate_all_agents():
-    env = aec_env(calling(*[PUMP, FAN] * 5), [PUMP, FAN], max_steps=3)
-    turns = play(env, 1)
-    assert decisions(turns) == ["pump_0", "fan_0", "pump_0"]
-    assert [(turn.terminated, turn.truncated) for turn in turns[3:]] == [(False, True)] * 2
+    assert env.step(1)[2:4] == flags
 
 
 def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
@@ -240,7 +196,7 @@ def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
     assert decisions(play(env, 1)) == ["pump_0"] * 3
 
 
-def test_max_steps_reward_the_agent_whose_decision_has_arisen_too():
+def test_max_steps_reward_and_truncate_the_agent_whose_decision_has_arisen_too():
     level = [0]
     pump = decision(agent="pump_0", reward_mapping=lambda: level[0])
     fan = decision(agent="fan_0", reward_mapping=lambda: -level[0])
@@ -256,45 +212,12 @@ def test_max_steps_reward_the_agent_whose_decision_has_arisen_too():
     env = aec_env(script(main), [pump, fan], max_steps=3)
     turns = play(env, 1)
     assert decisions(turns) == ["pump_0", "fan_0", "pump_0"]
+    assert [(turn.terminated, turn.truncated) for turn in turns[3:]] == [(False, True)] * 2
     assert rewards_of(turns, "pump_0") == [12.0, 22.0]
     assert rewards_of(turns, "fan_0") == [-22.0]
 
 
 # -- policies -------------------------------------------------------------------------------------
-
-
-class Counting:
-    """A policy that counts how often it was asked."""
-
-    def __init__(self):
-        self.asked = []
-
-    def __call__(self, observation):
-        self.asked.append(observation.tolist())
-        return len(self.asked)
-
-    def method(self, observation, info):
-        self.asked.append((observation.tolist(), info))
-        return 8
-
-
-@pytest.mark.parametrize("key", ["fan_0", FAN], ids=["agent", "point"])
-@pytest.mark.parametrize("points", [[PUMP, FAN], PUMP], ids=["listed", "unlisted"])
-def test_policies_answer_and_are_no_agents(key, points):
-    if points is PUMP and key == "fan_0":
-        with pytest.raises(UnknownPointError, match="known are pump"):
-            aec_env(BOTH, points, policies={key: lambda observation: 1})
-        return
-    policy = Counting()
-    env = aec_env(BOTH, points, policies={key: policy})
-    assert env.possible_agents == ["pump_0"]
-    env.reset()
-    assert env.agents == ["pump_0"]
-    assert set(env.rewards) == set(env.infos) == {"pump_0"}
-    turns = play(env, 5)
-    assert decisions(turns) == ["pump_0", "pump_0"]
-    assert env.unwrapped.simulation.log == [5, 1, 5]
-    assert policy.asked == [[1.0, 2.0]]
 
 
 class Room:
@@ -307,50 +230,37 @@ class Room:
         return "rule"
 
 
-def room():
-    return calling(Room().warm, Room().cool)
+WARM = f"{__name__}.Room.warm"
 
 
-def test_policies_may_name_points_by_their_dotted_name():
-    for points in ([Room.cool, Room.warm], Room.cool):
-        env = aec_env(room(), points, policies={f"{__name__}.Room.warm": lambda observation: 4})
-        play(env, 1)
-        assert env.unwrapped.simulation.log == [4, 1]
+@pytest.mark.parametrize(
+    ("points", "key"),
+    [
+        *(([Room.cool, Room.warm], key) for key in ("warmer_0", Room.warm, WARM)),
+        *((Room.cool, key) for key in (Room.warm, WARM)),
+    ],
+)
+@pytest.mark.parametrize(
+    ("policy", "answer"), [(lambda observation: 4, 4), (RULE, "rule"), (lambda observation: RULE, "rule")]
+)
+def test_what_policies_answer_is_no_agent(points, key, policy, answer):
+    room = Room()
+    env = aec_env(calling(room.cool, room.warm, room.cool), points, policies={key: policy})
+    assert env.possible_agents == ["cool_0"]
+    env.reset()
+    assert env.agents == ["cool_0"]
+    assert set(env.rewards) == set(env.infos) == {"cool_0"}
+    assert decisions(play(env, 5)) == ["cool_0", "cool_0"]
+    assert env.simulation.log == [5, answer, 5]
 
 
-def test_a_policy_may_be_rule():
-    for key in ("warmer_0", Room.warm, f"{__name__}.Room.warm"):
-        env = aec_env(room(), [Room.cool, Room.warm], policies={key: RULE})
-        assert env.possible_agents == ["cool_0"]
-        play(env, 1)
-        assert env.unwrapped.simulation.log == ["rule", 1]
-
-
-def test_a_policy_may_answer_rule():
-    env = aec_env(room(), [Room.cool, Room.warm], policies={Room.warm: lambda observation: RULE})
-    play(env, 1)
-    assert env.unwrapped.simulation.log == ["rule", 1]
-
-
-def one_argument(observation):
-    return len(observation)
-
-
-def two_arguments(observation, info):
+def first_legal(observation, info=None):
     return info["action_mask"].tolist().index(1)
-
-
-def optional_info(observation, info=None):
-    return info["action_mask"].tolist().index(1)
-
-
-def other_default(observation, scale=2):
-    return scale
 
 
 class Stateful:
     def __call__(self, observation, info):
-        return two_arguments(observation, info)
+        return first_legal(observation, info)
 
     def act(self, observation):
         return 2
@@ -359,24 +269,21 @@ class Stateful:
 @pytest.mark.parametrize(
     ("policy", "answer"),
     [
-        (one_argument, 2),
-        (two_arguments, 3),
-        (optional_info, 3),
-        (other_default, 2),
+        (lambda observation, info: first_legal(observation, info), 3),
+        (first_legal, 3),
+        (lambda observation, scale=2: scale, 2),
         (Stateful(), 3),
         (Stateful().act, 2),
-        (lambda observation: 1, 1),
-        (lambda *arguments: 3, 3),
+        (lambda *arguments: len(arguments[0]), 2),
         (len, 2),
     ],
 )
 def test_policies_are_callables_of_the_observation_or_of_observation_and_info(policy, answer):
-    masked = decision(agent="masked_0", action_mask_mapping=lambda: [0, 0, 0, 1, 1, 1, 1, 1, 1, 1])
-    plain = decision(agent="masked_0")
-    decide = masked if answer == 3 else plain
-    env = aec_env(calling(decide, PUMP), [decide, PUMP], policies={"masked_0": policy})
+    masks = {"action_mask_mapping": lambda: [0] * 3 + [1] * 7} if answer == 3 else {}
+    decide = decision(agent="decider_0", **masks)
+    env = aec_env(calling(decide, PUMP), [decide, PUMP], policies={"decider_0": policy})
     play(env, 1)
-    assert env.unwrapped.simulation.log == [answer, 1]
+    assert env.simulation.log == [answer, 1]
 
 
 def test_a_policys_action_is_checked_and_mapped():
@@ -391,39 +298,30 @@ def test_a_policys_action_is_checked_and_mapped():
     env.reset()
 
 
-def test_policies_of_agents_that_a_callable_names():
-    calls = calling(*[lambda name=name: NAMED(name) for name in ("a", "b", "a", "c")])
-    env = aec_env(calls, NAMED, policies={"a": lambda observation: 7})
-    assert decisions(play(env, 1)) == ["b", "c"]
-    assert env.unwrapped.simulation.log == [7, 1, 7, 1]
-    env = aec_env(calls, NAMED, policies={"a": RULE, "c": RULE})
-    assert decisions(play(env, 1)) == ["b"]
-    assert env.unwrapped.simulation.log == ["rule", 1, "rule", "rule"]
-    env = aec_env(calling(PUMP, *[lambda: NAMED("a")] * 2), [PUMP, NAMED], policies={NAMED: lambda observation: 6})
+@pytest.mark.parametrize(
+    ("policies", "asked", "log"),
+    [
+        ({"herd.1": lambda observation: 7}, ["Sheep 2", "c"], [7, 1, 7, 1]),
+        ({"herd.1": lambda observation: 7, "Sheep 2": lambda observation: 8}, ["c"], [7, 8, 7, 1]),
+        ({"herd.1": RULE, "c": RULE}, ["Sheep 2"], ["rule", 1, "rule", "rule"]),
+    ],
+)
+def test_policies_of_agents_that_a_callable_names_by_any_name(policies, asked, log):
+    calls = calling(*[lambda name=name: NAMED(name) for name in ("herd.1", "Sheep 2", "herd.1", "c")])
+    env = aec_env(calls, NAMED, policies=policies)
+    assert decisions(play(env, 1)) == asked
+    assert env.simulation.log == log
+
+
+def test_a_policy_of_a_point_answers_for_all_whom_a_callable_names():
+    calls = calling(PUMP, *[lambda: NAMED("a"), lambda: NAMED("b")])
+    env = aec_env(calls, [PUMP, NAMED], policies={NAMED: lambda observation: 6})
     assert decisions(play(env, 1)) == ["pump_0"]
-    assert env.unwrapped.simulation.log == [1, 6, 6]
-
-
-def test_policies_of_agents_that_a_callable_names_may_have_any_name():
-    calls = calling(*[lambda name=name: NAMED(name) for name in ("herd.1", "Sheep 2", "c")])
-    env = aec_env(calls, NAMED, policies={"herd.1": lambda observation: 7, "Sheep 2": lambda observation: 8})
-    assert decisions(play(env, 1)) == ["c"]
-    assert env.unwrapped.simulation.log == [7, 8, 1]
-
-
-@pytest.mark.parametrize("key", ["nobody_0", "tests.contract.test_environments.Nobody.decides", "no.where", 3, None])
-def test_policies_for_nobody_are_refused(key):
-    with pytest.raises(UnknownPointError, match="known are fan"):
-        aec_env(BOTH, [PUMP, FAN], policies={key: lambda observation: 1})
-
-
-def test_policies_for_everybody_leave_no_environment():
-    with pytest.raises(UnknownPointError, match="no decision point is left"):
-        aec_env(BOTH, PUMP, policies={PUMP: RULE})
+    assert env.simulation.log == [1, 6, 6]
 
 
 def test_policies_observe_in_order_with_everybody_else():
-    level = [0]
+    level, asked = [0], []
     pump = decision(agent="pump_0", observation_space_mapping=lambda: [level[0], 0])
     fan = decision(agent="fan_0", observation_space_mapping=lambda: [level[0], 0])
 
@@ -433,11 +331,14 @@ def test_policies_observe_in_order_with_everybody_else():
             level[0] += pump()
             level[0] += fan()
 
-    policy = Counting()
+    def policy(observation):
+        asked.append(observation.tolist())
+        return len(asked)
+
     env = aec_env(script(main), [pump, fan], policies={"fan_0": policy})
     turns = play(env, 5)
     assert [turn.observation[0] for turn in turns] == [0, 6, 13]
-    assert policy.asked == [[5.0, 0.0], [11.0, 0.0]]
+    assert asked == [[5.0, 0.0], [11.0, 0.0]]
 
 
 # -- agents ---------------------------------------------------------------------------------------
@@ -453,16 +354,12 @@ def test_a_callable_that_names_no_string_is_an_error(name):
 
 
 def test_an_agent_has_one_decision_point():
-    named = decision(agent=lambda: "pump_0")
-    env = aec_env(calling(PUMP, named), [PUMP, named])
-    env.reset()
-    with pytest.raises(AgentError, match="has one decision point"):
-        env.step(1)
-    other = decision(agent=lambda: "pump_0")
-    env = aec_env(calling(named, other), [named, other])
-    env.reset()
-    with pytest.raises(AgentError, match="has one decision point"):
-        env.step(1)
+    named, other = (decision(agent=lambda: "pump_0") for _ in range(2))
+    for first, second in ((PUMP, named), (named, other)):
+        env = aec_env(calling(first, second), [first, second])
+        env.reset()
+        with pytest.raises(AgentError, match="has one decision point"):
+            env.step(1)
 
 
 # -- rendering ------------------------------------------------------------------------------------
@@ -537,7 +434,8 @@ def test_a_point_that_is_named_has_the_simulations_own_definition(source, named)
 
 
 def test_instances_may_choose_their_render_mode():
-    env = generate_env(Rendering, PUMP)(render_mode="rgb_array")
+    env_class = generate_env(Rendering, PUMP)
+    env = env_class(render_mode="rgb_array")
     env.reset()
     assert env.render() == "rgb_array of 1"
-    assert list(generate_env(Rendering, PUMP).metadata["render_modes"]) == ["ansi", "rgb_array"]
+    assert list(env_class.metadata["render_modes"]) == ["ansi", "rgb_array"]

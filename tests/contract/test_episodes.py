@@ -1,6 +1,5 @@
 """Section 5 of the contract: what happens when, in the AEC and in the single view."""
 
-import gc
 import random
 import weakref
 from functools import partial
@@ -15,45 +14,46 @@ from simenv_marl import RULE, aec_env, single_env
 from simenv_marl.errors import InvalidActionError, ObservationError, RewardError
 from tests.worlds.models import Script, calling, decision, decisions, define, play, rewards_of, script
 
+VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
+
 # -- 5.2: the order of agents ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", ["a", "aaaa", "ab", "abba", "aab" * 5, "cab", "bbbb", "abcabc", "abcccbbbaaac", "c"])
+@pytest.mark.parametrize("order", ["aaaa", "abba", "cab", "abcccbbbaaac", "c"])
 def test_agents_are_selected_in_the_order_in_which_the_simulation_calls_them(order):
     points = {name: decision(agent=f"{name}_0") for name in "abc"}
     env = aec_env(calling(*[points[name] for name in order]), list(points.values()))
     for _ in range(2):
         turns = play(env, lambda agent, env: len(env.agents))
         assert decisions(turns) == [f"{name}_0" for name in order]
-        assert [turn.agent for turn in turns if turn.terminated].sort() == ["a_0", "b_0", "c_0"].sort()
+        assert sorted(turn.agent for turn in turns if turn.terminated) == ["a_0", "b_0", "c_0"]
         assert len(turns) == len(order) + 3
     assert env.agents == []
 
 
 def test_agents_that_are_named_at_the_call_join_when_they_first_decide_and_stay():
+    def is_booked(agents):
+        assert sorted(env.agents) == sorted(agents)
+        books = (env.rewards, env.terminations, env.truncations, env.infos)
+        assert all(set(book) == set(agents) for book in books)
+
     order = "abacdda"
     decide = decision(lambda name: 0, agent=lambda name: name)
     env = aec_env(calling(*[lambda name=name: decide(name) for name in order]), decide)
     env.reset()
-    joined = []
-    for name in order:
-        joined += [name] if name not in joined else []
-        assert env.agents == joined
+    for number, name in enumerate(order):
+        assert env.agents == list(dict.fromkeys(order[: number + 1]))
+        is_booked(env.agents)
         assert env.agent_selection == name
-        books = (env.rewards, env.terminations, env.truncations, env.infos)
-        assert all(set(book) == set(joined) for book in books)
         env.step(1)
-    assert sorted(env.agents) == sorted(joined)
-    assert all(env.terminations.values())
-    gone = []
+    left = list("abcd")
+    is_booked(left)
     for agent in env.agent_iter():
-        gone.append(agent)
+        left.remove(agent)
         assert env.last()[2:4] == (True, False)
         env.step(None)
-        assert agent not in env.agents
-        books = (env.rewards, env.terminations, env.truncations, env.infos)
-        assert all(set(book) == set(env.agents) for book in books)
-    assert sorted(gone) == sorted(joined)
+        is_booked(left)
+    assert left == []
     env.reset()
     assert env.agents == ["a"]
 
@@ -67,15 +67,6 @@ def test_declared_agents_stand_in_agents_from_reset_on():
     assert env.num_agents == env.max_num_agents == 2
     play(env)
     assert env.possible_agents == ["b_0", "a_0"]
-
-
-def test_num_cycles_of_agent_iter_may_be_limited():
-    a = decision(agent="a_0")
-    env = aec_env(calling(*[a] * 5), a)
-    env.reset()
-    for _ in env.agent_iter(max_iter=2):
-        env.step(1)
-    assert env.unwrapped.simulation.log == [1, 1]
 
 
 # -- 5.3: observations ----------------------------------------------------------------------------
@@ -105,11 +96,9 @@ def test_num_cycles_of_agent_iter_may_be_limited():
 )
 def test_observations_are_cast_to_their_spaces_dtype(space, value, expected):
     decide = decision(observation_space=space, observation_space_mapping=lambda: value)
-    observations = [single_env(calling(decide), decide).reset()[0]]
     env = aec_env(calling(decide), decide)
     env.reset()
-    observations += [env.last()[0], env.observe("choose_0")]
-    for observation in observations:
+    for observation in (single_env(calling(decide), decide).reset()[0], env.last()[0], env.observe("choose_0")):
         assert type(observation) is type(expected)
         assert observation.dtype == expected.dtype
         assert observation.shape == expected.shape
@@ -117,23 +106,17 @@ def test_observations_are_cast_to_their_spaces_dtype(space, value, expected):
         assert observation in space
 
 
-def test_observations_of_composed_spaces():
-    space = spaces.Dict(
-        {
-            "level": spaces.Box(0, 10, (2,), np.float32),
-            "kind": spaces.Discrete(3),
-            "parts": spaces.Tuple((spaces.Discrete(2), spaces.Box(0, 1, (1,), np.float32))),
-            "name": spaces.Text(5),
-        }
-    )
-    value = {"name": "abc", "kind": 2, "level": [1, 2], "parts": [1, [0.5]]}
+def test_observations_of_composed_spaces_are_cast_part_by_part():
+    parts = spaces.Tuple((spaces.Discrete(2), spaces.Box(0, 1, (1,), np.float32)))
+    space = spaces.Dict({"level": spaces.Box(0, 10, (2,), np.float32), "parts": parts, "name": spaces.Text(5)})
+    value = {"name": "abc", "level": [1, 2], "parts": [1, [0.5]]}
     decide = decision(observation_space=space, observation_space_mapping=lambda: value)
     env = aec_env(calling(decide), decide)
     env.reset()
     observation = env.last()[0]
     assert observation in space
     assert observation["level"].tolist() == [1, 2]
-    assert type(observation["kind"]) is np.int64
+    assert type(observation["parts"][0]) is np.int64
     assert observation["parts"][1].tolist() == [0.5]
     assert observation["name"] == "abc"
 
@@ -176,10 +159,9 @@ BOX2 = spaces.Box(0, 1, (2,), np.float32)
 def test_observations_that_do_not_fit_are_errors(space, value):
     decide = decision(observation_space=space, observation_space_mapping=lambda: value)
     for make in (aec_env, single_env):
-        env = make(calling(decide), decide)
-        with pytest.raises(ObservationError) as caught:
-            env.reset()
-        assert isinstance(caught.value, ValueError)
+        with pytest.raises(ObservationError):
+            make(calling(decide), decide).reset()
+    assert issubclass(ObservationError, ValueError)
 
 
 def fill(observation: Any) -> None:
@@ -195,138 +177,113 @@ def fill(observation: Any) -> None:
         observation[...] = 0
 
 
-class Mutable:
-    """A model whose observation is its own array, one that it has just made, a view, or parts of these."""
-
-    def __init__(self, kind):
-        self.kind = kind
-        self.array = np.array([5, 6, 7, 8], np.float32)
-        self.parts = {"a": self.array, "b": (self.array, 3)}
-        self.listed = [self.array, 3]
-
-    def observe(self):
-        array = self.array
-        return {
-            "own": lambda: array,
-            "copy": lambda: array.copy(),
-            "computed": lambda: array + 0,
-            "view": lambda: array[:],
-            "reversed": lambda: array[::-1][::-1],
-            "cast": lambda: array.astype(np.float64),
-            "fromlist": lambda: array.tolist(),
-            "dict": lambda: self.parts,
-            "list": lambda: self.listed,
-        }[self.kind]()
-
-
-SPACES = {
-    "dict": spaces.Dict(
-        {
-            "a": spaces.Box(0, 10, (4,), np.float32),
-            "b": spaces.Tuple((spaces.Box(0, 10, (4,), np.float32), spaces.Discrete(9))),
-        }
-    ),
-    "list": spaces.Tuple((spaces.Box(0, 10, (4,), np.float32), spaces.Discrete(9))),
+ROW = spaces.Box(0, 10, (4,), np.float32)
+LISTED = spaces.Tuple((ROW, spaces.Discrete(9)))
+KINDS = {
+    "own": (ROW, lambda array, parts: array),
+    "copy": (ROW, lambda array, parts: array.copy()),
+    "computed": (ROW, lambda array, parts: array + 0),
+    "view": (ROW, lambda array, parts: array[:]),
+    "reversed": (ROW, lambda array, parts: array[::-1][::-1]),
+    "cast": (ROW, lambda array, parts: array.astype(np.float64)),
+    "list of numbers": (ROW, lambda array, parts: array.tolist()),
+    "dict": (spaces.Dict({"a": ROW, "b": LISTED}), lambda array, parts: parts),
+    "list": (LISTED, lambda array, parts: parts["b"]),
 }
+"""What a model may give: its own array, one that it has just made, a view, or parts of these."""
 
 
-def expected_observation(observation, level):
+def level_of(observation):
+    """The first number in each of its arrays, of which the others are never changed."""
     if isinstance(observation, dict):
-        return set(observation) == {"a", "b"} and all(expected_observation(o, level) for o in observation.values())
+        assert set(observation) == {"a", "b"}
+        assert level_of(observation["a"]) == level_of(observation["b"])
+        return level_of(observation["a"])
     if isinstance(observation, tuple):
-        return expected_observation(observation[0], level) and observation[1] == 3
-    return observation.tolist() == [level, 6, 7, 8]
+        assert observation[1] == 3
+        return level_of(observation[0])
+    assert observation.tolist()[1:] == [6, 7, 8]
+    return observation[0]
 
 
-@pytest.mark.parametrize("kind", ["own", "copy", "computed", "view", "reversed", "cast", "fromlist", "dict", "list"])
-@pytest.mark.parametrize("make", [aec_env, single_env])
-def test_observations_are_never_shared_between_calls_or_with_the_model(kind, make):
-    model = Mutable(kind)
-    decide = decision(
-        observation_space=SPACES.get(kind, spaces.Box(0, 10, (4,), np.float32)),
-        observation_space_mapping=lambda: model.observe(),
-    )
-    held = []
+@pytest.mark.parametrize("kind", KINDS)
+@VIEWS
+def test_observations_are_never_shared_between_calls_or_with_the_model(kind, view):
+    space, observe = KINDS[kind]
+    array = np.array([5, 6, 7, 8], np.float32)
+    parts = {"a": array, "b": [array, 3]}
+    decide = decision(observation_space=space, observation_space_mapping=lambda: observe(array, parts))
 
     def main(simulation):
         for level in (1, 2, 3):
-            model.array[0] = level
+            array[0] = level
             decide()
             # What the user did to its observation is nothing to the model.
-            assert model.array.tolist() == [level, 6, 7, 8]
-            assert len(model.parts) == 2
-            model.array[0] = 9  # and what the model does now is nothing to what the user holds
+            assert array.tolist() == [level, 6, 7, 8]
+            assert len(parts) == 2
+            array[0] = 9  # and what the model does now is nothing to what the user holds
 
-    env = make(script(main), decide)
-    first = env.reset()
+    env = view(script(main), decide)
+    result = env.reset()
+    held, kept = [], []
     for level in (1, 2, 3):
-        seen = [env.last()[0], env.observe("choose_0"), env.last()[0]] if make is aec_env else [first[0]]
+        seen = [env.last()[0], env.observe("choose_0"), env.last()[0]] if view is aec_env else [result[0]]
         for observation in seen:
-            assert expected_observation(observation, level)
-            held.append(observation)
-            if level != 2:
+            assert level_of(observation) == level
+            if level == 2:
+                kept.append(observation)
+            else:
                 fill(observation)
-        first = env.step(1)
-    kept = held[len(held) // 3 : 2 * len(held) // 3]
-    assert all(expected_observation(observation, 2) for observation in kept)
-    arrays = [observation for observation in held if isinstance(observation, np.ndarray)]
-    assert not any(np.shares_memory(one, model.array) for one in arrays)
-    assert not any(np.shares_memory(one, two) for one in arrays for two in arrays if one is not two)
+        held += [observation for observation in seen if isinstance(observation, np.ndarray)]
+        result = env.step(1)
+    assert [level_of(observation) for observation in kept] == [2] * len(kept)
+    assert not any(np.shares_memory(one, array) for one in held)
+    assert not any(np.shares_memory(one, two) for one in held for two in held if one is not two)
 
 
 class Holder:
-    """Holds an array once, in one of the places in which things are held."""
+    """Holds an array as an attribute."""
 
-    def __init__(self, place):
-        array = np.array([1.0, 2.0])
-        if place == "attribute":
-            self.array = array
-            self.observe = lambda: self.array
-        elif place == "list":
-            listed = [array]
-            self.observe = lambda: listed[0]
-        elif place == "closure":
-            self.observe = lambda: array
-        elif place == "default":
-            self.observe = partial(self._given, array)
-        elif place == "dict":
-            held = {"array": array}
-            self.observe = partial(held.get, "array")
-        elif place == "iterator":
-            self.observe = partial(next, repeat(array))
+    def __init__(self, array):
+        self.array = array
 
-    @staticmethod
-    def _given(array):
-        return array
+    def observe(self):
+        return self.array
 
 
-@pytest.mark.parametrize("place", ["attribute", "list", "closure", "default", "dict", "iterator"])
-def test_an_array_that_is_held_but_once_is_held(place):
-    observe = Holder(place).observe
+HOLDERS = {
+    "attribute": lambda array: Holder(array).observe,
+    "closure": lambda array: lambda: array,
+    "argument": lambda array: partial(lambda given: given, array),
+    "list": lambda array: partial([array].__getitem__, 0),
+    "dict": lambda array: partial({"array": array}.get, "array"),
+    "iterator": lambda array: partial(next, repeat(array)),
+}
+
+
+@pytest.mark.parametrize("place", HOLDERS)
+@VIEWS
+def test_an_array_that_is_held_but_once_is_held(place, view):
+    observe = HOLDERS[place](np.array([1.0, 2.0]))
     decide = decision(observation_space_mapping=observe)
-    for env in (single_env(calling(decide, decide), decide), aec_env(calling(decide, decide), decide)):
-        for observation in (env.reset() or env.last())[0], (env.step(1) or env.last())[0]:
-            observation[:] = 0
-        assert observe().tolist() == [1.0, 2.0]
+    env = view(calling(decide, decide), decide)
+    for observation in (env.reset() or env.last())[0], (env.step(1) or env.last())[0]:
+        observation[:] = 0
+    assert observe().tolist() == [1.0, 2.0]
 
 
-@pytest.mark.parametrize("make", [aec_env, single_env])
-def test_infos_are_never_shared_between_steps(make):
-    decide = decision(action_mask_mapping=lambda: MASK)
-    env = make(calling(*[decide] * 3), decide)
-    first = env.reset()
-    infos = [env.last()[4] if make is aec_env else first[1]]
-    for _ in range(2):
-        result = env.step(1)
-        infos.append(env.last()[4] if make is aec_env else result[4])
+@VIEWS
+def test_infos_are_never_shared_between_steps(view):
+    mask = np.ones(10, np.int8)
+    decide = decision(action_mask_mapping=lambda: mask)
+    env = view(calling(*[decide] * 3), decide)
+    infos = [(env.reset() or env.last())[-1]]
+    infos += [(env.step(1) or env.last())[-1] for _ in range(2)]
     assert len({id(info) for info in infos}) == 3
     for info in infos:
         info["action_mask"][:] = 0
         info.clear()
-    assert MASK.tolist() == [1] * 10
-
-
-MASK = np.ones(10, np.int8)
+    assert mask.tolist() == [1] * 10
 
 
 def test_an_observation_is_computed_when_its_decision_arises():
@@ -361,13 +318,13 @@ def test_an_observation_is_computed_when_its_decision_arises():
 
 
 def test_at_the_end_observation_and_reward_are_computed_from_the_last_arguments():
+    @define(
+        observation_space_mapping=lambda entity, size: [entity["level"], size],
+        reward_mapping=lambda entity, size: size,
+    )
     def decide(entity, *, size):
         return 0
 
-    decide = define(
-        observation_space_mapping=lambda entity, size: [entity["level"], size],
-        reward_mapping=lambda entity, size: size,
-    )(decide)
     entities = [{"level": 1}, {"level": 2}]
 
     def main(simulation):
@@ -394,6 +351,8 @@ def test_at_the_end_observation_and_reward_are_computed_from_the_last_arguments(
         (spaces.Discrete(3, start=-9), -7),
         (spaces.MultiBinary(2), [0, 0]),
         (spaces.MultiDiscrete([2, 3]), [0, 0]),
+        (spaces.Dict({"a": spaces.Box(1, 2, (1,)), "b": spaces.Tuple((spaces.Discrete(2, start=1),))}), None),
+        (spaces.Text(3), None),
     ],
     ids=str,
 )
@@ -404,21 +363,12 @@ def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_it
     for _ in range(2):
         env.reset()
         observation = env.observe("late_0")
-        assert observation.tolist() == expected
         assert observation in space
-        assert observation.dtype == space.dtype
+        if expected is not None:
+            assert observation.tolist() == expected
+            assert observation.dtype == space.dtype
         assert env.observe("late_0") is not observation or np.isscalar(observation)
         env.step(1)
-
-
-def test_before_its_first_decision_composed_and_strange_observations_are_in_their_space():
-    space = spaces.Dict(
-        {"a": spaces.Box(1, 2, (1,)), "b": spaces.Tuple((spaces.Discrete(2, start=1),)), "c": spaces.Text(3)}
-    )
-    other, late = decision(agent="other_0"), decision(agent="late_0", observation_space=space)
-    env = aec_env(calling(other), [other, late])
-    env.reset()
-    assert env.observe("late_0") in space
 
 
 class Foreseeing(Script):
@@ -434,15 +384,15 @@ class Foreseeing(Script):
 
 def test_before_its_first_decision_an_agents_observation_comes_from_expected_calls():
     level = [7]
+    observe = {"observation_space_mapping": lambda room: [level[0], room]}
 
+    @define(agent="early_0", **observe)
     def early(room):
         return 0
 
+    @define(agent="late_0", **observe)
     def late(room):
         return 0
-
-    observe = {"observation_space_mapping": lambda room: [level[0], room]}
-    early, late = define(agent="early_0", **observe)(early), define(agent="late_0", **observe)(late)
 
     def main(simulation):
         early(1)
@@ -503,88 +453,66 @@ class Ledger:
         self.balance = {"a": 0.0, "b": 0.0}
         self.asked = {"a": 0, "b": 0}
 
-    def point(self, name):
+    def point(self, name, rule=None):
         def pay():
             self.asked[name] += 1
             paid, self.balance[name] = self.balance[name], 0.0
             return paid
 
-        return decision(agent=f"{name}_0", reward_mapping=pay)
+        return decision(rule, agent=f"{name}_0", reward_mapping=pay)
+
+    def earn(self, a, b=0.0):
+        self.balance["a"] += a
+        self.balance["b"] += b
 
 
-def test_in_aec_each_action_is_rewarded_once():
+def test_in_aec_each_action_is_rewarded_once_and_the_book_adds_up_to_what_last_tells():
     ledger = Ledger()
     a, b = ledger.point("a"), ledger.point("b")
 
-    def earn(a_earns, b_earns):
-        ledger.balance["a"] += a_earns
-        ledger.balance["b"] += b_earns
-
     def main(simulation):
-        earn(0.5, 0.25)  # before a has done anything: discarded
+        ledger.earn(0.5, 0.25)  # before a has done anything: discarded
         a()
-        earn(1, 0.25)  # b has done nothing yet
+        ledger.earn(1, 0.25)  # b has done nothing yet
         b()
-        earn(2, 10)
+        ledger.earn(2, 10)
         a()
-        earn(4, 20)
+        ledger.earn(4, 20)
         a()
-        earn(8, 40)
+        ledger.earn(8, 40)
 
     env = aec_env(script(main), [a, b])
     for number in (1, 2):
         ledger.balance = {"a": 0.0, "b": 0.0}
-        turns = play(env, 1)
-        assert decisions(turns) == ["a_0", "b_0", "a_0", "a_0"]
-        assert rewards_of(turns, "a_0") == [3.0, 4.0, 8.0]
-        assert rewards_of(turns, "b_0") == [70.0]
-        assert [turn.reward for turn in turns[:2]] == [0.0, 0.0]
-        assert ledger.asked == {"a": 4 * number, "b": 2 * number}
-        assert all(type(turn.reward) is float for turn in turns)
-
-
-def test_the_book_of_rewards_adds_up_to_what_last_tells():
-    ledger = Ledger()
-    a, b = ledger.point("a"), ledger.point("b")
-
-    def main(simulation):
-        for number in range(6):
-            (a if number % 3 else b)()
-            ledger.balance["a"] += 2.0**number
-            ledger.balance["b"] += 100 * 2.0**number
-
-    env = aec_env(script(main), [a, b])
-    env.reset()
-    told, booked = {"a_0": 0.0, "b_0": 0.0}, {"a_0": 0.0, "b_0": 0.0}
-    for agent in env.agent_iter():
-        _, reward, terminated, *_ = env.last()
-        assert env.last()[1] == reward
-        told[agent] += reward
-        dying = env.terminations[agent]
-        env.step(None if terminated else 1)
-        if not dying:
-            for name, value in env.rewards.items():
+        told, booked = {"a_0": [], "b_0": []}, {"a_0": 0.0, "b_0": 0.0}
+        env.reset()
+        for agent in env.agent_iter():
+            _, reward, ended, *_ = env.last()
+            assert env.last()[1] == reward
+            assert type(reward) is float
+            told[agent].append(reward)
+            env.step(None if ended else 1)
+            for name, value in env.rewards.items() if not ended else ():
                 assert type(value) is float
                 booked[name] += value
-    assert told == booked
-    assert told["a_0"] == sum(2.0**n for n in range(1, 6))
-    assert told["b_0"] == sum(100 * 2.0**n for n in range(6))
+        assert told == {"a_0": [0.0, 3.0, 4.0, 8.0], "b_0": [0.0, 70.0]}
+        assert booked == {"a_0": 15.0, "b_0": 70.0}
+        assert ledger.asked == {"a": 4 * number, "b": 2 * number}
 
 
-def test_in_the_single_view_a_steps_reward_is_that_of_its_action():
+def test_in_the_single_view_a_steps_reward_is_that_of_its_action_or_of_the_rule():
     ledger = Ledger()
-    a = ledger.point("a")
+    a = ledger.point("a", lambda: 6)
 
     def main(simulation):
-        ledger.balance["a"] = 1000
+        ledger.earn(1000)
         for _ in range(3):
-            earned = a()
-            ledger.balance["a"] += earned
+            ledger.earn(a())
 
     env = single_env(script(main), a)
     for number in (1, 2):
         env.reset()
-        assert [env.step(action)[1] for action in (5, 6, 7)] == [5.0, 6.0, 7.0]
+        assert [env.step(action)[1] for action in (5, RULE, 7)] == [5.0, 6.0, 7.0]
         assert ledger.asked["a"] == 4 * number
 
 
@@ -592,16 +520,16 @@ def test_in_the_single_view_a_steps_reward_is_that_of_its_action():
 def test_agents_that_never_act_are_never_rewarded(expected):
     asked, level = [], [0]
 
+    @define(
+        agent="b_0",
+        observation_space_mapping=lambda room: [room, level[0]],
+        reward_mapping=lambda room: asked.append(1) or 1.0,
+    )
     def idle(room):
         return 0
 
     a = decision(lambda: level.__setitem__(0, level[0] + 1), agent="a_0")
-    b = define(
-        agent="b_0",
-        observation_space_mapping=lambda room: [room, level[0]],
-        reward_mapping=lambda room: asked.append(1) or 1.0,
-    )(idle)
-    env = aec_env(lambda: Foreseeing(lambda simulation: [a(), a()], expected), [a, b])
+    env = aec_env(lambda: Foreseeing(lambda simulation: [a(), a()], expected), [a, idle])
     turns = [turn for turn in play(env) if turn.agent == "b_0"]
     assert [(turn.reward, turn.terminated) for turn in turns] == [(0.0, True)]
     # At the end it is observed anew on the call that was to come.
@@ -609,111 +537,80 @@ def test_agents_that_never_act_are_never_rewarded(expected):
     assert not asked
 
 
-@pytest.mark.parametrize(
-    ("value", "expected"),
-    [
-        (1, 1.0),
-        (True, 1.0),
-        (np.float32(0.5), 0.5),
-        (np.float64(0.1), 0.1),
-        (np.int64(3), 3.0),
-        (np.array(2.5), 2.5),
-        (np.array([2.5]), 2.5),
-        (-0.0, 0.0),
-    ],
-    ids=repr,
-)
-def test_rewards_are_python_floats(value, expected):
-    decide = decision(reward_mapping=lambda: value, agent="a_0")
-    env = single_env(calling(decide), decide)
-    env.reset()
-    reward = env.step(1)[1]
-    assert type(reward) is float
-    assert reward == expected
-    turns = play(aec_env(calling(decide), decide))
-    assert [type(turn.reward) for turn in turns] == [float, float]
-    assert turns[-1].reward == expected
-
-
-@pytest.mark.parametrize(
-    "value",
-    [None, "much", "1.0", [1, 2], np.array([1.0, 2.0]), 1j, np.nan, np.inf, -np.inf, {}, 10**400],
-    ids=lambda value: str(value)[:9],
-)
-def test_rewards_that_are_no_finite_number_are_errors(value):
-    decide = decision(reward_mapping=lambda: value, agent="a_0")
-    for env in (aec_env(calling(decide), decide), single_env(calling(decide), decide)):
-        env.reset()
-        with pytest.raises(RewardError) as caught:
-            env.step(1)
-        assert isinstance(caught.value, ValueError)
-
-
 class Paid:
-    """Is paid what it has, at each of its decisions; a method, as most decisions are."""
+    """Is paid and observes what it has."""
 
     value: Any = 0.0
     observed: Any = (0.0, 0.0)
 
-    @define(
-        agent="paid_0",
-        reward_mapping=lambda self: self.value,
-        observation_space_mapping=lambda self: self.observed,
-    )
     def choose(self):
         return "rule"
 
 
-def paid(values, attribute="value"):
-    def main(simulation):
-        being = Paid()
-        for value in values:
-            being.choose()
-            setattr(being, attribute, value)
+@pytest.fixture(params=["method", "function"])
+def paid(request):
+    """A decision point, and what makes simulations in which it is called once for each of some values."""
+    point = define(
+        agent="paid_0",
+        reward_mapping=lambda being: being.value,
+        observation_space_mapping=lambda being: being.observed,
+    )
+    holder = type("Being", (Paid,), {"choose": point(Paid.choose)}) if request.param == "method" else Paid
+    choose = holder.choose if request.param == "method" else point(lambda being: "rule")
 
-    return script(main)
+    def of(values, attribute="value"):
+        def main(simulation):
+            being = holder()
+            for value in values:
+                choose(being)
+                setattr(being, attribute, value)
+
+        return script(main)
+
+    return choose, of
 
 
-VALUES = [2, np.float32(0.5), True, np.array([2.5]), np.array(1.5), -3.25, np.int8(4)]
-
-
-def test_rewards_of_methods_are_python_floats_at_every_step():
-    env = single_env(paid(VALUES), Paid.choose)
+def test_rewards_are_python_floats_at_every_step(paid):
+    choose, of = paid
+    values = [2, True, -0.0, np.float32(0.5), np.float64(0.1), np.int8(4), np.array(1.5), np.array([2.5])]
+    env = single_env(of(values), choose)
     env.reset()
-    rewards = [env.step(1)[1] for _ in VALUES]
-    assert rewards == [2.0, 0.5, 1.0, 2.5, 1.5, -3.25, 4.0]
+    rewards = [env.step(1)[1] for _ in values]
+    assert rewards == [2.0, 1.0, 0.0, 0.5, 0.1, 4.0, 1.5, 2.5]
     assert {type(reward) for reward in rewards} == {float}
-    turns = play(aec_env(paid(VALUES), Paid.choose), 1)
+    turns = play(aec_env(of(values), choose), 1)
     assert rewards_of(turns, "paid_0") == rewards
     assert {type(turn.reward) for turn in turns} == {float}
 
 
-@pytest.mark.parametrize("value", [None, "1.0", np.nan, np.inf, [1.0, 2.0]], ids=str)
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_rewards_of_methods_that_are_no_finite_number_are_errors_at_every_step(value, number):
-    values = [1.0] * 3
-    values[number - 1] = value
-    for make in (aec_env, single_env):
-        env = make(paid(values), Paid.choose)
-        env.reset()
-        for _ in range(number - 1):
-            env.step(1)
-        with pytest.raises(RewardError):
-            env.step(1)
+NO_REWARDS = [None, "much", "1.0", [1, 2], np.array([1.0, 2.0]), 1j, np.nan, np.inf, -np.inf, {}, 10**400]
+NO_OBSERVATIONS = [None, "1.0", [1.0], [[1.0, 2.0]]]
 
 
-@pytest.mark.parametrize("value", [None, "1.0", [1.0], [[1.0, 2.0]]], ids=str)
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_observations_of_methods_that_do_not_fit_are_errors_at_every_step(value, number):
-    values = [[1.0, 2.0]] * 3
-    values[number - 1] = value
-    for make in (aec_env, single_env):
-        env = make(paid(values, "observed"), Paid.choose)
-        env.reset()
-        for _ in range(number - 1):
-            env.step(1)
-        with pytest.raises(ObservationError, match="its space Box"):
-            env.step(1)
+@pytest.mark.parametrize(
+    ("attribute", "legal", "illegal", "error", "said"),
+    [
+        ("value", 1.0, NO_REWARDS, RewardError, "reward"),
+        ("observed", [1.0, 2.0], NO_OBSERVATIONS, ObservationError, "its space Box"),
+    ],
+    ids=["rewards", "observations"],
+)
+def test_what_is_no_finite_number_or_does_not_fit_is_an_error_at_every_step(
+    paid, attribute, legal, illegal, error, said, number
+):
+    choose, of = paid
+    for value in illegal:
+        values = [legal] * 3
+        values[number - 1] = value
+        for view in (aec_env, single_env):
+            env = view(of(values, attribute), choose)
+            env.reset()
+            for _ in range(number - 1):
+                env.step(1)
+            with pytest.raises(error, match=said) as caught:
+                env.step(1)
+            assert isinstance(caught.value, ValueError)
 
 
 def test_the_first_reward_of_an_episode_is_discarded_whatever_it_is():
@@ -753,17 +650,12 @@ class Walk:
         return self.trace
 
 
-class Walking(Script):
-    def __init__(self):
-        super().__init__(lambda simulation: simulation.log.extend(Walk(simulation.seed).walk()))
-
-
 @pytest.mark.parametrize(
     "points", [[Walk.stride, Walk.turns], [Walk.stride], [Walk.turns]], ids=["both", "one", "other"]
 )
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_with_rule_throughout_a_run_is_the_plain_one_bit_for_bit(points, seed):
-    env = aec_env(Walking, points)
+    env = aec_env(script(lambda simulation: simulation.log.extend(Walk(simulation.seed).walk())), points)
     for _ in range(2):
         turns = play(env, RULE, seed=seed)
         assert len(turns) > 20
@@ -803,22 +695,6 @@ def test_rule_is_an_action_whatever_the_space(space):
         assert env.unwrapped.simulation.log == ["rule"]
 
 
-def test_rule_is_rewarded_and_observed_like_an_action():
-    level = [0]
-
-    def rule():
-        level[0] += 1
-        return level[0]
-
-    decide = decision(rule, reward_mapping=lambda: level[0], observation_space_mapping=lambda: [level[0], 0])
-    env = single_env(calling(decide, decide), decide)
-    env.reset()
-    observation, reward, terminated, *_ = env.step(RULE)
-    assert (observation.tolist(), reward, terminated) == ([1.0, 0.0], 1.0, False)
-    observation, reward, terminated, *_ = env.step(5)
-    assert (observation.tolist(), reward, terminated) == ([1.0, 0.0], 1.0, True)
-
-
 # -- 5.6: entities --------------------------------------------------------------------------------
 
 
@@ -834,19 +710,16 @@ class Sheep:
         return 1
 
 
-Sheep.choose = define(
-    agent=lambda self, meadow: f"sheep_{self.number}",
-    observation_space_mapping=lambda self, meadow: [self.number, self.eaten],
-    reward_mapping=lambda self, meadow: self.eaten,
-    choices=lambda self, meadow: [1, 2, 3],
-)(Sheep.choose)
-Sheep.choose_freely = define(
-    agent=lambda self: f"sheep_{self.number}",
-    observation_space_mapping=lambda self: [self.number, self.eaten],
-    reward_mapping=lambda self: self.eaten,
-)(Sheep.choose_freely)
+GRAZING = {
+    "agent": lambda sheep, *_: f"sheep_{sheep.number}",
+    "observation_space_mapping": lambda sheep, *_: [sheep.number, sheep.eaten],
+    "reward_mapping": lambda sheep, *_: sheep.eaten,
+}
+Sheep.choose = define(**GRAZING, choices=lambda sheep, meadow: [1, 2, 3])(Sheep.choose)
+Sheep.choose_freely = define(**GRAZING)(Sheep.choose_freely)
 
 
+@pytest.mark.usefixtures("_collected")
 @pytest.mark.parametrize("point", [Sheep.choose, Sheep.choose_freely])
 @pytest.mark.parametrize("actions", [RULE, 0, 1])
 def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(point, actions):
@@ -865,15 +738,9 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(point, 
                 sheep.eaten += point(sheep, *arguments)
                 del sheep
 
-    gc.collect()
-    gc.disable()
-    try:
-        env = aec_env(script(main), point)
-        turns = play(env, actions)
-    finally:
-        gc.enable()
-    gone = env.unwrapped.simulation.log
-    assert gone == [[True, False, False], [True, True, False], [True, True, True]]
+    env = aec_env(script(main), point)
+    turns = play(env, actions)
+    assert env.unwrapped.simulation.log == [[True, False, False], [True, True, False], [True, True, True]]
     assert decisions(turns) == [f"sheep_{number}" for number in (0, 1, 2, 1, 2, 2)]
     # Nothing is known any more of those who are gone: their last observation stays, and earns nothing.
     assert sorted(turn.agent for turn in turns if turn.terminated) == ["sheep_0", "sheep_1", "sheep_2"]
@@ -891,41 +758,31 @@ class Goat:
         return self.meadow[0]
 
 
-def browsing(agent):
-    return {Goat.browse: define(agent=agent, action_space=spaces.Discrete(2), choices=lambda goat: list(goat.meadow))}
-
-
-def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
+@pytest.mark.parametrize(
+    ("view", "agent", "action", "gone"),
+    [
+        (single_env, "goat_0", RULE, [True, False]),
+        (single_env, "goat_0", 0, [True, False]),
+        (aec_env, "goat_0", 1, [False, True]),
+        (aec_env, lambda goat: "goat_0", 1, [False, True]),
+    ],
+    ids=["rule", "first", "second", "of an entity"],
+)
+def test_a_choice_that_the_model_lets_go_goes_at_once(view, agent, action, gone):
     def main(simulation):
         goat = Goat()
         watched = [weakref.ref(grass) for grass in goat.meadow]
         goat.meadow.remove(goat.browse())
-        other()
-        simulation.log.append([watch() is None for watch in watched])
-        other()
+        simulation.log += [watch() is None for watch in watched]
 
-    other = decision(agent="other_0")
-    env = aec_env(script(main), browsing(lambda goat: "goat_0") | {other: define(agent="other_0")})
+    choices = {"choices": lambda goat: list(goat.meadow), "action_space": spaces.Discrete(2)}
+    env = view(script(main), {Goat.browse: define(agent=agent, **choices)})
     env.reset()
-    env.step(1)
-    env.step(0)
-    assert env.unwrapped.simulation.log == [[False, True]]
+    env.step(action)
+    assert env.unwrapped.simulation.log == gone
 
 
-def test_a_choice_that_the_model_lets_go_at_once_goes_at_once():
-    def main(simulation):
-        goat = Goat()
-        watched = [weakref.ref(grass) for grass in goat.meadow]
-        goat.meadow.remove(goat.browse())
-        simulation.log.append([watch() is None for watch in watched])
-
-    for action, gone in ((RULE, [True, False]), (0, [True, False]), (1, [False, True])):
-        env = single_env(script(main), browsing("goat_0"))
-        env.reset()
-        env.step(action)
-        assert env.unwrapped.simulation.log == [gone]
-
-
+@pytest.mark.usefixtures("_collected")
 @pytest.mark.parametrize("policy", [None, RULE, lambda observation: 1], ids=["nobody", "rule", "policy"])
 @pytest.mark.parametrize("actions", [RULE, 1])
 def test_nor_any_entity_that_is_no_agent_or_a_policys(policy, actions):
@@ -944,14 +801,8 @@ def test_nor_any_entity_that_is_no_agent_or_a_policys(policy, actions):
             lambs.pop(0).choose()
             simulation.log.append([watch() is None for watch in watched])
 
-    gc.collect()
-    gc.disable()
-    try:
-        env = aec_env(script(main), Lamb.choose, policies=policy and {"lamb_2": policy})
-        turns = play(env, actions)
-    finally:
-        gc.enable()
-    assert decisions(turns) == ["lamb_1", "lamb_1"]
+    env = aec_env(script(main), Lamb.choose, policies=policy and {"lamb_2": policy})
+    assert decisions(play(env, actions)) == ["lamb_1", "lamb_1"]
     assert env.unwrapped.simulation.log == [[True, False, False], [True, True, False], [True, True, True]]
 
 
@@ -967,39 +818,6 @@ def test_entities_that_live_are_rewarded_and_observed_at_the_end():
     turns = play(env, 5)
     ended = {turn.agent: (turn.observation.tolist(), turn.reward) for turn in turns if turn.terminated}
     assert ended == {"sheep_0": ([0, 50], 50.0), "sheep_1": ([1, 0], 0.0), "sheep_2": ([2, 5], 5.0)}
-
-
-def test_weak_sets_of_a_model_behave_as_in_the_plain_run():
-    class Cell:
-        def __init__(self, number, cells):
-            self.number = number
-            cells.add(self)
-
-        @define(agent=lambda self: f"cell_{self.number}")
-        def age(self):
-            return 1
-
-    def main(simulation):
-        cells: Any = weakref.WeakSet()
-        held = [Cell(number, cells) for number in range(5)]
-        for _ in range(6):
-            for cell in sorted(cells, key=lambda cell: cell.number):
-                simulation.log.append((cell.number, cell.age()))
-            cell = None
-            if held:
-                held.pop(0)
-            simulation.log.append(sorted(cell.number for cell in cells))
-
-    plain, env = Script(main), aec_env(script(main), Cell.age)
-    plain.reset()
-    gc.collect()
-    gc.disable()
-    try:
-        plain.run()
-        play(env, RULE)
-    finally:
-        gc.enable()
-    assert env.unwrapped.simulation.log == plain.log
 
 
 def test_entities_that_cannot_be_held_weakly_are_entities_too():
@@ -1034,27 +852,28 @@ def test_entities_that_cannot_be_held_weakly_are_entities_too():
     ],
     ids=str,
 )
-@pytest.mark.parametrize("make", [aec_env, single_env])
-def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(make, space, illegal):
+@VIEWS
+def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(view, space, illegal):
     moved = []
     decide = decision(
         action_space=space, agent="a_0", action_space_mapping=lambda action: moved.append(action) or ("done", action)
     )
-    env = make(calling(decide, decide), decide)
+    env = view(calling(decide, decide), decide)
     env.reset(seed=3)
+    actions = env.action_space("a_0") if view is aec_env else env.action_space
     for step in (0, 1):
         for action in illegal:
-            before = env.last() if make is aec_env else None
+            before = env.last() if view is aec_env else None
             with pytest.raises(InvalidActionError, match="a_0") as caught:
                 env.step(action)
             assert isinstance(caught.value, ValueError)
             assert len(moved) == len(env.unwrapped.simulation.log) == step
-            if make is aec_env:
+            if view is aec_env:
                 assert env.agent_selection == "a_0"
                 after = env.last()
                 assert after[1:] == before[1:]
                 assert np.array_equal(after[0], before[0])
-        env.step(env.action_space("a_0").sample() if make is aec_env else env.action_space.sample())
+        env.step(actions.sample())
     assert [done for done, _ in env.unwrapped.simulation.log] == ["done", "done"]
 
 
@@ -1084,9 +903,8 @@ def test_legal_actions_come_in_many_shapes(space, legal):
         env = single_env(calling(decide), decide)
         env.reset()
         env.step(action)
-        assert np.array_equal(
-            np.asarray(env.unwrapped.simulation.log[0]), np.asarray(action).astype(space.dtype or object)
-        )
+        expected = np.asarray(action).astype(space.dtype or object)
+        assert np.array_equal(np.asarray(env.unwrapped.simulation.log[0]), expected)
 
 
 def test_sampled_actions_are_legal():
@@ -1121,21 +939,17 @@ def test_a_scalar_for_a_one_element_box_reaches_the_mapping_as_it_is(action):
     assert all(got is action for got in seen)
 
 
-def test_arrays_for_a_box_reach_the_mapping_in_its_dtype_and_are_not_shared():
+def test_arrays_reach_the_mapping_in_the_spaces_dtype_unshared_and_discrete_actions_as_python_integers():
     decide = decision(action_space=spaces.Box(0, 1, (2,), np.float32))
     env = single_env(calling(decide, decide), decide)
     env.reset()
     action = np.array([0.5, 0.25], np.float32)
     env.step(action)
     action[:] = 1
-    received = env.unwrapped.simulation.log[0]
-    assert received.tolist() == [0.5, 0.25]
-    assert received.dtype == np.float32
     env.step([0.5, 0.25])
-    assert env.unwrapped.simulation.log[1].dtype == np.float32
-
-
-def test_discrete_actions_reach_the_mapping_as_python_integers():
+    for received in env.unwrapped.simulation.log:
+        assert received.tolist() == [0.5, 0.25]
+        assert received.dtype == np.float32
     decide = decision()
     env = single_env(calling(*[decide] * 3), decide)
     env.reset()

@@ -27,7 +27,8 @@ from simenv_marl.errors import (
     OptionValueError,
     ViewError,
 )
-from tests.worlds.many_worlds import Being, beings
+from tests.worlds.lives import life
+from tests.worlds.many_worlds import beings
 from tests.worlds.models import calling, decision, define, play
 
 EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
@@ -131,10 +132,7 @@ def test_gymnasiums_check_of_goals_passes():
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"goal_space": None}, "goal_space"),
-        ({"achieved_goal_mapping": None}, "achieved_goal_mapping"),
-        ({"desired_goal_mapping": None}, "desired_goal_mapping"),
-        ({"compute_reward": None}, "compute_reward"),
+        *(({part: None}, part) for part in GOAL if "goal" in part or part == "compute_reward"),
         ({"goal_space": (2,)}, "must be a gymnasium space"),
         ({"compute_reward": 3}, "compute_reward must be callable"),
     ],
@@ -161,7 +159,6 @@ def test_other_views_observe_no_goals(make):
 
 @pytest.mark.parametrize("seen", [True, False])
 def test_masks_stay_where_they_belong_beside_goals(seen):
-    space = spaces.Dict({"place": spaces.Box(-20, 20, (2,), np.float32), "action_mask": spaces.MultiBinary(3)})
     changes = {
         "action_space": spaces.Discrete(3),
         "action_space_mapping": lambda action: np.array([action - 1.0, 0]),
@@ -169,7 +166,7 @@ def test_masks_stay_where_they_belong_beside_goals(seen):
     }
     if seen:
         changes |= {
-            "observation_space": space,
+            "observation_space": spaces.Dict(place=GOAL["goal_space"], action_mask=spaces.MultiBinary(3)),
             "observation_space_mapping": lambda walker, pace: {"place": walker.place},
         }
     env = single_env(Walk, goals(**changes))
@@ -180,8 +177,7 @@ def test_masks_stay_where_they_belong_beside_goals(seen):
         assert observation["observation"]["action_mask"].tolist() == [1, 0, 1]
     with pytest.raises(InvalidActionError, match="is masked"):
         env.step(1)
-    observation, *_ = env.step(2)
-    assert observation["achieved_goal"].tolist() == [1, 0]
+    assert env.step(2)[0]["achieved_goal"].tolist() == [1, 0]
 
 
 # -- masks ----------------------------------------------------------------------------------------
@@ -197,10 +193,9 @@ def test_masks_on_request_pass_through_wrappers():
         masks()
     env.reset()
     assert masks().dtype == np.bool_
-    assert masks().tolist() == [True, False]
-    env.step(0)
-    assert masks().tolist() == [False, True]
-    env.step(1)
+    for action, expected in ((0, [True, False]), (1, [False, True])):
+        assert masks().tolist() == expected
+        env.step(action)
     assert masks().tolist() == [True, True]
 
 
@@ -270,42 +265,17 @@ def test_masked_actions_are_illegal_in_every_view(make, changes, mask, illegal, 
 
 
 def test_a_mask_that_the_model_itself_observes_is_no_mask_of_its_decisions():
-    seen = {"observation_space": spaces.Dict({"action_mask": spaces.MultiBinary(2)})}
     ant = decision(
         agent="ant_0",
         action_space=spaces.Discrete(2),
+        observation_space=spaces.Dict({"action_mask": spaces.MultiBinary(2)}),
         observation_space_mapping=lambda: {"action_mask": [0, 1]},
-        **seen,
     )
     env = single_env(calling(ant), ant)
     observation, info = env.reset()
     assert observation["action_mask"].tolist() == [0, 1]
     assert info == {}
     env.step(0)
-
-
-def announcing(main):
-    class Announcing:
-        def reset(self, seed=None):
-            self.beings, self.log, self.clock = [Being(number) for number in range(3)], [], 0
-
-        def run(self):
-            return main(self)
-
-        def expected_calls(self, point):
-            return [(being,) for being in self.beings]
-
-        def time(self):
-            return self.clock
-
-    return Announcing
-
-
-def one_after_the_other(simulation):
-    for number, being in enumerate(simulation.beings * 2):
-        simulation.clock = number * number
-        simulation.log.append(being.act())
-    simulation.clock = 100
 
 
 # -- time -----------------------------------------------------------------------------------------
@@ -362,17 +332,8 @@ def test_the_time_of_views_of_one_agent_is_that_of_its_steps(make):
 
 
 def test_the_time_of_the_dead():
-    def main(simulation):
-        one, two, _ = simulation.beings
-        one.act()
-        simulation.clock = 3
-        two.act()
-        simulation.clock = 5
-        one.leave()
-        simulation.clock = 8
-        two.act()
-
-    turns = play(aec_env(announcing(main), beings()), 1)
+    program = "0 acts, 3 o'clock, 1 acts, 5 o'clock, 0 leaves, 8 o'clock, 1 acts"
+    turns = play(aec_env(life(program, announced=[0, 1, 2], timed=True), beings()), 1)
     ends = {turn.agent: turn.info for turn in turns if turn.terminated}
     assert ends["being_0"] == {"time": 5.0, "elapsed": 5.0}
     assert times(turns, "being_1") == [(3, 0), (8, 5), (8, 0)]
@@ -381,28 +342,23 @@ def test_the_time_of_the_dead():
 def test_the_time_of_rounds_that_are_turns():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
-    _, infos = env.reset()
+    *_, infos = env.reset()
     assert (infos["ant_0"]["time"], infos["ant_0"]["elapsed"]) == (0, 0)
-    told = []
-    while env.agents:
-        agent = next(agent for agent in env.agents if infos[agent]["deciding"])
+    for agent, time, *elapsed in (("ant_0", 2, 2, 0), ("bee_0", 3, 3, 1), ("ant_0", 7, 4, 5), ("bee_0", 11, 8, 4)):
+        assert infos[agent]["deciding"]
         *_, infos = env.step({agent: 1})
-        told.append({name: (info.get("time"), info.get("elapsed")) for name, info in infos.items()})
-    assert told == [
-        {"ant_0": (2, 2), "bee_0": (2, 0)},
-        {"ant_0": (3, 3), "bee_0": (3, 1)},
-        {"ant_0": (7, 4), "bee_0": (7, 5)},
-        {"ant_0": (11, 8), "bee_0": (11, 4)},
-    ]
+        assert [info["time"] for info in infos.values()] == [time, time]
+        assert [infos[name]["elapsed"] for name in ("ant_0", "bee_0")] == elapsed
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_announced_agents_have_masks_and_times(make):
-    env = make(announcing(one_after_the_other), beings(action_mask_mapping=lambda being: [1] * 4 + [0] * 6))
+    program = "0 acts, 1 o'clock, 1 acts, 4 o'clock, 2 acts, 9 o'clock, 0 acts, 100 o'clock"
+    mask = [1] * 4 + [0] * 6
+    env = make(life(program, announced=[0, 1, 2], timed=True), beings(action_mask_mapping=lambda being: mask))
     result = env.reset()
     infos = env.infos if make is aec_env else result[1]
-    for number in range(3):
-        assert infos[f"being_{number}"]["action_mask"].tolist() == [1] * 4 + [0] * 6
+    assert [info["action_mask"].tolist() for info in infos.values()] == [mask] * 3
     assert {(info["time"], info["elapsed"]) for info in infos.values()} == {(0.0, 0.0)}
     if make is parallel_env:
         *_, infos = env.step(dict.fromkeys(env.agents, 1))
@@ -459,16 +415,15 @@ class Counted:
 def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
     ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
     env = make(lambda: Counted(ant), ant)
+    assert env.state_space is None
     env.reset()
     state = env.state()
-    assert state.tolist() == [0, 0]
     env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
     assert state.tolist() == [0, 0]
-    assert env.state().tolist() == [1, 4]
     state = env.state()
+    assert state.tolist() == [1, 4]
     state[:] = 9
     assert env.simulation.numbers.tolist() == [1, 4]
-    assert env.state_space is None
     env = make(lambda: Counted(ant), ant, state_space=space)
     assert env.state_space == space
     env.reset()
@@ -477,24 +432,24 @@ def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
 
 
 def test_states_that_cannot_be_are_refused():
-    ant, being = decision(agent="ant_0"), announcing(one_after_the_other)
-    env = parallel_env(lambda: Counted(ant), ant, state_space=spaces.Box(-9, 9, (3,), np.float32))
-    env.reset()
-    with pytest.raises(ObservationError, match="the observation has shape"):
-        env.state()
+    ant = decision(agent="ant_0")
+    for make, options, error, match in (
+        (lambda: Counted(ant), {"state_space": spaces.Box(-9, 9, (3,))}, ObservationError, "the observation has shape"),
+        (calling(ant), {}, NotImplementedError, None),
+    ):
+        env = parallel_env(make, ant, **options)
+        env.reset()
+        with pytest.raises(error, match=match):
+            env.state()
     for space in (3, "rewards"):
         with pytest.raises(OptionValueError, match="must be a gymnasium space"):
             aec_env(lambda: Counted(ant), ant, state_space=space)
-    env = parallel_env(calling(ant), ant)
-    env.reset()
-    with pytest.raises(NotImplementedError):
-        env.state()
     for space in (spaces.Sequence(spaces.Discrete(3)), spaces.Graph(spaces.Discrete(3), None)):
         ant = decision(agent="ant_0", observation_space=space)
         with pytest.raises(ViewError, match="flattened"):
             _ = aec_env(calling(ant), ant, state_space="observations").state_space
     with pytest.raises(ViewError, match="possible_agents"):
-        parallel_env(being, beings(), state_space="observations")
+        parallel_env(life("0 acts", announced=[0]), beings(), state_space="observations")
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
@@ -529,12 +484,10 @@ class Painted(Counted):
     """A simulation that can be rendered."""
 
     def render(self, mode):
+        text = f"now {self.numbers[1]}"
         if mode == "rgb_array":
             return np.full((4, 6, 3), self.numbers[1], np.uint8)
-        if mode == "human":
-            print(f"now {self.numbers[1]}")
-            return None
-        return f"now {self.numbers[1]}"
+        return print(text) if mode == "human" else text
 
 
 def painted(make=aec_env, **options):
@@ -554,39 +507,22 @@ def test_the_simulation_renders_in_its_modes(make, capsys):
     assert env.render() == "now 4"
     env = painted(make, render_mode="rgb_array")
     env.reset()
-    picture = env.render()
-    assert picture.shape == (4, 6, 3)
-    assert picture.dtype == np.uint8
-    env.close()
+    assert env.render().shape == (4, 6, 3)
+    assert env.render().dtype == np.uint8
     env = painted(make, render_mode="human")
-    env.reset()
-    assert capsys.readouterr().out == "now 0\n"
-    env.step(step)
-    assert capsys.readouterr().out == "now 4\n"
+    for act, text in ((env.reset, "now 0\n"), (lambda: env.step(step), "now 4\n"), (env.render, "now 4\n")):
+        act()
+        assert capsys.readouterr().out == text
     assert env.render() is None
-    assert capsys.readouterr().out == "now 4\n"
-    with pytest.raises(OptionValueError, match="is not one of the simulation's"):
-        painted(make, render_mode="video")
     ant = decision(agent="ant_0")
-    with pytest.raises(OptionValueError, match="is not one of the simulation's"):
-        make(lambda: Counted(ant), ant, render_mode="ansi")
+    for simulation, mode in ((Painted, "video"), (Counted, "ansi")):
+        with pytest.warns(UserWarning, match="is not one of the simulation's"):
+            env = make(lambda simulation=simulation: simulation(ant), ant, render_mode=mode)
+        assert env.render_mode is None
     env = painted(make)
     env.reset()
     with pytest.warns(UserWarning, match="render_mode"):
         assert env.render() is None
-
-
-def test_decision_functions_called_while_rendering_run_their_rule():
-    ant = decision(agent="ant_0")
-
-    class Curious(Painted):
-        def render(self, mode):
-            return ant()
-
-    env = aec_env(lambda: Curious(lambda: ant() and 1), ant, render_mode="ansi")
-    env.reset()
-    assert env.render() == "rule"
-    assert env.agent_selection == "ant_0"
 
 
 @pytest.mark.parametrize("make", [single_env, joint_env])

@@ -2,6 +2,7 @@
 
 import re
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from simenv_marl.errors import (
     UnknownOptionError,
     ViewError,
 )
+from tests.worlds.lives import life
 from tests.worlds.many_worlds import ROSTER, Announcing, Answered, Being, Colony, answer, beings, colony, designs, seeds
 from tests.worlds.models import calling, decision
 
@@ -70,39 +72,48 @@ def test_a_step_is_a_round(max_steps):
             env.step({"ant_0": 3, "bee_0": 4})
 
 
+BOTH = "ant_0, bee_0; given: "
+
+
 @pytest.mark.parametrize(
-    ("action", "match"),
+    ("flatten", "action", "match"),
     [
-        ({"ant_0": 1}, "ant_0, bee_0; given: ['ant_0']"),
-        ({"bee_0": 1}, "ant_0, bee_0; given: ['bee_0']"),
-        ({}, "given: []"),
-        ({"ant_0": 1, "bee_0": 1, "cat_0": 1}, "cat_0"),
-        ({"ant_0": 1, "cat_0": 1}, "cat_0"),
-        ({"ant_0": 1, 2: 1}, "2"),
-        ({"ant_0": 10, "bee_0": 1}, "ant_0"),
-        ({"ant_0": 1, "bee_0": 10}, "bee_0"),
-        ({"ant_0": 1, "bee_0": None}, "bee_0"),
-        (None, "given: None"),
-        (3, "given: 3"),
-        ([1, 1], "given: [1, 1]"),
-        ((1, 1), "given: (1, 1)"),
-        (np.array([1, 1]), "given: array([1, 1])"),
-        ("ant_0", "given: 'ant_0'"),
+        *((False, given, f"{BOTH}{list(given)}") for given in ({"ant_0": 0.5}, {"bee_0": 0.5}, {})),
+        (False, {"ant_0": 0.5, "bee_0": 0.5, "cat_0": 0.5}, "cat_0"),
+        (False, {"ant_0": 0.5, "cat_0": 0.5}, "cat_0"),
+        (False, {"ant_0": 0.5, 2: 0.5}, "2"),
+        (False, {"ant_0": 10, "bee_0": 0.5}, "ant_0"),
+        (False, {"ant_0": 0.5, "bee_0": 10}, "bee_0"),
+        (False, {"ant_0": 0.5, "bee_0": None}, "bee_0"),
+        *((False, given, f"given: {given!r}") for given in (None, 3, [1, 1], np.array([1, 1]), "ant_0")),
+        *(
+            (True, given, "action")
+            for given in (
+                *(np.array(row, np.float32) for row in ([0.5], [0.5] * 3, [[0.5, 0.5]], [0.5, 1.5], [0.5, np.nan])),
+                np.array([-0.5, 0.5]),
+                None,
+                0.5,
+                {"ant_0": [0.5], "bee_0": [0.5]},
+            )
+        ),
     ],
     ids=repr,
 )
-def test_actions_that_are_refused_move_nothing(action, match):
-    paid = []
-    ant, bee = points(reward_mapping=lambda: paid.append(0) or 1.0)
-    env = joint_env(calling(ant, bee), [ant, bee])
+def test_actions_that_are_refused_move_nothing(flatten, action, match):
+    paid, seen = [], []
+    changes = BOX | {"action_space_mapping": lambda action: seen.append(action) or float(action[0])}
+    ant, bee = points(reward_mapping=lambda: paid.append(0) or 1.0, **changes)
+    env = joint_env(calling(ant, bee), [ant, bee], flatten=flatten)
     env.reset()
     del paid[:]
     with pytest.raises(InvalidActionError, match=re.escape(match)):
         env.step(action)
-    assert env.simulation.log == []
-    assert paid == []
-    assert env.step({"ant_0": 1, "bee_0": 2})[2]
-    assert env.simulation.log == [1, 2]
+    assert env.simulation.log == seen == paid == []
+    action = np.array([0.25, 0.5])
+    assert env.step(action if flatten else {"ant_0": action[:1], "bee_0": action[1:]})[2]
+    action[:] = 0  # the user's own
+    assert env.simulation.log == [0.25, 0.5]
+    assert [part.tolist() for part in seen] == [[0.25], [0.5]]
 
 
 @pytest.mark.parametrize("flatten", [False, True])
@@ -122,16 +133,13 @@ def test_masks_and_choices_are_those_of_the_pending_decision():
     bee = decision(agent="bee_0", choices=lambda: ["x", "y"], action_space=spaces.Discrete(3))
     cat = decision(agent="cat_0")
     env = joint_env(calling(ant, bee, cat, ant, bee), [ant, bee, cat])
-    _, info = env.reset()
-    assert info["action_mask"]["ant_0"].tolist() == [1] * 3 + [0] * 7
-    assert info["action_mask"]["ant_0"].dtype == np.int8
-    with pytest.raises(InvalidActionError, match="mask"):
-        env.step({"ant_0": 3, "bee_0": 0, "cat_0": 0})
-    assert env.simulation.log == []
+    env.reset()
     *_, info = env.step({"ant_0": 2, "bee_0": 1, "cat_0": 0})
     assert env.simulation.log == [2, "y", 0]
-    assert info["action_mask"]["bee_0"].tolist() == [1, 1, 0]
-    assert "cat_0" not in info["action_mask"]
+    assert {agent: mask.tolist() for agent, mask in info["action_mask"].items()} == {
+        "ant_0": [1] * 3 + [0] * 7,
+        "bee_0": [1, 1, 0],
+    }
     *_, info = env.step({"ant_0": 2, "bee_0": 2, "cat_0": 0})
     assert env.simulation.log == [2, "y", 0, 2]
     assert info["deciding"] == "bee_0"
@@ -182,21 +190,15 @@ def test_the_roster_is_declared_or_asked_of_the_simulation(pack, options, names)
 
 @pytest.mark.parametrize("undeclared", ["error", "rule"])
 def test_agents_that_join_after_all_are_refused_or_follow_their_rule(undeclared):
-    class Growing(AnnouncingPack):
-        def run(self):
-            super().run()
-            self.log.append(Being(9).act())
-
-    env = joint_env(Growing, beings(), undeclared=undeclared)
+    env = joint_env(life("0 acts, 0 acts, 9 acts", announced=[0]), beings(), undeclared=undeclared)
     env.reset()
-    for _ in range(3):
-        env.step(dict.fromkeys(NAMES, 1))
+    env.step({"being_0": 1})
     if undeclared == "rule":
-        assert env.step(dict.fromkeys(NAMES, 1))[2]
-        assert env.simulation.log[-1] == "rule"
+        assert env.step({"being_0": 1})[2]
+        assert env.simulation.log == [1, 1, "rule"]
     else:
         with pytest.raises(AgentError, match="being_9"):
-            env.step(dict.fromkeys(NAMES, 1))
+            env.step({"being_0": 1})
 
 
 def test_the_dead_are_observed_as_they_ended_and_neither_act_nor_are_paid():
@@ -220,31 +222,17 @@ def test_the_dead_are_observed_as_they_ended_and_neither_act_nor_are_paid():
 
 
 def test_a_roster_that_is_not_known_is_refused():
-    class Nobody(Pack):
-        def run(self):
-            pass
-
-    for make in (joint_env, partial(vector_env, num_envs=2)):
-        with pytest.raises(ViewError, match=r"possible_agents=.*expected_calls.*agent="):
-            make(Nobody, beings())
-        with pytest.raises(ViewError, match="known when the environment is made"):
-            make(Pack, beings())
-
-    class Announced(Nobody):
-        def expected_calls(self, point):
-            return []
-
+    for make, program in product((joint_env, partial(vector_env, num_envs=2)), (life("0 whole 1"), Pack)):
+        with pytest.raises(ViewError, match=r"known when the environment is made.*possible_agents=.*expected_calls"):
+            make(program, beings())
     with pytest.raises(NoDecisionError, match="without a decision"):
-        joint_env(Announced, beings())
+        joint_env(life("0 whole 1", announced=[]), beings())
 
 
 def test_asking_for_the_roster_leaves_nothing_behind():
-    made, ended = [], []
+    ended = []
 
     class Ending(AnnouncingPack):
-        def __init__(self):
-            made.append(self)
-
         def run(self):
             try:
                 super().run()
@@ -257,7 +245,6 @@ def test_asking_for_the_roster_leaves_nothing_behind():
     assert ended == [0]
     env.close()
     assert ended == [0, 0]
-    assert env.simulation in made
 
 
 # -- flattened ------------------------------------------------------------------------------------
@@ -287,48 +274,14 @@ def test_flattened_spaces_are_boxes():
     assert info == {"deciding": "ant_0", "acted": dict.fromkeys(["ant_0", "bee_0", "cat_0"], True)}
 
 
-@pytest.mark.parametrize(
-    "action",
-    [
-        np.array([0.5], np.float32),
-        np.array([0.5, 0.5, 0.5], np.float32),
-        np.array([[0.5, 0.5]], np.float32),
-        np.array([0.5, 1.5], np.float32),
-        np.array([0.5, np.nan], np.float32),
-        np.array([-0.5, 0.5]),
-        None,
-        0.5,
-        {"ant_0": [0.5], "bee_0": [0.5]},
-    ],
-    ids=repr,
-)
-def test_flattened_actions_that_are_refused_move_nothing(action):
-    seen = []
-    ant, bee = points(**BOX | {"action_space_mapping": seen.append})
-    env = joint_env(calling(ant, bee), [ant, bee], flatten=True)
-    env.reset()
-    with pytest.raises(InvalidActionError):
-        env.step(action)
-    assert env.simulation.log == seen == []
-    action = np.array([0.25, 0.5])
-    env.step(action)
-    action[:] = 0  # the user's own
-    assert [part.tolist() for part in seen] == [[0.25], [0.5]]
-
-
-def discrete():
-    """Three decisions: one of two of which the first is not legal, with three; one of two from 5 on; one of two."""
+def test_flattened_discrete_spaces_have_one_mask():
     ant = decision(
         agent="ant_0",
         action_space=spaces.MultiDiscrete([2, 3]),
         action_space_mapping=lambda action: action.tolist(),
         action_mask_mapping=lambda: ([0, 1], [1, 1, 1]),
     )
-    return [ant, decision(agent="bee_0", action_space=spaces.Discrete(2, start=5)), decision(agent="cat_0")]
-
-
-def test_flattened_discrete_spaces_have_one_mask():
-    functions = discrete()
+    functions = [ant, decision(agent="bee_0", action_space=spaces.Discrete(2, start=5)), decision(agent="cat_0")]
     env = joint_env(calling(*functions * 2), functions, flatten=True)
     assert env.action_space == spaces.MultiDiscrete([2, 3, 2, 10], start=[0, 0, 5, 0])
     with pytest.raises(NotResetError, match="no episode yet"):
@@ -373,10 +326,12 @@ def test_flattened_discrete_spaces_have_one_mask():
 )
 def test_some_spaces_cannot_be_flattened(of_ant, of_bee, match):
     ant, bee = decision(agent="ant_0", **of_ant), decision(agent="bee_0", **of_bee)
-    with pytest.raises(ViewError, match=match):
-        joint_env(calling(ant, bee), [ant, bee], flatten=True)
-    for make in (aec_env, parallel_env):
-        with pytest.raises(UnknownOptionError, match="an option of the joint view only"):
+    for make, error, text in (
+        (joint_env, ViewError, match),
+        (aec_env, UnknownOptionError, "an option of the joint view only"),
+        (parallel_env, UnknownOptionError, "an option of the joint view only"),
+    ):
+        with pytest.raises(error, match=text):
             make(calling(ant, bee), [ant, bee], flatten=True)
 
 

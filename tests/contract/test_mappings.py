@@ -6,7 +6,6 @@ import pickle
 import types
 import weakref
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -25,6 +24,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.data import collect_episodes
+from simenv_marl.errors import DefinitionError
 
 DEAL = f"{__name__}.Dealer.deal"
 LEAVE = f"{__name__}.Dealer.leave"
@@ -128,9 +128,8 @@ def test_mappings_of_each_environment_get_its_own_simulation() -> None:
     envs = [aec_env(Market(title), points()) for title in ("here", "there")]
     for env in envs:
         env.reset(seed=1)
-    assert [env.agent_selection for env in envs] == ["here_0", "there_0"]
-    for env in envs:
         env.step(0)
+    assert [env.agent_selection for env in envs] == ["here_1", "there_1"]
     assert [env.unwrapped.simulation.log for env in envs] == [[("here", "low")], [("there", "low")]]
 
 
@@ -154,27 +153,18 @@ def test_mappings_of_actions_masks_and_the_rule_get_the_simulation() -> None:
 
 
 def test_the_mapping_of_a_difference_gets_the_simulation() -> None:
-    def sold(dealer, offers, *, _simulation):
-        return len(_simulation.log)
-
-    told, _ = played(aec_env(Market, points(reward_mapping=difference(sold))))
+    told, _ = played(aec_env(Market, points(reward_mapping=difference(pay))))
     assert [reward for agent, _, reward, _ in told if agent == "market_0"] == [0, 2, 2, 2]
 
 
 def test_mappings_of_goals_get_the_simulation() -> None:
-    def reached(dealer, offers, *, _simulation):
-        return [_simulation.day]
-
-    env = single_env(
-        Market,
-        points(
-            goal_space=spaces.Box(0, 9, (1,), np.float64),
-            achieved_goal_mapping=reached,
-            desired_goal_mapping=lambda dealer, offers: [2],
-            compute_reward=lambda achieved, desired, info: 0.0,
-        ),
-        agent="market_0",
+    goals = points(
+        goal_space=spaces.Box(0, 9, (1,), np.float64),
+        achieved_goal_mapping=lambda dealer, offers, *, _simulation: [_simulation.day],
+        desired_goal_mapping=lambda dealer, offers: [2],
+        compute_reward=lambda achieved, desired, info: 0.0,
     )
+    env = single_env(Market, goals, agent="market_0")
     env.reset(seed=4)
     observation = env.step(0)[0]
     assert {key: value.tolist() for key, value in observation.items()} == {
@@ -222,61 +212,13 @@ def test_mappings_keep_no_simulation_alive(episodes) -> None:
     assert simulation() is None
 
 
-def test_a_parameter_that_may_be_passed_by_position_does_not_ask_for_the_simulation() -> None:
-    env = aec_env(
-        Market, points(reward_mapping=lambda dealer, offers, _simulation=None: float(_simulation is not None))
-    )
-    told, _ = played(env)
-    assert {reward for _, _, reward, _ in told} == {0.0}
+@functools.wraps(pay)
+def paid_elsewhere(dealer, offers):
+    return pay(dealer, offers, _simulation=types.SimpleNamespace(log=[1, 2, 3]))
 
 
 def test_a_wrapper_may_give_another_simulation_by_itself() -> None:
-    @functools.wraps(pay)
-    def given(dealer, offers):
-        return pay(dealer, offers, _simulation=types.SimpleNamespace(log=[1, 2, 3]))
-
-    told, _ = played(aec_env(Market, points(reward_mapping=given)))
+    told, _ = played(aec_env(Market, points(reward_mapping=paid_elsewhere)))
     assert {reward for _, _, reward, _ in told} == {0.0, 3.0}
-
-
-# -- choices with apply ---------------------------------------------------------------------------
-
-
-class Desk(Dealer):
-    """Books what it deals, and returns nothing."""
-
-    def __init__(self, number):
-        super().__init__(number)
-        self.booked = []
-
-    def deal(self, offers):
-        self.booked.append(offers[-1])
-
-
-class Office(Market):
-    def run(self):
-        desk = Desk(0)
-        for _ in range(2):
-            assert desk.deal([{"price": 1}, {"price": 2}]) is None
-        self.log = desk.booked
-
-
-def test_apply_gets_the_chosen_answer_in_place_of_the_action() -> None:
-    made = make_step(
-        observation_space=spaces.Discrete(2),
-        observation_space_mapping=lambda desk, offers: 0,
-        action_space=spaces.Discrete(4),
-        choices=lambda desk, offers: offers,
-        apply=lambda offered, desk, offers: desk.booked.append(offered),
-        reward_mapping=lambda desk, offers: 0.0,
-        agent="desk",
-    )
-    named = {f"{__name__}.Desk.deal": made}
-    env = single_env(Office, named)
-    _, info = env.reset()
-    assert info["action_mask"].tolist() == [1, 1, 0, 0]
-    env.step(0)
-    assert env.step(RULE)[2]
-    assert env.simulation.log == [{"price": 1}, {"price": 2}]
-    assert simulate(Office, {"desk": lambda observation: 1}, points=named).log == [{"price": 2}] * 2
-    assert isinstance(env, gymnasium.Env)
+    with pytest.raises(DefinitionError, match="must be keyword-only"):
+        aec_env(Market, points(reward_mapping=lambda dealer, offers, _simulation=None: 0.0))

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import warnings
 
 import gymnasium
 import numpy as np
@@ -37,6 +36,7 @@ from simenv_marl.errors import (
     ViewError,
 )
 from tests.worlds.counters import same
+from tests.worlds.models import play
 
 NAMES = ("player_red", "player_blue")
 RED = {"agent": "player_red"}
@@ -107,6 +107,14 @@ def definition(**changes):
     return make_step(**given | changes)
 
 
+def zeros(agents=NAMES):
+    return dict.fromkeys(agents, 0)
+
+
+def moves_of(env, agent):
+    return [move for name, move in env.unwrapped.simulation.log if name == agent]
+
+
 MOVE = {f"{PLACE}.move": definition()}
 
 
@@ -136,25 +144,28 @@ def episode(env, choose=lambda info: 0):
 # -- agent= ---------------------------------------------------------------------------------------
 
 
-def test_one_named_agent_is_asked_and_all_others_are_left_to_their_rule() -> None:
-    env = single_env(Game, MOVE, agent="player_red")
+@pytest.mark.parametrize(
+    ("policies", "moves"),
+    [(None, [1, 3, 1, 2, 1, 1]), ({"player_blue": lambda observation: 0}, [1] * 6)],
+    ids=["their rule", "policies"],
+)
+def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) -> None:
+    env = single_env(Game, MOVE, agent="player_red", policies=policies)
     steps, offers = episode(env)
     assert offers == [1, 3, 1, 2, 1, 1]
     assert [step[0] for step in steps] == [1, 2, 3, 4, 5, 6]
     assert steps[-1][2:] == (True, False)
-    assert [move for name, move in env.simulation.log if name == "player_blue"] == [1, 3, 1, 2, 1, 1]
+    assert moves_of(env, "player_blue") == moves
     with pytest.raises(EpisodeOverError):
         env.step(0)
 
 
-def test_the_others_are_left_to_policies_by_agent() -> None:
-    env = single_env(Game, MOVE, agent="player_red", policies={"player_blue": lambda observation: 0})
-    episode(env)
-    assert [move for name, move in env.simulation.log if name == "player_blue"] == [1] * 6
-
-
-def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
-    env = single_env(Casino, NAMED, agent="mover")
+@pytest.mark.parametrize(
+    "options", [{}, {"possible_agents": ["mover", "better"], "policies": {"better": RULE}}], ids=["alone", "a roster"]
+)
+def test_an_agent_with_a_name_of_its_own_is_one_of_several_points(options) -> None:
+    """Names of a roster and of policies that are left to the rule are no reason for a warning."""
+    env = single_env(Casino, NAMED, agent="mover", **options)
     env.reset(seed=0)
     while not env.step(0)[2]:
         pass
@@ -176,9 +187,18 @@ def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
     assert env.simulation.log == [(6, 2), (5, 2)]
 
 
-def test_an_agent_that_never_decides_is_an_error_that_lists_who_did() -> None:
+def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did() -> None:
+    class Nothing(Game):
+        offers = ()
+
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
+    with pytest.raises(NoDecisionError):
+        single_env(Nothing, MOVE, agent="player_red", skip_forced=True).reset()
+
+
+def simulated(simulation, points, **options):
+    return simulate(simulation, points=points, **options)
 
 
 @pytest.mark.parametrize(
@@ -188,18 +208,8 @@ def test_an_agent_that_never_decides_is_an_error_that_lists_who_did() -> None:
         (single_env, Casino, NAMED, {}, ViewError, "agent="),
         (single_env, Casino, NAMED, {"agent": "mvoer"}, AgentError, "mover, better"),
         *((single_env, Game, MOVE, {"agent": agent}, OptionValueError, "agent") for agent in ("", 3, ("player_red",))),
-        *(
-            (make, Game, MOVE, {"agent": "player_red"}, UnknownOptionError, "single view")
-            for make in (aec_env, parallel_env, joint_env)
-        ),
-        (
-            lambda game, points, **options: simulate(game, points=points, **options),
-            Game,
-            MOVE,
-            {"agent": "player_red"},
-            UnknownOptionError,
-            "single_env",
-        ),
+        *((make, Game, MOVE, RED, UnknownOptionError, "single view") for make in (aec_env, parallel_env, joint_env)),
+        (simulated, Game, MOVE, RED, UnknownOptionError, "single_env"),
         (single_env, Game, MOVE, RED | {"policies": {"player_red": RULE}}, OptionValueError, "policies"),
         # Of a point all of whose agents a policy answers, none is left.
         (single_env, Game, MOVE, RED | {"policies": {f"{PLACE}.move": RULE}}, UnknownPointError, "no decision point"),
@@ -248,7 +258,7 @@ def test_forced_moves_are_not_asked_for_and_their_rewards_add_up() -> None:
     assert offers == [3, 2]
     rewards = [step[1] for step in steps]
     assert [step[1] for step in skipped] == [sum(rewards[:3]), sum(rewards[3:])]
-    assert [move for name, move in env.simulation.log if name == "player_red"] == [1] * 6
+    assert moves_of(env, "player_red") == [1] * 6
 
 
 def test_nobody_is_asked_for_a_forced_move_not_even_a_policy() -> None:
@@ -284,38 +294,40 @@ def test_trajectories_have_no_forced_moves_and_all_rewards() -> None:
 def test_in_rounds_forced_moves_use_no_action(make) -> None:
     env = make(Game, MOVE, possible_agents=list(NAMES), skip_forced=True)
     env.reset(seed=0)
-    rounds = 0
-    ended = False
-    while not ended:
-        *_, terminations, _, infos = env.step(dict.fromkeys(NAMES, 0))
-        acted = infos["acted"] if make is joint_env else {name: infos[name]["acted"] for name in NAMES}
-        assert all(acted.values())
-        ended = terminations if make is joint_env else all(terminations.values())
-        rounds += 1
-    assert rounds == 2
+    for ended in (False, True):
+        *_, terminations, _, infos = env.step(zeros())
+        if make is parallel_env:
+            infos = {"acted": {name: info["acted"] for name, info in infos.items()}}
+            assert set(terminations.values()) == {ended}
+        else:
+            assert terminations == ended
+        assert infos["acted"] == dict.fromkeys(NAMES, True)
     assert [move for _, move in env.unwrapped.simulation.log] == [1] * 12
 
 
-def test_a_space_of_one_action_is_a_forced_move_too() -> None:
-    one = spaces.Discrete(1, start=4)
-    points = {f"{PLACE}.move": definition(action_space=one, choices=None, action_space_mapping=lambda action: action)}
+@pytest.mark.parametrize(
+    ("changes", "asked", "moves"),
+    [
+        ({"action_space": spaces.Discrete(1, start=4), "action_space_mapping": int}, [], [4] * 6),
+        (
+            {
+                "action_space": spaces.MultiDiscrete([2, 3], start=[0, 5]),
+                "action_space_mapping": lambda action: int(action.sum()),
+                "action_mask_mapping": lambda player, moves: ([0, 1], [0, 0, 1] if len(moves) == 1 else [1, 0, 1]),
+            },
+            [np.array([1, 5])],
+            [8, 6, 8],
+        ),
+    ],
+    ids=["a space of one action", "several parts"],
+)
+def test_there_are_forced_moves_without_choices(changes, asked, moves) -> None:
+    points = {f"{PLACE}.move": definition(choices=None, **changes)}
     env = single_env(Game, points, agent="player_red", skip_forced=True)
     env.reset(seed=0)
-    assert [move for name, move in env.simulation.log if name == "player_red"] == [4] * 6
-
-
-def test_a_forced_move_of_several_parts() -> None:
-    made = definition(
-        action_space=spaces.MultiDiscrete([2, 3], start=[0, 5]),
-        choices=None,
-        action_space_mapping=lambda action: int(action.sum()),
-        action_mask_mapping=lambda player, moves: ([0, 1], [0, 0, 1] if len(moves) == 1 else [1, 0, 1]),
-    )
-    env = single_env(Game, {f"{PLACE}.move": made}, agent="player_red", skip_forced=True)
-    env.reset(seed=0)
-    assert env.simulation.log[0] == ("player_red", 8)
-    env.step(np.array([1, 5]))
-    assert [move for name, move in env.simulation.log if name == "player_red"][:3] == [8, 6, 8]
+    for action in asked:
+        env.step(action)
+    assert moves_of(env, "player_red") == moves
 
 
 def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
@@ -327,24 +339,20 @@ def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
         with pytest.raises(EpisodeOverError):
             env.step(0)
     aec = aec_env(Forced, MOVE, skip_forced=True)
-    aec.reset(seed=0)
-    told = {}
-    for agent in aec.agent_iter():
-        told[agent] = aec.last()[1:4]
-        aec.step(None)
-    assert told == dict.fromkeys(NAMES, (3.0, True, False))
+    assert {turn.agent: turn[2:5] for turn in play(aec)} == dict.fromkeys(NAMES, (3.0, True, False))
     with pytest.raises(EpisodeOverError):
         aec.step(0)
-    parallel = parallel_env(Forced, MOVE, skip_forced=True, possible_agents=list(NAMES))
+    roster = {"possible_agents": list(NAMES), "skip_forced": True}
+    parallel = parallel_env(Forced, MOVE, **roster)
     parallel.reset(seed=0)
     assert parallel.agents == list(NAMES)
-    assert parallel.step(dict.fromkeys(NAMES, 0))[2] == dict.fromkeys(NAMES, True)
+    assert parallel.step(zeros())[2] == dict.fromkeys(NAMES, True)
     actions = np.zeros(2, np.int64)
     for options, action, reward in (
-        (RED, actions, 3.0),
-        ({"view": "joint", "possible_agents": list(NAMES)}, dict.fromkeys(NAMES, actions), 4.0),
+        (RED | {"skip_forced": True}, actions, 3.0),
+        (roster | {"view": "joint"}, dict.fromkeys(NAMES, actions), 4.0),
     ):
-        vector = vector_env(Forced, MOVE, skip_forced=True, num_envs=2, **options)
+        vector = vector_env(Forced, MOVE, num_envs=2, **options)
         vector.reset(seed=0)
         for ended in (True, False, True):
             _, rewards, terminations, *_ = vector.step(action)
@@ -353,29 +361,18 @@ def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
         vector.close()
 
 
-def test_an_episode_without_any_decision_still_is_an_error() -> None:
-    class Nothing(Game):
-        offers = ()
-
-    with pytest.raises(NoDecisionError):
-        single_env(Nothing, MOVE, agent="player_red", skip_forced=True).reset()
-
-
 # -- clip_actions= --------------------------------------------------------------------------------
 
 BOX = spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, np.inf], np.float32))
 
 
-def flown(make, space, action, **options):
+def flown(make, space, action, *, clip_actions=True):
     """What reaches the mapping of an agent called ``pilot``."""
     taken = []
-
-    def mapping(action):
-        taken.append(action)
-        return 0
-
-    made = definition(action_space=space, choices=None, action_space_mapping=mapping, agent="pilot")
-    env = make(Game, {f"{PLACE}.move": made}, **options)
+    made = definition(
+        action_space=space, choices=None, action_space_mapping=lambda given: taken.append(given) or 0, agent="pilot"
+    )
+    env = make(Game, {f"{PLACE}.move": made}, clip_actions=clip_actions)
     env.reset(seed=0)
     env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
     return taken[0]
@@ -383,10 +380,11 @@ def flown(make, space, action, **options):
 
 ONE, HALF = spaces.Box(-1, 1, (1,), np.float32), spaces.Box(0.25, 0.5, (1,), np.float32)
 WHOLE = spaces.Box(0, 5, (1,), np.int8)
+CLIPPING_VIEWS = pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
 CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 1)]))
 
 
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+@CLIPPING_VIEWS
 @pytest.mark.parametrize(
     ("space", "action", "expected"),
     [
@@ -403,12 +401,14 @@ CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 
         ),
     ],
 )
-def test_actions_outside_a_box_are_clipped(make, space, action, expected) -> None:
-    taken = flown(make, space, action, clip_actions=True)
+def test_actions_outside_a_box_are_clipped_with_the_option_alone(make, space, action, expected) -> None:
+    taken = flown(make, space, action)
     assert same(taken, expected) or (type(taken) is float and taken == expected)
+    with pytest.raises(InvalidActionError):
+        flown(make, space, action, clip_actions=False)
 
 
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+@CLIPPING_VIEWS
 @pytest.mark.parametrize(
     ("space", "wrong"),
     [
@@ -419,12 +419,7 @@ def test_actions_outside_a_box_are_clipped(make, space, action, expected) -> Non
 )
 def test_what_is_no_action_is_refused_all_the_same(make, space, wrong) -> None:
     with pytest.raises(InvalidActionError):
-        flown(make, space, wrong, clip_actions=True)
-
-
-def test_without_the_option_nothing_is_clipped() -> None:
-    with pytest.raises(InvalidActionError):
-        flown(single_env, BOX, np.array([-7.5, 1.0]))
+        flown(make, space, wrong)
 
 
 @given(st.lists(st.floats(width=32), min_size=2, max_size=2))
@@ -442,19 +437,14 @@ def test_the_vector_view_clips_as_the_single_view_does(numbers) -> None:
         assert taken == []
     else:
         env.step(np.stack([np.zeros(2, np.float32), action]))
-        assert same(taken, [np.zeros(2, np.float32), flown(single_env, BOX, action, clip_actions=True)])
+        assert same(taken, [np.zeros(2, np.float32), flown(single_env, BOX, action)])
     env.close()
 
 
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-class Seats(Game, SimulationInterface):
-    """Red has no choice and is out before blue is asked; blue plays on for as long as it is let."""
-
-    offers = (1, 1)
-    days = 3
-
+class Timed(Game, SimulationInterface):
     def reset(self, seed=None):
         super().reset(seed)
         self.now = 0.0
@@ -462,15 +452,20 @@ class Seats(Game, SimulationInterface):
     def time(self):
         return self.now
 
+
+class Seats(Timed):
+    """Red has no choice and is out before blue is asked; blue plays on for as long as it is let."""
+
+    offers = (1, 1)
+    days = 3
+
     def run(self):
         red, blue = self.players
         for _ in self.offers:
             red.coins += red.move([1])
-            self.now += 10
         self.end_agent("player_red")
         for _ in range(self.days):
             blue.coins += blue.move([1, 2])
-            self.now += 10
 
 
 class Endless(Game, SimulationInterface):
@@ -483,17 +478,8 @@ class Endless(Game, SimulationInterface):
             self.players[1].move([1, 2])
 
 
-class Pauses(Game):
+class Pauses(Timed):
     """The same choices as the game's, at a time each."""
-
-    now = 0.0
-
-    def reset(self, seed=None):
-        super().reset(seed)
-        self.now = 0.0
-
-    def time(self):
-        return self.now
 
     def run(self):
         for offered in (2, 1, 1, 2, 1):
@@ -502,25 +488,26 @@ class Pauses(Game):
             self.now += 10
 
 
-def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_round() -> None:
+@pytest.mark.parametrize("days", [3, 0])
+def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_round(days) -> None:
+    class Days(Seats):
+        pass
+
+    Days.days = days
     roster = {"possible_agents": list(NAMES), "skip_forced": True}
-    env = parallel_env(Seats, MOVE, **roster)
+    env = parallel_env(Days, MOVE, **roster)
     env.reset(seed=1)
+    if days == 0:
+        assert env.step(zeros(env.agents))[1]["player_red"] == 2.0
+        return
     assert sorted(env.agents) == sorted(NAMES)
-    _, rewards, terminations, _, _ = env.step(dict.fromkeys(NAMES, 0))
+    _, rewards, terminations, _, _ = env.step(zeros())
     assert rewards == {"player_red": 2.0, "player_blue": 1.0}
     assert terminations == {"player_red": True, "player_blue": False}
     assert env.agents == ["player_blue"]
-    joint = joint_env(Seats, MOVE, **roster)
+    joint = joint_env(Days, MOVE, **roster)
     joint.reset(seed=1)
-    assert joint.step(dict.fromkeys(NAMES, 0))[1] == 3.0
-
-    class Short(Seats):
-        days = 0
-
-    env = parallel_env(Short, MOVE, **roster)
-    env.reset(seed=1)
-    assert env.step(dict.fromkeys(env.agents, 0))[1]["player_red"] == 2.0
+    assert joint.step(zeros())[1] == 3.0
 
 
 def test_the_single_view_of_an_agent_that_ends_during_the_reset() -> None:
@@ -530,7 +517,8 @@ def test_the_single_view_of_an_agent_that_ends_during_the_reset() -> None:
         assert env.step(0)[1:4] == (3.0, True, False)
     vector = vector_env(Seats, MOVE, agent="player_red", skip_forced=True, num_envs=2)
     vector.reset(seed=1)
-    assert vector.step(np.zeros(2, np.int64))[1:3] == (pytest.approx([3.0, 3.0]), pytest.approx([True, True]))
+    _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
+    assert (rewards.tolist(), terminations.tolist()) == ([3.0, 3.0], [True, True])
     vector.close()
 
 
@@ -542,22 +530,11 @@ def test_elapsed_time_adds_up_as_rewards_do() -> None:
     assert [step[-1]["elapsed"] for step in told] == [30.0, 20.0]
 
 
-def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do() -> None:
-    env = single_env(Endless, MOVE, agent="player_red")
+@pytest.mark.parametrize("policies", [None, {"player_blue": lambda observation: 0}])
+def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies) -> None:
+    env = single_env(Endless, MOVE, agent="player_red", policies=policies)
     for _ in range(2):
         env.reset(seed=1)
         assert env.step(0)[2:4] == (True, False)
         with pytest.raises(EpisodeOverError):
             env.step(0)
-    env = single_env(Endless, MOVE, agent="player_red", policies={"player_blue": lambda observation: 0})
-    env.reset(seed=1)
-    assert env.step(0)[2]
-
-
-def test_names_of_a_roster_and_of_policies_that_agent_leaves_to_the_rule() -> None:
-    env = single_env(Casino, NAMED, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE})
-    env.reset(seed=1)
-    env.step(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert env.step(0)[2]

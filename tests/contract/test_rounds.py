@@ -1,16 +1,14 @@
 """The parallel view: what becomes of the actions of a round."""
 
-import warnings
 from collections import Counter
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
-from pettingzoo.utils.conversions import parallel_to_aec, turn_based_aec_to_parallel
 
 from simenv_marl import RULE, TRUNCATED, aec_env, parallel_env
 from simenv_marl.envs import pad_agents
@@ -23,11 +21,13 @@ from simenv_marl.errors import (
     UnknownAgentError,
 )
 from tests.worlds import worlds
+from tests.worlds.lives import life
 from tests.worlds.many_worlds import (
     HERE,
     Announcing,
     Answered,
     Being,
+    Colony,
     answer,
     being_of,
     beings,
@@ -99,32 +99,28 @@ def test_a_decision_within_a_decision():
 
 
 @pytest.mark.parametrize(
-    ("actions", "error"),
+    ("actions", "error", "match"),
     [
-        ({"ant_0": 1, "nobody": 1}, UnknownAgentError),
-        ({"nobody": 1}, UnknownAgentError),
-        ({"ant_0": 1, 0: 1}, UnknownAgentError),
-        ({"ant_0": 10, "bee_0": 1}, InvalidActionError),
-        ({"ant_0": 1, "bee_0": 10}, InvalidActionError),
-        ({"ant_0": 1, "bee_0": None}, InvalidActionError),
-        ({"ant_0": None}, InvalidActionError),
-        ({"ant_0": 1, "bee_0": 1.5}, InvalidActionError),
-        ({"ant_0": 1, "bee_0": "1"}, InvalidActionError),
-        ({"ant_0": 1, "bee_0": np.array([1])}, InvalidActionError),
-        (None, InvalidActionError),
-        (3, InvalidActionError),
-        ("ant_0", InvalidActionError),
-        ([1, 2], InvalidActionError),
+        *((given, UnknownAgentError, "not a live agent") for given in ({"ant_0": 1, "nobody": 1}, {"ant_0": 1, 0: 1})),
+        *(
+            (given, InvalidActionError, "action")
+            for given in (
+                {"ant_0": 10, "bee_0": 1},
+                {"ant_0": None},
+                *({"ant_0": 1, "bee_0": wrong} for wrong in (10, None, 1.5, "1", np.array([1]))),
+            )
+        ),
+        *((given, InvalidActionError, "takes a dict of actions") for given in (None, 3, "ant_0", [1, 2])),
     ],
     ids=repr,
 )
-def test_actions_that_are_refused_move_nothing(actions, error):
+def test_actions_that_are_refused_move_nothing(actions, error, match):
     calls = []
     ant, bee = points(reward_mapping=lambda: calls.append(0) or 1.0)
     env = parallel_env(calling(ant, bee, ant), [ant, bee])
     env.reset()
     del calls[:]
-    with pytest.raises(error, match=None if isinstance(actions, dict) else "takes a dict of actions"):
+    with pytest.raises(error, match=match):
         env.step(actions)
     assert env.simulation.log == []
     assert calls == []
@@ -210,41 +206,14 @@ def test_rewards_are_asked_for_once_for_everybody_at_every_return():
 # -- births and deaths ----------------------------------------------------------------------------
 
 
-def test_a_newborn_joins_at_the_return_that_its_decision_brings():
-    def main(simulation):
-        simulation.beings = one, two = Being(0), Being(1)
-        for being in (one, two, one, two):
-            simulation.log.append(being.act())
-
-    env = parallel_env(script(main), beings())
-    assert not hasattr(env, "possible_agents")
-    observations, _ = env.reset()
-    assert set(observations) == {"being_0"} == set(env.agents)
-    with pytest.raises(UnknownAgentError, match="not a live agent"):
-        env.step({"being_0": 1, "being_1": 1})
-    results = env.step({"being_0": 1})
-    assert env.agents == ["being_0", "being_1"]
-    assert set(results[0]) == {"being_0", "being_1"}
-    assert results[1] == {"being_0": 0.0, "being_1": 0.0}
-    assert deciding(results) == ["being_1"]
-    assert flags(results) == {"being_0": (False, False), "being_1": (False, False)}
-    results = env.step({"being_0": 2, "being_1": 3})
-    assert env.simulation.log == [1, 3, 2]
-    assert deciding(results) == ["being_1"]
-
-
 class Hive:
     """In each round everybody acts who lives; who is born is known before it acts."""
-
-    def __init__(self, rounds=4):
-        self.rounds = rounds
 
     def reset(self, seed=None):
         self.beings, self.tick, self.log, self.asked = [Being(0), Being(1)], 0, [], []
 
     def run(self):
-        for tick in range(self.rounds):
-            self.tick = tick
+        for self.tick in range(4):
             for being in list(self.beings):
                 if being.whole:
                     being.health += 1
@@ -278,55 +247,34 @@ def test_with_announced_calls_each_tick_is_one_round():
 
 def test_who_is_announced_several_times_observes_its_next_call():
     """Of the calls to come the first one is decided on next."""
-    hour = define(agent="clerk_0", observation_space_mapping=lambda hour: [hour, 0], reward_mapping=lambda hour: 0.0)
-
-    @hour
-    def work(hour):
-        return "rule"
-
     door = decision(agent="door_0")
+    work = define(agent="clerk_0", observation_space_mapping=lambda hour: [hour, 0])(lambda hour: "rule")
 
-    class Day:
-        def reset(self):
-            self.hours, self.log = [7, 8, 9], []
-
-        def run(self):
-            while self.hours:
-                door()
-                self.log.append((self.hours[0], work(self.hours.pop(0))))
-
+    class Day(Script):
         def expected_calls(self, point):
-            return [(hour,) for hour in self.hours] if point.endswith("work") else []
+            return [(hour,) for hour in range(7 + len(self.log), 10)] if "lambda" in point else []
 
-    env = parallel_env(Day, [door, work])
+    def main(simulation):
+        for hour in (7, 8, 9):
+            door()
+            simulation.log.append(work(hour))
+
+    env = parallel_env(lambda: Day(main), [door, work])
     observations, _ = env.reset()
     told = []
     while env.agents:
         told.append(int(observations["clerk_0"][0]))
         observations, *_ = env.step({"door_0": 1, "clerk_0": 2})
-    assert env.simulation.log == [(7, 2), (8, 2), (9, 2)]
+    assert env.simulation.log == [2, 2, 2]
     assert told == [7, 8, 9]
 
 
 def test_the_dead_are_dropped_from_agents_in_the_same_step():
-    class Doomed(Hive):
-        def reset(self, seed=None):
-            super().reset()
-            self.beings.append(Being(2))
-
-        def run(self):
-            one, two, three = self.beings
-            one.act()
-            for being, health in ((two, 3), (one, 6)):
-                being.health = health
-                being.leave()
-            self.log += [three.act()]
-            self.log += [three.act()]
-
-    env = parallel_env(Doomed, beings())
+    program = "0 acts, 1 health 3, 1 leaves, 0 health 6, 0 leaves, 2 acts, 2 acts"
+    env = parallel_env(life(program, announced=[0, 1, 2]), beings())
     env.reset()
     results = env.step({"being_0": 1, "being_1": 2, "being_2": 3})
-    assert env.simulation.log == [3]
+    assert env.simulation.log == [1, 3]
     assert env.agents == ["being_2"]
     assert [set(part) for part in results] == [{"being_0", "being_1", "being_2"}] * 5
     assert {agent: seen.tolist() for agent, seen in results[0].items()} == {
@@ -341,30 +289,9 @@ def test_the_dead_are_dropped_from_agents_in_the_same_step():
     assert deciding(results) == ["being_2"]
     with pytest.raises(UnknownAgentError, match="being_0"):
         env.step({"being_0": 1, "being_2": 1})
+    # Whoever is announced after its end is not revived.
     results = env.step({"being_2": 1})
     assert [set(part) for part in results] == [{"being_2"}] * 5
-
-
-def test_whoever_is_announced_after_its_end_is_not_revived():
-    class Forgetful(Hive):
-        def run(self):
-            one, two = self.beings
-            one.act()
-            one.leave()
-            for _ in range(3):
-                two.act()
-
-        def expected_calls(self, point):
-            return [(being,) for being in self.beings]
-
-    env = parallel_env(Forgetful, beings())
-    env.reset()
-    for _ in range(2):
-        env.step(dict.fromkeys(env.agents, 1))
-        assert env.agents == ["being_1"]
-
-
-# -- ends -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mapping", ["reward_mapping", "observation_space_mapping", "action_mask_mapping"])
@@ -394,12 +321,11 @@ def test_what_is_returned_is_the_users_own():
     observations["ant_0"][:] = 7
     infos["ant_0"]["deciding"] = "me"
     env.agents.append("me")
-    results = env.step({"ant_0": 1, "bee_0": 1})
-    assert kept.tolist() == [1.0, 2.0]
-    assert results[0]["ant_0"].tolist() == [1.0, 2.0]
-    assert results[0]["ant_0"] is not results[0]["bee_0"]
+    observations, *_, infos = env.step({"ant_0": 1, "bee_0": 1})
+    assert kept.tolist() == observations["ant_0"].tolist() == [1.0, 2.0]
+    assert observations["ant_0"] is not observations["bee_0"]
     assert env.agents == ["ant_0", "bee_0"]
-    assert results[-1]["ant_0"]["deciding"] is True
+    assert infos["ant_0"]["deciding"] is True
 
 
 # -- the rule once more, literally ----------------------------------------------------------------
@@ -430,15 +356,7 @@ class World:
             self.calls += 1
             self.level = (self.level * 3 + value + 1) % 17
 
-    def rule(self):
-        return self.level % 4
-
-    ant, bee, cat, dog = (lambda self: self.rule() for _ in LETTERS)
-
-
-for _letter in LETTERS:
-    _function = World.__dict__[_letter]
-    _function.__name__, _function.__qualname__ = _letter, f"World.{_letter}"
+    ant, bee, cat, dog = (decision(lambda self: self.level % 4) for _ in LETTERS)
 
 
 class Rounds:
@@ -488,7 +406,7 @@ def allowed_now(world):
 def world_env(max_steps):
     """An environment of a world, whose program may be changed."""
     definitions = {
-        f"{__name__}.World.{letter}": define(
+        vars(World)[letter]: define(
             agent=f"{letter}_0",
             observation_space_mapping=lambda world: [world.level, world.calls],
             reward_mapping=lambda world: float(world.level),
@@ -594,36 +512,26 @@ def every_other(agents, infos):
 @settings(max_examples=60)
 def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
     plain = Answered(design, seed)
-    if not plain.decisions:
-        return
     died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}
-    for choose in (everybody, whose_turn_it_is, every_other):
-        for roster in (False, True):
-            env = colony(parallel_env, design, roster=roster)
-            totals, _, ended = played(env, seed, choose)
-            assert env.simulation.trace == plain.trace
-            assert env.simulation.random.getstate() == plain.random.getstate()
-            assert {agent: totals[agent] for agent in plain.first} == plain.totals
-            assert not any(total for agent, total in totals.items() if agent not in plain.first)
-            for agent, flags in ended.items():
-                assert flags == ((True, False) if agent in died or not design.truncates else (False, True))
-
-
-@given(designs, seeds)
-@settings(max_examples=60)
-def test_a_colony_that_announces_loses_no_reward(design, seed):
-    plain = Answered(design, seed)
-    for choose in (everybody, whose_turn_it_is):
-        env = colony(parallel_env, design, Announcing)
+    for simulation, roster, choose in (
+        *product((Colony,), (False, True), (everybody, whose_turn_it_is, every_other)),
+        *product((Announcing,), (False,), (everybody, whose_turn_it_is)),
+    ):
+        env = colony(parallel_env, design, simulation, roster=roster)
         if not plain.decisions:
             with pytest.raises(NoDecisionError):
                 env.reset(seed=seed)
-            return
+            continue
         totals, joined, ended = played(env, seed, choose)
         assert env.simulation.trace == plain.trace
-        assert set(ended) >= set(plain.first)
+        assert env.simulation.random.getstate() == plain.random.getstate()
         for agent in plain.first:
-            assert totals[agent] == plain.last[agent] - joined[agent]
+            since = joined[agent] if simulation is Announcing else plain.first[agent]
+            assert totals[agent] == plain.last[agent] - since
+        assert simulation is Announcing or not any(totals[agent] for agent in totals.keys() - plain.first.keys())
+        assert set(ended) >= set(plain.first)
+        for agent, over in ended.items():
+            assert over == ((True, False) if agent in died or not design.truncates else (False, True))
 
 
 # -- points of all kinds --------------------------------------------------------------------------
@@ -664,68 +572,9 @@ def test_in_turns_it_is_the_aec_view(design, seed, answers):
     assert set(truncated.values()) == set(aec.truncations.values())
 
 
-# -- PettingZoo's tests: those with agents that join late are in test_kit_of_pettingzoo.py ---------
-
-
-def unmasked(**options):
-    ant, bee, cat = points(3)
-    return parallel_env(calling(*[ant, bee, bee, cat, ant] * 5), [ant, bee, cat], **options)
-
-
-def masked():
-    space = spaces.Dict(
-        {"observation": spaces.Box(0, 100, (2,), np.float32), "action_mask": spaces.Box(0, 1, (10,), np.int8)}
-    )
-    ant, bee = points(
-        observation_space=space,
-        observation_space_mapping=lambda: {"observation": [1, 2]},
-        action_mask_mapping=lambda: [0] + [1] * 9,
-    )
-    return parallel_env(calling(*[ant, bee] * 5), [ant, bee])
-
-
-SHAPES = {
-    "irregular order": unmasked,
-    "truncated by steps": lambda: unmasked(max_steps=3),
-    "a hive": lambda: parallel_env(Hive, beings(), possible_agents=[f"being_{number}" for number in range(6)]),
-    "masked": masked,
-}
-
-
-@pytest.mark.parametrize("make", SHAPES.values(), ids=SHAPES.keys())
-def test_pettingzoos_tests_pass(make):
-    parallel_api_test(make(), num_cycles=100)
-    if make is not masked:  # its test of seeds knows of no masks, and a masked action is illegal
-        parallel_seed_test(make, num_cycles=100)
-
-
-def test_pettingzoos_conversions_pass_its_tests():
-    with warnings.catch_warnings():
-        # Those who have not been called yet are observed as zeros.
-        warnings.filterwarnings("ignore", message="Observation numpy array is all zeros")
-        api_test(parallel_to_aec(unmasked()), num_cycles=20)
-    env = turn_based_aec_to_parallel(aec_env(calling(*(pair := points()) * 9), list(pair)))
-    parallel_api_test(env, num_cycles=20)
-
-
 def test_one_that_was_announced_can_be_removed_when_its_agent_has_no_name_any_more():
-    class Crowd(Script):
-        def reset(self, seed=None):
-            super().reset(seed)
-            self.beings = [Being(0), Being(1)]
-
-        def expected_calls(self, point):
-            return [(being,) for being in self.beings]
-
-    def main(simulation):
-        one, other = simulation.beings
-        one.act()
-        other.health = 1
-        other.leave()
-        one.act()
-
     named = beings(agent=lambda being: being_of(being) if being.health == 0 else None)
-    env = parallel_env(lambda: Crowd(main), named)
+    env = parallel_env(life("0 acts, 1 health 1, 1 leaves, 0 acts", announced=[0, 1]), named)
     env.reset()
     assert env.agents == ["being_0", "being_1"]
     _, _, terminations, *_ = env.step({"being_0": 1, "being_1": 1})

@@ -5,16 +5,29 @@ import decimal
 import gc
 import logging
 import random
+import re
 import subprocess
 import sys
+from functools import partial
 from textwrap import dedent
 
 import greenlet
 import pytest
 import simpy
 
-from simenv_marl import RULE, aec_env, generate_env, single_env
-from tests.worlds.models import Script, calling, decision, decisions, define, play, rewards_of, script, stacks
+from simenv_marl import RULE, aec_env, difference, generate_env, single_env
+from tests.worlds.models import (
+    Script,
+    calling,
+    decision,
+    decisions,
+    define,
+    play,
+    rewards_of,
+    script,
+    stacks,
+    unwinding,
+)
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 
@@ -22,56 +35,39 @@ VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 # -- interleaved ----------------------------------------------------------------------------------
 
 
-class Account:
-    """Spends; its state is its own."""
-
-    def __init__(self, seed):
-        self.random, self.money, self.spent = random.Random(seed), 100, []
-
-    @define(
-        observation_space_mapping=lambda self: [self.money, len(self.spent)],
-        reward_mapping=lambda self: self.money / 8,
-        agent="spender_0",
-    )
-    def spend(self):
-        return self.random.randrange(3)
-
-    @define(observation_space_mapping=lambda self: [self.money, 0], agent="earner_0", reward_mapping=lambda self: 1)
-    def earn(self):
-        return self.random.randrange(5)
+@define(agent="spender_0")
+def spend(draw):
+    return draw.randrange(3)
 
 
-class Banking(Script):
-    def __init__(self):
-        super().__init__(None)
+@define(agent="earner_0")
+def earn(draw):
+    return -draw.randrange(5)
 
-    def run(self):
-        self.account = account = Account(self.seed)
-        for _ in range(12):
-            if account.random.random() < 0.7:
-                account.spent.append(account.spend())
-                account.money -= account.spent[-1]
-            else:
-                account.money += account.earn()
-        return account.money
+
+def banking(simulation):
+    draw = random.Random(simulation.seed)
+    for _ in range(12):
+        simulation.log.append(spend(draw) if draw.random() < 0.7 else earn(draw))
+
+
+def plain_log(make, seed=None):
+    """What a simulation logs without an environment."""
+    simulation = make()
+    simulation.reset(seed)
+    simulation.run()
+    return simulation.log
 
 
 def test_some_may_run_their_rule_and_others_be_decided():
-    one = aec_env(Banking, Account.spend)
-    two = aec_env(Banking, Account.earn)
-    three = aec_env(Banking, [Account.spend, Account.earn])
-    envs = [one, two, three]
+    envs = [aec_env(script(banking), points) for points in (spend, earn, [spend, earn])]
     for env in envs:
         env.reset(seed=4)
     while any(env.agents for env in envs):
         for env in envs:
             if env.agents:
                 env.step(None if env.last()[2] else RULE)
-    plain = Banking()
-    plain.reset(4)
-    plain.run()
-    assert [env.unwrapped.simulation.account.spent for env in envs] == [plain.account.spent] * 3
-    assert [env.unwrapped.simulation.account.money for env in envs] == [plain.account.money] * 3
+    assert [env.unwrapped.simulation.log for env in envs] == [plain_log(script(banking), 4)] * 3
 
 
 # -- nested ---------------------------------------------------------------------------------------
@@ -81,7 +77,7 @@ def inner_env():
     return single_env(calling(*[INNER] * 3), INNER)
 
 
-INNER = decision(lambda: "inner rule", agent="inner_0", reward_mapping=lambda: 1)
+INNER = decision(lambda: "inner rule", agent="inner_0", reward_mapping=difference(lambda: 1))
 
 
 def run_inner(env, action):
@@ -140,16 +136,14 @@ def test_decisions_while_an_inner_simulation_is_made_reset_or_stopped_are_nobody
             seen.append(("rendered", INNER()))
 
     def rule():
-        if source == "generate_env":
-            inner = generate_env(lambda: Inner(), INNER)(render_mode="ansi")
-        else:
-            inner = single_env(Inner if source == "class" else lambda: Inner(), INNER, render_mode="ansi")
+        make = generate_env(Inner, INNER) if source == "generate_env" else partial(single_env, kind, INNER)
+        inner = make(render_mode="ansi")
         inner.reset()
         inner.render()
         inner.reset()
         inner.close()
 
-    outer = decision(rule, agent="outer_0")
+    kind, outer = (lambda: Inner()) if source == "factory" else Inner, decision(rule, agent="outer_0")
     env = aec_env(calling(outer, INNER), [outer, INNER])
     assert decisions(play(env, {"outer_0": RULE, "inner_0": 9})) == ["outer_0", "inner_0"]
     done = [what for what, _ in seen if what != "made"]
@@ -167,9 +161,7 @@ def test_an_inner_environment_may_be_abandoned_inside():
             unwound.append(INNER())
 
     def rule():
-        inner = single_env(script(main), INNER)
-        inner.reset()
-        del inner
+        single_env(script(main), INNER).reset()
         gc.collect()
         return INNER()
 
@@ -192,7 +184,8 @@ def test_mappings_and_policies_may_run_an_environment_of_their_own(name):
         return value
 
     other = decision(agent="other_0")
-    outer = decision(**{"agent": "outer_0"} | ({} if name == "policy" else {name: nested}))
+    mapping = difference(nested) if name == "reward_mapping" else nested
+    outer = decision(**{"agent": "outer_0"} | ({} if name == "policy" else {name: mapping}))
     policies = {outer: nested} if name == "policy" else None
     env = aec_env(calling(outer, other, outer, INNER), [outer, other, INNER], policies=policies)
     play(env, 7)
@@ -201,77 +194,52 @@ def test_mappings_and_policies_may_run_an_environment_of_their_own(name):
     assert all(log == [4, 4, 4] for log in logs)
 
 
-def test_environments_nest_deeply():
+def test_errors_pass_through_environments_that_are_nested_deeply():
     def nested(depth):
-        decide = decision(lambda: nested(depth - 1) if depth else 0, agent="a_0", reward_mapping=lambda: 1.0)
-        env = single_env(calling(decide, decide), decide)
-        env.reset()
-        total = 0
-        while True:
-            _, reward, terminated, *_ = env.step(RULE)
-            total += reward + env.unwrapped.simulation.log[-1]
-            if terminated:
-                return total
+        decide = decision(lambda: nested(depth - 1) if depth else 1 / 0, agent=f"deep_{depth}")
+        run_inner(single_env(calling(decide), decide), RULE)
 
-    assert nested(5) == sum(2.0**n for n in range(1, 7))
-
-
-def test_errors_of_an_inner_environment_pass_through_both():
-    bad = decision(lambda: 1 / 0, agent="bad_0")
-    inner = single_env(calling(bad), bad)
-    outer = decision(lambda: run_inner(inner, RULE), agent="outer_0")
+    outer = decision(lambda: nested(5), agent="outer_0")
     env = single_env(calling(outer, outer), outer)
     for _ in range(2):
         env.reset(seed=111)
         with pytest.raises(ZeroDivisionError) as caught:
             env.step(RULE)
-        assert "bad_0" in caught.value.__notes__[0]
-        assert "outer_0" in caught.value.__notes__[1]
+        agents = [re.search(r"(deep|outer)_\d", note)[0] for note in caught.value.__notes__]
+        assert agents == [*(f"deep_{depth}" for depth in range(6)), "outer_0"]
     env.reset()
     env.step(1)
 
 
 def test_a_suspended_nest_is_collected():
-    before = stacks()
-    unwound = []
+    before, unwound, outer = stacks(), [], decision(agent="outer_0")
 
     class Nest(Script):
         def run(self):
-            self.inner = single_env(script(inside), INNER)
+            self.inner = single_env(unwinding(INNER, unwound), INNER)
             self.inner.reset()
             try:
                 outer()
             finally:
                 unwound.append("outer")
 
-    def inside(simulation):
-        try:
-            INNER()
-        finally:
-            unwound.append("inner")
-
-    outer = decision(agent="outer_0")
     env = single_env(lambda: Nest(None), outer)
     env.reset()
     del env
     assert stacks(before) == before
-    assert sorted(unwound) == ["inner", "outer"]
+    assert sorted(unwound) == ["outer", "unwound"]
 
 
 def test_environments_may_be_stepped_from_greenlets_of_the_user():
     decide = decision()
     env = single_env(calling(*[decide] * 6), decide)
     env.reset()
+    for number in range(5):
+        assert not greenlet.greenlet(env.step).switch(number)[2]
     main = greenlet.getcurrent()
-
-    def work(number):
-        while True:
-            main.switch(env.step(number)[2])
-
-    workers = [greenlet.greenlet(work) for _ in range(3)]
-    ended = [worker.switch(number) for _ in range(2) for number, worker in enumerate(workers)]
-    assert ended == [False] * 5 + [True]
-    assert env.unwrapped.simulation.log == [0, 1, 2, 0, 1, 2]
+    worker = greenlet.greenlet(lambda: main.switch(env.step(5)[2]))
+    assert worker.switch()
+    assert env.unwrapped.simulation.log == list(range(6))
 
 
 # -- SimPy ----------------------------------------------------------------------------------------
@@ -280,18 +248,14 @@ def test_environments_may_be_stepped_from_greenlets_of_the_user():
 class Shop:
     """Customers queue for a till; how long each is served is decided inside a process."""
 
-    def __init__(self, env):
-        self.env, self.till, self.log = env, simpy.Resource(env), []
+    def __init__(self, env, log):
+        self.env, self.till, self.log = env, simpy.Resource(env), log
 
-    @define(
-        observation_space_mapping=lambda self, customer: [self.env.now, customer],
-        reward_mapping=lambda self, customer: self.env.now,
-        agent="clerk_0",
-    )
+    @define(agent="clerk_0", reward_mapping=lambda self, customer: self.env.now)
     def service_time(self, customer):
         return 1 + customer % 2
 
-    @define(observation_space_mapping=lambda self: [self.env.now, 0], agent="manager_0")
+    @define(agent="manager_0")
     def pause(self):
         yield self.env.timeout(1)
         return "rested"
@@ -304,50 +268,36 @@ class Shop:
         self.log.append((number, self.env.now))
 
     def manager(self):
-        for _ in range(2):
-            yield self.env.timeout(2)
-            result = yield self.env.process(self.pause())
-            self.log.append((result, self.env.now))
-            self.log.append(((yield from self.pause()), self.env.now))
+        yield self.env.timeout(2)
+        result = yield self.env.process(self.pause())
+        self.log.append((result, self.env.now))
+        self.log.append(((yield from self.pause()), self.env.now))
 
 
-class Shopping(Script):
-    def __init__(self):
-        super().__init__(None)
-
-    def run(self):
-        env = simpy.Environment()
-        self.shop = Shop(env)
-        for number in range(4):
-            env.process(self.shop.customer(number))
-        env.process(self.shop.manager())
-        env.run()
-        self.log = self.shop.log
+def shopping(simulation):
+    env = simpy.Environment()
+    shop = Shop(env, simulation.log)
+    for number in range(4):
+        env.process(shop.customer(number))
+    env.process(shop.manager())
+    env.run()
 
 
 def test_decisions_inside_simpy_processes():
-    points = [Shop.service_time, Shop.pause]
-    plain = Shopping()
-    plain.reset()
-    plain.run()
-    env = aec_env(Shopping, points)
+    env = aec_env(script(shopping), [Shop.service_time, Shop.pause])
     turns = play(env, RULE)
-    assert env.unwrapped.simulation.log == plain.log
-    assert decisions(turns).count("clerk_0") == decisions(turns).count("manager_0") == 4
+    assert env.unwrapped.simulation.log == plain_log(script(shopping))
+    assert (decisions(turns).count("clerk_0"), decisions(turns).count("manager_0")) == (4, 2)
     turns = play(env, 3)
-    assert [entry for entry in env.unwrapped.simulation.log if entry[0] in range(4) and entry[0] != 3] == [
-        (0, 3),
-        (1, 6),
-        (2, 9),
-    ]
+    # The pauses take no time, and return the action.
+    assert env.unwrapped.simulation.log == [(3, 2), (3, 2), (0, 3), (1, 6), (2, 9), (3, 12)]
     assert rewards_of(turns, "clerk_0") == [3.0, 6.0, 9.0, 12.0]
 
 
 @pytest.mark.parametrize("number", [1, 3, 30])
 @pytest.mark.parametrize("how", ["close", "reset", "collect", "error"])
 def test_simpy_models_unwind(how, number):
-    unwound = []
-    decide = decision(lambda: 1 / 0)
+    before, unwound, decide = stacks(), [], decision(lambda: 1 / 0)
 
     def process(env, number):
         try:
@@ -360,18 +310,14 @@ def test_simpy_models_unwind(how, number):
         env = simpy.Environment()
         env.run(env.all_of([env.process(process(env, n)) for n in range(number)]))
 
-    before = stacks()
     gym = single_env(script(main), decide)
     gym.reset()
     if how == "error":
-        # SimPy keeps the error of a process until those that wait for it are told.
-        for n in range(number):
+        for n in range(number - 1):  # SimPy keeps the error of a process until those that wait for it are told
             assert len(unwound) == n
-            if n < number - 1:
-                gym.step(RULE)
-            else:
-                with pytest.raises(ZeroDivisionError):
-                    gym.step(RULE)
+            gym.step(RULE)
+        with pytest.raises(ZeroDivisionError):
+            gym.step(RULE)
     elif how != "collect":
         getattr(gym, how)()
         assert sorted(unwound) == list(range(number))
@@ -396,9 +342,8 @@ def test_greenlets_of_the_model_unwind_when_the_error_that_holds_them_is_gone():
 
 
 def use_greenlets_of_the_model(how):
-    before = stacks()
+    before, unwound = stacks(), []
     decide = decision(lambda name: name, agent=lambda name: f"{name}_0")
-    unwound = []
 
     def worker(name):
         parent = greenlet.getcurrent().parent
@@ -418,24 +363,19 @@ def use_greenlets_of_the_model(how):
             simulation.log.append(decide("m"))
 
     env = aec_env(script(main), decide)
-    env.reset()
-    order = []
-    error = None
-    for number in range(9 if how == "end" else 7 if how == "error" else 4):
-        order.append(env.agent_selection)
-        try:
-            env.step(None if env.terminations[env.agent_selection] else number)
-        except ZeroDivisionError as raised:
-            error = raised
-            break
     if how == "end":
-        assert order[:7] == ["a_0", "b_0", "m_0"] * 2 + ["m_0"]
-        assert env.unwrapped.simulation.log == [0, 1, 2, 3, 4, 5, None, None, 6]
-    elif how == "error":
-        assert error is not None
-    elif how == "close":
-        env.close()
-    error = None
+        turns = play(env, lambda agent, env: len(env.unwrapped.simulation.log))
+        assert decisions(turns) == ["a_0", "b_0", "m_0"] * 2 + ["m_0"]
+        assert env.unwrapped.simulation.log == [0, 1, 2, 3, 4, 5, None, None, 8]
+    else:
+        env.reset()
+        for number in range(5 if how == "error" else 4):
+            env.step(number)
+        if how == "error":
+            with pytest.raises(ZeroDivisionError):
+                env.step(5)
+        if how == "close":
+            env.close()
     del env
     assert stacks(before) == before
     assert sorted(unwound) == ["a", "b"]
@@ -475,29 +415,21 @@ def _no_loop_stays_behind(caplog):
         gc.collect()
 
 
-def office(number=4):
-    return script(lambda simulation: asyncio.run(Office().work(number, simulation.log)))
+def office():
+    return script(lambda simulation: asyncio.run(Office().work(4, simulation.log)))
 
 
 @pytest.mark.usefixtures("_no_loop_stays_behind")
 def test_decisions_inside_coroutines():
-    plain = office()()
-    plain.reset()
-    plain.run()
     env = aec_env(office(), [Office.rounds, Office.bonus])
-    turns = play(env, RULE)
-    assert env.unwrapped.simulation.log == plain.log
-    assert sorted(decisions(turns)) == ["boss_0"] * 4 + ["clerk_0"] * 4
-    play(env, {"clerk_0": iter([3, 2, 1, 0]), "boss_0": 7})
+    turns = play(env, {"clerk_0": iter([3, 2, 1, 0]), "boss_0": 7})
     assert env.unwrapped.simulation.log == [(3, 0, 7), (2, 1, 7), (1, 2, 7), (0, 3, 7)]
+    assert sorted(decisions(turns)) == ["boss_0"] * 4 + ["clerk_0"] * 4
 
 
 @pytest.mark.usefixtures("_no_loop_stays_behind")
 @VIEWS
 def test_models_that_use_asyncio_run_side_by_side(view):
-    plain = office()()
-    plain.reset()
-    plain.run()
     policies = {Office.bonus: RULE} if view is single_env else None
     envs = [view(office(), [Office.rounds, Office.bonus], policies=policies) for _ in range(3)]
     for env in envs:
@@ -508,7 +440,7 @@ def test_models_that_use_asyncio_run_side_by_side(view):
             result = env.step(RULE)
             if result[2] if view is single_env else any(env.terminations.values()):
                 running.remove(env)
-    assert [env.unwrapped.simulation.log for env in envs] == [plain.log] * 3
+    assert [env.unwrapped.simulation.log for env in envs] == [plain_log(office())] * 3
 
 
 @pytest.mark.usefixtures("_no_loop_stays_behind")
@@ -531,10 +463,9 @@ def test_models_may_be_the_first_to_import_asyncio():
         import asyncio
         async def use():
             return asyncio.get_running_loop().is_running()
-        assert asyncio.run(use())
-        env.step(1)
-        assert asyncio.run(use())
-        env.step(2)
+        for action in (1, 2):
+            assert asyncio.run(use())
+            env.step(action)
         print(env.unwrapped.simulation.log)
     """
     result = subprocess.run([sys.executable, "-c", dedent(code)], capture_output=True, text=True, check=False)
@@ -552,8 +483,7 @@ def test_decimal_contexts_and_handled_errors_do_not_leak():
                 raise KeyError("the model's")
             except KeyError:
                 decide()
-                simulation.log.append(decimal.Decimal(1) / 3)
-                simulation.log.append(sys.exc_info()[0])
+                simulation.log += [decimal.Decimal(1) / 3, sys.exc_info()[0]]
                 decide()
 
     decide = decision()

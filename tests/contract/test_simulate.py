@@ -36,7 +36,8 @@ from tests.worlds.models import calling, decision, decisions, notes, play, scrip
 
 
 def test_without_policies_it_is_the_plain_run_of_a_copy():
-    ant = decision(agent="ant_0")
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    assert simulate(calling(ant, bee), {bee: lambda observation: 2}, points=ant).log == ["rule", 2]  # and lists it
     for arguments in ({}, {"points": ant}, {"policies": {}, "points": [ant]}):
         given_simulation = calling(ant, ant)()
         simulation = simulate(given_simulation, **arguments)
@@ -62,13 +63,8 @@ def test_a_policy_names_points_and_agents_as_the_simulation_knows_them(key, own)
     assert vars(Being)["act"] is plain
 
 
-def test_a_policy_names_a_point_that_is_not_listed():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    assert simulate(calling(ant, bee), {bee: lambda observation: 2}, points=ant).log == ["rule", 2]
-
-
 def test_policies_see_what_agents_see():
-    seen = []
+    seen, mask = [], [0, 1] + [0] * 8
 
     def policy(observation, info):
         seen.append((observation.tolist(), info["action_mask"].tolist()))
@@ -77,11 +73,11 @@ def test_policies_see_what_agents_see():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Box(0, 9, (1,), np.float32),
-        observation_space_mapping=lambda: [len(seen)],
-        action_mask_mapping=lambda: [0, 1] + [0] * 8,
+        observation_space_mapping=difference(lambda: np.array([7 * len(seen)])),
+        action_mask_mapping=lambda: mask,
     )
     assert simulate(calling(ant, ant), {ant: policy}).log == [1, 1]
-    assert seen == [([0], [0, 1] + [0] * 8), ([1], [0, 1] + [0] * 8)]
+    assert seen == [([0], mask), ([7], mask)]
 
 
 def test_a_seed_is_handed_on_or_drawn():
@@ -128,33 +124,14 @@ def test_arguments_that_cannot_be(arguments, error, match):
 
 
 def test_one_name_at_two_points_is_an_error():
-    definitions = beings() | others(agent=lambda other: f"being_{other.number}")
-
-    def main(simulation):
-        Being(0).act()
-        Other(0).act()
-
+    points = beings() | others(agent=lambda other: f"being_{other.number}")
     with pytest.raises(AgentError, match="has one decision point"):
-        simulate(script(main), {"being_0": lambda observation: 1}, points=definitions)
+        simulate(script(lambda s: (Being(0).act(), Other(0).act())), {"being_0": lambda seen: 1}, points=points)
 
 
-def test_differences_in_what_policies_observe():
-    levels = iter(range(0, 100, 7))
-    ant = decision(
-        agent="ant_0",
-        observation_space=spaces.Box(-99, 99, (1,), np.float64),
-        observation_space_mapping=difference(lambda: np.array([next(levels)])),
-    )
-    assert simulate(calling(ant, ant, ant), {ant: lambda observation: int(observation[0])}).log == [0, 7, 7]
-
-
-def test_simulations_within_policies():
-    """A policy may look ahead by a simulation of its own."""
+def test_policies_may_look_ahead_by_simulations_of_their_own():
     ant = decision(agent="ant_0")
-
-    def policy(observation):
-        return len(simulate(calling(ant, ant, ant), points=ant).log)
-
+    policy = lambda observation: len(simulate(calling(ant, ant, ant), points=ant).log)  # noqa: E731
     assert simulate(calling(ant, ant), {ant: policy}).log == [3, 3]
 
 
@@ -199,9 +176,6 @@ def test_some_agents_decide_by_their_policies_and_the_rest_by_their_rule(design,
         assert decisions(turns) == [agent for agent in plain.decisions if agent != "overseer_0"]
 
 
-# -- who answers for whom -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("of_point", "of_agent", "expected"),
     [
@@ -226,8 +200,6 @@ def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent,
 
 @pytest.mark.parametrize("action", [1, RULE])
 def test_policies_keep_nobody_alive(action):
-    """What the model lets go of after a decision is gone at once."""
-
     def main(simulation):
         for number in range(3):
             being = Being(number)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simenv_marl import RULE, simulate, simulate_many
+from simenv_marl.data import collect_episodes
 from simenv_marl.errors import (
     InvalidActionError,
     MissingExtraError,
@@ -20,7 +21,6 @@ from simenv_marl.errors import (
     UnknownOptionError,
     UnknownPointError,
 )
-from simenv_marl.experiments import Variant
 from tests.worlds import worlds
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, colony_points, designs
@@ -33,8 +33,6 @@ PAIRS = {"observation_space": spaces.Box(-9, 9, (2,), np.float32), "observation_
 
 
 def by_row(policy):
-    """The policy of many that answers each row as another one answers it alone."""
-
     def of_many(observations, infos):
         return [policy(observation, info) for observation, info in zip(observations, infos, strict=True)]
 
@@ -62,29 +60,28 @@ class Going:
 going = {Going.decide: define(agent="going_0")}
 
 
-# -- it is what simulate does ---------------------------------------------------------------------
+def alike_one_by_one(source, many, one, seeds, **options):
+    found = simulate_many(source, many, seeds=seeds, **options)
+    del options["batch_size"]
+    for seed, simulation in zip(seeds, found, strict=True):
+        alone = simulate(source, one, seed=seed, **options)
+        assert simulation.trace == alone.trace
+        assert simulation.random.getstate() == alone.random.getstate()
 
 
 @given(designs, some_seeds, sizes)
 @settings(max_examples=40)
 def test_colonies_are_what_they_are_one_by_one(design, seeds, size):
-    points = colony_points(overseen=bool(design.overseen))
-
     def answered(observation):
         number = int(observation.sum()) % 6
         return RULE if number == 5 else number
 
-    many = {Creature.act: lambda observations: [answered(observation) for observation in observations]}
-    one = {Creature.act: answered}
-    many |= {"creature_0": lambda observations: [3] * len(observations), "creature_2": RULE}
+    points = colony_points(overseen=bool(design.overseen))
+    one = {Creature.act: answered} | ({"overseer_0": answered} if design.overseen else {})
+    of_many = by_row(lambda observation, info: answered(observation))
+    many = dict.fromkeys(one, of_many) | {"creature_0": lambda seen: [3] * len(seen), "creature_2": RULE}
     one |= {"creature_0": lambda observation: 3, "creature_2": RULE}
-    if design.overseen:
-        many["overseer_0"], one["overseer_0"] = many[Creature.act], answered
-    found = simulate_many(lambda: Colony(design), many, seeds=seeds, points=points, batch_size=size)
-    for seed, simulation in zip(seeds, found, strict=True):
-        alone = simulate(lambda: Colony(design), one, seed=seed, points=points)
-        assert simulation.trace == alone.trace
-        assert simulation.random.getstate() == alone.random.getstate()
+    alike_one_by_one(lambda: Colony(design), many, one, seeds, points=points, batch_size=size)
 
 
 @given(worlds.designs(), some_seeds, sizes)
@@ -92,17 +89,9 @@ def test_colonies_are_what_they_are_one_by_one(design, seeds, size):
 def test_worlds_are_what_they_are_one_by_one(design, seeds, size):
     """Whatever the decision points are like: nested, generators, with choices, of entities, named now and then."""
     points = worlds.points_of(design)
-    policies = {points[number]: worlds.advised for number in range(len(points)) if number not in design.rules}
-
-    def simulation():
-        return worlds.World(design, points)
-
-    many = {point: by_row(policy) for point, policy in policies.items()}
-    found = simulate_many(simulation, many, seeds=seeds, points=points, batch_size=size)
-    for seed, one in zip(seeds, found, strict=True):
-        alone = simulate(simulation, policies, seed=seed, points=points)
-        assert one.trace == alone.trace
-        assert one.random.getstate() == alone.random.getstate()
+    one = {points[number]: worlds.advised for number in range(len(points)) if number not in design.rules}
+    many = {point: by_row(policy) for point, policy in one.items()}
+    alike_one_by_one(lambda: worlds.World(design, points), many, one, seeds, points=points, batch_size=size)
 
 
 def test_without_policies_they_are_plain_runs():
@@ -121,9 +110,6 @@ def test_each_seed_has_a_simulation_of_its_own_and_its_results_stand_in_their_or
     (found,) = simulate_many(given_simulation, {Going.decide: ones}, points=going, seeds=[1])
     assert found is not given_simulation  # it is copied
     assert not hasattr(given_simulation, "log")
-
-
-# -- what policies are asked ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -163,22 +149,7 @@ def test_policies_see_stacks_of_all_kinds_of_spaces(space, value):
         assert all(np.array_equal(row, value) for row in rows)
 
 
-def test_what_policies_are_given_is_theirs():
-    ant = decision(agent="ant_0", **PAIRS)
-
-    def policy(observations, infos):
-        assert observations.tolist() == [[1, 2]] * 3
-        assert infos == [{}] * 3
-        observations[:] = 7
-        for info in infos:
-            info["seen"] = True
-        return ones(observations)
-
-    found = simulate_many(calling(ant, ant, ant), {ant: policy}, seeds=range(3))
-    assert [simulation.log for simulation in found] == [[1, 1, 1]] * 3
-
-
-def test_policies_get_the_infos_if_they_take_them():
+def test_what_policies_are_given_is_theirs_with_infos_if_they_take_them():
     class Timed(Script):
         def time(self):
             return len(self.log)
@@ -186,31 +157,34 @@ def test_policies_get_the_infos_if_they_take_them():
     def main(simulation):
         simulation.log += [ant(), ant()]
 
-    ant = decision(agent="ant_0", action_mask_mapping=lambda: [0, 1] + [0] * 8)
-    seen = []
+    mask = [0, 1] + [0] * 8
+    ant = decision(agent="ant_0", action_mask_mapping=lambda: mask, **PAIRS)
 
     def policy(observations, infos):
-        seen.extend((info["time"], info["elapsed"], info["action_mask"].tolist()) for info in infos)
-        return [1] * len(infos)
+        assert observations.tolist() == [[1, 2]] * 3
+        told = [info | {"action_mask": info["action_mask"].tolist()} for info in infos]
+        assert told == [{"time": 0.0, "elapsed": 0.0, "action_mask": mask}] * 3
+        observations[:] = 7
+        for info in infos:
+            info["seen"] = True
+        return ones(observations)
 
-    simulate_many(lambda: Timed(main), {ant: policy}, seeds=range(2))
-    assert seen == [(0.0, 0.0, [0, 1] + [0] * 8)] * 4
+    found = simulate_many(lambda: Timed(main), {ant: policy}, seeds=range(3))
+    assert [simulation.log for simulation in found] == [[1, 1]] * 3
 
 
 def test_policies_that_are_the_same_are_asked_together():
     ant, bee = decision(agent="ant_0", **PAIRS), decision(agent="bee_0", **PAIRS)
+    cat = decision(agent="cat_0")  # who observes something else
     asked = []
 
     def policy(observations):
         asked.append(len(observations))
         return ones(observations)
 
-    def main(simulation):
-        simulation.log.append(ant() if simulation.seed % 2 else bee())
-
-    simulate_many(script(main), {ant: policy, bee: policy}, seeds=range(10))
+    source = script(lambda simulation: simulation.log.append(ant() if simulation.seed % 2 else bee()))
+    simulate_many(source, {ant: policy, bee: policy}, seeds=range(10))
     assert asked == [10]
-    cat = decision(agent="cat_0")  # who observes something else
     assert [s.log for s in simulate_many(calling(ant, cat), {ant: policy, cat: policy}, seeds=range(3))] == [[1, 1]] * 3
     assert asked == [10, 3, 3]
 
@@ -246,24 +220,14 @@ def test_simulations_that_have_ended_make_room_for_others_and_never_for_more():
         asked.append(len(observations))
         return ones(observations)
 
-    points = {Watched.decide: define(agent="going_0")}
-    simulate_many(
-        Watched,
-        {Watched.decide: policy},
-        points=points,
-        seeds=[1, 1, 1, 9] * 5,
-        batch_size=4,
-        collect=lambda simulation: under_way.remove(id(simulation)),
-    )
+    given = {"points": going, "seeds": [1, 1, 1, 9] * 5, "batch_size": 4}
+    simulate_many(Watched, {Going.decide: policy}, **given, collect=lambda model: under_way.remove(id(model)))
     assert not under_way
     assert max(asked) == 4
     assert len(asked) < 30  # and not 45, which it would be if all of four had to end first
 
 
 def test_simulations_are_collected_as_soon_as_they_end():
-    class Mortal(Going):
-        pass
-
     watched, ended = [], []
 
     def collect(simulation):
@@ -273,19 +237,12 @@ def test_simulations_are_collected_as_soon_as_they_end():
         ended.append(simulation.seed)
         return simulation.seed * 10
 
-    found = simulate_many(
-        Mortal, {Mortal.decide: ones}, points=going, seeds=[3, 1, 2], batch_size=2, collect=collect
-    )  # fmt: skip
-    assert found == [30, 10, 20]
+    given = {"points": going, "seeds": [3, 1, 2], "batch_size": 2, "collect": collect}
+    assert simulate_many(Going, {Going.decide: ones}, **given) == [30, 10, 20]
     assert ended == [1, 3, 2]
 
 
-# -- what policies answer -------------------------------------------------------------------------
-
-
 class Tensor:
-    """What only becomes an array, as tensors do."""
-
     def __init__(self, values):
         self.values = values
 
@@ -293,6 +250,7 @@ class Tensor:
         return np.array(self.values, dtype)
 
 
+PAIRED = np.array([[1.0, 2], [3, 4]])
 BOTH = spaces.Dict(a=spaces.Discrete(9), b=spaces.Box(0, 9, (2,), np.float64))
 
 
@@ -301,28 +259,23 @@ BOTH = spaces.Dict(a=spaces.Discrete(9), b=spaces.Box(0, 9, (2,), np.float64))
     [
         *(
             (spaces.Discrete(10), answer, [4, 5])
-            for answer in ([4, 5], (4, 5), np.array([4, 5]), np.array([4, 5], np.int8), [np.int64(4), np.array(5)])
-        ),
-        *(
-            (spaces.Discrete(10), answer, [4, 5])
-            for answer in (Tensor([4, 5]), {4: None, 5: None}.keys(), ([4, 5], {"values": [0.5, 0.5]}))
+            for answer in (
+                *([4, 5], (4, 5), np.array([4, 5]), np.array([4, 5], np.int8), [np.int64(4), np.array(5)]),
+                *(Tensor([4, 5]), {4: None, 5: None}.keys(), ([4, 5], {"values": [0.5, 0.5]})),
+            )
         ),
         (spaces.Discrete(10), [3, RULE], [3, "rule"]),
         (spaces.Discrete(10), np.array([RULE, 4], object), ["rule", 4]),
         (spaces.Discrete(10), RULE, ["rule", "rule"]),
-        (spaces.Box(0, 9, (2,), np.float32), np.array([[1.0, 2], [3, 4]]), np.float32([[1, 2], [3, 4]])),
-        (
-            BOTH,
-            {"a": np.array([5, 6]), "b": np.array([[1.0, 2], [3, 4]])},
-            [{"a": 5, "b": np.array([1.0, 2])}, {"a": 6, "b": np.array([3.0, 4])}],
-        ),
+        (spaces.Box(0, 9, (2,), np.float32), PAIRED, PAIRED.astype(np.float32)),
+        (BOTH, {"a": np.array([5, 6]), "b": PAIRED}, [{"a": 5, "b": PAIRED[0]}, {"a": 6, "b": PAIRED[1]}]),
         (spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9)]), [(1, 2), (3, 4)], [(1, 2), (3, 4)]),
     ],
     ids=lambda value: type(value).__name__,
 )
 def test_actions_come_as_anything_that_has_rows(space, answer, expected):
     ant = decision(agent="ant_0", action_space=space)
-    found = simulate_many(calling(ant), {ant: lambda observations: answer}, seeds=range(2))
+    found = simulate_many(calling(ant), {ant: lambda observations: answer}, seeds=range(len(expected)))
     assert same([simulation.log for simulation in found], [[action] for action in expected])
 
 
@@ -338,12 +291,7 @@ def test_a_wrong_number_of_actions(answer):
     assert "3" in notes(caught.value)
 
 
-# -- errors ---------------------------------------------------------------------------------------
-
-
 class Delicate(Going):
-    """Notes in ``ended`` what has been unwound or has ended."""
-
     ended: ClassVar[list] = []
 
     def run(self):
@@ -359,7 +307,6 @@ delicate = {Delicate.decide: define(agent="going_0")}
 
 
 def raising(kind):
-    """A policy that raises at every fifth question."""
     answered = []
 
     def policy(observations):
@@ -389,6 +336,7 @@ def failing_collection(simulation):
     return 1 // (simulation.seed - 17)
 
 
+@pytest.mark.parametrize("run", [simulate_many, collect_episodes])
 @pytest.mark.parametrize(
     ("error", "arguments", "told"),
     [
@@ -402,13 +350,13 @@ def failing_collection(simulation):
     ],
     ids=["model", "policy", "exit", "interrupt", "interrupt in model", "mapping", "illegal action", "collect"],
 )
-def test_an_error_anywhere_says_of_which_seed_and_unwinds_all(error, arguments, told):
+def test_an_error_anywhere_says_of_which_seed_and_unwinds_all(error, arguments, told, run):
     Delicate.ended.clear()
     plain, before = vars(Going)["decide"], stacks()
     usual = {"policies": {Delicate.decide: ones}, "points": delicate, "seeds": [20, 13, 17, 30], "batch_size": 3}
     usual |= arguments
     with pytest.raises(error) as caught:
-        simulate_many(Delicate, **usual)
+        run(Delicate, **usual)
     assert all(words in notes(caught.value) for words in told)
     assert sorted(Delicate.ended) == sorted(usual["seeds"][:3])
     assert "decide" not in vars(Delicate)
@@ -421,14 +369,9 @@ def test_an_error_in_a_reset_or_a_factory_says_of_which_seed():
         def reset(self, seed):
             super().reset(1 // (seed - 17) or seed)
 
-    made = []
-
-    def factory():
-        made.append(1)
-        return Delicate() if len(made) < 2 else 1 // 0
-
-    for source in (Fussy, factory):
-        with pytest.raises(ZeroDivisionError) as caught:
+    made = [Delicate]
+    for source in (Fussy, lambda: made.pop()()):
+        with pytest.raises((ZeroDivisionError, IndexError)) as caught:
             simulate_many(source, {Delicate.decide: ones}, points=delicate, seeds=[20, 17])
         assert "seed 17" in notes(caught.value)
 
@@ -467,44 +410,20 @@ def test_arguments_that_cannot_be(wrong):
 
 
 def test_seeds_may_be_an_array_and_workers_as_many_as_there_are():
-    found = simulate_many(
-        Going,
-        {Going.decide: ones},
-        seeds=np.arange(3),
-        points=going,
-        workers=-1,
-        collect=lambda simulation: (type(simulation.seed), simulation.log),
-    )
-    assert found == [(int, [1] * seed) for seed in range(3)]
-
-
-# -- other things around --------------------------------------------------------------------------
+    told = lambda simulation: (type(simulation.seed), simulation.log)  # noqa: E731
+    given = {"seeds": np.arange(3), "points": going, "workers": -1}
+    assert simulate_many(Going, {Going.decide: ones}, **given, collect=told) == [(int, [1] * seed) for seed in range(3)]
 
 
 def test_plugins_are_for_these_simulations_alone():
     called = []
-
-    def extended(simulation):
-        called.append(simulation.seed)
-
-    options = {"plugins": [(extended, Going.decide, "before")]}
-    found = simulate_many(Going, {Going.decide: ones}, points=going, seeds=[2, 1, 3], batch_size=2, **options)
+    plugins = [(lambda simulation: called.append(simulation.seed), Going.decide, "before")]
+    given = {"points": going, "batch_size": 2, "plugins": plugins}
+    found = simulate_many(Going, {Going.decide: ones}, seeds=[2, 1, 3], **given)
     assert [simulation.log for simulation in found] == [[1, 1], [1], [1, 1, 1]]
     assert sorted(called) == [1, 2, 2, 3, 3, 3]
     simulate_many(Going, {Going.decide: ones}, points=going, seeds=[2])
     assert len(called) == 6
-
-
-def test_variants_whose_own_policies_are_asked_one_by_one():
-    ant, bee = decision(agent="ant_0", **PAIRS), decision(agent="bee_0", **PAIRS)
-
-    def of_one(observation):
-        assert observation.shape == (2,)
-        return 5
-
-    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: of_one})
-    found = simulate_many(variant, {ant: ones}, seeds=range(3))
-    assert [simulation.log for simulation in found] == [[1, 5]] * 3
 
 
 def test_simulations_within_policies_and_rules():

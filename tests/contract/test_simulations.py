@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium import spaces
 
 from simenv_marl import RULE, TRUNCATED, SimulationInterface, aec_env, generate_env, single_env
 from simenv_marl.errors import NoDecisionError, NotResetError, OptionValueError, SimulationError
@@ -39,50 +38,48 @@ class Simulation(SimulationInterface):
             self.parts.append(self.model.decide())
 
 
-def test_an_instance_is_copied():
-    original = Simulation()
-    one, two = aec_env(original, Model.decide), aec_env(original, Model.decide)
-    play(one, 4)
-    play(two, 5)
-    assert original.parts == ["as made"]
-    assert original.resets == 0
-    assert not hasattr(original, "model")
-    assert one.unwrapped.simulation.parts == ["as made", 4, 4]
-    assert two.unwrapped.simulation.parts == ["as made", 5, 5]
-
-
 def test_an_instance_is_copied_as_it_stands_when_the_environment_is_made():
     original = Simulation()
     original.parts.append("grown")
-    env = single_env(original, Model.decide)
+    one, two = aec_env(original, Model.decide), aec_env(original, Model.decide)
     original.parts.append("too late")
-    assert env.unwrapped.simulation.parts == ["as made", "grown"]
+    play(one, 4)
+    play(two, 5)
+    assert original.resets == 0
+    assert not hasattr(original, "model")
+    assert original.parts == ["as made", "grown", "too late"]
+    assert one.unwrapped.simulation.parts == ["as made", "grown", 4, 4]
+    assert two.unwrapped.simulation.parts == ["as made", "grown", 5, 5]
 
 
+@pytest.mark.parametrize("named", [True, False], ids=["points", "points of the simulation"])
 @pytest.mark.parametrize("kind", ["class", "factory"])
-def test_classes_and_factories_make_one_simulation_for_each_environment(kind):
-    source = Simulation if kind == "class" else lambda: Simulation()
-    envs = [single_env(source, Model.decide) for _ in range(3)]
-    assert len({id(env.unwrapped.simulation) for env in envs}) == 3
-    assert all(type(env.unwrapped.simulation) is Simulation for env in envs)
-
-
 @pytest.mark.parametrize("view", ["aec", "single"])
-def test_a_simulation_is_made_once_and_reset_for_each_episode(view):
-    before = Simulation.made
-    env_class = generate_env(lambda: Simulation(), Model.decide, view=view)
+def test_a_simulation_is_made_once_for_each_environment_and_reset_for_each_episode(view, kind, named):
+    made = []
+
+    class Counted(Simulation):
+        points = None if named else [Model.decide]
+
+        def __init__(self):
+            super().__init__()
+            made.append(self)
+
+    env_class = generate_env(
+        Counted if kind == "class" else lambda: Counted(), Model.decide if named else None, view=view
+    )
     env = env_class()
-    assert Simulation.made == before + 1
     simulation = env.unwrapped.simulation
+    assert made == [simulation]
     for number in (1, 2, 3):
         env.reset()
-        assert env.unwrapped.simulation is simulation
         assert simulation.resets == number
         env.step(1)
     env.close()
     env.reset()
     assert env.unwrapped.simulation is simulation
-    assert Simulation.made == before + 1
+    others = [env_class(), env_class(max_steps=3)]
+    assert made == [simulation, *(other.unwrapped.simulation for other in others)]
 
 
 def test_anything_that_runs_and_resets_is_a_simulation():
@@ -95,28 +92,17 @@ def test_anything_that_runs_and_resets_is_a_simulation():
         def run(self):
             self.log.append(Model().decide())
 
-    for source in (Duck, Duck(), lambda: Duck()):
+    class Derived(Duck, SimulationInterface):
+        pass
+
+    for source in (Duck, Duck(), lambda: Duck(), Derived):
         env = single_env(source, Model.decide)
         env.reset()
         env.reset()  # in mid-episode, without a stop
         env.step(3)
         assert env.unwrapped.simulation.log == [3]
-
-
-def test_the_interface_asks_for_run_and_reset_alone():
     with pytest.raises(TypeError):
         SimulationInterface()
-
-    class Least(SimulationInterface):
-        def reset(self):
-            pass
-
-        def run(self):
-            Model().decide()
-
-    env = single_env(Least, Model.decide)
-    env.reset()
-    env.close()
 
 
 class NoReset:
@@ -168,57 +154,31 @@ def recording(reset_of: Any) -> Any:
     return Recording
 
 
-def reset_plain(self):
-    self.got.append({})
-
-
 def reset_seed(self, seed=None):
     self.got.append({"seed": seed})
 
 
-def reset_seed_required(self, seed):
-    self.got.append({"seed": seed})
-
-
-def reset_both(self, seed=None, options=None):
-    self.got.append({"seed": seed, "options": options})
-
-
-def reset_keywords(self, *, seed=None, options=None):
-    self.got.append({"seed": seed, "options": options})
-
-
-def reset_anything(self, **keywords):
-    self.got.append(keywords)
-
-
-def reset_options(self, options=None):
-    self.got.append({"options": options})
+SIZE = {"size": 3}
 
 
 @pytest.mark.parametrize("make", [aec_env, single_env])
 @pytest.mark.parametrize(
-    ("reset", "expected"),
+    ("reset", "given", "expected"),
     [
-        (reset_plain, {}),
-        (reset_seed, {"seed": 7}),
-        (reset_seed_required, {"seed": 7}),
-        (reset_both, {"seed": 7, "options": {"size": 3}}),
-        (reset_keywords, {"seed": 7, "options": {"size": 3}}),
-        (reset_anything, {"seed": 7, "options": {"size": 3}}),
-        (reset_options, {"options": {"size": 3}}),
+        (lambda self: self.got.append({}), SIZE, {}),
+        (lambda self, seed=None: self.got.append({"seed": seed}), SIZE, {"seed": 7}),
+        (lambda self, seed: self.got.append({"seed": seed}), SIZE, {"seed": 7}),
+        (lambda self, seed=None, options=None: self.got.append((seed, options)), SIZE, (7, SIZE)),
+        (lambda self, seed=None, options=None: self.got.append((seed, options)), None, (7, None)),
+        (lambda self, *, seed=None, options=None: self.got.append((seed, options)), SIZE, (7, SIZE)),
+        (lambda self, **keywords: self.got.append(keywords), SIZE, {"seed": 7, "options": SIZE}),
+        (lambda self, options=None: self.got.append({"options": options}), SIZE, {"options": SIZE}),
     ],
 )
-def test_reset_gets_what_it_takes(make, reset, expected):
+def test_reset_gets_what_it_takes(make, reset, given, expected):
     env = make(recording(reset), Model.decide)
-    env.reset(seed=7, options={"size": 3})
+    env.reset(seed=7, options=given)
     assert env.unwrapped.simulation.got == [expected]
-
-
-def test_options_that_were_not_given_are_none():
-    env = single_env(recording(reset_both), Model.decide)
-    env.reset(seed=1)
-    assert env.unwrapped.simulation.got == [{"seed": 1, "options": None}]
 
 
 def seeds_of(env):
@@ -236,27 +196,18 @@ def test_a_simulation_always_gets_an_integer_seed(make):
     assert len(set(seeds)) == 6
 
 
-@pytest.mark.parametrize("make", [aec_env, single_env])
-def test_seeds_follow_from_the_last_that_was_given(make):
-    one, two = (make(recording(reset_seed), Model.decide) for _ in range(2))
+def test_seeds_follow_from_the_last_that_was_given_in_every_view():
+    one, two, three = (make(recording(reset_seed), Model.decide) for make in (aec_env, single_env, aec_env))
     one.reset()
     one.reset(seed=3)
     for _ in range(2):
-        for env in (one, two):
+        for env in (one, two, three):
             env.reset(seed=5)
             for _ in range(3):
                 env.reset()
-    assert seeds_of(one)[2:] == seeds_of(two)
+    assert seeds_of(one)[2:] == seeds_of(two) == seeds_of(three)
     assert seeds_of(two)[:4] == seeds_of(two)[4:]
     assert len(set(seeds_of(two))) == 4
-
-
-def test_the_views_draw_the_same_seeds():
-    aec, single = (make(recording(reset_seed), Model.decide) for make in (aec_env, single_env))
-    for env in (aec, single):
-        env.reset(seed=5)
-        env.reset()
-    assert seeds_of(aec) == seeds_of(single)
 
 
 def test_two_unseeded_environments_differ():
@@ -277,70 +228,22 @@ def test_seeds_that_are_none_are_refused_and_nothing_happens(make, seed):
     env.step(3)
 
 
-def several_points():
-    def choose(name):
-        return 0
-
-    decide = decision(choose, agent=lambda name: name)
-    other = decision()
-    return calling(other, *[lambda name=name: decide(name) for name in "abcab"]), [decide, other]
-
-
-def samples(env, agent):
-    return [env.action_space(agent).sample() for _ in range(8)]
-
-
-def sample_all(env, seed):
-    env.reset(seed=seed)
-    drawn = {}
-    for agent in env.agent_iter():
-        terminated = env.last()[2]
-        drawn.setdefault(agent, samples(env, agent))
-        env.step(None if terminated else 1)
-    return drawn
-
-
-def test_action_spaces_are_seeded_those_of_late_joiners_included():
-    simulation, points = several_points()
-    one, two = aec_env(simulation, points), aec_env(simulation, points)
-    two.reset(seed=9)  # another history
-    first = sample_all(one, 3)
-    assert set(first) == {"choose_0", "a", "b", "c"}
-    assert sample_all(one, 3) == first
-    assert sample_all(two, 3) == first
-    assert sample_all(two, 4) != first
-
-
-def test_a_declared_agents_action_space_is_seeded_before_it_is_asked_for_and_after():
+def test_action_spaces_are_seeded_before_they_are_asked_for_and_after():
     points = [decision(agent="a_0"), decision(agent="b_0")]
     one, two = (aec_env(calling(*points), points) for _ in range(2))
-    spaces_before = {agent: two.action_space(agent) for agent in ("a_0", "b_0")}
-    for env in (one, two):
+    before = {agent: two.action_space(agent) for agent in ("a_0", "b_0")}
+    singles = [single_env(calling(points[0]), points[0]) for _ in range(2)]
+    for env in (one, two, *singles):
         env.reset(seed=3)
-    assert {agent: two.action_space(agent) for agent in ("a_0", "b_0")} == spaces_before
-    for agent in ("a_0", "b_0"):
-        assert two.action_space(agent) is spaces_before[agent]
-        assert samples(one, agent) == samples(two, agent)
+    for agent, space in before.items():
+        assert two.action_space(agent) is space
+        assert samples(one.action_space(agent)) == samples(space)
+    drawn, again = (samples(env.action_space) for env in singles)
+    assert drawn == again
 
 
-def test_the_single_view_seeds_its_action_space():
-    envs = [single_env(calling(decide := decision()), decide) for _ in range(2)]
-    for env in envs:
-        env.reset(seed=3)
-    drawn = [[env.action_space.sample() for _ in range(8)] for env in envs]
-    assert drawn[0] == drawn[1]
-
-
-def test_spaces_are_the_environments_own():
-    decide = decision(action_space=spaces.Discrete(1000))
-    one, two = (aec_env(calling(decide), decide) for _ in range(2))
-    assert one.action_space("choose_0") is one.action_space("choose_0")
-    assert one.action_space("choose_0") is not two.action_space("choose_0")
-    assert one.observation_space("choose_0") is not two.observation_space("choose_0")
-    assert one.action_space("choose_0") == spaces.Discrete(1000)
-    single = [single_env(calling(decide), decide) for _ in range(2)]
-    assert single[0].action_space is not single[1].action_space
-    assert single[0].observation_space is not single[1].observation_space
+def samples(space):
+    return [space.sample() for _ in range(8)]
 
 
 # -- ends -----------------------------------------------------------------------------------------
@@ -357,24 +260,19 @@ def test_the_return_of_run_ends_the_episode(ends, truncated):
     assert flags == (not truncated, truncated)
     assert [type(flag) for flag in flags] == [bool, bool]
     env = aec_env(calling(one, two, one, ends=ends), [one, two])
-    turns = play(env)
-    ended = [turn for turn in turns if turn.terminated or turn.truncated]
-    assert {turn.agent for turn in ended} == {"a_0", "b_0"}
-    assert len(ended) == 2
-    assert {(turn.terminated, turn.truncated) for turn in ended} == {(not truncated, truncated)}
-    assert {type(flag) for turn in turns for flag in (turn.terminated, turn.truncated)} == {bool}
-
-
-def test_flags_in_the_books_are_python_bools():
-    one, two = decision(agent="a_0"), decision(agent="b_0")
-    env = aec_env(calling(one, two), [one, two])
     env.reset()
-    assert env.terminations == env.truncations == {"a_0": False, "b_0": False}
-    env.step(1)
-    env.step(1)
-    assert env.terminations == {"a_0": True, "b_0": True}
-    assert env.truncations == {"a_0": False, "b_0": False}
-    assert all(type(flag) is bool for flag in [*env.terminations.values(), *env.truncations.values()])
+    for over in (False, False, False, True):
+        books = env.terminations, env.truncations
+        assert books == tuple(dict.fromkeys(("a_0", "b_0"), over and flag) for flag in flags)
+        assert {type(flag) for book in books for flag in book.values()} == {bool}
+        if not over:
+            env.step(1)
+    ended = play(env, reset=False)
+    assert sorted((turn.agent, turn.terminated, turn.truncated) for turn in ended) == [
+        ("a_0", *flags),
+        ("b_0", *flags),
+    ]
+    assert {type(flag) for turn in ended for flag in (turn.terminated, turn.truncated)} == {bool}
 
 
 def test_stop_is_called_to_unwind_and_only_then():
@@ -421,93 +319,69 @@ def test_an_episode_without_a_decision_is_an_error(make):
         env.reset()
 
 
-def test_an_episode_in_which_nobody_is_an_agent_is_one_without_a_decision():
-    decide = decision(agent=lambda: None)
-    with pytest.raises(NoDecisionError, match="without a decision"):
-        aec_env(calling(decide, decide), decide).reset()
-
-
-def test_an_episode_in_which_policies_answer_everything_is_one_without_a_decision():
-    decide, other = decision(), decision(agent="other_0")
-    with pytest.raises(NoDecisionError, match="without a decision"):
-        aec_env(calling(decide), [decide, other], policies={decide: lambda observation: 1}).reset()
+def test_an_episode_in_which_no_agent_is_asked_is_one_without_a_decision():
+    nobody, decide, other = decision(agent=lambda: None), decision(), decision(agent="other_0")
+    for calls, points, policies in (
+        ((nobody, nobody), nobody, None),
+        ((decide,), [decide, other], {decide: lambda observation: 1}),
+    ):
+        with pytest.raises(NoDecisionError, match="without a decision"):
+            aec_env(calling(*calls), points, policies=policies).reset()
 
 
 # -- decisions where nobody can be asked ----------------------------------------------------------
 
 
-def test_decisions_while_a_simulation_is_made_or_reset_run_their_rule():
-    class Early:
+def test_decisions_outside_of_run_run_their_rule():
+    class Curious(Script):
         def __init__(self):
-            self.made = Model().decide()
+            super().__init__(lambda simulation: simulation.log.append(Model().decide()))
+            self.seen = [Model().decide()]
 
-        def reset(self):
-            self.at_reset = Model().decide()
+        def reset(self, seed=None, options=None):
+            super().reset(seed, options)
+            self.seen.append(Model().decide())
 
-        def run(self):
-            self.ran = Model().decide()
-
-    env = single_env(Early, Model.decide)
-    for _ in range(2):
-        env.reset()
-        env.step(5)
-        simulation = env.unwrapped.simulation
-        assert (simulation.made, simulation.at_reset, simulation.ran) == (0, 0, 5)
-
-
-def test_decisions_while_it_is_stopped_or_rendered_run_their_rule():
-    seen = []
-
-    class Late(Script):
         def stop(self):
-            seen.append(Model().decide())
+            self.seen.append(Model().decide())
 
         def render(self, mode):
-            seen.append(Model().decide())
+            self.seen.append(Model().decide())
             return mode
 
-    env = single_env(lambda: Late(lambda simulation: Model().decide()), Model.decide, render_mode="ansi")
+    env = aec_env(Curious, Model.decide, render_mode="ansi")
+    simulation = env.unwrapped.simulation
+    for number in (1, 2):
+        env.reset()
+        assert env.render() == "ansi"
+        env.step(5)
+        assert simulation.seen == [0] * (1 + 2 * number)
+        assert simulation.log == [5]
     env.reset()
-    assert env.render() == "ansi"
     env.close()
-    assert seen == [0, 0]
+    assert simulation.seen == [0] * 7
 
 
-def test_decisions_in_mappings_run_their_rule():
+def test_decisions_in_mappings_and_policies_run_their_rule():
     seen = []
 
-    def observe():
+    def ask(*args, answer=None):
         seen.append(Model().decide())
-        return [0, 0]
-
-    def ask(*args):
-        seen.append(Model().decide())
-        return args[0] if args else [1] * 10
+        return args[0] if answer is None else answer
 
     decide = decision(
-        observation_space_mapping=observe,
-        reward_mapping=lambda: Model().decide(),
+        observation_space_mapping=lambda: ask(answer=[0, 0]),
+        reward_mapping=lambda: ask(0.0),
         action_space_mapping=ask,
-        action_mask_mapping=ask,
-        agent=lambda: f"agent_{Model().decide()}",
+        action_mask_mapping=lambda: ask(answer=[1] * 10),
+        agent=lambda: f"agent_{ask(0)}",
     )
-    env = aec_env(calling(decide, decide), [decide, Model.decide], policies={Model.decide: lambda observation: 7})
+    other = decision(agent="other_0")
+    policies = {Model.decide: lambda observation: 7, other: lambda observation: ask(1)}
+    env = aec_env(calling(decide, other, decide), [decide, other, Model.decide], policies=policies)
     assert decisions(play(env, 3)) == ["agent_0", "agent_0"]
     assert set(seen) == {0}
-    assert env.unwrapped.simulation.log == [3, 3]
-
-
-def test_decisions_in_policies_run_their_rule():
-    seen = []
-    other = decision(agent="other_0")
-
-    def policy(observation):
-        seen.append(Model().decide())
-        return 1
-
-    env = aec_env(calling(other, lambda: Model().decide()), [other, Model.decide], policies={other: policy})
-    assert decisions(play(env, 3)) == ["decide_0"]
-    assert seen == [0]
+    assert env.unwrapped.simulation.log == [3, 1, 3]
 
 
 def test_decisions_called_from_rules_are_decisions_like_any_other():
@@ -522,40 +396,12 @@ def test_decisions_called_from_rules_are_decisions_like_any_other():
 # -- how often it is made -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("points", [None, "given"])
-def test_a_factory_makes_one_simulation_for_each_environment(points):
-    made = []
-    ant = decision(agent="ant_0")
-
-    def factory():
-        made.append(calling(ant)())
-        made[-1].points = ant
-        return made[-1]
-
-    env = aec_env(factory, points and ant)
-    env.reset()
-    env.reset()
-    assert made == [env.simulation]
-    cls = generate_env(factory, points and ant)
-    envs = [cls(), cls(), cls(max_steps=3)]
-    assert made[1:] == [env.simulation for env in envs]
-
-
 def test_rosters_may_be_iterators():
-    def main(simulation):
-        return None
-
-    cls = generate_env(script(main), beings(), possible_agents=(f"being_{number}" for number in range(2)))
-    assert cls().possible_agents == cls().possible_agents == ["being_0", "being_1"]
     (point,) = beings()
-    cls = generate_env(script(main), beings(), possible_agents={point: (f"being_{number}" for number in range(2))})
-    assert cls().possible_agents == cls().possible_agents == ["being_0", "being_1"]
-
-
-@pytest.mark.parametrize("roster", [5, {"being_0": 5}])
-def test_what_is_no_roster(roster):
-    with pytest.raises(OptionValueError, match="possible_agents"):
-        aec_env(script(lambda simulation: None), beings(), possible_agents=roster)
+    for by_point in (False, True):
+        names = iter(["being_0", "being_1"])
+        cls = generate_env(calling(), beings(), possible_agents={point: names} if by_point else names)
+        assert cls().possible_agents == cls().possible_agents == ["being_0", "being_1"]
 
 
 def test_a_reset_may_be_any_callable():

@@ -8,13 +8,11 @@ import warnings
 
 import numpy as np
 import pytest
-from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
     aec_env,
     joint_env,
-    make_step,
     parallel_env,
     simulate,
     simulate_many,
@@ -23,13 +21,11 @@ from simenv_marl import (
 )
 from simenv_marl.core import rng
 from simenv_marl.errors import UnknownPointError
-from tests.worlds.models import calling, decision, script
+from tests.worlds.models import calling, decision, define
+from tests.worlds.models import play as play_in_turns
 
 DRAWS = "draws from the global generator"
 ABSENT = "did not appear in the episode"
-
-
-ALONE = pytest.mark.usefixtures("_alone")
 
 
 @pytest.fixture
@@ -41,9 +37,10 @@ def heard():
 
 
 @pytest.fixture
-def _alone(monkeypatch):
+def heard_alone(heard, monkeypatch):
     """As if no threads of other tests were left, beside which the driver of threads can blame no simulation."""
     monkeypatch.setattr(rng, "enumerate_threads", lambda: [threading.current_thread()])
+    return heard
 
 
 # -- global generators ----------------------------------------------------------------------------
@@ -84,13 +81,12 @@ def play(env, draw=lambda: None):
     ],
 )
 @pytest.mark.parametrize("in_reset", [False, True])
-@ALONE
-def test_a_simulation_that_draws_is_warned_of_once(heard, draw, name, in_reset) -> None:
+def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_reset) -> None:
     kind = gambler(draw, in_reset=in_reset)
     for make in (single_env, aec_env):
         for _ in range(2):
             play(make(kind, decide))
-    (message,) = heard(DRAWS)
+    (message,) = heard_alone(DRAWS)
     assert f"of {name}," in message
     assert "global_rng=True" in message
     assert "Gambler" in message
@@ -99,20 +95,11 @@ def test_a_simulation_that_draws_is_warned_of_once(heard, draw, name, in_reset) 
 @pytest.mark.parametrize("run", [
     lambda kind: simulate(kind, {decide: lambda observation: 1}),
     lambda kind: simulate_many(kind, {decide: lambda observations: np.ones(len(observations), np.int64)}, seeds=[1, 2]),
-    lambda kind: _vector(kind),
+    lambda kind: vector_env(kind, decide, num_envs=3).reset(seed=1),
 ])  # fmt: skip
-@ALONE
-def test_all_runners_notice(heard, run) -> None:
+def test_all_runners_notice(heard_alone, run) -> None:
     run(gambler(random.random))
-    assert len(heard(DRAWS)) == 1
-
-
-def _vector(kind):
-    env = vector_env(kind, decide, num_envs=3)
-    env.reset(seed=1)
-    for _ in range(3):
-        env.step(np.ones(3, np.int64))
-    env.close()
+    assert len(heard_alone(DRAWS)) == 1
 
 
 def test_what_its_user_draws_is_none_of_the_simulations(heard) -> None:
@@ -205,48 +192,39 @@ class Hill:
                 ant.step()
 
 
-STEP = f"{__name__}.Ant.step"
-HILL = {
-    STEP: make_step(
-        observation_space=spaces.Box(0, 1, (1,), np.float64),
-        observation_space_mapping=lambda ant: [0],
-        action_space=spaces.Discrete(3),
-        action_space_mapping=lambda action: action,
-        reward_mapping=lambda ant: 0.0,
-        agent=lambda ant: ant.name,
-    )
-}
+HILL = {f"{__name__}.Ant.step": define(agent=lambda ant: ant.name)}
 
 
 def through(env):
     """Play an AEC environment to its end, twice."""
     for _ in range(2):
-        env.reset(seed=1)
-        for _ in env.agent_iter():
-            env.step(None if any(env.last()[2:4]) else RULE)
+        play_in_turns(env, seed=1)
 
 
-def test_a_slip_in_policies_is_told_at_the_end_of_the_episode_and_once(heard) -> None:
-    through(aec_env(Hill, HILL, policies={"ant_O": lambda observation: 1}))
+@pytest.mark.parametrize(
+    ("options", "absent"),
+    [
+        ({"policies": {"ant_O": lambda observation: 1}}, "ant_O"),
+        ({"possible_agents": ["ant_0", "ant_1", "ant_2"]}, "ant_2"),
+    ],
+    ids=["policies", "a roster"],
+)
+def test_an_agent_that_never_comes_is_told_of_at_the_end_of_the_episode_and_once(heard, options, absent) -> None:
+    through(aec_env(Hill, HILL, **options))
     (message,) = heard(ABSENT)
-    assert "ant_O" in message
-    assert "ant_0, ant_1" in message
+    missing, _, those_who_came = message.partition(";")
+    assert absent in missing
+    assert "ant_1" not in missing
+    assert "ant_0, ant_1" in those_who_came
 
 
-def test_an_agent_of_the_roster_that_never_comes_is_told_of(heard) -> None:
-    through(aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1", "ant_2"]))
-    (message,) = heard(ABSENT)
-    assert "ant_2" in message.partition(";")[0]
-    assert "ant_1" not in message.partition(";")[0]
-
-
-def test_of_a_roster_in_rounds_and_of_joint_views_too(heard) -> None:
-    roster = {"possible_agents": ["ant_0", "ant_1", "ant_2"]}
-    for env in (parallel_env(Hill, HILL, **roster), joint_env(Hill, HILL, **roster)):
-        env.reset(seed=1)
-        for _ in range(2):
-            env.step(RULE)
-    assert len(heard(ABSENT)) == 2
+@pytest.mark.parametrize("make", [parallel_env, joint_env])
+def test_of_a_roster_in_rounds_and_of_joint_views_too(heard, make) -> None:
+    env = make(Hill, HILL, possible_agents=["ant_0", "ant_1", "ant_2"])
+    env.reset(seed=1)
+    for _ in range(2):
+        env.step(RULE)
+    assert len(heard(ABSENT)) == 1
 
 
 def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
@@ -258,27 +236,21 @@ def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
 
 
 def test_those_that_come_and_episodes_that_are_broken_off_are_not_told_of(heard) -> None:
-    env = aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1"], policies={"ant_1": lambda observation: 0})
-    through(env)
+    class Dotted(Hill):
+        names = ("nest.1", "ant_0")
+
+    # A dot makes no path.
+    through(aec_env(Dotted, HILL, possible_agents=["nest.1", "ant_0"], policies={"nest.1": lambda observation: 0}))
     env = aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1", "ant_9"])
     env.reset()
     env.close()
     assert heard(ABSENT) == []
 
 
-def test_what_leads_into_a_module_and_not_to_a_function_is_refused() -> None:
-    for slip in (f"{__name__}.Ant.setp", f"{__name__}.Nat.step"):
-        with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
-            aec_env(Hill, HILL, policies={slip: lambda observation: 0})
-
-
-def test_a_dot_makes_no_path(heard) -> None:
-    class Dotted(Hill):
-        names = ("nest.1", "random.2")
-
-    env = aec_env(Dotted, HILL, policies={"nest.1": lambda observation: 0})
-    through(env)
-    assert heard(ABSENT) == []
+@pytest.mark.parametrize("slip", [f"{__name__}.Ant.setp", f"{__name__}.Nat.step"])
+def test_what_leads_into_a_module_and_not_to_a_function_is_refused(slip) -> None:
+    with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
+        aec_env(Hill, HILL, policies={slip: lambda observation: 0})
 
 
 # -- rounds that stand still ----------------------------------------------------------------------
@@ -298,13 +270,8 @@ def test_rounds_without_an_action_for_the_pending_agent_are_told_of(heard) -> No
 
 
 def test_turns_are_no_standstill(heard) -> None:
-    def main(simulation):
-        for _ in range(400):
-            one()
-            two()
-
     one, two = decision(agent="one"), decision(agent="two")
-    env = parallel_env(script(main), [one, two])
+    env = parallel_env(calling(*[one, two] * 400), [one, two])
     env.reset(seed=1)
     for number in range(600):
         # Two rounds of three leave the pending agent out.

@@ -1,34 +1,163 @@
-"""What no driver may do differently: results, nesting, threads that models start, forks, ends of the process."""
+"""What no driver may do differently: stacks, nesting, threads that models start, forks, ends of the process."""
 
 import asyncio
+import contextvars
 import gc
 import os
+import signal
 import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from queue import Queue
 from textwrap import dedent
 
+import greenlet
 import pytest
 
-from simenv_marl import single_env
+from simenv_marl import RULE, aec_env, single_env
 from simenv_marl.errors import WrongThreadError
-from simenv_marl.hooks.stacks import STACKS
+from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, calling, culprits, decision, nobody_is_asked, notes, script
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
+REFUSED = "choose was called in a thread that the simulation has started"
 
 
 @pytest.fixture(autouse=True)
 def _nobody_is_running_afterwards():
+    gc.collect()
     before = set(STACKS)  # of environments that other modules of tests keep
     yield
     gc.collect()
+    gc.collect()
     assert nobody_is_asked()
-    assert STACKS.keys() <= before
+    assert set(STACKS) <= before
+    assert EVALUATING == {}
+
+
+# -- 5.0: one stack of its own, kept over the episodes --------------------------------------------
+
+
+@DRIVERS
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver, view):
+    variable = contextvars.ContextVar("variable", default="nobody's")
+    seen = []
+
+    def look():
+        seen.append((greenlet.getcurrent(), threading.get_ident()))
+
+    class Engine(Script):
+        """Makes a greenlet in ``reset`` to which ``run`` switches, as discrete-event engines do."""
+
+        def __init__(self):
+            super().__init__(None)
+            look()
+
+        def reset(self, seed=None):
+            super().reset(seed)
+            look()
+            self.log.append(variable.get())
+            variable.set("the model's")
+            self.worker = greenlet.greenlet(self.work)
+
+        def work(self):
+            for _ in range(3):
+                self.log.append(decide())
+
+        def run(self):
+            look()
+            self.log.append(variable.get())
+            self.worker.switch()
+            self.log.append(variable.get())
+            look()
+
+    decide = decision()
+    env = view(Engine, decide, driver=driver)
+    for user in ("one", "two", "after it was closed"):
+        token = variable.set(user)
+        for _ in range(2):
+            env.reset()
+            assert variable.get() == user
+            for action in (1, 2, RULE):
+                env.step(action)
+            assert env.unwrapped.simulation.log == [user, "the model's", 1, 2, "rule", "the model's"]
+        if user == "two":
+            env.reset()
+            assert len(set(seen)) == 1
+            assert greenlet.getcurrent() is not seen[0][0]
+            env.close()
+            seen.clear()
+        variable.reset(token)
+    assert len(set(seen)) == 1
+    env.close()
+
+
+@DRIVERS
+def test_an_event_loop_is_the_simulations_own_while_that_is_unwound(driver):
+    async def work(simulation):
+        try:
+            decide()
+        finally:
+            simulation.log.append(asyncio.get_running_loop() is not here)
+            await asyncio.sleep(0)
+            simulation.log.append("unwound")
+
+    async def use(env):
+        nonlocal here
+        here = asyncio.get_running_loop()
+        env.reset()
+        env.close()
+        return asyncio.get_running_loop()
+
+    decide, here = decision(), None
+    env = single_env(script(lambda simulation: asyncio.run(work(simulation))), decide, driver=driver)
+    assert asyncio.run(use(env)) is here
+    assert env.simulation.log == [True, "unwound"]
+
+
+@DRIVERS
+def test_an_event_loop_that_was_made_in_reset_is_used_in_run(driver):
+    class Office(Script):
+        def __init__(self):
+            super().__init__(None)
+
+        def reset(self, seed=None):
+            super().reset(seed)
+            self.loop = asyncio.new_event_loop()
+            self.done = self.loop.create_future()
+
+        async def work(self):
+            self.loop.call_soon(self.done.set_result, "done")
+            for _ in range(2):
+                await asyncio.sleep(0)
+                self.log.append(decide())
+            return await self.done
+
+        def run(self):
+            try:
+                self.log.append(self.loop.run_until_complete(self.work()))
+            finally:
+                self.loop.close()
+
+    async def use():
+        env.reset()
+        await asyncio.sleep(0)
+        env.step(1)
+        assert asyncio.get_running_loop().is_running()
+        return env.step(2)[2]
+
+    decide = decision()
+    env = single_env(Office, decide, driver=driver)
+    for _ in range(2):
+        assert asyncio.run(use())
+        assert env.simulation.log == [1, 2, "done"]
+    env.reset()
+    env.step(1)
+    assert env.step(2)[2]
+    env.close()
 
 
 # -- several at once ------------------------------------------------------------------------------
@@ -37,7 +166,6 @@ def _nobody_is_running_afterwards():
 @DRIVERS
 @pytest.mark.parametrize("inside", ["greenlet", "thread"])
 def test_environments_run_inside_each_others_simulations(driver, inside):
-    """Each decides for itself alone, and the mappings of the inner one are not the outer one's."""
     seen = []
 
     def spy(value):
@@ -96,17 +224,13 @@ def test_unrelated_threads_run_their_rule_while_a_simulation_is_moving(driver):
     env.step(1)
     thread.join()
     assert said == ["rule"]
-    env.close()
 
 
 # -- threads that models start --------------------------------------------------------------------
 
 
 def by_thread(function):
-    """In a thread of its own: what it has returned there, or that it was refused."""
-    with suppress(WrongThreadError):
-        return in_a_thread(function)
-    return "refused"
+    return in_a_thread(lambda: refused_or(function))
 
 
 def by_pool(function):
@@ -123,21 +247,21 @@ WAYS = [
 
 
 @DRIVERS
+@pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("way", WAYS, ids=["thread", "grandchild", "pool", "asyncio"])
-def test_decisions_in_threads_of_the_model_are_refused_and_the_next_step_says_so(driver, way):
+def test_decisions_in_threads_of_the_model_are_refused_and_the_step_says_so(driver, way, last):
     def main(simulation):
         simulation.log.append(decide())
         with suppress(WrongThreadError):
             simulation.log.append(way(decide))
         simulation.log.append("refused")
-        simulation.log.append(decide())
+        if not last:
+            simulation.log.append(decide())
 
     decide = decision()
     env = single_env(script(main), decide, driver=driver)
     env.reset(seed=5)
-    with pytest.raises(
-        WrongThreadError, match="choose was called in a thread that the simulation has started"
-    ) as caught:
+    with pytest.raises(WrongThreadError, match=REFUSED) as caught:
         env.step(1)
     assert env.simulation.log == [1, "refused"]
     assert "after decision 1, of 'choose_0'" in notes(caught.value)
@@ -155,42 +279,35 @@ def test_a_refusal_is_raised_once_or_told_of_by_another_error(driver):
         by_thread(decide)
         raise KeyError("nobody has put it there")
 
+    def raised_by(function, kind):
+        env = single_env(calling(decide, function), decide, driver=driver)
+        env.reset()
+        with pytest.raises(kind) as caught:
+            env.step(1)
+        env.close()
+        return caught.value
+
     decide = decision()
-    env = single_env(calling(decide, passed_on), decide, driver=driver)
-    env.reset()
-    with pytest.raises(WrongThreadError, match="in a thread that the simulation has started") as caught:
-        env.step(1)
-    assert "passed_on" in culprits(caught.value)
-    assert notes(caught.value).count("\n") == 0
-    env.close()
-    env = single_env(calling(decide, followed_by_another), decide, driver=driver)
-    env.reset()
-    with pytest.raises(KeyError) as caught:
-        env.step(1)
-    assert "a decision was refused" in notes(caught.value)
-    env.close()
+    error = raised_by(passed_on, WrongThreadError)
+    assert REFUSED in str(error)
+    assert "passed_on" in culprits(error)
+    assert notes(error).count("\n") == 0
+    assert "a decision was refused" in notes(raised_by(followed_by_another, KeyError))
 
 
-@DRIVERS
-def test_a_refusal_in_the_last_step_surfaces_at_the_end(driver):
-    decide = decision()
-    env = single_env(calling(decide, lambda: by_thread(decide)), decide, driver=driver)
-    env.reset()
-    with pytest.raises(WrongThreadError, match="in a thread that the simulation has started"):
-        env.step(1)
-    assert env.simulation.log == [1, "refused"]
+def refused_or(function):
+    """What it has returned in this thread, or that it was refused."""
+    with suppress(WrongThreadError):
+        return function()
+    return "refused"
 
 
 @DRIVERS
 @pytest.mark.parametrize("how", ["step", "close", "reset"])
 def test_a_thread_that_runs_while_the_simulation_is_suspended_is_refused_too(driver, how):
-    ask, said = threading.Event(), []
-
     def work():
         assert ask.wait(10)
-        said.append("refused")
-        with suppress(WrongThreadError):
-            said[0] = decide()
+        said.append(refused_or(decide))
 
     def main(simulation):
         simulation.thread = threading.Thread(target=work)
@@ -198,50 +315,24 @@ def test_a_thread_that_runs_while_the_simulation_is_suspended_is_refused_too(dri
         decide()
         decide()
 
-    decide = decision()
+    ask, said, decide = threading.Event(), [], decision()
     env = single_env(script(main), decide, driver=driver)
-    env.reset()
-    ask.set()
-    env.simulation.thread.join()
-    assert said == ["refused"]
-    with pytest.raises(WrongThreadError, match="in a thread that the simulation has started"):
-        env.step(1) if how == "step" else getattr(env, how)()
-    ask.clear()
-    env.reset()
-    ask.set()
-    env.simulation.thread.join()
-    with pytest.raises(WrongThreadError, match="in a thread that the simulation has started"):
-        env.close()
-
-
-class Pooled(Script):
-    """Has threads that are there before any episode, or that outlive some."""
-
-    def __init__(self, main):
-        super().__init__(main)
-        self.requests, self.answers = Queue(), Queue()
-        self.thread = None
-
-    def work(self):
-        for function in iter(self.requests.get, None):
-            try:
-                self.answers.put(function())
-            except WrongThreadError:
-                self.answers.put("refused")
-
-    def hire(self):
-        self.thread = threading.Thread(target=self.work, daemon=True)
-        self.thread.start()
-
-    def ask(self, function):
-        self.requests.put(function)
-        return self.answers.get(timeout=10)
+    for use in (how, "close"):
+        ask.clear()
+        env.reset()
+        ask.set()
+        env.simulation.thread.join()
+        with pytest.raises(WrongThreadError, match=REFUSED):
+            env.step(1) if use == "step" else getattr(env, use)()
+    assert said == ["refused"] * 2
 
 
 @DRIVERS
 @pytest.mark.parametrize("when", ["made", "reset", "episode before"])
 def test_threads_that_are_older_than_the_episode_are_refused_too(driver, when):
-    class Hiring(Pooled):
+    class Hiring(Script):
+        pool = None
+
         def __init__(self):
             super().__init__(main)
             if when == "made":
@@ -251,14 +342,21 @@ def test_threads_that_are_older_than_the_episode_are_refused_too(driver, when):
             super().reset()
             if when == "reset":
                 self.hire()
-                self.log.append(self.ask(decide))
+                self.log.append(self.ask())
+
+        def hire(self):
+            self.pool = ThreadPoolExecutor(1)
+            self.pool.submit(int).result()  # now its thread is there
+
+        def ask(self):
+            return self.pool.submit(refused_or, decide).result()
 
     def main(simulation):
         simulation.log.append(decide())
-        if simulation.thread is None:
+        if simulation.pool is None:
             simulation.hire()
             return
-        simulation.log.append(simulation.ask(decide))
+        simulation.log.append(simulation.ask())
         decide()
 
     decide = decision()
@@ -266,16 +364,14 @@ def test_threads_that_are_older_than_the_episode_are_refused_too(driver, when):
     env.reset()
     if when == "episode before":
         assert env.step(1)[2]
-        simulation = env.simulation
-        assert simulation.ask(decide) == "rule"  # between episodes nobody would be asked anyway
+        assert env.simulation.ask() == "rule"  # between episodes nobody would be asked anyway
         env.reset()
-    with pytest.raises(WrongThreadError, match="in a thread that the simulation has started"):
+    with pytest.raises(WrongThreadError, match=REFUSED):
         env.step(1)
     assert env.simulation.log == [*(["rule"] if when == "reset" else []), 1, "refused"]
     env.close()
-    assert env.simulation.ask(decide) == "rule"
-    env.simulation.requests.put(None)
-    env.simulation.thread.join()
+    assert env.simulation.ask() == "rule"
+    env.simulation.pool.shutdown()
 
 
 @DRIVERS
@@ -310,13 +406,15 @@ def test_threads_of_the_model_may_use_environments_of_their_own(driver, inner):
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="the platform has no fork")
 
 
-def run(code):
-    """Run code in a process of its own; return what it has printed."""
+def process(code):
+    """Run code in a process of its own, with warnings as errors; one that hangs is ended."""
     preamble = """
-        import os, sys, threading
-        from simenv_marl import aec_env, single_env
+        import os, random, signal, sys, threading, time
+        from contextlib import suppress
+        from simenv_marl import aec_env, parallel_env, single_env
         from simenv_marl.errors import WrongThreadError
         from tests.worlds.models import calling, decision, script
+        decide = decision()
         def in_a_child(function):
             child = os.fork()
             if child == 0:
@@ -332,9 +430,14 @@ def run(code):
     """
     # Python warns of forks where there are other threads; here there are, and that is what is tested.
     command = [sys.executable, "-W", "error", "-W", "ignore:This process:DeprecationWarning", "-c"]
-    result = subprocess.run(
+    return subprocess.run(
         [*command, dedent(preamble) + dedent(code)], capture_output=True, text=True, check=False, timeout=60
     )
+
+
+def run(code):
+    """Run code that ends well in a process of its own; return what it has printed."""
+    result = process(code)
     assert (result.returncode, result.stderr) == (0, ""), result.stdout + result.stderr
     return result.stdout
 
@@ -342,7 +445,6 @@ def run(code):
 @needs_fork
 def test_a_process_that_is_forked_in_mid_episode_goes_on_twice_with_greenlets():
     said = run("""
-        decide = decision()
         env = single_env(calling(decide, decide), decide)
         env.reset()
         env.step(1)
@@ -361,7 +463,6 @@ def test_a_process_that_is_forked_in_mid_episode_goes_on_twice_with_greenlets():
 @needs_fork
 def test_a_process_that_is_forked_in_mid_episode_has_to_reset_with_threads():
     said = run("""
-        decide = decision()
         env = single_env(calling(decide, decide), decide, driver="thread")
         other = single_env(calling(decide), decide, driver="thread")
         other.reset()
@@ -388,7 +489,6 @@ def test_a_process_that_is_forked_in_mid_episode_has_to_reset_with_threads():
 @needs_fork
 def test_what_a_forked_model_in_a_thread_does_not_catch_is_printed():
     said = run("""
-        decide = decision()
         def main(simulation):
             decide()
             child = os.fork()
@@ -411,7 +511,6 @@ def test_what_a_forked_model_in_a_thread_does_not_catch_is_printed():
 def test_a_fork_while_other_threads_are_moving_leaves_nothing_of_them_in_the_child(driver):
     said = run(f"""
         inside, go_on = threading.Event(), threading.Event()
-        decide = decision()
         def main(simulation):
             decide()
             inside.set()
@@ -446,7 +545,6 @@ def test_a_fork_while_other_threads_are_moving_leaves_nothing_of_them_in_the_chi
 def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
     said = run(f"""
         where = {where!r}
-        decide = decision()
         ready, never = threading.Event(), threading.Event()
         def main(simulation):
             try:
@@ -474,10 +572,8 @@ def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
             for env in envs:
                 env.reset()
                 if where in ("over", "moving", "failed"):
-                    try:
+                    with suppress(ZeroDivisionError):
                         env.step(1)
-                    except ZeroDivisionError:
-                        pass
                 if where == "over":
                     env.step(1)
                 if where == "closed":
@@ -498,3 +594,87 @@ def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
     # What is moving when the process ends, or was on a greenlet of another thread, is not unwound.
     never = where == "moving" or (where in ("in a thread", "in daemons") and driver == "greenlet")
     assert said == "unwound\n" * (0 if never else {"a hundred": 100, "inside": 2}.get(where, 1))
+
+
+@DRIVERS
+def test_a_model_may_end_the_process(driver):
+    code = f"""
+        def main(simulation):
+            decide()
+            END
+        env = aec_env(script(main), decide, driver={driver!r})
+        env.reset()
+        env.step(1)
+        print("went on")
+    """
+    assert process(code.replace("END", "sys.exit(3)")).returncode == 3
+    assert process(code.replace("END", "os._exit(4)")).returncode == 4
+    said = process(code.replace("END", "raise KeyboardInterrupt"))
+    assert "KeyboardInterrupt" in said.stderr
+    assert "went on" not in said.stdout
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="this platform has no timers that signal")
+@DRIVERS
+def test_signals_at_any_time_never_spoil_an_environment(driver):
+    result = process(f"""
+        class Alarm(BaseException):
+            pass
+        def ring(*_):
+            raise Alarm
+        signal.signal(signal.SIGALRM, ring)
+        def main(simulation):
+            for _ in range(5):
+                simulation.log.append(decide())
+        draw, rung = random.Random(3), 0
+        envs = [view(script(main), decide, driver={driver!r}) for view in (aec_env, single_env, parallel_env)]
+        def use(env):
+            env.reset()
+            for _ in range(5):
+                env.step(dict(choose_0=2) if env is envs[2] else 2)
+        for env in envs:
+            use(env)
+        begun = time.perf_counter()
+        for env in envs:
+            use(env)
+        usual = (time.perf_counter() - begun) / 3
+        for number in range(6000):
+            if number > 600 and rung > 20:
+                break
+            env = envs[number % 3]
+            try:
+                signal.setitimer(signal.ITIMER_REAL, draw.uniform(0.1, 1.5) * min(usual, 0.0005))
+                try:
+                    use(env)
+                finally:
+                    signal.setitimer(signal.ITIMER_REAL, 0)
+            except Alarm:
+                rung += 1
+            except RuntimeError as error:  # Python itself starts threads with a lock that gives way to signals
+                assert isinstance(error.__context__, Alarm)
+            use(env)
+            assert env.unwrapped.simulation.log == [2] * 5
+        for env in envs:
+            env.close()
+        assert sum(thread.is_alive() for thread in threading.enumerate()) == 1
+        print(rung > 20)
+    """)
+    # Whether an alarm rang in the midst of Python's own cleaning up is printed, but of no consequence.
+    assert (result.returncode, result.stdout) == (0, "True\n"), result.stderr
+
+
+def test_starting_threads_is_watched_only_while_there_are_simulations():
+    said = run("""
+        def is_watched():
+            return threading.Thread.start is not original
+        original, watched = threading.Thread.start, []
+        env = single_env(calling(decide), decide)
+        watched.append(is_watched())
+        other = single_env(calling(decide), decide)
+        env.close()
+        watched.append(is_watched())
+        del other
+        watched.append(is_watched())
+        print(watched)
+    """)
+    assert said == "[True, True, False]\n"

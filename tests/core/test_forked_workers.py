@@ -30,6 +30,7 @@ PREAMBLE = """
     warnings.simplefilter("ignore", DeprecationWarning)  # of forks where there are threads
     context = multiprocessing.get_context("fork")
     decide, other = decision(), decision(lambda: "not active")
+    RULED, REFUSED = ("decided", "rule", "not active"), ("refused", True, "not active")
 
     def ask(*_):
         try:
@@ -45,17 +46,32 @@ PREAMBLE = """
         def __init__(self):
             self.queue = context.SimpleQueue()
             self.process = context.Process(target=tell, args=(self.queue,))
+        def begin(self):
+            if not self.process.pid:
+                self.process.start()
         def ask(self):
-            self.process.start()
+            self.begin()
             told = {self.queue.get() for _ in range(2)}
             self.process.join()
             assert self.process.exitcode == 0
+            return told
+
+    class Executor:
+        def __init__(self):
+            self.pool = ProcessPoolExecutor(1, mp_context=context)
+        def begin(self):
+            self.pool.submit(int).result(20)
+        def ask(self):
+            told = {self.pool.submit(ask).result(20) for _ in range(3)}
+            self.pool.shutdown()
             return told
 
     class Pool:
         options = {}
         def __init__(self):
             self.pool = context.Pool(1, **self.options)
+        def begin(self):
+            pass
         def ask(self):
             told = {self.pool.apply_async(ask).get(20) for _ in range(3)}
             self.pool.close()
@@ -65,14 +81,6 @@ PREAMBLE = """
     class Changing(Pool):
         options = {"maxtasksperchild": 1}  # all but the first are forked in a thread of the pool
 
-    class Executor:
-        def __init__(self):
-            self.pool = ProcessPoolExecutor(1, mp_context=context)
-        def ask(self):
-            told = {self.pool.submit(ask).result(20) for _ in range(3)}
-            self.pool.shutdown()
-            return told
-
     class Fork:
         def __init__(self):
             self.reader, self.writer = os.pipe()
@@ -81,8 +89,7 @@ PREAMBLE = """
             if child == 0:
                 status = 1
                 try:
-                    told = {ask(), ask()}
-                    os.write(self.writer, repr(told).encode())
+                    os.write(self.writer, repr({ask(), ask()}).encode())
                     status = 0
                 finally:
                     os._exit(status)
@@ -102,11 +109,14 @@ PREAMBLE = """
     def directly(function):
         return function()
 
-    def play(main, make=Script):
+    def play(between, make=Script):
+        def main(simulation):
+            simulation.log.append(decide())
+            simulation.log.append(between(simulation))
+            simulation.log.append(decide())
         env = single_env(lambda: make(main), decide, driver=driver)
         env.reset()
-        first = env.step(1)[2]
-        assert (first, env.step(2)[2]) == (False, True)
+        assert [env.step(action)[2] for action in (1, 2)] == [False, True]
         assert env.simulation.log[::2] == [1, 2]
         env.close()
         return env.simulation.log[1]
@@ -119,8 +129,7 @@ def run(code, driver):
     """Run code in a process of its own, which no worker leaves as a second one."""
     source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + "\nprint('end', os.getpid() == user)\n"
     result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False, timeout=LIMIT)
-    assert (result.returncode, result.stderr) == (0, ""), result.stdout + result.stderr
-    return result.stdout
+    assert (result.returncode, result.stdout, result.stderr) == (0, "end True\n", ""), result.stdout + result.stderr
 
 
 KINDS = pytest.mark.parametrize("kind", ["Process", "Pool", "Changing", "Executor"])
@@ -129,91 +138,57 @@ KINDS = pytest.mark.parametrize("kind", ["Process", "Pool", "Changing", "Executo
 @DRIVERS
 @KINDS
 def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(kind, driver):
-    said = run(
+    run(
         f"""
         for way in (directly, in_a_thread, in_a_greenlet):
-            def main(simulation):
-                simulation.log.append(decide())
-                simulation.log.append(way(lambda: {kind}().ask()))
-                simulation.log.append(decide())
             for _ in range(2):
-                assert play(main) == {{("refused", True, "not active")}}, way
+                assert play(lambda simulation: way(lambda: {kind}().ask())) == {{REFUSED}}, way
         """,
         driver,
     )
-    assert said == "end True\n"
 
 
 @DRIVERS
 @KINDS
 def test_workers_that_were_forked_before_the_model_runs_have_the_rule(kind, driver):
-    said = run(
+    run(
         f"""
         class Model(Script):
             def reset(self, seed=None, options=None):
                 super().reset(seed, options)
                 self.workers = {kind}()
-                if {kind} is Process:
-                    self.workers.process.start()
-                    self.workers.process.start = lambda: None
-                elif {kind} is Executor:
-                    self.workers.pool.submit(int).result(20)
-        def main(simulation):
-            simulation.log.append(decide())
-            simulation.log.append(simulation.workers.ask())
-            simulation.log.append(decide())
-        told = play(main, Model)
-        assert ("decided", "rule", "not active") in told
-        assert told <= {{("decided", "rule", "not active"), ("refused", True, "not active")}}
+                self.workers.begin()
+        told = play(lambda simulation: simulation.workers.ask(), Model)
+        assert RULED in told
+        assert told <= {{RULED, REFUSED}}
         """,
         driver,
     )
-    assert said == "end True\n"
 
 
-@pytest.mark.parametrize(
-    ("way", "driver"),
-    [
-        ("directly", "greenlet"),
-        ("directly", "thread"),
-        ("in_a_thread", "thread"),
-        ("in_a_thread", "greenlet"),
-        ("in_a_greenlet", "thread"),
-    ],
-)
+@DRIVERS
+@pytest.mark.parametrize("way", ["directly", "in_a_thread", "in_a_greenlet"])
 def test_a_plain_fork_without_the_user_is_refused_as_well(way, driver):
-    said = run(
-        f"""
-        def main(simulation):
-            simulation.log.append(decide())
-            simulation.log.append({way}(Fork().ask))
-            simulation.log.append(decide())
-        assert play(main) == {{("refused", True, "not active")}}
-        """,
-        driver,
-    )
-    assert said == "end True\n"
+    run(f"assert play(lambda simulation: {way}(Fork().ask)) == {{REFUSED}}", driver)
 
 
 @DRIVERS
 def test_a_forked_worker_uses_environments_of_its_own(driver):
-    said = run(
+    run(
         """
         def play_own(queue):
             env = single_env(script(lambda simulation: simulation.log.append(decide())), decide, driver=driver)
             env.reset()
             queue.put((env.step(7)[2], env.simulation.log, ask()[0]))
             env.close()
-        def main(simulation):
-            simulation.log.append(decide())
+        def between(simulation):
             queue = context.SimpleQueue()
             worker = context.Process(target=play_own, args=(queue,))
             worker.start()
-            simulation.log.append(queue.get())
+            told = queue.get()
             worker.join()
-            simulation.log.append(decide())
-        assert play(main) == (True, [7], "refused")
+            return told
+        assert play(between) == (True, [7], "refused")
         """,
         driver,
     )
-    assert said == "end True\n"

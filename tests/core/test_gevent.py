@@ -46,18 +46,35 @@ PREAMBLE = """
 
 def run(code, driver="greenlet"):
     """Run code in a process of its own, whose hub nothing else has used."""
-    source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + "\nprint('end')\n"
+    source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + dedent(RULED)
     result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False, timeout=LIMIT)
     assert (result.returncode, result.stdout, result.stderr) == (0, "end\n", ""), result.stdout + result.stderr
 
 
-@DRIVERS
-@pytest.mark.parametrize("first", ["user", "model"])
-@pytest.mark.parametrize("where", ["main", "spawned"])
+RULED = """
+    env.close()
+    told.clear()
+    gevent.spawn(ask).join(timeout=10)
+    assert told == ["rule", "not active"]
+    print("end")
+"""
+"""The end of all: nobody is asked any more."""
+
+
+@pytest.mark.parametrize(
+    ("where", "first", "driver"),
+    [
+        ("main", "user", "greenlet"),  # a hub that begins in a simulation belongs to it
+        ("spawned", "user", "greenlet"),
+        ("spawned", "model", "greenlet"),
+        ("main", "user", "thread"),
+        ("main", "model", "thread"),
+        ("spawned", "user", "thread"),
+        ("spawned", "model", "thread"),
+    ],
+)
 def test_a_decision_of_the_users_while_the_model_waits_in_a_hub_runs_the_rule(where, first, driver):
     """Whichever of the two has used the hub first, and wherever the user steps."""
-    if (where, first, driver) == ("main", "model", "greenlet"):
-        pytest.skip("a hub that begins in a simulation belongs to it")
     run(
         f"""
         if {first!r} == "user":
@@ -75,13 +92,7 @@ def test_a_decision_of_the_users_while_the_model_waits_in_a_hub_runs_the_rule(wh
                 assert env.step(3)[2]
                 assert env.simulation.log == [1, 2, 3]
         env = single_env(script(waiting), decide, driver=driver)
-        if {where!r} == "main":
-            use()
-        else:
-            gevent.spawn(use).get(timeout=20)
-        env.close()
-        gevent.spawn(ask).join(timeout=10)
-        assert told[-2:] == ["rule", "not active"]
+        use() if {where!r} == "main" else gevent.spawn(use).get(timeout=20)
         """,
         driver,
     )
@@ -98,11 +109,11 @@ def test_models_wait_side_by_side_in_greenlets_of_their_users(driver):
                 ends = [env.step(number + step)[2] for step in range(3)]
                 assert ends == [False, False, True]
                 assert env.simulation.log == [number, number + 1, number + 2]
-            env.close()
-            return number
+            return env
         users = [gevent.spawn(use, number) for number in range(3)]
         gevent.joinall(users, timeout=20, raise_error=True)
-        assert [user.value for user in users] == [0, 1, 2]
+        for env in [user.value for user in users]:
+            env.close()
         """,
         driver,
     )
@@ -139,9 +150,6 @@ def test_what_a_model_spawns_on_the_hub_is_refused(how, first):
             else:
                 raise AssertionError(told)
             assert told == ["refused", "not active"]
-        env.close()
-        gevent.spawn(ask).join(timeout=10)
-        assert told == ["refused", "not active", "rule", "not active"]
         """
     )
 
@@ -164,7 +172,6 @@ def test_what_a_model_spawns_on_a_hub_of_its_own_decides():
             assert (env.simulation.log, told) == ([0, 3], [1, "not active", 2, "not active"])
         env.reset()
         env.step(1)
-        env.close()
         """
     )
 
@@ -185,8 +192,5 @@ def test_a_model_that_waits_in_the_hub_unwinds(how):
         env.step(1)
         env.{how}()
         assert unwound == [1]
-        env.close()
-        gevent.spawn(ask).join(timeout=10)
-        assert told == ["rule", "not active"]
         """
     )

@@ -43,7 +43,7 @@ def test_a_decorated_function_is_found_under_its_name_and_as_itself():
     assert point.permanent
 
 
-def test_an_undecorated_function_is_one_point_however_it_is_named():
+def test_an_undecorated_function_is_one_point_however_it_is_named_set_or_handled():
     one, two = define(), define()
     by_name, as_itself = find_point(f"{HERE}.Base.plain", one), find_point(Base.plain, two)
     point = by_name[0]
@@ -51,10 +51,6 @@ def test_an_undecorated_function_is_one_point_however_it_is_named():
     assert point.definition is None
     assert not point.permanent
     assert hook_of(vars(Base)["plain"]) is None  # nothing is set before it is held
-
-
-def test_it_is_found_while_it_is_set_and_while_it_has_handlers():
-    point = locate(Base.plain)
     point.install(1)
     try:
         assert locate(Base.plain) is locate(f"{HERE}.Base.plain") is point
@@ -63,8 +59,17 @@ def test_it_is_found_while_it_is_set_and_while_it_has_handlers():
         point.uninstall(1)
     with handlers((lambda self: None, f"{HERE}.Base.plain", "before")):
         assert locate(Base.plain) is point
-    fetched = Base.plain
-    assert locate(fetched) is point
+    assert locate(Base.plain) is point
+
+
+def test_a_function_of_a_class_inside_a_function_is_found_as_itself():
+    class Inside:
+        def decide(self):
+            return "rule"
+
+    point, _ = find_point(Inside.decide, define())
+    assert point.rule is vars(Inside)["decide"]
+    assert point.name == f"{HERE}.{Inside.decide.__qualname__}"
 
 
 def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_base_class():
@@ -104,16 +109,15 @@ def test_two_definitions_of_one_function_are_one_point():
 
 def test_a_point_goes_with_its_model():
     def made():
-        @define()
-        def function():
-            return 0
+        return define()(lambda: 0)
 
-        return weakref.ref(point_of(function)[0])
-
-    reference = made()
+    function = made()
+    reference, name = weakref.ref(point_of(function)[0]), point_of(function)[0].name
+    assert name in registered()
+    del function
     gc.collect()
     assert reference() is None
-    assert f"{HERE}.test_a_point_goes_with_its_model.<locals>.made.<locals>.function" not in registered()
+    assert name not in registered()
 
 
 def test_a_point_is_itself_again_where_it_is_and_comes_along_with_its_hook():

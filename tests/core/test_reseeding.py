@@ -116,12 +116,13 @@ def test_the_models_of_mesa():
     assert one.model.rng.random() == other.model.rng.random()
 
 
-def test_what_processes_of_simpy_hold():
-    def customer(environment, chance, log):
-        while True:
-            log.append(chance.random())
-            yield environment.timeout(1)
+def customer(environment, chance, log):
+    while True:
+        log.append(chance.random())
+        yield environment.timeout(1)
 
+
+def test_what_processes_of_simpy_hold():
     logs = [], []
     for seed, log in enumerate(logs):
         environment = simpy.Environment()

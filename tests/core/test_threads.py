@@ -10,15 +10,16 @@ from contextlib import nullcontext
 from itertools import count
 
 import pytest
+from greenlet import greenlet
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core import threads
 from simenv_marl.core.context import ExclusiveLock
 from simenv_marl.core.plan import Plan
 from simenv_marl.errors import ReentrancyError
-from tests.worlds.models import Script, calling, decision, notes, play, script
+from tests.worlds.models import Script, calling, decision, notes, play, script, step, unwinding
 
-VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
+VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
 
 
 def in_a_thread(function, *args):
@@ -66,9 +67,8 @@ def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(
 
     def main(simulation):
         for _ in range(3):
-            here("simulation", decide())
-            here("simulation", other())
-            here("simulation", applied())
+            for point in (decide, other, applied):
+                here("simulation", point())
             ruled()
 
     decide = decision(
@@ -81,28 +81,25 @@ def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(
     applied = decision(apply=lambda action: here("simulation", action), agent="c_0")
     ruled = decision(lambda: here("simulation", 0), agent="d_0")
     policies = {"b_0": lambda observation: here("user", 1), "d_0": RULE}
-    env = aec_env(script(main), [decide, other, applied, ruled], policies=policies, driver="thread")
-    play(env, 1)
-    me = threading.get_ident()
-    assert set(seen["user"]) == {me}
+    play(aec_env(script(main), [decide, other, applied, ruled], policies=policies, driver="thread"), 1)
+    assert set(seen["user"]) == {threading.get_ident()}
     assert len(seen["user"]) > 9
     assert len(seen["simulation"]) == 15
     assert len(set(seen["simulation"])) == 1
-    assert me not in seen["simulation"]
+    assert set(seen["simulation"]).isdisjoint(seen["user"])
 
 
 # -- from any thread ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("view", [aec_env, parallel_env, single_env, joint_env])
+@VIEWS
 def test_an_environment_may_be_used_from_a_new_thread_each_time(view):
     decide = decision(agent="a_0")
     env = view(calling(*[decide] * 3), decide, driver="thread")
-    action = {aec_env: 1, single_env: 1}.get(view, {"a_0": 1})
     for _ in range(2):
         in_a_thread(env.reset)
         for _ in range(3):
-            in_a_thread(env.step, action)
+            in_a_thread(step, env, 1, "a_0")
         assert env.simulation.log == [1, 1, 1]
     in_a_thread(env.reset)
     in_a_thread(env.close)
@@ -111,8 +108,8 @@ def test_an_environment_may_be_used_from_a_new_thread_each_time(view):
     env.close()
 
 
-@pytest.mark.parametrize("what", ["step", "reset", "close"])
 @VIEWS
+@pytest.mark.parametrize("what", ["step", "reset", "close"])
 def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what):
     inside, go_on = threading.Event(), threading.Event()
 
@@ -125,22 +122,22 @@ def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what):
     decide = decision()
     env = view(script(main), decide, driver="thread")
     env.reset()
-    stepping = threading.Thread(target=env.step, args=(1,))
+    stepping = threading.Thread(target=step, args=(env, 1, "choose_0"))
     stepping.start()
     assert inside.wait(10)
     with pytest.raises(ReentrancyError, match="another thread"):
-        env.step(2) if what == "step" else getattr(env, what)()
+        step(env, 2, "choose_0") if what == "step" else getattr(env, what)()
     go_on.set()
     stepping.join()
-    env.step(3)
+    step(env, 3, "choose_0")
     assert env.simulation.log == [1, 3]
     assert env.simulation.episodes == 1
 
 
-@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+@VIEWS
 @pytest.mark.parametrize("move", ["reset", "step"])
 def test_what_comes_of_a_move_is_read_before_another_thread_may_move(view, move):
-    action = {"choose_0": 1} if view in (parallel_env, joint_env) else 1
+    armed, decide = [], decision()
 
     class Drawn(Script):
         render_modes = ("human",)
@@ -148,30 +145,26 @@ def test_what_comes_of_a_move_is_read_before_another_thread_may_move(view, move)
         def render(self, mode):
             pass
 
-    armed, decide = [], decision()
-    base = type(view(calling(decide), decide))
-
-    class Shown(base):
+    class Shown(type(view(calling(decide), decide))):
         def render(self):
             if armed:
                 armed.clear()
                 with pytest.raises(ReentrancyError, match="another thread"):
-                    in_a_thread(env.step, action)
+                    in_a_thread(step, env, 1, "choose_0")
 
     main = calling(*[decide] * 4)().main
     env = Shown(Plan(lambda: Drawn(main), decide, {"driver": "thread", "render_mode": "human"}))
     env.reset()
     armed.append(True)
-    env.reset() if move == "reset" else env.step(action)
+    env.reset() if move == "reset" else step(env, 1, "choose_0")
     assert not armed
     assert env.simulation.log == [1] * (move == "step")
-    in_a_thread(env.step, action)
+    in_a_thread(step, env, 1, "choose_0")
     env.close()
 
 
-@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+@VIEWS
 def test_a_move_that_is_about_to_begin_lets_no_other_pass(view, monkeypatch):
-    action = {"choose_0": 1} if view in (parallel_env, joint_env) else 1
     decide = decision()
     env = view(calling(*[decide] * 4), decide, driver="thread")
     env.reset()
@@ -180,11 +173,11 @@ def test_a_move_that_is_about_to_begin_lets_no_other_pass(view, monkeypatch):
     def slowly(claim):
         claims.append(threading.get_ident())
         if len(claims) == 1:
-            in_a_thread(env.step, action)
+            in_a_thread(step, env, 1, "choose_0")
         enter(claim)
 
     monkeypatch.setattr(ExclusiveLock, "__enter__", slowly)
-    env.step(action)
+    step(env, 1, "choose_0")
     assert len(set(claims)) == 2
     assert env.simulation.log == [1, 1]
     env.close()
@@ -207,36 +200,17 @@ def test_an_interrupt_leaves_an_environment_to_any_thread():
         pass
 
 
-def test_many_threads_at_once_get_a_step_each_or_none():
-    decide = decision(observation_space_mapping=lambda: [len(env.simulation.log), 0.0])
-    env = single_env(calling(*[decide] * 400), decide, driver="thread")
-    env.reset()
-    results, refused, barrier = [], [], threading.Barrier(4)
+def test_a_simulation_on_a_greenlet_that_another_thread_collects_unwinds_in_its_own():
+    def drop():
+        envs.clear()
+        gc.collect()
 
-    def work(number):
-        barrier.wait()
-        for _ in range(100):
-            try:
-                results.append((number, int(env.step(number)[0][0])))
-            except ReentrancyError:
-                refused.append(number)
-                time.sleep(0)
-
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-5)
-    try:
-        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    finally:
-        sys.setswitchinterval(interval)
-    assert len(results) + len(refused) == 400
-    # Each step was answered with what came of it, and with nothing of anybody else's.
-    assert sorted(place for _, place in results) == list(range(1, len(results) + 1))
-    assert [number for number, _ in sorted(results, key=lambda result: result[1])] == env.simulation.log[: len(results)]
-    env.close()
+    log, decide = [], decision()
+    envs = [single_env(unwinding(decide, log), decide, driver="greenlet")]
+    envs[0].reset()
+    in_a_thread(drop)
+    greenlet(decide).switch()
+    assert log == ["unwound"]
 
 
 # -- what is left behind --------------------------------------------------------------------------
@@ -245,7 +219,7 @@ def test_many_threads_at_once_get_a_step_each_or_none():
 @pytest.mark.parametrize(
     "how", ["end", "truncated", "close", "collect", "reset", "model error", "mapping error", "none"]
 )
-def test_no_thread_is_left_after_any_end(how):
+def test_no_thread_is_left_after_any_end(how, older_threads):
     def rewarded():
         if how == "mapping error" and env.failing:
             raise ZeroDivisionError
@@ -259,11 +233,10 @@ def test_no_thread_is_left_after_any_end(how):
         if how == "truncated":
             decide()
 
-    before = simulation_threads()
     decide = decision(reward_mapping=rewarded)
     env = single_env(script(main), decide, driver="thread", max_steps=2)
     env.failing = False
-    assert len(simulation_threads()) == len(before) + 1  # in which the simulation was made
+    assert len(simulation_threads()) == len(older_threads) + 1  # in which the simulation was made
     if how != "none":
         env.reset()
         env.failing = True
@@ -273,29 +246,27 @@ def test_no_thread_is_left_after_any_end(how):
             env.step(1)
         for _ in range(5 if how == "reset" else 0):
             env.reset()
-    assert len(simulation_threads()) == len(before) + 1  # the one in which the next episode is going to run
+    assert len(simulation_threads()) == len(older_threads) + 1  # the one in which the next episode is going to run
     if how in ("collect", "none"):
         del env
     else:
         env.close()
-    assert simulation_threads() == before
+    assert simulation_threads() == older_threads
 
 
-def test_too_many_threads_are_an_error(monkeypatch):
+def test_too_many_threads_are_an_error(monkeypatch, older_threads):
     def refuse(*args, **kwargs):
         raise RuntimeError("can't start new thread")
 
     decide = decision()
     env = single_env(calling(decide), decide, driver="thread")
     env.close()
-    before = simulation_threads()
     monkeypatch.setattr(threading, "_start_joinable_thread", refuse, raising=False)
     monkeypatch.setattr(threading, "_start_new_thread", refuse, raising=False)
-    with pytest.raises(RuntimeError, match="can't start"):
-        env.reset()
-    with pytest.raises(RuntimeError, match="can't start"):
-        single_env(calling(decide), decide, driver="thread")
-    assert simulation_threads() == before
+    for move in (env.reset, lambda: single_env(calling(decide), decide, driver="thread")):
+        with pytest.raises(RuntimeError, match="can't start"):
+            move()
+    assert simulation_threads() == older_threads
     monkeypatch.undo()
     env.reset()
     env.step(1)
@@ -327,13 +298,10 @@ def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_
         finally:
             log.append("unwound")
 
-    def stop():
-        interrupted.set()
-
     decide = decision()
     env = single_env(script(main), decide, driver="thread")
     env.reset()
-    env.simulation.stop = stop  # is called as soon as the interruption has surfaced
+    env.simulation.stop = lambda: interrupted.set()  # is called as soon as the interruption has surfaced
     with pytest.raises(KeyboardInterrupt) as caught:
         env.step(1)
     assert log == [1, "unwound"]
@@ -378,7 +346,7 @@ def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkey
 @pytest.mark.parametrize("how", ["close", "collect"])
 def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(monkeypatch, how, older_threads):
     monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
-    go_on = threading.Event()
+    go_on, decide = threading.Event(), decision()
 
     def main(simulation):
         try:
@@ -386,7 +354,6 @@ def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(mon
         finally:
             go_on.wait(10)
 
-    decide = decision()
     env = single_env(script(main), decide, driver="thread")
     env.reset()
     (stuck,) = set(simulation_threads()) - set(older_threads)

@@ -8,11 +8,11 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, aec_env
+from simenv_marl import RULE, aec_env, simulate_many
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
-from tests.contract.test_simulate_many import by_row
+from tests.contract.test_simulate_many import by_row, ones
 from tests.worlds import worlds
 from tests.worlds.many_worlds import Announcing, Being, Colony, Other, beings, colony_points, designs, others
 from tests.worlds.models import Script, calling, decision, play, script
@@ -21,18 +21,8 @@ some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=6)
 sizes = st.integers(1, 8)
 
 
-def ones(observations):
-    return np.ones(len(observations), np.int64)
-
-
 def played(env, policies, seed):
-    """What each agent lives through in one episode of an AEC environment: by agent its rows, and its last observation.
-
-    Args:
-        env: The environment.
-        policies: By agent, a policy of observation and info.
-        seed: Of the episode.
-    """
+    """What each agent lives through in an episode: by agent its rows, and its last observation."""
     rows, last, turn = defaultdict(list), {}, 0
     try:
         turns = play(env, lambda agent, env: policies(agent)(*env.last()[::4]), seed=seed)
@@ -46,44 +36,30 @@ def played(env, policies, seed):
             if rows[agent]:
                 rows[agent][-1] |= {"terminated": terminated, "truncated": truncated, "turn of the end": turn}
             continue
-        rows[agent].append(
-            {
-                "observation": observation,
-                "action": action,
-                "mask": info.get("action_mask"),
-                "time": info.get("time"),
-                "turn": turn,
-                "terminated": False,
-                "truncated": False,
-            }
-        )
+        told = {"observation": observation, "action": action, "turn": turn, "terminated": False, "truncated": False}
+        rows[agent].append(told | {"mask": info.get("action_mask"), "time": info.get("time")})
         turn += 1
     return {agent: own for agent, own in rows.items() if own}, last
 
 
-def check(found, episodes):
-    """Compare what was collected under one key with what was played.
-
-    Args:
-        found: What was collected.
-        episodes: Of each episode what ``played`` has returned, but for agents of other keys.
-    """
+def check(found, episodes, chosen):
+    """Compare what was collected under one key with what was ``played`` by the agents that belong to it."""
     trajectory = row = 0
     following = found.next_observations
     for number, (agents, last) in enumerate(episodes):
         for agent, rows in agents.items():  # in the order of their first decisions
-            assert found.starts[trajectory] == row
-            assert found.lengths[trajectory] == len(rows)
+            if not chosen(agent):
+                continue
+            assert (found.starts[trajectory], found.lengths[trajectory]) == (row, len(rows))
             assert np.array_equal(found.last_observations[trajectory], last[agent])
             assert found.last_turns[trajectory] == rows[-1]["turn of the end"]
             assert found.returns[trajectory] == pytest.approx(sum(row["reward"] for row in rows))
+            upcoming = [*(row["observation"] for row in rows[1:]), last[agent]]
             for step, expected in enumerate(rows):
                 assert found.names[found.agents[row]] == agent
-                assert found.episodes[row] == number
-                assert (found.steps[row], found.turns[row]) == (step, expected["turn"])
+                assert (found.episodes[row], found.steps[row], found.turns[row]) == (number, step, expected["turn"])
                 assert np.array_equal(found.observations[row], expected["observation"])
-                upcoming = rows[step + 1]["observation"] if step + 1 < len(rows) else last[agent]
-                assert np.array_equal(following[row], upcoming)
+                assert np.array_equal(following[row], upcoming[step])
                 assert found.by_rule[row] == (expected["action"] is RULE)
                 assert found.by_rule[row] or found.actions[row] == expected["action"]
                 assert found.rewards[row] == expected["reward"]
@@ -93,64 +69,50 @@ def check(found, episodes):
                     assert found.action_masks[row].tolist() == expected["mask"].tolist()
                 if found.times is not None:
                     assert found.times[row] == expected["time"]
-                    if expected["elapsed"] is None:
-                        assert np.isnan(found.elapsed[row])
-                    else:
-                        assert found.elapsed[row] == expected["elapsed"]
+                    elapsed = np.nan if expected["elapsed"] is None else expected["elapsed"]
+                    assert np.array_equal(found.elapsed[row], elapsed, equal_nan=True)
                 row += 1
             trajectory += 1
     assert (len(found), len(found.starts)) == (row, trajectory)
 
 
-def only(episodes, chosen):
-    return [({agent: rows for agent, rows in agents.items() if chosen(agent)}, last) for agents, last in episodes]
-
-
-# -- it is what an AEC environment is -------------------------------------------------------------
-
-
 @given(designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
 @settings(max_examples=60)
 def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, most):
-    """Births and deaths, agents that are announced, limits of steps; some left to the rule now and then."""
-    points = colony_points(overseen=bool(design.overseen))
-    kind = Announcing if announcing else Colony
-
     def policy(observation, info):
         number = int(observation.sum()) % 6
         return RULE if number == 5 else number
 
-    policies = dict.fromkeys(points, by_row(policy))
-    found = collect_episodes(
-        lambda: kind(design), policies, points=points, seeds=seeds, batch_size=size, max_steps=most
-    )  # fmt: skip
-    env = aec_env(lambda: kind(design), points, max_steps=most)
+    def simulation():
+        return (Announcing if announcing else Colony)(design)
+
+    points = colony_points(overseen=bool(design.overseen))
+    given = {"points": points, "max_steps": most}
+    found = collect_episodes(simulation, dict.fromkeys(points, by_row(policy)), seeds=seeds, batch_size=size, **given)
+    env = aec_env(simulation, **given)
     episodes = [played(env, lambda agent: policy, seed) for seed in seeds]
     assert found.keys() == points.keys()
     act, *oversee = points  # as long as the environment is there, the class has others in their place
-    check(found[act], only(episodes, lambda agent: agent != "overseer_0"))
-    if design.overseen:
-        check(found[oversee[0]], only(episodes, lambda agent: agent == "overseer_0"))
+    check(found[act], episodes, lambda agent: agent != "overseer_0")
+    for point in oversee:
+        check(found[point], episodes, lambda agent: agent == "overseer_0")
 
 
 @given(worlds.designs(), some_seeds, sizes)
 @settings(max_examples=80)
 def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
-    points = worlds.points_of(design)
-
     def simulation():
         return worlds.World(design, points)
 
+    points = worlds.points_of(design)
+    given = {"points": points, "max_steps": design.max_steps}
     answered = {points[number]: by_row(worlds.advised) for number in range(len(points)) if number not in design.rules}
-    found = collect_episodes(
-        simulation, answered, points=points, seeds=seeds, batch_size=size, max_steps=design.max_steps
-    )  # fmt: skip
-    rules = {points[number]: RULE for number in design.rules}
-    env = aec_env(simulation, points, policies=rules, max_steps=design.max_steps)
+    found = collect_episodes(simulation, answered, seeds=seeds, batch_size=size, **given)
+    env = aec_env(simulation, policies={points[number]: RULE for number in design.rules}, **given)
     episodes = [played(env, lambda agent: worlds.advised, seed) for seed in seeds]
     for number, point in enumerate(points):
         if point in answered:
-            check(found[point], only(episodes, lambda agent, number=number: agent.split("_")[1] == str(number)))
+            check(found[point], episodes, lambda agent, number=number: agent.split("_")[1] == str(number))
 
 
 def test_agents_under_their_own_keys():
@@ -169,9 +131,6 @@ def test_agents_under_their_own_keys():
     assert found["being_1"].seeds == (3, 4)
     assert found[Being.act].names == ("being_0",)
     assert found[Being.act].observations.tolist() == [[0, 0]] * 4
-
-
-# -- what arrays there are ------------------------------------------------------------------------
 
 
 class Timed(Script):
@@ -199,23 +158,19 @@ def test_shapes_and_dtypes(policy):
         action_mask_mapping=lambda: [0, 1] + [0] * 8,
     )
     found = collect_episodes(lambda: Timed(main), {ant: policy}, seeds=range(3))[ant]
-    rows = {
-        np.float64: "rewards times elapsed",
-        np.bool_: "terminations truncations by_rule",
-        np.int64: "actions episodes agents steps turns",
-    }
-    trajectories = {np.int64: "starts lengths last_turns", np.float64: "returns"}
-    shapes = {
-        "observations": ((6, 2, 3), np.float32),
-        "next_observations": ((6, 2, 3), np.float32),
-        "last_observations": ((3, 2, 3), np.float32),
-        "action_masks": ((6, 10), np.int8),
-    }
-    for size, names in ((6, rows), (3, trajectories)):
-        shapes |= {name: ((size,), dtype) for dtype, several in names.items() for name in several.split()}
-    for name, (shape, dtype) in shapes.items():
-        array = getattr(found, name)
-        assert (array.shape, array.dtype) == (shape, dtype), name
+    for shape, dtype, names in (
+        ((6,), np.float64, "rewards times elapsed"),
+        ((6,), np.bool_, "terminations truncations by_rule"),
+        ((6,), np.int64, "actions episodes agents steps turns"),
+        ((3,), np.float64, "returns"),
+        ((3,), np.int64, "starts lengths last_turns"),
+        ((6, 2, 3), np.float32, "observations next_observations"),
+        ((3, 2, 3), np.float32, "last_observations"),
+        ((6, 10), np.int8, "action_masks"),
+    ):
+        for name in names.split():
+            array = getattr(found, name)
+            assert (array.shape, array.dtype) == (shape, dtype), name
     assert found.times.tolist() == [0, 2] * 3
     assert found.elapsed.tolist() == [2, 2] * 3
     assert len(found) == 6
@@ -285,20 +240,25 @@ def test_masks_of_several_parts_and_scalars_for_boxes_of_one_element():
     assert found.actions.dtype == np.float32
 
 
-def test_what_policies_do_to_their_observations_is_not_seen():
-    ant = decision(agent="ant_0")
+class Tensor:
+    """Becomes an array as those of torch do, which know no copies."""
 
-    def policy(observations):
-        observations[:] = 99
-        return ones(observations)
+    def __init__(self, array):
+        self.array = array
 
-    assert collect_episodes(calling(ant), {ant: policy}, seeds=[1])[ant].observations.tolist() == [[1.0, 2.0]]
+    def __array__(self, dtype=None):
+        return self.array if dtype is None else self.array.astype(dtype)
 
 
-def test_extras_stand_row_by_row():
+def test_extras_stand_row_by_row_whatever_the_policy_does_to_them_later():
+    buffer = np.zeros((2, 3), np.float32)
+
     def policy(observations, infos):
         numbers = observations[:, 0] * 10 + observations[:, 1]
-        return ones(observations), {"values": numbers, "logits": np.stack([numbers] * 3, axis=1).astype(np.float32)}
+        own = buffer[: len(numbers)]
+        own[:] = numbers[:, np.newaxis]
+        observations[:] = 99  # which is its own
+        return ones(observations), {"values": numbers, "tensors": Tensor(own), "arrays": own}
 
     def main(simulation):
         for _ in range(1 + simulation.seed % 3):
@@ -309,31 +269,12 @@ def test_extras_stand_row_by_row():
 
     points = beings(observation_space_mapping=lambda being: [being.number, being.health], removed_by=())
     found = collect_episodes(script(main), {Being.act: policy}, points=points, seeds=[5, 1, 3], batch_size=2)[Being.act]
-    assert found.extras["values"].tolist() == (found.observations @ [10, 1]).tolist()
-    assert found.extras["logits"].shape == (len(found), 3)
-    assert found.extras["logits"].dtype == np.float32
-
-
-def test_extras_may_be_tensors_and_buffers_that_are_used_again():
-    class Tensor:
-        """Becomes an array as those of torch do, which know no copies."""
-
-        def __init__(self, array):
-            self.array = array
-
-        def __array__(self, dtype=None):
-            return self.array if dtype is None else self.array.astype(dtype)
-
-    buffer = np.zeros(1, np.float32)
-    ant = decision(agent="ant_0")
-
-    def policy(observations):
-        buffer[:] += 1
-        return ones(observations), {"tensors": Tensor(buffer), "arrays": buffer}
-
-    found = collect_episodes(calling(ant, ant, ant), {ant: policy}, seeds=[1])[ant]
-    assert found.extras["tensors"].tolist() == found.extras["arrays"].tolist() == [1, 2, 3]
-    assert found.extras["tensors"].dtype == np.float32
+    values = (found.observations @ [10, 1]).tolist()
+    assert set(values) == {1, 11, 3, 13, 5, 15}
+    assert found.extras["values"].tolist() == values
+    for name in ("tensors", "arrays"):
+        assert found.extras[name].tolist() == [[value] * 3 for value in values]
+        assert found.extras[name].dtype == np.float32
 
 
 @pytest.mark.parametrize(
@@ -350,31 +291,23 @@ def test_extras_that_do_not_fit(second, match):
 
 def test_episodes_in_which_nobody_decides():
     ant, bee = decision(agent="ant_0", action_space=spaces.Box(0, 1, (2,))), decision(agent="bee_0")
-
-    def main(simulation):
-        if simulation.seed % 2:
-            bee()
-
-    found = collect_episodes(script(main), {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))
+    source = script(lambda simulation: bee() if simulation.seed % 2 else None)
+    found = collect_episodes(source, {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))
     assert found[bee].episodes.tolist() == [1, 3]
     nothing = found[ant]
     assert len(nothing) == 0
-    assert nothing.observations.shape == nothing.next_observations.shape == (0, 2)
-    assert nothing.actions.shape == (0, 2)
+    assert nothing.observations.shape == nothing.next_observations.shape == nothing.actions.shape == (0, 2)
     assert nothing.seeds == (0, 1, 2, 3)
-    assert len(collect_episodes(script(main), {ant: ones}, seeds=[])[ant]) == 0
+    assert len(collect_episodes(source, {ant: ones}, seeds=[])[ant]) == 0
 
 
 def test_what_is_collected_of_each_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
-    def main(simulation):
-        for _ in range(simulation.seed):  # the last seeds are the first to end
-            ant()
-
     def found(**options):
+        source = script(lambda simulation: [ant() and None for _ in range(simulation.seed)])  # the last end first
         given = {"points": [ant, bee], "seeds": [4, 0, 2], **options}
-        return collect_episodes(script(main), {ant: ones, bee: ones}, **given)
+        return collect_episodes(source, {ant: ones, bee: ones}, **given)
 
     collected = found(collect=lambda simulation: simulation.seed)
     assert collected[ant].collected == collected[bee].collected == (4, 0, 2)  # also of whom has never decided
@@ -385,26 +318,27 @@ def test_what_is_collected_of_each_simulation():
 
 
 def test_one_name_at_points_whose_spaces_differ():
-    definitions = beings() | others(
-        agent=lambda other: f"being_{other.number}",
-        observation_space=spaces.Discrete(3),
-        observation_space_mapping=lambda other: 1,
-    )
-
-    def main(simulation):
-        (Being if simulation.seed else Other)(0).act()
-
+    space = {"observation_space": spaces.Discrete(3), "observation_space_mapping": lambda other: 1}
+    points = beings() | others(agent=lambda other: f"being_{other.number}", **space)
+    source = script(lambda simulation: (Being if simulation.seed else Other)(0).act() and None)
     with pytest.raises(AgentError, match="being_0"):
-        collect_episodes(script(main), {"being_0": ones}, points=definitions, seeds=range(2))
+        collect_episodes(source, {"being_0": ones}, points=points, seeds=range(2))
 
 
 def test_whom_no_policy_of_the_call_decides_for_is_no_agent():
     asked = []
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0)
-    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: lambda observation: 5})
-    found = collect_episodes(variant, {ant: ones}, seeds=range(2))
+
+    def of_one(observation):
+        assert observation.shape == (2,)  # and not a row of many
+        return 5
+
+    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: of_one})
+    found = collect_episodes(variant, {ant: ones}, seeds=range(2), collect=lambda simulation: simulation.log)
     assert list(found) == [ant]
     assert found[ant].turns.tolist() == [0, 0]
+    logs = simulate_many(variant, {ant: ones}, seeds=range(2), collect=lambda simulation: simulation.log)
+    assert list(found[ant].collected) == logs == [[1, 5]] * 2
     found = collect_episodes(calling(ant, bee, ant), {"ant_0": ones}, points=[ant, bee], seeds=[1])
     assert found["ant_0"].turns.tolist() == [0, 1]
     assert asked == []

@@ -8,33 +8,16 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, simulate_many
-from simenv_marl.data import (
-    Mixture,
-    collect_episodes,
-    compare_with_rule,
-    record_dataset,
-    save_dataset,
-)
+from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset, save_dataset
 from simenv_marl.data.collect import _random_numbers
-from simenv_marl.errors import (
-    DefinitionError,
-    InvalidActionError,
-    MissingExtraError,
-    OptionValueError,
-)
+from simenv_marl.errors import DefinitionError, InvalidActionError, MissingExtraError, OptionValueError
+from tests.contract.test_simulate_many import ones
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, plainly, script
 
 
-def ones(observations):
-    return np.ones(len(observations), np.int64)
-
-
 def twos(observations):
     return [2] * len(observations)
-
-
-# -- mixtures -------------------------------------------------------------------------------------
 
 
 def test_mixtures_tell_what_they_are_made_of():
@@ -86,42 +69,32 @@ def test_mixtures_draw_by_seed_and_decision_alone():
 
 
 def test_mixtures_give_policies_what_is_theirs():
-    seen = []
+    seen, mask = [], [0, 1, 1] + [0] * 7
 
     def informed(observations, infos, identities):
         assert len(observations) == len(infos) == len(identities)
-        seen.extend(
-            (int(observation[0]), info["action_mask"].tolist(), identity)
-            for observation, info, identity in zip(observations, infos, identities, strict=True)
-        )
+        masks = [info["action_mask"].tolist() for info in infos]
+        seen.extend(zip(observations[:, 0].tolist(), masks, identities, strict=True))
         return [1] * len(observations), {"dropped": np.zeros(len(observations))}
-
-    points = beings(action_mask_mapping=lambda being: [0, 1, 1] + [0] * 7)
 
     def main(simulation):
         simulation.crowd = [Being(number) for number in range(6)]
         for being in simulation.crowd:
             being.act()
 
+    points = beings(action_mask_mapping=lambda being: mask)
     found = collect_episodes(script(main), {Being.act: Mixture({informed: 1, twos: 1})}, points=points, seeds=range(9))
     own = found[Being.act]
-    expected = [
-        (int(o[0]), [0, 1, 1] + [0] * 7, (own.seeds[e], int(t)))
-        for o, e, t, c in zip(own.observations, own.episodes, own.turns, own.extras["component"], strict=True)
-        if c == 0
-    ]
-    assert sorted(seen, key=repr) == sorted(expected, key=repr)
+    rows = np.flatnonzero(own.extras["component"] == 0)
+    expected = [(own.observations[r, 0], mask, (own.seeds[own.episodes[r]], own.turns[r])) for r in rows]
+    assert sorted(seen) == sorted(expected)
     assert own.extras.keys() == {"component"}
 
 
 def test_mixtures_work_with_composite_spaces():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), what=spaces.Discrete(3))
-    ant = decision(
-        agent="ant_0",
-        observation_space=space,
-        action_space=space,
-        observation_space_mapping=lambda: {"how": [1, 2], "what": 1},
-    )
+    observed = {"observation_space": space, "observation_space_mapping": lambda: {"how": [1, 2], "what": 1}}
+    ant = decision(agent="ant_0", action_space=space, **observed)
 
     def stacked(observations):
         return {"how": observations["how"] * 2, "what": observations["what"] + 1}
@@ -146,15 +119,11 @@ def test_mixtures_that_cannot_be(parts):
         Mixture(parts)
 
 
-def test_policies_of_mixtures_answer_each_decision():
+@pytest.mark.parametrize(("answer", "match"), [([1, 2], "1 decisions"), (None, "None")])
+def test_policies_of_mixtures_answer_each_decision(answer, match):
     ant = decision(agent="ant_0")
-    with pytest.raises(InvalidActionError, match="1 decisions"):
-        collect_episodes(calling(ant), {ant: Mixture({(lambda observations: [1, 2]): 1})}, seeds=[1])
-    with pytest.raises(InvalidActionError, match="None"):
-        collect_episodes(calling(ant), {ant: Mixture({(lambda observations: None): 1})}, seeds=[1])
-
-
-# -- data sets, as far as nobody writes them ------------------------------------------------------
+    with pytest.raises(InvalidActionError, match=match):
+        collect_episodes(calling(ant), {ant: Mixture({(lambda observations: answer): 1})}, seeds=[1])
 
 
 def test_without_minari_the_extra_is_named(monkeypatch):
@@ -162,14 +131,14 @@ def test_without_minari_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari", None)
     ant = decision(agent="ant_0")
     found = collect_episodes(calling(ant), {ant: ones}, seeds=[1])
-    with pytest.raises(MissingExtraError, match=r"simenv-marl\[minari\]"):
-        record_dataset("ants-v0", calling(ant), {ant: ones}, seeds=[1])
-    with pytest.raises(MissingExtraError, match=r"simenv-marl\[minari\]"):
-        save_dataset("ants-v0", found[ant])
-    with pytest.raises(OptionValueError, match="under each key"):
-        save_dataset("ants-v0", found)
-    with pytest.raises(OptionValueError, match="policies"):
-        record_dataset("ants-v0", calling(ant), ones, seeds=[1])
+    for call, error, match in (
+        (lambda: record_dataset("ants-v0", calling(ant), {ant: ones}, seeds=[1]), MissingExtraError, r"marl\[minari\]"),
+        (lambda: save_dataset("ants-v0", found[ant]), MissingExtraError, r"marl\[minari\]"),
+        (lambda: save_dataset("ants-v0", found), OptionValueError, "under each key"),
+        (lambda: record_dataset("ants-v0", calling(ant), ones, seeds=[1]), OptionValueError, "policies"),
+    ):
+        with pytest.raises(error, match=match):
+            call()
 
 
 @pytest.mark.parametrize(
@@ -193,29 +162,28 @@ def test_each_policy_needs_a_data_set_of_its_own(dataset_id, match):
 def test_what_the_rule_decides_must_be_known_before_anything_runs(monkeypatch):
     monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
 
-    def never(simulation):
-        raise AssertionError
+    class Ran(Exception):
+        pass
+
+    def main(simulation):
+        raise Ran
 
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", rule_action_mapping=lambda decided: 3)
+    unknown = DefinitionError, r"choose.*rule_action_mapping"
+    cases = [(ant, Mixture({ones: 1, RULE: 0}), Ran, None)]
     for policy in (RULE, Mixture({ones: 1, RULE: 1}), Mixture({Mixture({RULE: 1}): 1})):
-        with pytest.raises(DefinitionError, match=r"choose.*rule_action_mapping"):
-            record_dataset("ants-v0", script(never), {ant: policy}, points=[ant, bee], seeds=[1])
-        with pytest.raises(AssertionError):
-            record_dataset("bees-v0", script(never), {bee: policy}, points=[ant, bee], seeds=[1])
-    with pytest.raises(AssertionError):
-        record_dataset("ants-v0", script(never), {ant: Mixture({ones: 1, RULE: 0})}, points=[ant], seeds=[1])
+        cases += [(ant, policy, *unknown), (bee, policy, Ran, None)]
+    for point, policy, error, match in cases:
+        with pytest.raises(error, match=match):
+            record_dataset("ants-v0", script(main), {point: policy}, points=[ant, bee], seeds=[1])
     with pytest.raises(DefinitionError, match="rule_action_mapping"):
-        compare_with_rule(script(never), {ant: ones}, points=[ant], seeds=[1])
-
-
-# -- comparisons ----------------------------------------------------------------------------------
+        compare_with_rule(script(main), {ant: ones}, points=[ant], seeds=[1])
 
 
 TOLD = beings(rule_action_mapping=lambda decided, being: being.health)
 
 
 def crowd(simulation):
-    """Beings whose rule corresponds to 0, 1, 2, one after the other."""
     simulation.crowd = [Being(number) for number in range(3)]
     for step in range(3):
         for being in simulation.crowd:
@@ -233,14 +201,14 @@ def test_policies_are_asked_while_the_rule_decides(size):
 
     given = {"points": TOLD, "seeds": [1, 2], "batch_size": size}
     found = compare_with_rule(script(main), {Being.act: ones}, **given)[Being.act]
-    assert logs == [["rule"] * 9] * 2
-    assert found.trajectories.actions.tolist() == [0, 1, 2] * 6
+    alone = collect_episodes(script(main), {Being.act: RULE}, **given)[Being.act]
+    assert logs == [["rule"] * 9] * 4
     assert found.policy_actions.tolist() == [1] * 18
     assert found.agreements.tolist() == [False, True, False] * 6
     assert found.agreement == pytest.approx(1 / 3)
-    assert found.trajectories.extras == {}
     assert "0.333" in repr(found)
-    alone = collect_episodes(script(crowd), {Being.act: RULE}, **given)[Being.act]
+    assert found.trajectories.actions.tolist() == [0, 1, 2] * 6
+    assert found.trajectories.extras == {}
     for name in ("observations", "actions", "rewards", "terminations", "starts", "episodes", "by_rule", "turns"):
         assert np.array_equal(getattr(found.trajectories, name), getattr(alone, name)), name
 
@@ -254,12 +222,11 @@ def test_who_would_leave_it_to_the_rule_agrees_with_it():
 
 def test_numbers_may_differ_by_a_tolerance():
     space = spaces.Dict(how=spaces.Box(-9, 9, (2,), np.float32), what=spaces.Discrete(3))
-
-    def action(how, what):
-        return {"how": np.array(how, np.float32), "what": what}
-
-    ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: action([1, 2], 1))
-    answers = [action([1, 2], 1), action([1.5, 2], 1), action([1, 2.75], 1), action([1, 2], 2)]
+    answers = [
+        {"how": np.array(how, np.float32), "what": what}
+        for how, what in (([1, 2], 1), ([1.5, 2], 1), ([1, 2.75], 1), ([1, 2], 2))
+    ]
+    ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: answers[0])
     for tolerance, number in ((0.0, 1), (0.5, 2), (1, 3)):
         found = compare_with_rule(calling(ant), {ant: lambda seen: answers}, seeds=range(4), tolerance=tolerance)
         assert found[ant].agreements.tolist() == [True] * number + [False] * (4 - number)
@@ -286,12 +253,9 @@ def test_actions_of_all_kinds_are_compared():
 def test_comparisons_of_several_policies_and_of_nobody():
     ant, bee = (decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0"))
     cat, logs = decision(agent="cat_0"), []
-
-    def main(simulation):
-        logs.append([ant(), cat(), ant()])
-
+    source = script(lambda simulation: logs.append([ant(), cat(), ant()]))
     given = {"points": [ant, bee, cat], "seeds": [1], "others": {cat: twos}}
-    found = compare_with_rule(script(main), {"ant_0": ones, bee: ones}, **given)
+    found = compare_with_rule(source, {"ant_0": ones, bee: ones}, **given)
     assert logs == [["rule", 2, "rule"]]  # others may decide
     assert list(found) == ["ant_0", bee]
     assert found["ant_0"].agreement == 1.0

@@ -16,6 +16,7 @@ from simenv_marl.data import collect_episodes, plot_returns, plot_timeline
 from simenv_marl.data.plots import COLOURS
 from simenv_marl.data.timeline import UNKNOWN
 from simenv_marl.errors import MissingExtraError, OptionValueError, UnknownAgentError
+from tests.contract.test_simulate_many import ones
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script
 
@@ -26,21 +27,15 @@ def _without_windows():
     assert "matplotlib.pyplot" not in sys.modules or not matplotlib.pyplot.get_fignums()
 
 
-def ones(observations):
-    return np.ones(len(observations), np.int64)
+class Clocked(Script):
+    def time(self):
+        return 10.0 * len(self.log)
 
 
-def clocked(main):
-    class Clocked(Script):
-        def time(self):
-            return 10.0 * len(self.log)
-
-    return lambda: Clocked(main)
+SPACED = {"how": np.array([0.5, 0.25], np.float32), "what": 2, "say": "hello"}
 
 
 def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **definition):
-    """What was collected of beings that act in turns; some are banished after their first step."""
-
     def main(simulation):
         simulation.crowd = [Being(place) for place in range(number)]
         for step in range(steps):
@@ -56,7 +51,6 @@ def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **d
 
 
 def asked(*functions, answers=None, seeds=(1,), **options):
-    """What was collected of decisions that are made one after the other, by answers or always by one."""
     given = iter([]) if answers is None else iter(answers)
     policy = lambda seen: next(given, ones(seen))  # noqa: E731
     return collect_episodes(calling(*functions), dict.fromkeys(functions, policy), seeds=seeds, **options)
@@ -67,38 +61,31 @@ def of(axes, kind):
 
 
 def dots(axes):
-    """Of each collection of dots that is not empty: where they are, and whether they are filled."""
-    found = []
-    for drawn in of(axes, PathCollection):
-        if len(drawn.get_offsets()):
-            filled = to_hex(drawn.get_facecolor()[0]) != to_hex("white")
-            found.append((np.asarray(drawn.get_offsets()).tolist(), filled))
-    return found
+    drawn = [own for own in of(axes, PathCollection) if len(own.get_offsets())]
+    return [(np.asarray(own.get_offsets()).tolist(), to_hex(own.get_facecolor()[0]) != "#ffffff") for own in drawn]
 
 
 def texts(axes):
     return [text.get_text() for legend in axes.findobj(Legend) for text in legend.get_texts()]
 
 
-# -- few agents -----------------------------------------------------------------------------------
+def ticks(axes):
+    return [label.get_text() for label in axes.get_yticklabels()]
 
 
 def test_charts_show_each_action_and_each_reward():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: 2.0)
     answers = {ant: iter([3, 4, 5]), bee: iter([7, 8])}
     policies = {key: lambda observations, own=own: [next(own)] for key, own in answers.items()}
-    found = collect_episodes(calling(ant, bee, ant, bee, ant), policies, seeds=[17])
-    figure = plot_timeline(found)
+    figure = plot_timeline(collect_episodes(calling(ant, bee, ant, bee, ant), policies, seeds=[17]))
     of_ant, paid_ant, of_bee, paid_bee = figure.axes
     assert "17" in figure.get_suptitle()
     assert dots(of_ant) == [([[0, 3], [2, 4], [4, 5]], True)]
     assert dots(of_bee) == [([[1, 7], [3, 8]], True)]
-    assert [line.tolist() for line in of(paid_bee, LineCollection)[0].get_segments()] == [
-        [[1, 0], [1, 2]],
-        [[3, 0], [3, 2]],
-    ]
+    bars = [line.tolist() for line in of(paid_bee, LineCollection)[0].get_segments()]
+    assert bars == [[[1, 0], [1, 2]], [[3, 0], [3, 2]]]
     assert "decision" in paid_bee.get_xlabel()
-    assert [label.get_text() for label in of_ant.get_yticklabels()] == ["3", "4", "5"]
+    assert ticks(of_ant) == ["3", "4", "5"]
     assert "sum 4" in [text.get_text() for text in paid_bee.texts]
     assert "sum 0" in [text.get_text() for text in paid_ant.texts]
 
@@ -111,8 +98,8 @@ def test_the_clock_is_what_runs_from_left_to_right():
             simulation.log.append(keeper.act())
 
     bee = decision(agent="bee_0")  # who never decides, and so tells no time
-    points = beings() | {bee: None}
-    found = collect_episodes(clocked(main), {Being.act: ones, bee: ones}, points=points, seeds=[1])
+    given = {"points": beings() | {bee: None}, "seeds": [1]}
+    found = collect_episodes(lambda: Clocked(main), {Being.act: ones, bee: ones}, **given)
     first, _, second, paid = plot_timeline(found).axes
     assert dots(first) == [([[0, 1]], True)]
     assert dots(second) == [([[10, 1], [20, 1], [30, 1]], True)]
@@ -142,13 +129,12 @@ def test_actions_have_names():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     policies = {"ant_0": lambda seen: [1], "bee_0": lambda seen: [2]}
     found = collect_episodes(calling(ant, bee), policies, points=[ant, bee], seeds=[1])
-
-    def names(**options):
-        return [[tick.get_text() for tick in axes.get_yticklabels()] for axes in plot_timeline(found, **options).axes]
-
-    assert names(action_names=["no", "left", "right"])[::2] == [["left"], ["right"]]
-    assert names(action_names={1: "left"})[::2] == [["left"], ["2"]]
-    assert names(action_names={"ant_0": {1: "dig"}, "bee_0": ["a", "b", "fly"]})[::2] == [["dig"], ["fly"]]
+    for given, names in (
+        (["no", "left", "right"], [["left"], ["right"]]),
+        ({1: "left"}, [["left"], ["2"]]),
+        ({"ant_0": {1: "dig"}, "bee_0": ["a", "b", "fly"]}, [["dig"], ["fly"]]),
+    ):
+        assert [ticks(axes) for axes in plot_timeline(found, action_names=given).axes[::2]] == names
     with pytest.raises(OptionValueError, match="action_names"):
         plot_timeline(found, action_names="dig")
 
@@ -156,12 +142,11 @@ def test_actions_have_names():
 def test_actions_of_several_parts_have_a_chart_for_each_part():
     space = spaces.Dict(how=spaces.Box(0, 1, (2,), np.float32), what=spaces.Discrete(3), say=spaces.Text(9))
     ant = decision(agent="ant_0", action_space=space)
-    answer = {"how": np.array([0.5, 0.25], np.float32), "what": 2, "say": "hello"}
-    by_name = {axes.get_ylabel(): axes for axes in plot_timeline(asked(ant, ant, answers=[[answer]] * 2)).axes}
+    by_name = {axes.get_ylabel(): axes for axes in plot_timeline(asked(ant, ant, answers=[[SPACED]] * 2)).axes}
     assert set(by_name) == {"how", "what", "say", "reward"}
     assert dots(by_name["how"]) == [([[0, 0.5], [1, 0.5]], True), ([[0, 0.25], [1, 0.25]], True)]
     assert dots(by_name["what"]) == [([[0, 2], [1, 2]], True)]
-    assert [tick.get_text() for tick in by_name["say"].get_yticklabels()] == ["hello"]
+    assert ticks(by_name["say"]) == ["hello"]
     assert {"how[0]", "how[1]"} <= set(texts(by_name["how"]))
     space = spaces.Tuple([spaces.Discrete(3), spaces.Dict(far=spaces.Box(0, 9, (1,), np.float32))])
     ant = decision(agent="ant_0", action_space=space)
@@ -183,9 +168,6 @@ def test_where_nobody_lives_is_shaded():
     assert [line.get_marker() for line in third.lines[1:]] == ["|"]
 
 
-# -- many agents ----------------------------------------------------------------------------------
-
-
 def drawn(axes):
     """The cells that are coloured over the white ones, as (begin, end, height in the middle)."""
     cells = [path.get_extents() for cells in of(axes, PolyCollection)[1:] for path in cells.get_paths()]
@@ -199,18 +181,14 @@ def test_many_agents_have_a_row_each():
     figure = plot_timeline(found)
     actions, rewards = figure.axes[:2]
     figure.canvas.draw()
-    labels = [label.get_text() for label in actions.get_yticklabels() if label.get_text()]
+    labels = list(filter(None, ticks(actions)))
     assert 10 < len(labels) < 60
     assert labels[0] == "being_0"
     cells = drawn(actions)
-    assert len(cells) == len(found[Being.act]) == 400
+    assert len(cells) == len(found[Being.act]) == len(of(rewards, PolyCollection)[0].get_paths()) == 400
     # The first decides but once, at 0, and ends when all have decided; the second decides again then.
-    assert cells[0] == pytest.approx((0, 200, 0))
-    assert cells[1] == pytest.approx((1, 200, 1))
-    assert len(of(rewards, PolyCollection)[0].get_paths()) == 400
-    crosses, dashes = actions.lines
-    assert (crosses.get_marker(), len(crosses.get_xdata())) == ("x", 100)
-    assert (dashes.get_marker(), len(dashes.get_xdata())) == ("|", 100)
+    assert cells[:2] == [pytest.approx((0, 200, 0)), pytest.approx((1, 200, 1))]
+    assert [(line.get_marker(), len(line.get_xdata())) for line in actions.lines] == [("x", 100), ("|", 100)]
 
 
 @pytest.mark.parametrize("key", [Being.act, f"{Being.__module__}.Being.act"])
@@ -227,13 +205,10 @@ def test_rows_of_actions_with_components_are_coloured_by_one():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), far=spaces.Discrete(5))
     answer = {"how": np.array([1, 2], np.float32), "far": 4}
     found = herd(8, 1, policy=lambda seen: [answer] * len(seen), action_space=space)
-
-    def values(component):
-        return set(of(plot_timeline(found, component=component).axes[0], PolyCollection)[-1].get_array().tolist())
-
-    assert values("how[0]") == {1}
-    assert values("how[1]") == {2}
-    assert "how[0], one of 3" in plot_timeline(found).axes[0].get_title(loc="left")
+    for component, name, value in ((None, "how[0]", 1), ("how[0]", "how[0]", 1), ("how[1]", "how[1]", 2)):
+        axes = plot_timeline(found, component=component).axes[0]
+        assert set(of(axes, PolyCollection)[-1].get_array().tolist()) == {value}
+        assert f"action {name}, one of 3" in axes.get_title(loc="left")
     assert "action far, one of 3" in plot_timeline(found, component="far").axes[0].get_title(loc="left")
     with pytest.raises(OptionValueError, match=r"'how\[1\]'"):
         plot_timeline(found, component="where")
@@ -251,11 +226,10 @@ def test_what_only_the_rule_knows_is_grey():
 
 
 def test_policies_have_panels_of_their_own_unless_they_are_many():
-    def collected(number):
-        return herd(number, 2, key={f"being_{place}": ones for place in range(number)})
-
-    assert len(plot_timeline(collected(4)).axes) == 8
-    many = plot_timeline(collected(30))
+    few, many = (
+        plot_timeline(herd(number, 2, key={f"being_{place}": ones for place in range(number)})) for number in (4, 30)
+    )
+    assert len(few.axes) == 8
     assert [axes.get_title(loc="left") for axes in many.axes[:2]] == ["30 agents: action", "reward"]
     assert len(drawn(many.axes[0])) == 60
     assert texts(many.axes[0]) == ["1"]
@@ -264,13 +238,11 @@ def test_policies_have_panels_of_their_own_unless_they_are_many():
 def test_numbers_and_too_many_different_actions_share_a_scale():
     policies = {f"being_{place}": lambda seen, own=place: [own] * len(seen) for place in range(30)}
     many = herd(30, 1, key=policies, action_space=spaces.Discrete(40))
-    numbers = herd(
-        10,
-        2,
-        policy=lambda seen: (seen[:, :1] / 2).astype(np.float32),
-        action_space=spaces.Box(0, 9, (1,), np.float32),
-        observation_space_mapping=lambda being: [being.number, 0],
-    )
+    given = {
+        "action_space": spaces.Box(0, 9, (1,), np.float32),
+        "observation_space_mapping": lambda being: [being.number, 0],
+    }
+    numbers = herd(10, 2, policy=lambda seen: (seen[:, :1] / 2).astype(np.float32), **given)
     for found, values, most in ((many, list(range(30)), 29), (numbers, np.repeat(np.arange(10) / 2, 2).tolist(), 4.5)):
         scale = of(plot_timeline(found).axes[0], PolyCollection)[-1]
         assert scale.get_array().tolist() == values
@@ -286,12 +258,9 @@ def test_decisions_of_the_same_time_share_it():
                 being.act()
             simulation.log.append(1)
 
-    found = collect_episodes(clocked(main), {Being.act: ones}, points=beings(), seeds=[5])
+    found = collect_episodes(lambda: Clocked(main), {Being.act: ones}, points=beings(), seeds=[5])
     first = [cell[:2] for cell in drawn(plot_timeline(found).axes[0]) if cell[2] == pytest.approx(0)]
     assert first == [(0, 5), (5, 10), (10, 15), (15, 20)]
-
-
-# -- what is asked for ----------------------------------------------------------------------------
 
 
 def test_some_agents_can_be_chosen():
@@ -328,11 +297,10 @@ def test_episodes_in_which_nobody_decides():
 
 
 @pytest.mark.parametrize("wrong", [None, [], {}, {"ant": 1}, 3])
-def test_what_cannot_be_drawn(wrong):
+@pytest.mark.parametrize("draw", [plot_timeline, plot_returns])
+def test_what_cannot_be_drawn(draw, wrong):
     with pytest.raises(OptionValueError, match="draw"):
-        plot_timeline(wrong)
-    with pytest.raises(OptionValueError, match="draw"):
-        plot_returns(wrong)
+        draw(wrong)
 
 
 def test_pictures_are_drawn_where_they_are_asked_for():
@@ -357,12 +325,7 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch, draw):
         draw(found)
 
 
-# -- returns --------------------------------------------------------------------------------------
-
-
 def paid_by_seed(number, factor=1.0):
-    """Beings each of which is paid the seed and its own number, twice."""
-
     def main(simulation):
         simulation.crowd = [Being(place) for place in range(number)]
         for being in simulation.crowd:
@@ -378,8 +341,7 @@ def paid_by_seed(number, factor=1.0):
 def rows_of(figure):
     """By the label of a row: where its points are."""
     (axes,) = figure.axes
-    ticks = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
-    labels = {round(place, 6): text.get_text() for place, text in ticks}
+    labels = dict(zip(np.round(axes.get_yticks(), 6).tolist(), ticks(axes), strict=True))
     means = {round(float(line.get_ydata()[0]), 6): float(line.get_xdata()[0]) for line in axes.lines}
     points = [np.asarray(drawn.get_offsets())[:, 0].tolist() for drawn in of(axes, PathCollection)]
     assert [np.mean(values) for values in points] == pytest.approx(list(means.values()))
@@ -389,15 +351,18 @@ def rows_of(figure):
 @pytest.mark.parametrize(
     ("per", "rows"),
     [
-        ("policy", [("Being.act", [3, 5, 13])]),
-        ("agent", [("being_0", [2, 4, 12]), ("being_1", [4, 6, 14])]),
-        ("team", [("Being.act", [6, 10, 26])]),
+        ("policy", {"Being.act": [3, 5, 13]}),
+        ("agent", {"being_0": [2, 4, 12], "being_1": [4, 6, 14]}),
+        ("team", {"": [6, 10, 26]}),
     ],
 )
 def test_a_point_is_the_mean_of_the_agents_or_of_one_or_the_sum(per, rows):
     found = rows_of(plot_returns(paid_by_seed(2), per=per))
-    assert [values for _, values in found] == [values for _, values in rows]
-    assert found == rows or per == "team"
+    assert [values for _, values in found] == list(rows.values())
+    assert dict(found) == rows or per == "team"
+
+
+def test_intervals_are_the_same_each_time_and_teams_are_of_all_policies():
     intervals = [plot_returns(paid_by_seed(3)).axes[0].texts[0].get_text() for _ in range(2)]
     assert intervals == ["8  [-5.145, 21.14]"] * 2  # by Student's t
     ant, bee = (decision(agent=name, reward_mapping=lambda paid=paid: paid) for name, paid in (("a", 1.0), ("b", 10.0)))
@@ -409,8 +374,7 @@ def test_several_collections_stand_side_by_side():
     several = {"once": paid_by_seed(3), "twice": paid_by_seed(3, 2.0)}
     figure = plot_returns(several)
     assert rows_of(figure) == [("once", [4, 6, 14]), ("twice", [6, 10, 26])]
-    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert labels == ["Being.act", "once", "twice"]
+    assert ticks(figure.axes[0]) == ["Being.act", "once", "twice"]
     alone = plot_returns({name: found[Being.act] for name, found in several.items()})
     assert rows_of(alone) == rows_of(figure)
     assert rows_of(plot_returns(several, per="team")) == [("once", [12, 18, 42]), ("twice", [18, 30, 78])]

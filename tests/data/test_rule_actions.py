@@ -9,45 +9,29 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    aec_env,
-    joint_env,
-    make_step,
-    parallel_env,
-    simulate,
-    simulate_many,
-    single_env,
-    vector_env,
-)
+from simenv_marl import RULE, aec_env, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import DefinitionError, InvalidActionError
-from tests.worlds.models import calling, decision, notes, play, script
+from tests.worlds.models import calling, decision, define, notes, play, script
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
 
 def counting() -> Any:
-    """A rule that decides 10, 20, 30, ..."""
     tens = iter(range(10, 100, 10))
     return lambda: next(tens)
 
 
 def four(function: Any) -> Any:
-    """A simulation that asks four times."""
-
     def main(simulation: Any) -> None:
         simulation.log += [function() for _ in range(4)]
 
     return script(main)
 
 
-# -- infos ------------------------------------------------------------------------------------------
-
-
-def begun(function: Any, **options: Any) -> Any:
-    env = single_env(four(function), function, **options)
-    env.reset(seed=0)
+def begun(source: Any, function: Any, **options: Any) -> Any:
+    env = single_env(source, function, **options)
+    env.reset(seed=3)
     return env
 
 
@@ -62,7 +46,8 @@ def begun(function: Any, **options: Any) -> Any:
 )
 @DRIVERS
 def test_the_next_info_tells_the_rules_action_and_only_that_of_the_latest_decision(mapping, told, driver):
-    env = begun(decision(counting(), rule_action_mapping=mapping), driver=driver)
+    function = decision(counting(), rule_action_mapping=mapping)
+    env = begun(four(function), function, driver=driver)
     expected = [{} if action is None else {"rule_action": action} for action in told]
     assert [env.step(action)[4] for action in (RULE, 7, RULE, RULE)] == expected
     assert env.simulation.log == [10, 7, 20, 30]
@@ -76,14 +61,7 @@ def test_a_mapping_may_take_the_arguments_of_the_call_as_they_were_passed():
         return 1
 
     function = decision(lambda step=10: step + 1, rule_action_mapping=mapping)
-
-    def main(simulation):
-        function(5)
-        function(step=7)
-        function()
-
-    env = single_env(script(main), function)
-    env.reset(seed=0)
+    env = begun(script(lambda simulation: [function(5), function(step=7), function()].clear()), function)
     for _ in range(3):
         env.step(RULE)
     assert seen == [(6, (5,), {}), (8, (), {"step": 7}), (11, (), {})]
@@ -107,8 +85,7 @@ def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
         except Exception:
             simulation.log.append("swallowed")
 
-    env = single_env(script(main), function)
-    env.reset(seed=3)
+    env = begun(script(main), function)
     with pytest.raises(error, match=match) as caught:
         env.step(RULE)
     assert note in notes(caught.value)
@@ -116,20 +93,16 @@ def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
     env.reset(seed=0)
 
 
-@pytest.mark.parametrize("raising", [False, True])
-def test_decisions_within_rules_do_not_take_each_others_place(raising):
+def test_decisions_within_rules_do_not_take_each_others_place():
     inner = decision(lambda: 2, agent="inner_0", rule_action_mapping=lambda decided: decided)
-    outer = decision(
-        lambda: 10 * inner(), agent="outer_0", rule_action_mapping=lambda decided: decided // (0 if raising else 5)
-    )
-    env = aec_env(calling(outer, outer), [outer, inner])
-    if raising:
-        with pytest.raises(ZeroDivisionError) as caught:
-            play(env, RULE, seed=0)
-        assert "of 'outer_0'" in notes(caught.value)
-        return
-    told = [(turn.agent, turn.info.get("rule_action")) for turn in play(env, RULE, seed=0)]
+    outer = decision(lambda: 10 * inner(), agent="outer_0", rule_action_mapping=lambda decided: decided // 5)
+    wrong = decision(lambda: 10 * inner(), agent="wrong_0", rule_action_mapping=lambda decided: decided // 0)
+    turns = play(aec_env(calling(outer, outer), [outer, inner]), RULE, seed=0)
+    told = [(turn.agent, turn.info.get("rule_action")) for turn in turns]
     assert told == [("outer_0", None), ("inner_0", None), *[("outer_0", 4), ("inner_0", 2)] * 2]
+    with pytest.raises(ZeroDivisionError) as caught:
+        play(aec_env(calling(wrong), [wrong, inner]), RULE, seed=0)
+    assert "of 'wrong_0'" in notes(caught.value)
 
 
 @pytest.mark.parametrize("wrong", [3, "name"])
@@ -140,12 +113,9 @@ def test_what_is_no_mapping_is_refused(wrong):
 
 def test_arrays_are_cast_and_nobody_elses():
     decided = np.array([0.25, 0.5])
-    function = decision(
-        lambda: decided,
-        action_space=spaces.Box(0, 1, (2,), np.float32),
-        rule_action_mapping=lambda value: value,
-    )
-    env = begun(function)
+    space = spaces.Box(0, 1, (2,), np.float32)
+    function = decision(lambda: decided, action_space=space, rule_action_mapping=lambda value: value)
+    env = begun(four(function), function)
     action = env.step(RULE)[4]["rule_action"]
     assert action.dtype == np.float32
     action[:] = 0
@@ -160,13 +130,11 @@ def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
         def fill(self) -> None:
             self.level += 3
 
-    point = make_step(
+    point = define(
         observation_space=spaces.Discrete(100),
         observation_space_mapping=lambda tank: tank.level,
-        action_space=spaces.Discrete(10),
         apply=lambda action, tank: setattr(tank, "level", tank.level + action),
         rule_action_mapping=lambda nothing, tank: tank.level % 10,
-        reward_mapping=lambda tank: 0.0,
     )
     Tank.fill = point(Tank.fill)
 
@@ -176,8 +144,7 @@ def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
             tank.fill()
         tank.level = 50  # what comes after is not looked at
 
-    env = single_env(script(main), Tank.fill)
-    env.reset(seed=0)
+    env = begun(script(main), Tank.fill)
     assert [env.step(RULE)[4]["rule_action"] for _ in range(3)] == [3, 6, 9]
 
 
@@ -220,37 +187,40 @@ class Sheep:
         return self.number * 10
 
 
-def sheep(**changes: Any) -> Any:
-    defined: dict[str, Any] = {
-        "observation_space": spaces.Discrete(10),
-        "observation_space_mapping": lambda sheep: sheep.number,
-        "action_space": spaces.Discrete(10),
-        "action_space_mapping": lambda action: 10 * action,
-        "reward_mapping": lambda sheep: 0.0,
-        "agent": lambda sheep: sheep.name,
-        "rule_action_mapping": lambda decided: decided // 10,
-    }
-    return {f"{__name__}.Sheep.move": make_step(**defined | changes)}
+class Herd:
+    def __init__(self, number: int = 3) -> None:
+        self.number = number
+
+    def reset(self) -> None:
+        self.log: list[Any] = []
+
+    def run(self) -> None:
+        self.flock = [Sheep(number) for number in range(self.number)]
+        for _ in range(2):
+            self.log += [each.move() for each in self.flock]
 
 
-def herd(simulation: Any) -> None:
-    flock = [Sheep(number) for number in range(3)]
-    for _ in range(2):
-        simulation.log += [each.move() for each in flock]
+ROSTER = ["sheep_0", "sheep_1", "sheep_2"]
+SHEEP = {
+    f"{__name__}.Sheep.move": define(
+        observation_space=spaces.Discrete(10),
+        observation_space_mapping=lambda sheep: sheep.number,
+        action_space_mapping=lambda action: 10 * action,
+        agent=lambda sheep: sheep.name,
+        rule_action_mapping=lambda decided: decided // 10,
+    )
+}
 
 
 def test_rounds_tell_it_too():
-    roster = ["sheep_0", "sheep_1", "sheep_2"]
-    env = parallel_env(script(herd), sheep(), possible_agents=roster)
+    env = parallel_env(Herd, SHEEP, possible_agents=ROSTER)
     env.reset(seed=0)
     infos = env.step({"sheep_0": RULE, "sheep_1": 4, "sheep_2": RULE})[4]
-    assert [infos[agent].get("rule_action") for agent in roster] == [0, None, 2]
-    env.close()
-    env = joint_env(script(herd), sheep(), possible_agents=roster)
+    assert [infos[agent].get("rule_action") for agent in ROSTER] == [0, None, 2]
+    env = joint_env(Herd, SHEEP, possible_agents=ROSTER)
     env.reset(seed=0)
     env.step(RULE)
     assert env.simulation.log == [0, 10, 20]
-    env.close()
 
 
 def test_simulations_and_vectors_run_as_they_did():
@@ -269,20 +239,17 @@ def test_simulations_and_vectors_run_as_they_did():
 def test_batched_policies_get_it_in_their_infos_as_single_ones_do():
     seen = []
 
-    def policy(observations, infos):
-        return [alone(observations, info) for info in infos]
-
     def alone(observation, info):
         seen.append(info.get("rule_action"))
         return RULE
 
-    for run, own, seeds in ((simulate_many, policy, {"seeds": [0]}), (simulate, alone, {"seed": 0})):
+    def batched(observations, infos):
+        return [alone(None, info) for info in infos]
+
+    for run, own, seeds in ((simulate_many, batched, {"seeds": [0]}), (simulate, alone, {"seed": 0})):
         function = decision(counting(), rule_action_mapping=lambda tens: tens // 10)
         run(four(function), {function: own}, **seeds)
     assert seen == [None, 1, 2, 3] * 2
-
-
-# -- what was collected -----------------------------------------------------------------------------
 
 
 MOVES = {0: "stay", 1: "north", 2: "south"}
@@ -325,31 +292,17 @@ def test_a_policy_may_decide_some_of_them():
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_entities_that_were_collected(workers):
-    found = collect_episodes(Herd, {f"{__name__}.Sheep.move": RULE}, points=sheep(), seeds=range(5), workers=workers)
-    (herds,) = found.values()
+    (herds,) = collect_episodes(
+        Herd, dict.fromkeys(SHEEP, RULE), points=SHEEP, seeds=range(5), workers=workers
+    ).values()
     assert herds.known.all()
     assert herds.actions.tolist() == herds.observations.tolist() == [0, 0, 1, 1, 2, 2] * 5
-
-
-class Herd:
-    def reset(self) -> None:
-        self.log: list[Any] = []
-
-    def run(self) -> None:
-        herd(self)
 
 
 @pytest.mark.parametrize(
     ("actions", "told"), [(RULE, [0, 1, 0, 1]), ({"sheep_0": RULE, "sheep_1": 3}, [0, None, 0, None])]
 )
 def test_entities_are_told_each_their_own(actions, told):
-    """Also where the point has no name of its own, and the others follow the policy."""
-
-    def pair(simulation):
-        simulation.flock = one, other = Sheep(0), Sheep(1)
-        for _ in range(2):
-            simulation.log += [one.move(), other.move()]
-
-    turns = play(aec_env(script(pair), sheep()), actions, seed=0)
+    turns = play(aec_env(lambda: Herd(2), SHEEP), actions, seed=0)
     found = [(turn.agent, turn.info.get("rule_action")) for turn in turns]
     assert found == list(zip(["sheep_0", "sheep_1"] * 3, [None, None, *told], strict=True))

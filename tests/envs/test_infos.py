@@ -5,8 +5,9 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env
-from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import calling, decision, script
+from tests.worlds.lives import life
+from tests.worlds.many_worlds import beings
+from tests.worlds.models import Script, calling, decision
 
 MASKED = {"action_mask_mapping": lambda: [0, 1, 1] + [0] * 7}
 SEES_MASKS = {
@@ -17,16 +18,14 @@ SEES_MASKS = {
 }
 
 
-def clocked(*functions, ends=None):
+def clocked(*functions):
     """A factory of simulations with a clock, which call those functions one after the other."""
-    make = calling(*functions, ends=ends)
 
-    def factory():
-        simulation = make()
-        simulation.time = lambda: float(len(simulation.log))
-        return simulation
+    class Clocked(Script):
+        def time(self):
+            return float(len(self.log))
 
-    return factory
+    return lambda: Clocked(calling(*functions)().main)
 
 
 def keys(env):
@@ -97,19 +96,9 @@ def test_a_mask_in_an_observation_without_a_decision_is_open(make):
 
 def test_agents_that_the_model_has_let_go_of_keep_their_keys():
     """Without a word: there is nothing to observe any more, and nobody is said to have ended."""
-
-    def main(simulation):
-        one, two = Being(0), Being(1)
-        simulation.beings = [one, two]
-        one.act()
-        two.act()
-        simulation.beings.remove(one)
-        del one
-        two.act()
-        two.act()
-
     points = beings(action_mask_mapping=lambda being: [0, 1] + [0] * 8)
-    env = parallel_env(script(main), points, possible_agents=["being_0", "being_1"])
+    program = life("0 acts, 1 acts, 0 forgotten, 1 acts, 1 acts")
+    env = parallel_env(program, points, possible_agents=["being_0", "being_1"])
     _, infos = env.reset()
     assert infos["being_0"].keys() == infos["being_1"].keys() == {"action_mask", "deciding", "acted"}
     _, _, _, _, infos = env.step({"being_0": 1, "being_1": 1})

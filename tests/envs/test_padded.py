@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from simenv_marl import RULE, aec_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import AgentError, UnknownAgentError, ViewError
+from tests.worlds.lives import life
 from tests.worlds.many_worlds import (
     ROSTER,
     Announcing,
     Answered,
-    Being,
     Colony,
     answer,
     beings,
@@ -134,20 +134,14 @@ def test_rounds_have_everybody_and_are_those_of_the_living(world):
 
 
 NAMES = ["being_1", "being_2"]
+VIEWS = [(parallel_env, {"being_1": 3, "being_2": 4}), (aec_env, 3)]
 
 
-def generations(simulation):
-    first, second = Being(1), Being(2)
-    simulation.log.append(first.act())
-    first.health = 7
-    first.leave()
-    second.health = 1
-    simulation.log.append(second.act())
-    simulation.log.append(second.act())
+GENERATIONS = life("1 acts, 1 health 7, 1 leaves, 2 health 1, 2 acts, 2 acts")
 
 
 def test_the_removed_are_paid_at_once_and_blank_from_then_on():
-    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=NAMES))
+    env = pad_agents(parallel_env(GENERATIONS, beings(), possible_agents=NAMES))
     observations, infos = env.reset(seed=0)
     assert observations["being_1"].tolist() == [1, 0]
     assert [infos[agent]["present"] for agent in env.agents] == [True, False]
@@ -171,42 +165,27 @@ def test_the_removed_are_paid_at_once_and_blank_from_then_on():
 
 
 @pytest.mark.parametrize("steps", [1, 2])
-def test_a_limit_of_time_truncates_all_alike(steps):
-    options = {"possible_agents": NAMES, "max_steps": steps}
-    for view, action in ((parallel_env, {"being_1": 1, "being_2": 1}), (aec_env, 1)):
-        env = pad_agents(view(script(generations), beings(), **options))
-        env.reset(seed=0)
-        for _ in range(steps):
-            results = env.step(action)
-        terminations, truncations = results[2:4] if results else (env.terminations, env.truncations)
-        assert truncations == {"being_1": True, "being_2": True}
-        assert terminations == {"being_1": False, "being_2": False}
+@pytest.mark.parametrize(("view", "action"), VIEWS)
+def test_a_limit_of_time_truncates_all_alike(steps, view, action):
+    env = pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, max_steps=steps))
+    env.reset(seed=0)
+    for _ in range(steps):
+        results = env.step(action)
+    terminations, truncations = results[2:4] if results else (env.terminations, env.truncations)
+    assert truncations == {"being_1": True, "being_2": True}
+    assert terminations == {"being_1": False, "being_2": False}
 
 
 def test_masks_are_open_and_clocks_go_on():
-    def main(simulation):
-        simulation.hours = 0.0
-        first, second = Being(1), Being(2)
-        for hour in range(4):
-            simulation.hours = float(hour)
-            (first if hour < 2 else second).act()
-            if hour == 1:
-                first.leave()
-
-    class Timed(type(script(main)())):
-        def time(self):
-            return getattr(self, "hours", 0.0)
-
+    program = "1 acts, 1 o'clock, 1 acts, 1 leaves, 2 o'clock, 2 acts, 3 o'clock, 2 acts"
     masked = beings(
         action_mask_mapping=lambda being: [0, 1, 0],
         action_space=spaces.Discrete(3),
-        observation_space=spaces.Dict(
-            {"health": spaces.Discrete(9), "action_mask": spaces.MultiBinary(3)}
-        ),
+        observation_space=spaces.Dict(health=spaces.Discrete(9), action_mask=spaces.MultiBinary(3)),
         observation_space_mapping=lambda being: {"health": being.health},
-    )  # fmt: skip
+    )
     names = ["being_1", "being_2", "being_3"]
-    env = pad_agents(parallel_env(lambda: Timed(main), masked, possible_agents=names))
+    env = pad_agents(parallel_env(life(program, timed=True), masked, possible_agents=names))
     observations, infos = env.reset(seed=0)
     hours = [0.0]
     while True:
@@ -218,23 +197,18 @@ def test_masks_are_open_and_clocks_go_on():
         if not env.agents:
             break
         observations, _, _, _, infos = env.step(dict.fromkeys(names, 1))
-        hours.append(env.simulation.hours)
+        hours.append(env.simulation.now)
     assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
 
 
 def test_errors_surface_and_the_next_episode_is_as_ever():
-    def back(simulation):
-        being = Being(1)
-        being.act()
-        being.leave()
-        being.act()
-
-    env = pad_agents(parallel_env(script(back), beings(), possible_agents=NAMES))
+    program = life("1 acts, 1 leaves, 1 acts")
+    env = pad_agents(parallel_env(program, beings(), possible_agents=NAMES))
     env.reset(seed=0)
     with pytest.raises(AgentError, match="after its end"):
         env.step({"being_1": 1, "being_2": 1})
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
-    env = pad_agents(aec_env(script(generations), points, possible_agents=NAMES))
+    env = pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES))
     env.reset(seed=0)
     with pytest.raises(ZeroDivisionError) as caught:
         env.step(1)
@@ -246,40 +220,33 @@ def test_errors_surface_and_the_next_episode_is_as_ever():
 def test_padding_needs_a_view_of_many_agents_and_a_roster():
     for view in (aec_env, parallel_env):
         with pytest.raises(ViewError, match="possible_agents"):
-            pad_agents(view(script(generations), beings()))
+            pad_agents(view(GENERATIONS, beings()))
     function = decision()
     with pytest.raises(ViewError, match="aec_env or parallel_env"):
         pad_agents(single_env(script(lambda simulation: function()), function))
 
 
 def test_results_stand_in_the_order_of_the_roster():
-    def main(simulation):
-        simulation.crowd = [Being(2), Being(0)]
-        for _ in range(3):
-            for being in simulation.crowd:
-                being.act()
-
     names = ["being_0", "being_1", "being_2"]
-    env = pad_agents(parallel_env(script(main), beings(), possible_agents=names))
+    env = pad_agents(parallel_env(life("2 acts, 0 acts, 2 acts, 0 acts"), beings(), possible_agents=names))
     told = env.reset()
     while env.agents:
         assert env.agents == names
         assert [list(part) for part in told] == [names] * len(told)
-        told = env.step({"being_0": 1, "being_1": 1, "being_2": 1})
+        told = env.step(dict.fromkeys(names, 1))
     assert [list(part) for part in told] == [names] * 5
 
 
-def test_the_state_of_observations_has_blanks_for_the_removed():
-    options = {"possible_agents": NAMES, "state_space": "observations"}
-    for view, action in ((parallel_env, {"being_1": 3, "being_2": 4}), (aec_env, 3)):
-        env = pad_agents(view(script(generations), beings(), **options))
-        env.reset(seed=0)
-        assert env.state()[:2].tolist() == [1, 0]
-        env.step(action)
-        assert env.state()[:2].tolist() == [0, 0]
+@pytest.mark.parametrize(("view", "action"), VIEWS)
+def test_the_state_of_observations_has_blanks_for_the_removed(view, action):
+    env = pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, state_space="observations"))
+    env.reset(seed=0)
+    assert env.state()[:2].tolist() == [1, 0]
+    env.step(action)
+    assert env.state()[:2].tolist() == [0, 0]
 
 
 def test_a_copy_in_mid_episode_has_no_agents_before_its_reset():
-    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=NAMES))
+    env = pad_agents(parallel_env(GENERATIONS, beings(), possible_agents=NAMES))
     env.reset(seed=0)
     assert copy.deepcopy(env).agents == []

@@ -18,15 +18,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    joint_env,
-    make_step,
-    register_simulation,
-    single_env,
-    vector_env,
-)
+from simenv_marl import RULE, TRUNCATED, joint_env, register_simulation, single_env, vector_env
 from simenv_marl.errors import (
     ClosedError,
     CopyError,
@@ -48,9 +40,6 @@ from tests.worlds.worlds import FuseError, designs, seeds
 
 pytestmark = FORKS
 PROCESSES = pytest.mark.parametrize("processes", [0, 2])
-
-
-# -- what is told -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -82,9 +71,13 @@ def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number):
     assert [s.trace for s in ours.get_attr("simulation")] == [s.trace for s in theirs.get_attr("simulation")]
 
 
+def begun(envs, seed=0):
+    envs.reset(seed=seed)
+    return envs
+
+
 def amount(what, most, agent):
-    """A definition whose observation and reward are one attribute, and whose action is a number."""
-    return make_step(
+    return definition(
         observation_space=spaces.Box(-99, 99, (1,), np.float64),
         observation_space_mapping=lambda self: [getattr(self, what)],
         action_space=spaces.Box(-most, most, (1,), np.float64),
@@ -95,37 +88,25 @@ def amount(what, most, agent):
 
 
 class Pair:
-    """Two decisions, one of an agent with a name of its own and one of entities that are born and die."""
-
     def reset(self, seed: int | None = None) -> None:
         self.random = np.random.default_rng(seed)
-        self.entities = [Entity(number) for number in range(2)]
-        self.level = 0
-
-    def expected_calls(self, point: str) -> list[Any]:
-        return [(entity,) for entity in self.entities] if point.endswith("grow") else [(self,)]
+        self.level = self.size = 0
 
     def run(self) -> None:
         for _ in range(int(self.random.integers(2, 5))):
             self.level += self.steer()
-            for entity in self.entities:
-                entity.size += entity.grow()
+            self.size += self.grow()
 
     @amount("level", 1, "steerer")
     def steer(self) -> float:
         return 0.0
 
-
-class Entity:
-    def __init__(self, number: int) -> None:
-        self.number, self.size = number, 0.0
-
-    @amount("size", 2, lambda self: f"entity_{self.number}")
+    @amount("size", 2, "grower")
     def grow(self) -> float:
         return 0.0
 
 
-PAIR = [Pair.steer, Entity.grow]
+PAIR = [Pair.steer, Pair.grow]
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -142,9 +123,7 @@ def test_matches_sync_vector_env_over_joint_views(flatten, mode):
 
 
 def test_the_view_can_be_chosen():
-    envs = vector_env(Counter, Counter.decide, num_envs=2, view="joint")
-    assert isinstance(envs.single_action_space, spaces.Dict)
-    envs.close()
+    assert isinstance(vector_env(Counter, POINT, num_envs=2, view="joint").single_action_space, spaces.Dict)
     with pytest.raises(ViewError, match="needs one active decision point"):
         vector_env(Pair, PAIR, num_envs=2, view="single")
 
@@ -166,28 +145,22 @@ def test_options_mean_what_they_mean_to_one_environment(options):
     theirs.close()
 
 
-# -- seeds and resets -------------------------------------------------------------------------------
-
-
 def seeds_of(envs: Any) -> list[int | None]:
     return [simulation.seed for simulation in envs.get_attr("simulation")]
 
 
 def test_seeds_are_one_for_all_or_one_for_each():
-    envs = vector_env(Counter, Counter.decide, num_envs=3)
-    envs.reset(seed=7)
-    assert seeds_of(envs) == [7, 8, 9]
-    assert envs.np_random_seed == (7, 8, 9)
-    envs.reset(seed=np.int64(4))
-    assert seeds_of(envs) == [4, 5, 6]
-    envs.reset(seed=[3, None, 1])
-    assert seeds_of(envs)[::2] == [3, 1]
-    assert seeds_of(envs)[1] != 5
-    envs.reset()
-    drawn = seeds_of(envs)
-    envs.reset(seed=[3, None, 1])
-    envs.reset()
-    assert seeds_of(envs)[::2] == drawn[::2]
+    envs, drawn = vector_env(Counter, Counter.decide, num_envs=3), []
+    for seed, told in ((7, [7, 8, 9]), (np.int64(4), [4, 5, 6])):
+        envs.reset(seed=seed)
+        assert seeds_of(envs) == list(envs.np_random_seed) == told
+    for _ in range(2):
+        envs.reset(seed=[3, None, 1])
+        assert seeds_of(envs)[::2] == [3, 1]
+        assert seeds_of(envs)[1] != 5
+        envs.reset()
+        drawn.append(seeds_of(envs)[::2])
+    assert drawn[0] == drawn[1]
     for wrong in ([1, 2], -1, [1, 2, -3], [1.0, 2, 3]):
         with pytest.raises(OptionValueError, match="seed"):
             envs.reset(seed=wrong)
@@ -234,14 +207,11 @@ def test_without_autoreset_an_ended_episode_must_be_reset(processes):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"num_envs": 0}, OptionValueError, "num_envs"),
-        ({"num_envs": "2"}, OptionValueError, "num_envs"),
-        ({"num_envs": True}, OptionValueError, "num_envs"),
+        *(({"num_envs": number}, OptionValueError, "num_envs") for number in (0, "2", True)),
         ({"workers": -1}, OptionValueError, "workers"),
         ({"autoreset_mode": "never"}, OptionValueError, "autoreset_mode"),
         ({"view": "aec"}, OptionValueError, "view must be"),
-        ({"workers": 1, "context": "magic"}, OptionValueError, "context must be"),
-        ({"workers": 1, "context": 3}, OptionValueError, "context must be"),
+        *(({"workers": 1, "context": context}, OptionValueError, "context must be") for context in ("magic", 3)),
         ({"max_step": 3}, UnknownOptionError, "max_steps"),
     ],
 )
@@ -250,17 +220,13 @@ def test_options_that_cannot_be_are_refused(options, error, match):
         vector_env(Counter, Counter.decide, **{"num_envs": 2} | options)
 
 
-# -- actions ----------------------------------------------------------------------------------------
-
-
 def counts(envs: Any) -> list[int]:
     return [simulation.count for simulation in envs.get_attr("simulation")]
 
 
 @PROCESSES
 def test_one_illegal_action_moves_nobody(processes):
-    envs = vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK))
     for actions, number in (
         ([1, 1, 9], 2),
         ([1, 0, 1], 1),
@@ -289,7 +255,7 @@ def test_one_illegal_action_in_a_joint_view_moves_nobody():
     legal = {agent: np.zeros((2, 1)) for agent in observations}
     for illegal in (
         {**legal, "steerer": np.array([[0.0], [3.0]])},
-        {**legal, "entity_1": np.array([[0.0], [np.nan]])},
+        {**legal, "grower": np.array([[0.0], [np.nan]])},
         {**legal, "steerer": [np.zeros(1), RULE]},
         {"steerer": np.zeros((2, 1))},
         {agent: np.zeros((1, 1)) for agent in observations},
@@ -302,8 +268,7 @@ def test_one_illegal_action_in_a_joint_view_moves_nobody():
 
 
 def test_the_action_of_one_that_is_reset_is_not_looked_at():
-    envs = vector_env(Counter, Counter.decide, num_envs=2, max_steps=2)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, Counter.decide, num_envs=2, max_steps=2))
     envs.step([1, 1])
     *_, truncations, _ = envs.step([1, 1])
     assert truncations.all()
@@ -315,8 +280,7 @@ def test_the_action_of_one_that_is_reset_is_not_looked_at():
 
 
 def test_boxes_take_actions_in_other_dtypes():
-    envs = vector_env(Counter, {POINT: VARIETY["box"][1]}, num_envs=2)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, {POINT: VARIETY["box"][1]}, num_envs=2))
     for batch in (np.ones((2, 2)), np.ones((2, 2), int), [[1.0, 1.0], [1, 1]]):
         envs.reset(seed=0)
         envs.step(batch)
@@ -343,79 +307,65 @@ def test_observations_are_copies_unless_told_otherwise(kind, copy, processes):
     assert image.sum() > 0  # it can be read still
 
 
-# -- errors -----------------------------------------------------------------------------------------
+@pytest.mark.parametrize("where", ["run", "observation_space_mapping", "reward_mapping", "action_space_mapping"])
+@pytest.mark.parametrize("culprit", [0, 2])
+def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(where, culprit):
+    def fail(thing: Any) -> Any:
+        if thing == 3 or (isinstance(thing, Counter) and thing.seed == culprit and thing.count):
+            raise FuseError
+        return [0, 0] if where.startswith("obs") else 1
 
+    def made() -> Any:
+        return vector_env(Counter, {POINT: definition(**{where: fail} if where != "run" else {})}, num_envs=3)
 
-@pytest.mark.parametrize("culprit", [0, 1])
-def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(culprit):
     stacks_before = stacks()
-    envs = vector_env(Counter, Counter.decide, num_envs=3)
+    envs, fresh = made(), made()
     envs.reset(seed=0)
-    envs.envs[culprit].simulation.failing = True
+    envs.envs[culprit].simulation.failing = where == "run"
     with pytest.raises(FuseError) as caught:
-        envs.step([1, 1, 1])
+        envs.step(np.where(np.arange(3) == culprit, 3, 1))
     assert f"sub-environment {culprit}" in notes(caught.value)
     assert f"seed {culprit}" in notes(caught.value)
-    for _ in range(2):
-        with pytest.raises(EpisodeOverError, match="an error has ended"):
-            envs.step([1, 1, 1])
-    with pytest.raises(EpisodeOverError, match="without a reset_mask"):
-        envs.reset(options={"reset_mask": np.array([False, True, False])})
+    if (where, culprit) == ("action_space_mapping", 0):
+        envs.step([1, 1, 1])  # nothing had moved
+        assert counts(envs) == [1, 1, 1]
+    else:
+        for _ in range(2):
+            with pytest.raises(EpisodeOverError, match=r"an error has ended .*begin the next ones"):
+                envs.step([1, 1, 1])
+        with pytest.raises(EpisodeOverError, match="without a reset_mask"):
+            envs.reset(options={"reset_mask": np.array([False, True, False])})
     envs.envs[culprit].simulation.failing = False
-    fresh = vector_env(Counter, Counter.decide, num_envs=3)
-    agree(envs, fresh, 10, np.random.default_rng(0))
+    envs.reset(seed=5)
+    envs.step([1, 1, 1])
+    assert counts(envs) == [1, 1, 1]
+    if where == "run":
+        agree(envs, fresh, 10, np.random.default_rng(0))
     envs.close()
     fresh.close()
     assert stacks(stacks_before) == stacks_before
 
 
-@pytest.mark.parametrize("mapping", ["observation_space_mapping", "reward_mapping", "action_space_mapping"])
-@pytest.mark.parametrize("culprit", [0, 2])
-def test_an_error_in_a_mapping_says_where_it_was(mapping, culprit):
-    stacks_before = stacks()
-
-    def fail(thing: Any) -> Any:
-        if isinstance(thing, Counter):
-            if thing.seed == culprit and thing.count:
+def test_an_error_after_another_one_was_reset_or_in_a_reset_has_all_be_reset():
+    class Fragile(Counter):
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+            super().reset(seed, options)
+            if seed == 66:
                 raise FuseError
-            return [0, 0] if mapping.startswith("obs") else 0.0
-        if thing == 3:
-            raise FuseError
-        return 1
 
-    envs = vector_env(Counter, {POINT: definition(**{mapping: fail})}, num_envs=3)
-    envs.reset(seed=0)
-    actions = np.where(np.arange(3) == culprit, 3, 1)
+    envs = vector_env(Fragile, {POINT: definition(action_space_mapping=lambda action: {1: 1}[action])}, num_envs=2)
     with pytest.raises(FuseError) as caught:
-        envs.step(actions)
-    assert f"sub-environment {culprit}" in notes(caught.value)
-    if mapping == "action_space_mapping" and culprit == 0:
-        envs.step([1, 1, 1])  # nothing had moved
-        assert counts(envs) == [1, 1, 1]
-    else:
-        with pytest.raises(EpisodeOverError, match="begin the next ones"):
-            envs.step([1, 1, 1])
-    envs.reset(seed=5)
-    envs.step([1, 1, 1])
-    assert counts(envs) == [1, 1, 1]
-    envs.close()
-    assert stacks(stacks_before) == stacks_before
-
-
-def test_an_error_after_another_one_was_reset_has_all_be_reset():
-    def fail_at_three(action: int) -> int:
-        if action == 3:
-            raise FuseError
-        return 1
-
-    envs = vector_env(Counter, {POINT: definition(action_space_mapping=fail_at_three)}, num_envs=2)
+        envs.reset(seed=65)
+    assert "sub-environment 1" in notes(caught.value)
+    with pytest.raises(NotResetError, match="no episode yet"):
+        envs.step([1, 1])
     goals = {seed: int(np.random.default_rng(seed).integers(3, 12)) for seed in range(10)}
     envs.reset(seed=[max(goals, key=goals.__getitem__), min(goals, key=goals.__getitem__)])
     over = np.zeros(2, bool)
     while not over.any():
         over = np.logical_or(*envs.step([1, 1])[2:4])
     assert over.tolist() == [False, True]
-    with pytest.raises(FuseError) as caught:
+    with pytest.raises(KeyError) as caught:
         envs.step([3, 1])
     assert "sub-environment 0" in notes(caught.value)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
@@ -424,26 +374,8 @@ def test_an_error_after_another_one_was_reset_has_all_be_reset():
     envs.step([1, 1])
 
 
-def test_an_error_in_a_reset_says_where_it_was():
-    class Fragile(Counter):
-        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-            super().reset(seed, options)
-            if seed == 6:
-                raise FuseError
-
-    envs = vector_env(Fragile, {POINT: definition()}, num_envs=3)
-    with pytest.raises(FuseError) as caught:
-        envs.reset(seed=5)
-    assert "sub-environment 1" in notes(caught.value)
-    with pytest.raises(NotResetError, match="no episode yet"):
-        envs.step([1, 1, 1])
-    envs.reset(seed=0)
-    envs.step([1, 1, 1])
-
-
 def test_inside_another_simulation_it_works_all_the_same():
-    inner = vector_env(Counter, {POINT: definition()}, num_envs=2)
-    told = []
+    inner, told = vector_env(Counter, {POINT: definition()}, num_envs=2), []
 
     class Outer(Counter):
         def run(self) -> Any:
@@ -451,15 +383,13 @@ def test_inside_another_simulation_it_works_all_the_same():
             told.append(inner.step([1, 2])[0][:, 0].tolist())
             return super().run()
 
-    outer = vector_env(Outer, {POINT: definition()}, num_envs=2)
-    outer.reset(seed=0)
+    vector_env(Outer, {POINT: definition()}, num_envs=2).reset(seed=0)
     assert told == [[1, 2], [1, 2]]
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_another_thread_may_use_it_with_the_thread_driver_alone(driver):
-    envs = vector_env(Counter, Counter.decide, num_envs=2, driver=driver)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, Counter.decide, num_envs=2, driver=driver))
     errors = []
 
     def use() -> None:
@@ -481,14 +411,10 @@ def test_another_thread_may_use_it_with_the_thread_driver_alone(driver):
     envs.close()
 
 
-# -- the simulations themselves -----------------------------------------------------------------------
-
-
 @PROCESSES
 def test_sub_environments_can_be_asked_and_told(processes):
     points = {POINT: VARIETY["goal"][1]}
-    envs = vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK)
-    envs.reset(seed=3)
+    envs = begun(vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK), 3)
     envs.step([1, 2, 3])
     assert envs.render() == ("ansi 1", "ansi 2", "ansi 3")
     assert envs.call("compute_reward", np.ones(1), np.zeros(1), {}) == (-1.0,) * 3
@@ -518,11 +444,9 @@ def test_a_sub_environment_that_somebody_else_resets_is_stepped_where_it_then_st
     envs.reset(seed=[5, 6])
     for _ in range(2):
         envs.step([1, 1])
-    other = envs.envs[1]
-    observation, _ = other.reset(seed=6)
-    assert observation[0] == 0
+    assert envs.envs[1].reset(seed=6)[0][0] == 0
     assert envs.step([1, 1])[0][:, 0].tolist() == [3, 1]
-    other.close()
+    envs.envs[1].close()
     with pytest.raises(ResetNeededError, match="call reset"):
         envs.step([1, 1])
     envs.reset(seed=[5, 6])
@@ -567,8 +491,7 @@ def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
                     raise LookupError("it would not go") from None
                 raise
 
-    envs = vector_env(Stubborn, {POINT: definition()}, num_envs=3)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Stubborn, {POINT: definition()}, num_envs=3))
     simulations = envs.get_attr("simulation")
     with pytest.raises(LookupError) as caught:
         envs.close()
@@ -581,8 +504,7 @@ def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
 
 def test_one_that_is_dropped_unwinds_all():
     stacks_before = stacks()
-    envs = vector_env(Counter, Counter.decide, num_envs=2)
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, Counter.decide, num_envs=2))
     simulations = envs.get_attr("simulation")
     del envs
     gc.collect()
@@ -590,27 +512,24 @@ def test_one_that_is_dropped_unwinds_all():
     assert stacks(stacks_before) == stacks_before
 
 
-# -- beside Gymnasium ---------------------------------------------------------------------------------
-
-
 def test_gymnasium_makes_it_of_registered_ids():
-    ids = register_simulation(Pair, PAIR, name="vectors")
+    ids = [identity for identity in register_simulation(Pair, PAIR, name="vectors") if identity in gymnasium.registry]
+    given = {"num_envs": 3, "max_steps": 3}
     try:
-        for identity in ids[:2]:
-            ours = gymnasium.make_vec(identity, num_envs=3, vectorization_mode="vector_entry_point", max_steps=3)
+        for identity in ids:
+            ours = gymnasium.make_vec(identity, vectorization_mode="vector_entry_point", **given)
             assert type(ours).__name__ == "SimulationVectorEnv"
             assert ours.spec.id == identity
             ours.spec.to_json()
-            theirs = gymnasium.make_vec(identity, num_envs=3, vectorization_mode="sync", max_steps=3)
+            theirs = gymnasium.make_vec(identity, vectorization_mode="sync", **given)
             agree(ours, theirs, 12, np.random.default_rng(0))
-            ours.close()
-            theirs.close()
+        assert len(ids) == 3
         envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
         assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         envs.reset(seed=0)
         envs.close()
     finally:
-        for identity in ids[:2]:
+        for identity in ids:
             gymnasium.registry.pop(identity)
 
 
@@ -641,10 +560,6 @@ def test_an_agent_that_is_removed_terminates_and_is_not_truncated(view, mode):
 
 
 def test_what_is_reset_to_ask_for_the_agents_is_unwound():
-    """Where no roster is declared, a simulation is reset when the environment is made."""
-
-    ended = []
-
     class Announcing(Counter):
         def run(self):
             try:
@@ -655,14 +570,14 @@ def test_what_is_reset_to_ask_for_the_agents_is_unwound():
         def expected_calls(self, point):
             return [(self,)]
 
-    point = definition(agent=lambda self: "counter_0")
-    vector_env(Announcing, {f"{__name__}.Counter.decide": point}, num_envs=2)
+    ended, points = [], {POINT: definition(agent=lambda self: "counter_0")}
+    ours = vector_env(Announcing, points, num_envs=2)
     assert len(ended) == 1
+    theirs = SyncVectorEnv([lambda: joint_env(Announcing, points)] * 2)
+    agree(ours, theirs, 20, np.random.default_rng(0))
 
 
-def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
-    """Neither the answers nor what comes from the simulations is held any longer than it is used."""
-
+def test_neither_answers_nor_results_are_held_longer_than_they_are_used():
     class Answer:
         pass
 
@@ -673,16 +588,9 @@ def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
         answers.add(made)
         return made
 
-    decide = decision(
-        agent="a_0", action_space_mapping=answer, reward_mapping=lambda: there.append(len(answers)) or 0.0
-    )
-
-    def main(simulation):
-        for _ in range(3):
-            decide()
-
-    envs = vector_env(script(main), decide, num_envs=4)
-    envs.reset(seed=0)
+    reward = lambda: there.append(len(answers)) or 0.0  # noqa: E731
+    decide = decision(agent="a_0", action_space_mapping=answer, reward_mapping=reward)
+    envs = begun(vector_env(script(lambda simulation: [decide() and None for _ in range(3)]), decide, num_envs=4))
     there.clear()
     envs.step(np.ones(4, np.int64))
     assert there == [0] * 4

@@ -21,12 +21,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simenv_marl import vector_env
-from simenv_marl.errors import (
-    EpisodeOverError,
-    OptionValueError,
-    RewardError,
-    WorkerError,
-)
+from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
+from tests.envs.test_vector import begun
 from tests.processes import alone, descriptors, gone
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
 from tests.worlds.models import notes
@@ -38,7 +34,6 @@ pytestmark = FORKS
 
 
 def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
-    """A vector environment of four counters in two workers."""
     options = {"num_envs": 4, "workers": 2, "context": FORK, **options}
     return vector_env(model, {POINT: decision or definition()}, **options)
 
@@ -52,16 +47,12 @@ def _nothing_is_left():
 
 
 class Odd(Exception):
-    """An error that is not made of its arguments."""
-
     def __init__(self, *, count: int) -> None:
         super().__init__("it is odd")
         self.count = count
 
 
 class Failing(Counter):
-    """Does something terrible at a count that its options tell."""
-
     def __init__(self) -> None:
         self.process = os.getpid()
 
@@ -71,24 +62,43 @@ class Failing(Counter):
         self.how = (options or {}).get(seed)
 
     def run(self) -> Any:
-        while True:
-            self.count += self.decide()
-            if self.how == "odd":
-                raise Odd(count=self.count)
-            if self.how == "local":
-                raise type("Local", (ValueError,), {})("made here")
-            if self.how == "unpicklable":
-                error = ValueError("with something in it")
-                error.thing = (part for part in ())
-                raise error
-            if self.how == "kill":
-                os.kill(os.getpid(), signal.SIGKILL)
-            if self.how in (1, 7):
-                os._exit(self.how)
-            if self.how == "system exit":
-                raise SystemExit(3)
-            if self.how == "reward":
-                self.count = 7  # for which nothing is paid that were a number
+        try:
+            while True:
+                self.count += self.decide()
+                self.fail()
+        finally:
+            self.unwind()
+
+    def fail(self) -> None:
+        if self.how == "odd":
+            raise Odd(count=self.count)
+        if self.how == "local":
+            raise type("Local", (ValueError,), {})("made here")
+        if self.how == "unpicklable":
+            error = ValueError("with something in it")
+            error.thing = (part for part in ())
+            raise error
+        if self.how == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.how in (1, 7):
+            os._exit(self.how)
+        if self.how == "system exit":
+            raise SystemExit(3)
+        if self.how == "reward":
+            self.count = 7  # for which nothing is paid that were a number
+        if self.how == "interrupt":
+            time.sleep(0.1)
+            os.kill(self.options["process"], signal.SIGALRM)
+            time.sleep(0.3)
+
+    def unwind(self) -> None:
+        if self.how == "stubborn":
+            raise LookupError("it would not go") from None
+        if self.how == "hanging":
+            time.sleep(60)
+        if isinstance(self.how, Path):
+            time.sleep(0.3)
+            self.how.touch()
 
 
 ONES = np.ones(4, np.int64)
@@ -96,14 +106,9 @@ KILLED = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no 
 
 
 def goes_on(envs: Any, seed: int = 0) -> None:
-    """All begin anew, and take a step."""
     envs.reset(seed=seed)
     assert [simulation.seed for simulation in envs.get_attr("simulation")] == [seed + place for place in range(4)]
-    observations, *_ = envs.step(ONES)
-    assert observations[:, 0].tolist() == [1, 1, 1, 1]
-
-
-# -- the same -----------------------------------------------------------------------------------------
+    assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -114,7 +119,6 @@ def goes_on(envs: Any, seed: int = 0) -> None:
     ],
 )
 def test_workers_tell_what_one_process_tells(kind, mode, context):
-    """However they are started, in all modes of resets and of all kinds of spaces."""
     model, decision = VARIETY[kind]
     with_workers = workers(model, decision, num_envs=5, autoreset_mode=mode, context=context)
     without = vector_env(model, {POINT: decision}, num_envs=5, autoreset_mode=mode)
@@ -126,15 +130,13 @@ def test_workers_tell_what_one_process_tells(kind, mode, context):
 @given(designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.integers(1, 5))
 @settings(max_examples=15)
 def test_workers_tell_the_same_of_random_worlds(design, seed, mode, number, processes):
-    joint_or_single = made(design, number, mode)
-    if joint_or_single is None:
-        return
-    with_workers = made(design, number, mode, workers=processes, context=FORK)
-    agree(with_workers, joint_or_single, 12, np.random.default_rng(seed))
+    alone = made(design, number, mode)
+    if alone is not None:
+        with_workers = made(design, number, mode, workers=processes, context=FORK)
+        agree(with_workers, alone, 12, np.random.default_rng(seed))
 
 
 def processes_of(envs: Any) -> list[int]:
-    """In which process each simulation is."""
     return [simulation.process for simulation in envs.get_attr("simulation")]
 
 
@@ -157,8 +159,6 @@ def test_models_and_mappings_that_no_module_holds_are_sent_along():
 
 
 class Plain(Counter):
-    """Decides by a function that nobody has decorated."""
-
     def decide(self) -> int:
         return 1
 
@@ -174,9 +174,6 @@ def test_what_cannot_be_sent_is_refused():
     lock = threading.Lock()
     with pytest.raises(OptionValueError, match="cannot be sent to another process"):
         vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
-
-
-# -- errors ---------------------------------------------------------------------------------------------
 
 
 def test_errors_come_back_as_themselves_and_the_next_reset_works():
@@ -210,13 +207,15 @@ def test_errors_in_a_factory_surface_where_the_environment_is_made():
 
 
 class Breaking:
-    """A factory that works in one process alone."""
+    """A factory that works in one process alone, and in others raises or ends them."""
 
-    def __init__(self, process: int) -> None:
-        self.process = process
+    def __init__(self, process: int, *, ends: bool = False) -> None:
+        self.process, self.ends = process, ends
 
     def __call__(self) -> Any:
-        return Counter() if os.getpid() == self.process else 1 / 0
+        if os.getpid() == self.process:
+            return Counter()
+        return os._exit(3) if self.ends else 1 / 0
 
 
 @KILLED
@@ -238,8 +237,7 @@ def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, c
 @KILLED
 @pytest.mark.parametrize("use", ["step", "call", "close"])
 def test_workers_that_are_killed_between_steps_are_noticed(use):
-    envs = workers(Failing)
-    envs.reset(seed=0)
+    envs = begun(workers(Failing))
     there = set(processes_of(envs)) if use != "call" else processes_of(envs)[:1]
     for process in there:
         os.kill(process, signal.SIGKILL)
@@ -254,82 +252,37 @@ def test_workers_that_are_killed_between_steps_are_noticed(use):
     assert envs.closed
 
 
-# -- the end --------------------------------------------------------------------------------------------
-
-
-class Stubborn(Counter):
-    """Raises while it is unwound."""
-
-    def run(self) -> Any:
-        try:
-            super().run()
-        except BaseException:
-            raise LookupError("it would not go") from None
-
-
 def test_errors_while_closing_surface_and_the_workers_end():
-    envs = workers(Stubborn)
-    envs.reset(seed=0)
+    envs = workers(Failing, context=multiprocessing.get_context(FORK))
+    envs.reset(seed=0, options=dict.fromkeys(range(4), "stubborn"))
     with pytest.raises(LookupError, match="it would not go"):
         envs.close()
     assert envs.closed
 
 
-def test_an_environment_that_is_dropped_ends_its_workers():
+def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
     envs = workers(Failing)
-    envs.reset(seed=0)
+    envs.reset(seed=0, options={seed: tmp_path / str(seed) for seed in range(4)})
     there = set(processes_of(envs))
     del envs
     gc.collect()
-    assert all(map(gone, there))
-
-
-class Leaving(Counter):
-    """Leaves a file, which takes a while, when it is unwound."""
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        super().reset(seed, options)
-        self.path = Path((options or {})["path"]) / str(seed)
-
-    def run(self) -> Any:
-        try:
-            return super().run()
-        finally:
-            time.sleep(0.3)
-            self.path.touch()
-
-
-def test_workers_of_an_environment_that_is_dropped_may_finish(tmp_path):
-    envs = workers(Leaving)
-    envs.reset(seed=0, options={"path": str(tmp_path)})
-    del envs
-    gc.collect()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2", "3"]
+    assert all(map(gone, there))
 
 
 def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
     monkeypatch.setattr("simenv_marl.many.parallel.SECONDS_TO_CLOSE", 0.5)
-    envs = workers(Hanging)
-    envs.reset(seed=0)
+    envs = workers(Failing)
+    envs.reset(seed=0, options={0: "hanging"})
     with pytest.warns(ResourceWarning, match="did not close"):
         envs.close()
     assert envs.closed
 
 
-class Hanging(Counter):
-    """Does not come to an end when it is unwound."""
-
-    def run(self) -> Any:
-        try:
-            super().run()
-        finally:
-            time.sleep(60)
-
-
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="there is no SIGALRM")
 def test_an_interrupted_step_leaves_the_environment_in_step():
-    envs = workers(Slow)
-    envs.reset(seed=0, options={"process": os.getpid()})
+    envs = workers(Failing)
+    envs.reset(seed=0, options={"process": os.getpid(), 0: "interrupt"})
 
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -343,22 +296,6 @@ def test_an_interrupted_step_leaves_the_environment_in_step():
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
     goes_on(envs, 7)
-
-
-class Slow(Counter):
-    """Interrupts the process that waits for it."""
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        super().reset(seed, options)
-        self.process = (options or {}).get("process")
-
-    def run(self) -> Any:
-        while True:
-            self.count += self.decide()
-            if self.process is not None and self.seed == 0:
-                time.sleep(0.1)
-                os.kill(self.process, signal.SIGALRM)
-                time.sleep(0.3)
 
 
 SCRIPT = """
@@ -412,8 +349,7 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
 
 @pytest.mark.skipif(FORK != "fork", reason="there is no fork")
 def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
-    envs = workers()
-    envs.reset(seed=0)
+    envs = begun(workers())
     child = os.fork()
     if child == 0:
         code = 1
@@ -426,19 +362,7 @@ def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
             gc.collect()
             os._exit(code)
     assert os.waitpid(child, 0)[1] == 0
-    observations, *_ = envs.step(ONES)
-    assert observations[:, 0].tolist() == [1, 1, 1, 1]
-
-
-def test_a_context_may_be_an_object_of_multiprocessing():
-    goes_on(workers(context=multiprocessing.get_context(FORK)))
-
-
-class Ending(Breaking):
-    """A factory that ends all other processes."""
-
-    def __call__(self) -> Any:
-        return Counter() if os.getpid() == self.process else os._exit(3)
+    assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -446,7 +370,7 @@ class Ending(Breaking):
     [
         *[("OSError", (what, number)) for what in ("Process.start", "Pipe") for number in (1, 2)],
         ("ZeroDivisionError", ("Breaking",)),
-        ("WorkerError", ("Ending",)),
+        ("WorkerError", ("Breaking", 0, True)),
     ],
 )
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
@@ -454,13 +378,12 @@ def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error, what):
     alone(start_in_vain, error, *what)
 
 
-def start_in_vain(error: str, what: str, number: int = 0) -> None:
-    """Start workers of which one cannot be started, or cannot work, and look for what is left open."""
+def start_in_vain(error: str, what: str, number: int = 0, ends: bool = False) -> None:
     context = multiprocessing.get_context(FORK)
     workers().close()  # multiprocessing keeps its shared memory for the next time
     gc.collect()
     before = descriptors()
-    model: Any = {"Breaking": Breaking, "Ending": Ending}.get(what, lambda _: Counter)(os.getpid())
+    model = Breaking(os.getpid(), ends=ends) if what == "Breaking" else Counter
     if number:
         owner, name = (context.Process, "start") if what == "Process.start" else (context, what)
         real, calls = getattr(owner, name), iter(range(1, 10))

@@ -31,7 +31,6 @@ class Case(NamedTuple):
 
 
 def drawn(*needs: str, **arguments: Any) -> Case:
-    """Of a wrapper around pictures."""
     return Case(arguments, needs=needs, render_mode="rgb_array")
 
 

@@ -1,18 +1,17 @@
 """The agency that collects debts: its money, the law, its views, and what a better policy is worth."""
 
-import collections
 import pickle
 import subprocess
 import sys
 from pathlib import Path
-from random import Random
 
 import pytest
 from studies.debt_collection.env import CASES, COLLECTOR, NAMED_CASES, NAMED_COLLECTOR, CollectionSim, lawful
-from studies.debt_collection.model import CHOICES, LIMITATION, VALIDATION, Agency, Debtor, Parameters
+from studies.debt_collection.model import CHOICES, Agency, Debtor, Parameters
 from studies.debt_collection.study import HELD_OUT, LEARNED, compare
 
 from simenv_marl import aec_env, joint_env, parallel_env, single_env
+from simenv_marl.errors import InvalidActionError
 from simenv_marl.testing import check_simulation
 from tests.worlds.models import follow_the_rule
 
@@ -49,55 +48,6 @@ def test_runs_on_its_own():
     assert f"{plain(3, 90).profit / 100:.2f}" in run.stdout.splitlines()[2]
 
 
-class Audit:
-    """Has an agency choose at random among what is lawful, and checks the law and the staff by the record alone."""
-
-    def __init__(self, seed, **parameters):
-        self.agency = agency = Agency(seed, Parameters(**parameters))
-        self.draw, self.calls, self.letters = Random(seed), {}, {}
-        self.eager = self.draw.choice([0.0, 0.9])  # how often it calls where that is lawful
-        self.today = collections.Counter()
-        agency.world.calendar.every(1, self.end_day, start=0)
-
-    def choose(self, agency, debtor, choices):
-        day, eager = agency.world.month, "call" in choices and self.draw.random() < self.eager
-        choice = "call" if eager else self.draw.choice(choices)
-        calls, letters = self.calls.setdefault(debtor, []), self.letters.setdefault(debtor, [])
-        assert choice == "leave" or day % 7 < 5
-        if choice == "call":
-            self.today[day] += 1
-            assert letters
-            assert not debtor.ceased
-            assert len([earlier for earlier in calls if earlier > day - 7]) < 7
-            assert debtor.talked is None or day >= debtor.talked + 7
-            calls.append(day)
-        elif choice == "write":
-            assert not debtor.ceased
-            letters.append(day)
-        elif choice == "sue":
-            assert letters[0] + VALIDATION <= day < debtor.since + LIMITATION
-        return choice
-
-    def end_day(self):
-        assert self.today[self.agency.world.month] <= self.agency.parameters.calls
-        self.agency.world.check()
-
-
-def test_no_cent_is_lost_and_no_law_broken_by_random_lawful_choices(monkeypatch):
-    counts, last_calls = collections.Counter(), 0
-    for seed in range(100):
-        draw = Random(seed)
-        audit = Audit(seed, arrivals=draw.choice([0.0, 0.5, 1.0]), stock=draw.randrange(1, 20), calls=draw.randrange(9))
-        monkeypatch.setattr(Agency, "choose_contact", lambda *call, audit=audit: audit.choose(*call))
-        for _ in range(150):
-            audit.agency.advance()
-        counts += audit.agency.world.counts
-        last_calls += any(number == audit.agency.parameters.calls > 0 for number in audit.today.values())
-    assert last_calls > 30  # the staff was fully used somewhere
-    happened = {"paid", "insolvent", "not owed", "dismissed", "nothing to garnish", "Plan granted"}
-    assert happened | set(CHOICES) <= set(counts)
-
-
 VIEWS = {"aec": aec_env, "parallel": parallel_env, "single": single_env, "joint": joint_env}
 ROSTER = {"possible_agents": [f"debtor_{number}" for number in range(20)], "undeclared": "rule"}
 
@@ -123,6 +73,9 @@ def test_actions_number_the_lawful_choices_and_rewards_sum_up_to_the_profit():
         choices = lawful(observation)
         assert info["action_mask"].tolist() == [1] * len(choices) + [0] * (len(CHOICES) - len(choices))
         assert info["time"] % 7 < 5
+        if len(choices) < len(CHOICES):
+            with pytest.raises(InvalidActionError):
+                environment.step(len(choices))
         asked.add(choices[-1])
         before = counts[choices[-1]]
         observation, reward, *over, info = environment.step(len(choices) - 1)

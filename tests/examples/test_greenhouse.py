@@ -12,13 +12,11 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-from examples.greenhouse_coop import plan, train
+from examples.greenhouse_coop import train
 from examples.greenhouse_coop.env import (
     DAYS,
-    GreenhouseSim,
     env,
     joint_env,
-    observe,
     parallel_env,
     raw_env,
     ventilation_env,
@@ -28,8 +26,7 @@ from examples.greenhouse_coop.model import Greenhouse, Plant
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, seed_test
 
-from simenv_marl import RULE, TRUNCATED, branch
-from simenv_marl.data import collect_episodes
+from simenv_marl import RULE, branch
 from tests.worlds.models import follow_the_rule, play
 
 ROOT = Path(__file__).parents[2]
@@ -61,16 +58,6 @@ def kept_plainly(seed):
     return greenhouse
 
 
-class Kept(Greenhouse):
-    """A greenhouse whose own rules are 80 litres and 90 % of the air."""
-
-    def choose_water_amount(self):
-        return 80.0
-
-    def update_air_exchange(self):
-        self.humidity = 0.1 * self.humidity + 0.9 * self.outside_humidity
-
-
 KEEP = {"waterer_0": 0.08, "ventilator_0": 0.9}
 
 
@@ -79,9 +66,6 @@ def pair():
     environment = raw_env()
     yield environment
     environment.close()
-
-
-# -- the model ------------------------------------------------------------------------------------
 
 
 def test_a_day_in_the_papers_order():
@@ -122,21 +106,12 @@ def test_the_model_tells_its_days_as_in_the_paper(start):
     assert alive[-1] == 0  # the rule means too well
 
 
-# -- the environments -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("make", [raw_env, parallel_env, joint_env, watering_env, ventilation_env])
 def test_ruled_throughout_a_pickled_environment_is_the_plain_model(make):
     environment = pickle.loads(pickle.dumps(make()))
     for seed in (0, 1, 2**31 - 1):
         assert state(follow_the_rule(environment, seed).greenhouse) == state(kept_plainly(seed))
     environment.close()
-
-
-def test_deciding_as_the_rule_does_is_the_plain_model(pair):
-    # A plain float reaches the model as it is; in the space's float32 there is no exact fifth.
-    play(pair, 0.2, seed=4)
-    assert state(pair.simulation.greenhouse) == state(kept_plainly(4))
 
 
 def test_the_model_is_undecorated_again(pair):
@@ -159,54 +134,6 @@ def test_it_ends_when_all_are_dead_and_is_truncated_after_a_hundred_days(pair):
     assert [turn[3:5] for turn in alive[-2:]] == [(False, True)] * 2
     assert pair.simulation.greenhouse.alive > 0
     assert [turn.agent for turn in alive[: 2 * DAYS]] == ["ventilator_0", "waterer_0"] * DAYS
-    simulation = GreenhouseSim()
-    simulation.greenhouse = Kept(1)
-    assert simulation.run() is TRUNCATED
-
-
-def test_observed_is_what_it_says():
-    greenhouse = Greenhouse(1)
-    greenhouse.temp, greenhouse.humidity, greenhouse.day = 25, 0.7, 30
-    for number, plant in enumerate(greenhouse.pots):
-        plant.water, plant.health = (3.0, 0.0) if number < 100 else (1.5, 1.0) if number < 150 else (0.75, 0.5)
-    assert observe(greenhouse) == pytest.approx([0.5, 0.7, 0.5, 0.3, (1.5 + 0.75) / 2 / 3, 0.75 / 3])
-    for plant in greenhouse.pots:
-        plant.health = 0.0
-    assert observe(greenhouse) == pytest.approx([0.5, 0.7, 0, 0.3, 0, 0])
-
-
-def test_observations_of_random_actions_stay_in_their_space(pair):
-    """The first episode is one in which the humidity does not: the windows stay shut, and all taps are soon open."""
-    greatest = []
-    for seed, actions in [(9, [0, 1] * 4 + [1, 1, 0, 0, 1, 1, 0, 1, 0, 0, 1]), *((seed, None) for seed in range(20))]:
-        draw = np.random.default_rng(seed)
-        pair.reset(seed=seed)
-        humidity = []
-        for number, agent in enumerate(pair.agent_iter()):
-            observation, reward, terminated, truncated, _ = pair.last()
-            assert pair.observation_space(agent).contains(observation), observation
-            assert -2 <= reward <= 1
-            assert terminated or truncated or number <= 2 * DAYS
-            humidity.append(abs(pair.simulation.greenhouse.humidity))
-            action = actions[number % len(actions)] if actions else draw.random()
-            pair.step(None if terminated or truncated else np.array([action], np.float32))
-        greatest.append(max(humidity))
-    assert greatest[0] > 1.5
-
-
-def test_the_teams_return_is_one_agents_return(pair):
-    for seed in range(3):
-        turns = play(pair, KEEP, seed=seed)
-        greenhouse = Kept(seed)
-        days = []
-        for _ in range(DAYS):
-            greenhouse.update_day()
-            days.append(greenhouse.alive / 200 - 0.08)
-        assert pair.simulation.greenhouse.alive == greenhouse.alive
-        # The first value that an agent sees is no reward of anything.
-        rewards = {agent: [turn.reward for turn in turns if turn.agent == agent] for agent in KEEP}
-        assert rewards["ventilator_0"] == pytest.approx([0, *days])
-        assert rewards["waterer_0"] == pytest.approx([0, *days[1:], days[-1]])
 
 
 @pytest.mark.parametrize(("make", "agent"), [(watering_env, "waterer_0"), (ventilation_env, "ventilator_0")])
@@ -295,9 +222,6 @@ def test_the_weather_that_lies_ahead_can_be_drawn_anew():
     assert forked[0][2] == forked[1][2]  # the plants are what they are
 
 
-# -- training and planning ------------------------------------------------------------------------
-
-
 def test_trains_end_to_end(tmp_path, capsys):
     folder = tmp_path / "new" / "folder"
     train.main(["--budget", "1", "--seeds", "2", "--workers", "1", "--out", str(folder)])
@@ -323,31 +247,3 @@ def test_training_is_worth_it():
     rule, constant, learnt = train.rate([{}, pair, trained], seeds)
     assert rule < 5 < 65 < constant < learnt - 3
     assert max(train.draw_seeds(np.random.default_rng(0), 10000)) < train.HELD_OUT
-
-
-class Short(GreenhouseSim):
-    """A greenhouse that is nearly at its end when it begins."""
-
-    def reset(self, seed=None):
-        super().reset(seed)
-        self.greenhouse.day = DAYS - 4
-
-
-def test_planned_greenhouses_are_those_of_the_demo():
-    kept = plan.keep(plan.BEST, [plan.HELD_OUT, plan.HELD_OUT + 1])
-    for number in range(2):
-        outcome = train.play(plan.BEST, plan.HELD_OUT + number)
-        assert kept.returns[number] == pytest.approx(outcome.value)
-        assert kept.alive[number].round().tolist() == outcome.alive
-        assert kept.poured[number] == pytest.approx(outcome.poured)
-
-
-def test_a_planner_pours_what_saves_the_plants_and_counts_all_days_in_branches(monkeypatch):
-    monkeypatch.setattr(plan, "GreenhouseSim", Short)
-    planned = plan.keep({"waterer_0": plan.water_planner(RULE, 2, 1)}, [1, 2])
-    assert planned.simulated == 9 * (2 + 2 + 2 + 1)
-    assert planned.poured.sum() < plan.keep({}, [1, 2]).poured.sum()
-    # Nine amounts are tried out once, then five, then three, then two again in what is left of two times nine.
-    team = {"waterer_0": plan.water_planner(RULE, 3, 2), "ventilator_0": RULE}
-    days = collect_episodes(Short, team, seeds=[1])["waterer_0"].extras["days"]
-    assert days.tolist() == [(9 + 5 + 3) * ahead for ahead in (3, 3, 2, 1)]

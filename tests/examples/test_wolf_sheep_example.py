@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from examples.wolf_sheep.env import DIRECTIONS, MOVE, Meadow, cells, go, look, numbers, sheep_points
+from examples.wolf_sheep.env import MOVE, Meadow, numbers, sheep_points
 from gymnasium.utils.env_checker import check_env
 from mesa.examples.advanced.wolf_sheep.agents import GrassPatch, Sheep, Wolf
 
@@ -46,10 +46,6 @@ def by_rule(observations):
     return [RULE] * len(observations)
 
 
-def eastwards(observations):
-    return np.full(len(observations), DIRECTIONS.index((0, 1)))
-
-
 @pytest.mark.parametrize("sight", [1, 2])
 def test_left_to_the_rule_it_is_the_plain_model(sight):
     expected = [plain(seed) for seed in range(4)]
@@ -63,69 +59,10 @@ def test_left_to_the_rule_it_is_the_plain_model(sight):
     assert picture(env.simulation) == expected[2]
 
 
-def test_ticks_one_by_one_are_those_that_the_model_runs_at_once():
-    meadow = Pasture()
-    meadow.reset(3)
-    meadow._runner.run_for(meadow.ticks)
-    assert picture(meadow) == plain(3)
-
-
 @pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # of their energy
 def test_gymnasium_accepts_a_herd_as_one_agent():
     herd = [f"sheep_{number}" for number in range(1, 21)]
     check_env(joint_env(Pasture, possible_agents=herd, undeclared="rule"), skip_render_check=True)
-
-
-@pytest.mark.parametrize("home", [(4, 4), (0, 0), (7, 3)])  # the meadow has no edges
-def test_a_sheep_sees_what_is_around_it_and_goes_where_it_is_sent(home):
-    meadow = Pasture()
-    meadow.reset(0)
-    for kind in (Sheep, Wolf):
-        for animal in list(meadow.model.agents_by_type[kind]):
-            animal.remove()
-    for patch in meadow.model.agents_by_type[GrassPatch]:
-        patch.fully_grown = False
-
-    def cell(row, column):
-        return meadow.model.grid[(home[0] + row) % 8, (home[1] + column) % 8]
-
-    sheep = Sheep(meadow.model, energy=3.5, cell=cell(0, 0))
-    for row, column in ((0, 0), (-1, 0)):
-        Sheep(meadow.model, energy=8.0, cell=cell(row, column))
-    for row, column in ((0, 0), (0, 1), (0, 1), (0, 1), (1, -1), (2, 1)):  # the last is three steps away
-        Wolf(meadow.model, energy=8.0, cell=cell(row, column))
-    for row, column in ((0, 0), (0, -2)):
-        next(agent for agent in cell(row, column).agents if isinstance(agent, GrassPatch)).fully_grown = True
-    for sight, grass, wolves in (
-        (2, {(0, 0): 1, (0, -2): 1}, {(0, 0): 1, (0, 1): 3, (1, -1): 1}),
-        (1, {(0, 0): 1}, {(0, 0): 1, (0, 1): 3}),
-    ):
-        observation = look(sheep, sight)
-        assert observation.dtype == np.float32
-        assert observation[0] == 3.5
-        parts = [dict(zip(cells(sight), part.tolist(), strict=True)) for part in np.split(observation[1:], 3)]
-        seen = [{place: number for place, number in part.items() if number} for part in parts]
-        assert seen == [grass, wolves, {(0, 0): 1, (-1, 0): 1}]
-    for action, direction in enumerate(DIRECTIONS):
-        lamb = Sheep(meadow.model, energy=8.0, cell=cell(0, 0))
-        go(np.int64(action), lamb)
-        assert lamb.cell is cell(*direction)
-
-
-def test_who_is_sent_goes():
-    def columns(meadow):
-        return {sheep.unique_id: sheep.cell.coordinate[1] for sheep in meadow.sheep}
-
-    changes = {"initial_wolves": 1, "initial_sheep": 10, "sheep_reproduce": 0}
-    now = Pasture(0, **changes)
-    now.reset(1)
-    before = columns(now)
-    found = collect_episodes(
-        lambda: Pasture(3, **changes), {MOVE: eastwards}, points=sheep_points(), seeds=[1], collect=columns
-    )[MOVE]
-    after = found.collected[0]
-    assert after
-    assert after == {number: (before[number] + 3) % 8 for number in after}
 
 
 def test_lives_begin_with_births_and_end_with_deaths():
@@ -156,25 +93,6 @@ def test_lives_begin_with_births_and_end_with_deaths():
     assert (died & ~starved).sum() > 5
     assert (last[died & ~starved, 1 + 13] > 0).all()
     assert (last[~died, 0] >= 0).all()
-
-
-def test_meadows_that_end_with_their_sheep():
-    changes = {"initial_wolves": 40, "initial_sheep": 5}
-    lasting, ended = (
-        collect_episodes(
-            lambda only=only: Pasture(30, only_with_sheep=only, **changes),
-            {MOVE: eastwards},
-            points=sheep_points(),
-            seeds=range(4),
-            collect=lambda meadow: len(numbers(meadow)["sheep"]),
-        )[MOVE]
-        for only in (False, True)
-    )
-    assert lasting.collected == (31,) * 4
-    assert max(ended.collected) < 31
-    assert np.array_equal(lasting.observations, ended.observations)
-    assert lasting.terminations.tolist() == ended.terminations.tolist()
-    assert not ended.truncations.any()
 
 
 def test_the_future_of_a_meadow_can_be_drawn_anew():

@@ -1,5 +1,6 @@
 """What factors do."""
 
+import itertools
 import math
 
 import numpy as np
@@ -13,8 +14,6 @@ from tests.worlds.shops import POINTS
 
 
 class Sum:
-    """A model that decides nothing, and of which all effects are known."""
-
     def __init__(self, a, b, c="x", noise=0.0):
         self.a, self.b, self.c, self.noise = a, b, c, noise
 
@@ -37,17 +36,16 @@ def labels(axes):
 def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
     found = effects(results(design({"a": [0, 1], "b": (0.0, 1.0), "c": ["x", "y"]}), tmp_path), "y")
     assert list(found.main.columns) == ["mean", "low", "high", "effect", "count"]
-    assert found.main.loc[("a", 1), "effect"] - found.main.loc[("a", 0), "effect"] == pytest.approx(1)
-    assert found.main.loc[("b", 1.0), "effect"] - found.main.loc[("b", 0.0), "effect"] == pytest.approx(4)
+    for factor, difference in (("a", 1), ("b", 4)):
+        low, high = found.main.loc[factor]["effect"]
+        assert high - low == pytest.approx(difference)
     strengths = found.interactions["strength"]
     assert strengths.index[0] == ("b", "c")
-    assert strengths.iloc[0] == pytest.approx(1.0)
-    assert strengths.iloc[1:].tolist() == pytest.approx([0, 0], abs=1e-9)
+    assert strengths.tolist() == pytest.approx([1, 0, 0], abs=1e-9)
     cells = found.cells("b", "c")
     assert (cells.loc[1.0, "y"] - cells.loc[1.0, "x"]) == pytest.approx(4)
     assert found.cells("c", "b").equals(cells.T)
-    drawn = found.plot().axes
-    assert sum(axes.get_visible() for axes in drawn) == 4
+    assert sum(axes.get_visible() for axes in found.plot().axes) == 4
     with pytest.raises(OptionValueError, match="not two factors"):
         found.cells("a", "z")
 
@@ -64,11 +62,9 @@ def test_many_numbers_are_grouped(tmp_path):
 def test_all_that_is_missing_is_one_level(tmp_path):
     table = pd.DataFrame({"a": [0, 1, 0, 1], "b": 0.0, "c": [1.0, 1.0, math.nan, math.nan]})
     found = effects(results(table, tmp_path), "y")
-    assert found.main.loc["c"]["count"].tolist() == [4, 4]
-    assert found.main.loc["c"]["mean"].tolist() == [0.5, 0.5]
+    assert found.main.loc["c"][["mean", "count"]].values.tolist() == [[0.5, 4], [0.5, 4]]
     assert found.cells("a", "c").to_numpy().tolist() == [[0, 0], [1, 1]]
-    drawn = found.plot().axes
-    assert labels(drawn[1]) == ["1", "nan"]
+    assert labels(found.plot().axes[1]) == ["1", "nan"]
 
 
 def test_levels_of_one_factor_are_not_taken_for_those_of_another(tmp_path):
@@ -89,11 +85,10 @@ def test_many_factors_are_drawn_in_rows(tmp_path):
 
 
 def test_sobol_indices_are_those_of_the_model(tmp_path):
-    frame = results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 512), tmp_path)
-    found = sobol_indices(frame, "y")
+    found = sobol_indices(results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 512), tmp_path), "y")
     assert list(found.index) == ["a", "b"]
-    assert found["first"].tolist() == pytest.approx([0.2, 0.8], abs=0.03)
-    assert found["total"].tolist() == pytest.approx([0.2, 0.8], abs=0.03)
+    for column in ("first", "total"):
+        assert found[column].tolist() == pytest.approx([0.2, 0.8], abs=0.03)
 
 
 def test_what_cannot_be_is_refused(tmp_path):
@@ -101,26 +96,23 @@ def test_what_cannot_be_is_refused(tmp_path):
     frame = results(design(factors, "sobol", 6), tmp_path)
     odd = {"text": lambda s: "x", "some": lambda s: s.y if s.a > 0.5 else None}
     whole = results(design(factors, "saltelli", 2), tmp_path / "odd", metric=odd)
-    for look, given, message in (
-        (sobol_indices, (frame, "y"), "saltelli"),
-        (effects, (frame, "a"), "not a column of numbers"),
-        *[(each, (wrong,), "that run_experiment returned")
-          for each in (effects, sobol_indices) for wrong in (None, frame["y"], frame[["a"]])],
-        *[(each, (whole, "text"), "'text' is not a column of numbers") for each in (effects, sobol_indices)],
-        (sobol_indices, (whole, "some"), "'some' is missing or not finite"),
-        (sobol_indices, (whole, "return"), "no variance"),
-    ):  # fmt: skip
-        with pytest.raises(OptionValueError, match=message):
-            look(*given)
-    with pytest.raises(OptionValueError, match="no contender 'x'"):
-        effects(frame, "y", contender="x")
-    for look in (effects, sobol_indices):
-        with pytest.raises(OptionValueError, match="confidence must lie between 0 and 1"):
-            look(frame, "y", confidence=95)
+    both = (effects, sobol_indices)
+    for looks, tables, given, message in (
+        (both, [None, frame["y"], frame[["a"]]], {}, "that run_experiment returned"),
+        (both, [frame], {"metric": "y", "confidence": 95}, "confidence must lie between 0 and 1"),
+        (both, [whole], {"metric": "text"}, "'text' is not a column of numbers"),
+        ([effects], [frame], {"metric": "a"}, "not a column of numbers"),
+        ([effects], [frame], {"metric": "y", "contender": "x"}, "no contender 'x'"),
+        ([sobol_indices], [frame], {"metric": "y"}, "saltelli"),
+        ([sobol_indices], [whole], {"metric": "some"}, "'some' is missing or not finite"),
+        ([sobol_indices], [whole], {"metric": "return"}, "no variance"),
+    ):
+        for look, table in itertools.product(looks, tables):
+            with pytest.raises(OptionValueError, match=message):
+                look(table, **given)
 
 
 def row(a, seed, **more):
-    """A row of a table of results."""
     told = {"contender": "rule", "seed": seed, "agent": "team", "length": 1, "status": "ok", "error": None}
     return {"a": a, **told, **more}
 

@@ -26,9 +26,10 @@ from simenv_marl.errors import OptionValueError, StoreError, UnknownPointError
 from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.experiments import store as stores
 from simenv_marl.experiments.runner import Outcome
+from simenv_marl.planning import RolloutPolicy
 from simenv_marl.plugins import ChangedResult
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
-from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
+from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 DESIGN = pd.DataFrame({"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]})
 ROOT = Path(__file__).parents[2]
@@ -41,34 +42,28 @@ def run(store, design=DESIGN, make=Shop, **arguments):
 
 
 def lines(store):
-    """All whole lines of a store."""
     whole = (line for path in store.glob("*.jsonl") for line in path.read_bytes().split(b"\n")[:-1])
     return [json.loads(line) for line in whole]
 
 
 def test_the_table_is_tidy_and_in_order(tmp_path):
     frame = run(tmp_path)
-    others = ["contender", "seed", "agent", "return", "length", "level", "status", "error"]
-    assert list(frame.columns) == ["days", "price", "kind", *others]
-    assert frame[["days", "price", "kind"]].dtypes.equals(DESIGN.dtypes)
+    factors, outcome = ["days", "price", "kind"], ["status", "error"]
+    others = ["contender", "seed", "agent", "return", "length", "level", *outcome]
+    assert list(frame.columns) == [*factors, *others]
+    assert frame[factors].dtypes.equals(DESIGN.dtypes)
     runs = frame[frame.agent == "team"]
-    expected = [
-        (*row, name, seed) for row in DESIGN.values.tolist() for name in ("rule", "much", "some") for seed in range(4)
-    ]
-    assert runs[["days", "price", "kind", "contender", "seed"]].values.tolist() == [list(row) for row in expected]
+    names = ("rule", "much", "some")
+    expected = [[*row, name, seed] for row in DESIGN.values.tolist() for name in names for seed in range(4)]
+    assert runs[[*factors, "contender", "seed"]].values.tolist() == expected
     failed = runs[runs.status == "error"]
-    assert set(failed["kind"]) == {"faulty"}
-    assert set(failed["seed"]) == {1, 3}
+    assert set(zip(failed["kind"], failed["seed"], strict=True)) == {("faulty", 1), ("faulty", 3)}
     assert set(failed["error"]) == {"ZeroDivisionError: no change"}
     assert failed["return"].isna().all()
-    good = frame[(frame["kind"] == "plain") & (frame["days"] == 2)].drop(
-        columns=["days", "price", "kind", "status", "error"]
-    )
-    alone = evaluate(
-        lambda: Shop(2, 2.0), {"rule": {}, "much": {"keeper": much}, "some": {"keeper": some}}, seeds=range(4),
-        points=POINTS, metric={"level": level},
-    )  # fmt: skip
-    assert good.reset_index(drop=True).equals(alone.frame)
+    good = frame[(frame["kind"] == "plain") & (frame["days"] == 2)].drop(columns=[*factors, *outcome])
+    contenders = {"rule": {}, "much": {"keeper": much}, "some": {"keeper": some}}
+    given = {"seeds": range(4), "points": POINTS, "metric": {"level": level}}
+    assert good.reset_index(drop=True).equals(evaluate(lambda: Shop(2, 2.0), contenders, **given).frame)
 
 
 @pytest.mark.parametrize(
@@ -98,14 +93,24 @@ def test_the_table_is_the_same_whoever_is_born_and_dies(tmp_path):
     contenders = {"one": {"creature_4": lambda observation: 5}, "all": {Creature.act: lambda observation: 3}}
     given = {"contenders": contenders, "seeds": range(5), "points": colony_points(overseen=False)}
     given["possible_agents"] = ["creature_4"]  # is not born in short episodes
-    frames = [
+    alone, one, two = (
         run_experiment(make, {"ticks": [1, 5]}, store=tmp_path / str(workers), workers=workers, **given)
         for workers in (0, 1, 2)
-    ]
-    assert frames[1].equals(frames[0])
-    assert frames[2].equals(frames[0])
-    assert set(frames[0]["status"]) == {"ok"}
-    assert frames[0].groupby(["ticks", "contender", "seed"]).size().nunique() > 2
+    )
+    assert one.equals(alone)
+    assert two.equals(alone)
+    assert set(alone["status"]) == {"ok"}
+    assert alone.groupby(["ticks", "contender", "seed"]).size().nunique() > 2
+
+
+@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
+def test_planners_are_contenders(arguments, tmp_path):
+    contenders = {"planned": {"helper": RolloutPolicy([0, 1, 2], futures=2, horizon=1)}}
+    given = {"seeds": range(2), "points": NEAR, "metric": level}
+    frame = run_experiment(Shop, {"days": [3]}, contenders=contenders, store=tmp_path, **given, **arguments)
+    assert set(frame["status"]) == {"ok"}
+    told = frame[(frame.contender == "planned") & (frame.agent == "team")]["metric"]
+    assert told.tolist() == evaluate(Shop, contenders, **given).values("metric")["planned"].tolist()
 
 
 @pytest.mark.parametrize(
@@ -126,16 +131,13 @@ def test_whatever_makes_simulations(make, tmp_path):
 @pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError, MemoryError])
 @pytest.mark.parametrize("method", ["run", "close"])
 def test_whatever_ends_a_run_is_an_error_of_that_run(method, error, arguments, tmp_path):
-    class Ending(Shop):
-        pass
-
     def end(shop):
         getattr(Shop, method, lambda shop: None)(shop)
         if shop.seed == 1:
             raise error("enough")
 
-    setattr(Ending, method, end)
-    frame = run(tmp_path, {"days": [1]}, make=Ending, contenders=None, **arguments)
+    ending = type("Ending", (Shop,), {method: end})
+    frame = run(tmp_path, {"days": [1]}, make=ending, contenders=None, **arguments)
     assert frame["status"].tolist() == ["ok"] * 3 + ["error"] + ["ok"] * 6
     assert frame["error"][3] == f"{error.__name__}: enough"
     assert len(lines(tmp_path)) == 4
@@ -155,17 +157,13 @@ def test_an_interrupt_ends_the_experiment(batched, tmp_path):
 
 
 def test_points_and_options_that_can_be_asked_for_once_serve_all(tmp_path):
-    def twice(shop, _result):
-        return ChangedResult(2 * _result)
-
-    plugins, contenders = [(twice, "tests.worlds.shops.Shop.sell", "after")], {"much": {"keeper": much}}
-
     class Own(Shop):
         points = POINTS
 
-    expected = run(tmp_path / "a", make=Own, contenders=contenders, points=[Shop.order], plugins=plugins)
-    again = run(tmp_path / "b", make=Own, contenders=contenders, points=iter([Shop.order]), plugins=iter(plugins))
-    assert again.equals(expected)
+    plugins = [(lambda shop, _result: ChangedResult(2 * _result), "tests.worlds.shops.Shop.sell", "after")]
+    points, given = [Shop.order], {"make": Own, "contenders": {"much": {"keeper": much}}}
+    expected = run(tmp_path / "a", points=points, plugins=plugins, **given)
+    assert run(tmp_path / "b", points=iter(points), plugins=iter(plugins), **given).equals(expected)
 
 
 def test_points_may_differ_from_row_to_row(tmp_path):
@@ -184,10 +182,9 @@ def test_each_run_is_a_line_with_its_provenance(tmp_path):
     run(tmp_path)
     known = lines(tmp_path)
     assert len(known) == 3 * 3 * 4
-    assert {(entry["status"], entry["error"]) for entry in known} == {
-        ("ok", None), ("error", "ZeroDivisionError: no change")
-    }  # fmt: skip
-    entry = next(entry for entry in known if entry["contender"] == "some" and entry["seed"] == 2)
+    ends = {("ok", None), ("error", "ZeroDivisionError: no change")}
+    assert {(entry["status"], entry["error"]) for entry in known} == ends
+    (entry,) = (e for e in known if (e["contender"], e["seed"], e["factors"]["days"]) == ("some", 2, 1))
     provenance = entry["provenance"]
     assert provenance["seed"] == 2
     assert provenance["simulation"] == "tests.worlds.shops.Shop"
@@ -285,10 +282,8 @@ def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
     assert again()["status"].tolist() == ["ok"] * 3
 
 
-scalars = st.one_of(
-    st.floats(), st.integers(), st.booleans(), st.none(), st.text(max_size=5), st.floats(width=32).map(np.float32),
-    st.integers(-9, 9).map(np.int64),
-)  # fmt: skip
+numbers = (st.floats(width=32).map(np.float32), st.integers(-9, 9).map(np.int64))
+scalars = st.one_of(st.floats(), st.integers(), st.booleans(), st.none(), st.text(max_size=5), *numbers)
 
 
 @given(row=st.dictionaries(st.text(max_size=4), scalars, max_size=4), values=st.lists(scalars, max_size=4))
@@ -305,40 +300,22 @@ def test_values_come_back_as_they_were(row, values, tmp_path_factory):
     place.read([])
     (((key, contender, seed), known),) = place.runs.items()
     assert (contender, seed) == ("rule", 3)
-    assert same(json.loads(key), row)
-    assert same(known.metrics, outcome.metrics)
-
-
-def same(one, other):
-    return list(one) == list(other) and all(
-        type(one[key]) is type(other[key])
-        and (
-            one[key] == other[key] or (isinstance(one[key], float) and math.isnan(one[key]) and math.isnan(other[key]))
-        )
-        for key in one
-    )
+    assert repr(json.loads(key)) == repr(row)
+    assert repr(known.metrics) == repr(outcome.metrics)
 
 
 def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
-    class Holder:
+    class Holder(Shop):
         def __init__(self, thing):
+            super().__init__()
             self.thing = thing
 
-        def reset(self):
-            pass
-
-        def run(self):
-            pass
-
     things = [1, 1.0, True, "1", None, math.inf, -0.0, 2**70]
-    design = pd.DataFrame({"thing": pd.Series(things, dtype=object)})
-    frame = run_experiment(Holder, design, seeds=[0], points=POINTS, metric=lambda s: s.thing, store=tmp_path)
+    given = {"seeds": [0], "points": POINTS, "metric": lambda shop: shop.thing, "store": tmp_path}
+    frame = run_experiment(Holder, pd.DataFrame({"thing": pd.Series(things, dtype=object)}), **given)
+    told = frame[frame.agent == "team"]
     for column in ("thing", "metric"):
-        assert [(type(value), value) for value in frame[column]] == [(type(value), value) for value in things]
-    assert math.copysign(1, frame["metric"][6]) == -1
-
-
-# -- what cannot be -------------------------------------------------------------------------------
+        assert list(map(repr, told[column])) == list(map(repr, things))
 
 
 def one_argument(days):
@@ -375,21 +352,21 @@ def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, t
 
 def test_a_store_of_another_experiment_is_refused(tmp_path):
     run(tmp_path)
-    with pytest.raises(OptionValueError, match="its factors are"):
-        run(tmp_path, DESIGN[["days"]])
-    with pytest.raises(OptionValueError, match="its metrics are"):
-        run(tmp_path, metric=None)
-    with pytest.raises(OptionValueError, match="but this design has none"):
-        run(tmp_path, DESIGN.assign(days=7))
+    for match, arguments in (
+        ("its factors are", {"design": DESIGN[["days"]]}),
+        ("its metrics are", {"metric": None}),
+        ("but this design has none", {"design": DESIGN.assign(days=7)}),
+        (r'"days":1,.*its first is {"days":1.0,', {"design": DESIGN.astype({"days": float})}),
+    ):
+        with pytest.raises(OptionValueError, match=match):
+            run(tmp_path, **arguments)
     with pytest.warns(UserWarning, match="1 rows that this design does not have"):
         run(tmp_path, DESIGN[1:])
     assert len(run(tmp_path)) > 0
-    with pytest.raises(OptionValueError, match=r'"days":1,.*its first is {"days":1.0,'):
-        run(tmp_path, DESIGN.astype({"days": float}))
     other = tmp_path / "other"
     other.mkdir()
-    (other / ".hidden").write_text("")
-    (other / "thesis.tex").write_text("")
+    for name in (".hidden", "thesis.tex"):
+        (other / name).write_text("")
     with pytest.raises(OptionValueError, match="not the store of an experiment"):
         run(other)
     (other / "thesis.tex").unlink()
@@ -424,13 +401,13 @@ def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch)
     ],
 )
 def test_what_was_made_otherwise_is_warned_of(told, arguments, tmp_path):
-    first = run(tmp_path, contenders={"much": {"keeper": much}})
-    with pytest.warns(UserWarning, match=told):
-        assert run(tmp_path, **{"contenders": {"much": {"keeper": much}}} | arguments).equals(first)
+    contenders = {"contenders": {"much": {"keeper": much}}}
+    first = run(tmp_path, **contenders)
     more = pd.concat([DESIGN[:1].assign(days=7), DESIGN])  # of whose first row nothing is stored
-    with pytest.warns(UserWarning, match=told):
-        frame = run(tmp_path, more, **{"contenders": {"much": {"keeper": much}}} | arguments)
-    assert frame[frame["days"] != 7].reset_index(drop=True).equals(first)
+    for design in (DESIGN, more):
+        with pytest.warns(UserWarning, match=told):
+            frame = run(tmp_path, design, **contenders | arguments)
+        assert frame[frame["days"] != 7].reset_index(drop=True).equals(first)
 
 
 def test_a_row_that_is_known_to_fail_does_not_keep_others_from_being_run(tmp_path):
@@ -506,8 +483,6 @@ def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
     assert frame["status"].tolist() == ["ok"] * len(frame)
     assert len(list((tmp_path / "shared").glob("*.jsonl"))) == 2
 
-
-# -- killed ---------------------------------------------------------------------------------------
 
 SCRIPT = """
     import sys
@@ -588,8 +563,14 @@ NAMED = """
     class Own(Sum):
         points = {"__main__.Sum.decide": decided}
 
+    class Pure(Sum):
+        def run(self):
+            self.y += self.a
+
     if __name__ == "__main__":
         given = {"seeds": [5, 6], "workers": int(sys.argv[2])}
+        frame = run_experiment(Pure, {"a": [1, 2]}, metric=lambda model: model.y, store=f"{sys.argv[1]}/pure", **given)
+        print(frame[["a", "seed", "agent", "return", "metric"]].values.tolist())
         for make, points in ((Sum, {"__main__.Sum.decide": decided}), (Own, None)):
             for key in ("a", "__main__.Sum.decide"):
                 contenders = {"four": {key: lambda observation: 4}}
@@ -600,39 +581,12 @@ NAMED = """
 """
 
 
-def output_of(text, tmp_path, *arguments):
-    """What a script prints."""
-    path = tmp_path / "script.py"
-    path.write_text(textwrap.dedent(text), encoding="utf-8")
-    command = [sys.executable, path, tmp_path / "store", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
 @pytest.mark.parametrize("workers", ["0", "2"])
-def test_what_a_script_names_is_found_in_its_workers(workers, tmp_path):
-    expected = ["[9.0, 10.0]", "[6.0, 7.0, 9.0, 10.0, 7.0, 8.0, 13.0, 14.0]"] * 4
-    assert output_of(NAMED, tmp_path, workers) == expected
-
-
-PURE = """
-    import sys, pandas as pd
-    from simenv_marl.experiments import run_experiment
-
-    class Sum:
-        def __init__(self, a):
-            self.a = a
-        def reset(self, seed):
-            self.seed = seed
-        def run(self):
-            self.y = self.a + self.seed
-
-    frame = run_experiment(Sum, {"a": [1, 2]}, seeds=[5, 6], metric=lambda s: s.y, store=sys.argv[1])
-    print(frame[["a", "seed", "agent", "return", "metric"]].values.tolist())
-"""
-
-
-def test_models_that_decide_nothing_have_metrics(tmp_path):
-    expected = [[a, seed, "team", 0.0, a + seed] for a in (1, 2) for seed in (5, 6)]
-    assert output_of(PURE, tmp_path) == [str(expected)]
+def test_what_a_script_names_is_found_in_its_workers_and_models_need_not_decide(workers, tmp_path):
+    path = tmp_path / "script.py"
+    path.write_text(textwrap.dedent(NAMED), encoding="utf-8")
+    command = [sys.executable, path, tmp_path, workers]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    pure = [[a, seed, "team", 0.0, a + seed] for a in (1, 2) for seed in (5, 6)]
+    named = ["[9.0, 10.0]", "[6.0, 7.0, 9.0, 10.0, 7.0, 8.0, 13.0, 14.0]"] * 4
+    assert done.stdout.splitlines() == [str(pure), *named], done.stderr

@@ -1,18 +1,35 @@
-"""Section 8: handlers before, after and instead of a model's functions, for the whole process."""
+"""Section 8: handlers before, after and instead of a model's functions, of the whole process and of one environment."""
 
 import asyncio
 import collections.abc
 import copy
 import gc
 import inspect
+import itertools
 import pickle
-import statistics
+import sys
+from contextlib import nullcontext
+from random import Random
 
+import numpy as np
 import pytest
 
-from simenv_marl import SimEnvError, aec_env
-from simenv_marl.errors import HandlerError, PatchError, UnknownTargetError
-from simenv_marl.hooks.places import resolve
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    SimEnvError,
+    aec_env,
+    generate_env,
+    joint_env,
+    parallel_env,
+    simulate,
+    single_env,
+    vector_env,
+)
+from simenv_marl.core import agent as agent_module
+from simenv_marl.errors import HandlerError, OptionValueError, PatchError, UnknownTargetError
+from simenv_marl.hooks.hook import hook_of
+from simenv_marl.hooks.stacks import EVALUATING
 from simenv_marl.plugins import (
     ChangedArgs,
     ChangedResult,
@@ -25,498 +42,41 @@ from simenv_marl.plugins import (
     remove_handler,
     trace,
 )
-from tests.foreign import market, shop
-from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
-from tests.worlds.models import calling, decision, define, notes, plainly, play
+from tests.foreign import market
+from tests.foreign.market import Broker, Trader
+from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
+from tests.worlds.models import (
+    alive,
+    calling,
+    decision,
+    decisions,
+    define,
+    nobody_is_asked,
+    notes,
+    plainly,
+    play,
+    script,
+    stacks,
+    step,
+)
 from tests.worlds.undone import left_as_they_were
 
-MARKET = "tests.foreign.market"
 HERE = __name__
+
+# Traders and brokers decide under one name here: it is about functions, and not about agents.
+pytestmark = pytest.mark.filterwarnings("ignore:several objects decide")
 
 
 @pytest.fixture(autouse=True)
-def _nothing_stays_attached():
-    with left_as_they_were(market, shop, Trader, Broker, Junior, Dealer, Cautious, Greenhouse, Heated):
+def _nothing_stays_attached(monkeypatch):
+    with left_as_they_were(*PLACES, House):
         yield
+        monkeypatch.undo()
+        gc.collect()
         assert attached_handlers() == []
 
 
-class Greenhouse:
-    def __init__(self, humidity=50):
-        self.humidity = humidity
-
-    def __repr__(self):
-        return f"Greenhouse({self.humidity})"
-
-    def update_air_exchange(self):
-        self.humidity += 1
-
-    def water(self, amount, *, twice=False):
-        """Water the plants."""
-        return amount * (2 if twice else 1)
-
-    def days(self, number):
-        yield from range(number)
-        return "over"
-
-    async def wire(self, amount):
-        return amount
-
-    @staticmethod
-    def rounded(amount):
-        return int(amount)
-
-    @classmethod
-    def kind(cls, suffix=""):
-        return cls.__name__ + suffix
-
-
-class Heated(Greenhouse):
-    def water(self, amount, *, twice=False):
-        return super().water(amount, twice=twice) + 100
-
-
-HOUSE = f"{HERE}.Greenhouse"
-
-
-def local():
-    """A function of its own, exposed, with a log of its handlers."""
-
-    @expose_to_plugins
-    def function(value, more=0):
-        """Add."""
-        return value + more
-
-    return function
-
-
-# -- positions ------------------------------------------------------------------------------------
-
-
-def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and_their_changes_chain():
-    function, seen = local(), []
-
-    def see(*args, **kwargs):
-        seen.append((args, kwargs))
-
-    with handlers(
-        (lambda value, more=0: ChangedArgs(value * 2, more=5), function, "before"),
-        (see, function, "before"),
-        (lambda value, more=0: ChangedArgs(value + 1, more=more), function, "before"),
-        (see, function, "after"),
-        (lambda value, more=0, *, _result=None: ChangedResult(_result * 10), function, "after"),
-        (lambda *args, _result, **kwargs: ChangedResult(_result + 1), function, "after"),
-        (lambda value, more=0: seen.append("plain"), function, "after"),
-    ):
-        assert function(3) == (7 + 5) * 10 + 1
-    assert seen == [((6,), {"more": 5}), ((7,), {"more": 5, "_result": 12}), "plain"]
-    assert repr(ChangedArgs(1, b=2)) == "ChangedArgs(1, b=2)"
-    assert repr(ChangedResult("x")) == "ChangedResult('x')"
-
-
-@pytest.mark.parametrize("nothing", [None, 0, False, "text", (1, 2)])
-def test_whatever_else_handlers_return_changes_nothing(nothing):
-    function = local()
-    with handlers((lambda *args: nothing, function, "before"), (lambda *args, _result: nothing, function, "after")):
-        assert function(1, 2) == 3
-
-
-@pytest.mark.parametrize(
-    ("args", "kwargs", "under_other_names"),
-    [
-        ((1,), {}, (1, 8, 9)),
-        ((1, 2), {}, (1, 2, 9)),
-        ((1,), {"more": 2}, (1, 2, 9)),
-        ((), {"value": 1}, (1, 8, 9)),
-        ((), {"more": 3, "value": 1}, (1, 3, 9)),
-        ((1,), {"most": 5}, (1, 2, 5)),
-    ],
-    ids=str,
-)
-def test_handlers_get_the_arguments_as_they_were_passed_whatever_they_call_them(args, kwargs, under_other_names):
-    @expose_to_plugins
-    def function(value, more=2, most=3):
-        return value, more, most
-
-    seen = []
-    with handlers(
-        (lambda *args, **kwargs: seen.append((args, kwargs)), function, "before"),
-        (lambda a, b=8, c=9: seen.append((a, b, c)), function, "before"),
-    ):
-        assert function(*args, **kwargs) == function.__wrapped__(*args, **kwargs)
-    assert seen == [(args, kwargs), under_other_names]
-
-
-def test_a_wrong_call_is_the_functions_own_error_and_no_handler_runs():
-    function, log = local(), []
-    with handlers((lambda *args, **kwargs: log.append(1), function, "before")):
-        for wrong in (lambda: function(), lambda: function(1, 2, 3), lambda: function(1, other=3)):
-            with pytest.raises(TypeError):
-                wrong()
-    assert log == []
-
-
-def test_of_several_instead_the_latest_alone_runs_and_may_call_what_it_replaces():
-    function, log = local(), []
-    with handlers(
-        (lambda *args: log.append("before"), function, "before"),
-        (lambda *args: "first", function, "instead"),
-        (lambda value, more=0: function.__wrapped__(value, more) * 10, function, "instead"),
-        (lambda *args: log.append("after"), function, "after"),
-    ):
-        assert function(2) == 20
-        assert log == []
-        remove_handler(function, "instead", attached_handlers()[2][0])
-        assert function(1) == "first"
-    assert function(1) == 1
-    with handlers((lambda self, *_, **__: Greenhouse.water.__wrapped__(self, 1) + 0.5, f"{HOUSE}.water", "instead")):
-        assert Greenhouse().water(7) == 1.5
-
-
-def test_handlers_that_call_the_function_again_are_called_again():
-    function, depths = local(), []
-
-    def before(value, more=0):
-        depths.append(value)
-        if value:
-            function(value - 1)
-
-    with handlers((before, function, "before")):
-        function(2)
-    assert depths == [2, 1, 0]
-
-
-def test_handlers_may_come_and_go_while_the_function_runs():
-    log = []
-
-    @expose_to_plugins
-    def function():
-        if not attached_handlers():
-            attach_handler(lambda: log.append("after"), function, "after")
-            attach_handler(once, function, "before")
-            attach_handler(lambda: log.append("second"), function, "before")
-
-    def once():
-        log.append("once")
-        remove_handler(function, "before")
-
-    function()
-    assert log == []
-    function()
-    function()
-    assert log == ["once", "second", "after", "after"]
-    remove_handler(function, "after")
-
-
-# -- what can be extended -------------------------------------------------------------------------
-
-
-FORMS = {
-    "method": (f"{HOUSE}.water", lambda: Greenhouse().water(3), 3),
-    "construction": (f"{HOUSE}.__init__", lambda: Heated(humidity=3).humidity, 3),
-    "inherited": (f"{HERE}.Heated.update_air_exchange", lambda: Heated().update_air_exchange(), None),
-    "overridden": (f"{HOUSE}.water", lambda: Heated().water(3) - 100, 3),
-    "staticmethod": (f"{HOUSE}.rounded", lambda: Greenhouse.rounded(2.5), 2),
-    "staticmethod of an object": (f"{HOUSE}.rounded", lambda: Heated().rounded(2.5), 2),
-    "inherited staticmethod": (f"{HERE}.Heated.rounded", lambda: Heated.rounded(2.5), 2),
-    "classmethod": (f"{HOUSE}.kind", lambda: Heated.kind(suffix="!"), "Heated!"),
-    "inherited classmethod": (f"{HERE}.Heated.kind", lambda: Heated.kind(suffix="!"), "Heated!"),
-    "function": (f"{MARKET}.price", lambda: market.price("tea", rebate=2), 8),
-    "imported by name": (f"{MARKET}.price", lambda: shop.total("tea"), 10),
-    "imported under another name": (f"{MARKET}.price", lambda: shop.total_cost("tea"), 9),
-    "private": (f"{MARKET}.Trader.__hidden", lambda: Trader().look(), 7),
-    "standard library": ("statistics.mean", lambda: statistics.mean([1, 2, 3]), 2),
-    "generator function": (f"{HOUSE}.days", lambda: list(Greenhouse().days(3)), [0, 1, 2]),
-    "coroutine function": (f"{HOUSE}.wire", lambda: asyncio.run(Greenhouse().wire(3)), 3),
-}
-
-
-@pytest.mark.parametrize("how", ["by name", "as itself"])
-@pytest.mark.parametrize("form", FORMS)
-def test_whatever_is_importable_can_be_extended(form, how):
-    name, call, result = FORMS[form]
-    target, log = name, []
-    if how == "as itself":
-        owner, attribute = resolve(name, UnknownTargetError)
-        target = getattr(owner, attribute)
-    with handlers(
-        (lambda *args, **kwargs: log.append("before"), target, "before"),
-        (lambda *args, **kwargs: log.append("after"), target, "after"),
-    ):
-        assert call() == result
-        assert log == ["before", "after"]
-    assert call() == result
-    assert log == ["before", "after"]
-
-
-def test_an_inherited_method_is_extended_for_its_class_and_subclasses_alone():
-    log = []
-    sub = (lambda self, *args, **kwargs: log.append(type(self).__name__), f"{MARKET}.Broker.bid", "before")
-    base = (lambda self, *args, **kwargs: log.append("base"), f"{MARKET}.Trader.bid", "before")
-    with handlers(sub):
-        assert [kind().bid("tea") for kind in (Trader, Broker, Junior, Dealer, Cautious)] == [5, 5, 5, 5, 4]
-    assert log == ["Broker", "Junior"]
-    for first, second in ((sub, base), (base, sub)):
-        log.clear()
-        attach_handler(*first)
-        attach_handler(*second)
-        Broker().bid("tea")
-        assert log == ["Broker", "base"]
-        remove_handler(first[1], "before")
-        Broker().bid("tea")
-        assert log == ["Broker", "base", "base" if first is sub else "Broker"]
-        remove_handler(second[1], "before")
-
-
-@pytest.mark.parametrize("name", ["over", "under", "class_over", "class_under"])
-def test_statics_and_class_methods_can_be_exposed_in_either_order(name):
-    held = vars(Greenhouse)
-
-    class Model(Greenhouse):
-        over = expose_to_plugins(held["rounded"])
-        under = staticmethod(expose_to_plugins(held["rounded"].__func__))
-        class_over = expose_to_plugins(held["kind"])
-        class_under = classmethod(expose_to_plugins(held["kind"].__func__))
-
-    class Sub(Model):
-        pass
-
-    log = []
-    given, result = (("!",), "Sub!") if name.startswith("class") else ((2.5,), 2)
-    with handlers((lambda *args, **kwargs: log.append(1), getattr(Model, name), "before")):
-        assert getattr(Sub(), name)(*given) == getattr(Sub, name)(*given) == result
-    assert getattr(Sub, name)(*given) == result
-    assert log == [1, 1]
-
-
-def test_exposing_again_gives_the_same():
-    function = local()
-    assert expose_to_plugins(function) is function
-    items = expose_to_plugins([1])
-    assert expose_to_plugins(items) is items
-    held = expose_to_plugins(vars(Greenhouse)["rounded"])
-    assert isinstance(held, staticmethod)
-    assert expose_to_plugins(held) is held
-    again = expose_to_plugins(expose_to_plugins(Greenhouse.kind))
-    assert isinstance(again, classmethod)
-
-
-@pytest.mark.parametrize(
-    "function",
-    [Greenhouse.water, Greenhouse.days, Greenhouse.wire, market.price],
-    ids=lambda function: function.__name__,
-)
-def test_an_exposed_function_keeps_its_looks(function):
-    exposed = expose_to_plugins(function)
-    assert exposed is not function
-    assert inspect.signature(exposed) == inspect.signature(function)
-    for name in ("__name__", "__qualname__", "__doc__", "__module__"):
-        assert getattr(exposed, name) == getattr(function, name)
-    for kind in (inspect.isgeneratorfunction, inspect.iscoroutinefunction, inspect.isfunction):
-        assert kind(exposed) == kind(function)
-    assert exposed.__wrapped__ is function
-
-
-def test_siblings_may_each_expose_what_they_have_inherited():
-    class Wolf(Greenhouse):
-        pass
-
-    class Sheep(Greenhouse):
-        pass
-
-    Wolf.water = expose_to_plugins(Wolf.water)
-    Sheep.water = expose_to_plugins(Sheep.water)
-    with handlers((lambda self, amount, *, twice=False: "wolf", Wolf.water, "instead")):
-        assert [kind().water(3) for kind in (Greenhouse, Wolf, Sheep)] == [3, "wolf", 3]
-
-
-@pytest.mark.parametrize("parameter", ["found", "rule", "args", "self", "SLOT"])
-def test_parameters_may_have_any_name(parameter):
-    scope = {"expose_to_plugins": expose_to_plugins}
-    exec(
-        f"class Model:\n    @staticmethod\n    @expose_to_plugins\n    def function({parameter}): return {parameter}",
-        scope,
-    )
-    function, log = scope["Model"].function, []
-    for attached in ([], [(lambda *args, **kwargs: log.append(1), function, "before")]):
-        with handlers(*attached):
-            assert function(3) == function(**{parameter: 4}) - 1 == 3
-    assert log == [1, 1]
-
-
-def test_what_was_exposed_inside_a_function_has_its_name_all_the_same():
-    first, function = local(), local()
-    with handlers((lambda value, more=0: 9, f"{HERE}.local.<locals>.function", "instead")):
-        assert (first(1), function(1)) == (1, 9)
-
-
-def test_builtins_can_be_exposed_as_themselves():
-    length = expose_to_plugins(len)
-    with handlers((lambda thing, **kwargs: ChangedResult(kwargs["_result"] + 1), length, "after")):
-        assert length([1, 2]) == 3
-    assert length([1, 2]) == 2
-
-
-# -- what is refused ------------------------------------------------------------------------------
-
-
-def two(a, b):
-    return a, b
-
-
-@pytest.mark.parametrize(
-    ("handler", "target", "position", "error"),
-    [
-        (print, "nowhere", "before", UnknownTargetError),
-        (print, "", "before", UnknownTargetError),
-        (print, f"{MARKET}.Trader.missing", "before", UnknownTargetError),
-        (print, f"{MARKET}.Trader.quote", "before", PatchError),
-        (print, f"{MARKET}.OPEN", "before", PatchError),
-        (print, f"{HERE}.CLOSED", "before_next", PatchError),
-        (print, "math.sqrt", "before", PatchError),
-        (print, "datetime.datetime.now", "before", PatchError),
-        (print, len, "before", PatchError),
-        (print, 3, "before", PatchError),
-        (print, [1, 2], "before_next", PatchError),
-        (print, Trader().bid, "before", PatchError),
-        (print, Trader, "before_next", PatchError),
-        (print, f"{MARKET}.Trader", "before", PatchError),
-        (print, two, "during", HandlerError),
-        (print, two, None, HandlerError),
-        (print, two, "before_next", HandlerError),
-        (print, expose_to_plugins([1]), "before", HandlerError),
-        (print, expose_to_plugins([1]), "after", HandlerError),
-        (print, expose_to_plugins([1]), "instead", HandlerError),
-        (None, two, "before", HandlerError),
-        (lambda: None, two, "before", HandlerError),
-        (lambda a: None, two, "before", HandlerError),
-        (lambda a, b, c: None, two, "before", HandlerError),
-        (lambda a, *, b: None, two, "before", HandlerError),
-        (lambda a, b, _result: None, two, "before", HandlerError),
-        (lambda a, b, _result: None, two, "instead", HandlerError),
-        (lambda **kwargs: None, two, "before", HandlerError),
-        (lambda good: None, f"{MARKET}.price", "before", HandlerError),
-        (lambda good, *, discount=0: None, f"{MARKET}.price", "before", HandlerError),
-        (lambda self, good: None, f"{MARKET}.Trader.bid", "before", HandlerError),
-        (lambda good, limit: None, f"{MARKET}.Trader.bid", "after", HandlerError),
-    ],
-    ids=plainly,
-)
-def test_what_cannot_work_is_refused_when_it_is_attached(handler, target, position, error):
-    with pytest.raises(error) as caught:
-        attach_handler(handler, target, position)
-    assert isinstance(caught.value, SimEnvError)
-    with pytest.raises(error), handlers((handler, target, position)):
-        raise AssertionError
-
-
-def test_whatever_can_be_called_with_the_arguments_is_accepted():
-    good = [lambda a, b: None, lambda x, y: None, lambda *args, **kwargs: None, lambda *args: None]
-    good += [lambda a, *rest: None, lambda a, b, c=0: None, lambda a, b, /: None, Trader().bid, print]
-    for handler in good:
-        with handlers((handler, two, "before")):
-            assert two(1, b=2) == (1, 2)
-            assert two(a=1, b=2) == (1, 2)
-
-
-@pytest.mark.parametrize(
-    ("target", "position", "handler"),
-    [(two, "before", None), (two, "before", print), (two, "during", None), (f"{MARKET}.Trader.bid", "after", None)],
-    ids=plainly,
-)
-def test_removing_what_is_not_attached_is_refused(target, position, handler):
-    with handlers((two, two, "after")), pytest.raises(HandlerError, match="handlers are attached") as caught:
-        remove_handler(target, position, handler)
-    assert ("no handler is attached" in str(caught.value)) is (handler is None)
-
-
-def test_a_slip_of_the_pen_gets_a_hint():
-    with pytest.raises(UnknownTargetError, match=r"did you mean .*counting"):
-        attach_handler(print, f"{HERE}.countin", "before")
-
-
-# -- for a while ----------------------------------------------------------------------------------
-
-
-def test_handlers_are_there_for_as_long_as_the_block_runs():
-    bid = (lambda *args, **kwargs: 1, f"{MARKET}.Trader.bid", "instead")
-    with handlers(bid):
-        assert Trader().bid("tea") == 1
-        assert attached_handlers() == [bid]
-    assert Trader().bid("tea") == 5
-    with pytest.raises(ZeroDivisionError), handlers(bid):
-        raise ZeroDivisionError
-    assert Trader().bid("tea") == 5
-    with (
-        pytest.raises(HandlerError, match="cannot be called with the arguments"),
-        handlers(bid, (lambda: 1, f"{MARKET}.price", "instead")),
-    ):
-        raise AssertionError
-    with pytest.raises(HandlerError, match="handlers are given as"), handlers(print):
-        raise AssertionError
-
-
-def test_blocks_may_overlap_and_remove_nothing_but_their_own():
-    function, log = local(), []
-
-    def see(value, more=0):
-        log.append(value)
-
-    for _ in range(2):
-        attach_handler(see, function, "before")
-    one, two = handlers((see, function, "before")), handlers((see, function, "before"))
-    one.__enter__()
-    two.__enter__()
-    function(1)
-    assert log == [1] * 4
-    one.__exit__(None, None, None)
-    remove_handler(function, "before", see)
-    function(2)
-    assert log == [1] * 4 + [2] * 2
-    remove_handler(function, "before")  # all of them
-    two.__exit__(None, None, None)
-    function(3)
-    assert log == [1] * 4 + [2] * 2
-    with pytest.raises(HandlerError, match="not attached"):
-        remove_handler(function, "before", see)
-
-
-# -- errors ---------------------------------------------------------------------------------------
-
-
-def failing(*args, **kwargs):
-    raise ZeroDivisionError("of the handler")
-
-
-@pytest.mark.parametrize(
-    ("position", "target"),
-    [(position, f"{MARKET}.Trader.bid") for position in ("before", "after", "instead")]
-    + [("before_next", f"{HERE}.counting")],
-)
-def test_a_handlers_error_is_its_own_and_says_where_it_was_attached(position, target):
-    def call():
-        return next(counting(3)) if position == "before_next" else Trader().bid("tea")
-
-    log, expected = [], call()
-    with handlers((failing, target, position)):
-        with pytest.raises(ZeroDivisionError, match="of the handler") as caught:
-            call()
-        assert notes(caught.value) == f"simenv_marl: in the handler failing, attached {position} {target}"
-        remove_handler(target, position)
-        with handlers((lambda *args, **kwargs: log.append(1), target, "before")):
-            assert call() == expected
-    assert log == [1]
-
-
-def test_a_functions_error_passes_by_what_comes_after():
-    function, log = local(), []
-    with handlers((lambda *args: log.append(1), function, "after")), pytest.raises(TypeError) as caught:
-        function("text", 1)
-    assert log == []
-    assert notes(caught.value) == ""
-
-
-# -- generator functions --------------------------------------------------------------------------
+# -- what handlers are attached to ------------------------------------------------------------------
 
 
 @expose_to_plugins
@@ -538,148 +98,309 @@ def counting(number, step=1):
 CLOSED = []
 
 
-def test_handlers_of_a_generator_function_see_its_arguments_its_items_and_what_it_returns():
-    log = []
-    with handlers(
-        (lambda number, step=1: ChangedArgs(number + 1, 10), counting, "before"),
-        (lambda number, step=1, *, _result: log.append((number, step, _result)), counting, "after"),
-        (lambda number, step=1: log.append(number), counting, "before_next"),
-        (lambda number, step=1, *, _result: ChangedResult(_result + 100), counting, "after_next"),
-        (lambda number, step=1, *, _result: ChangedResult(_result * 2), counting, "after_next"),
-    ):
-        generator = counting(2)
-        assert log == []
-        assert list(generator) == [200, 220, 240]
-    assert log == [3, 3, 3, 3, (3, 10, 0)]
-    assert inspect.isgeneratorfunction(counting)
+def local():
+    """An exposed function of its own."""
+
+    @expose_to_plugins
+    def function(value, more=0):
+        """Add."""
+        return value + more
+
+    return function
 
 
-@pytest.mark.parametrize("position", [None, "before", "after_next"])
-def test_what_is_sent_and_thrown_reaches_the_generator(position):
-    attached = [] if position is None else [(lambda *args, **kwargs: None, counting, position)]
-    with handlers(*attached):
-        generator = counting(4)
-        assert next(generator) == 0
-        assert generator.send(5) == 1
-        assert generator.throw(KeyError()) == 2
-        assert generator.send(7) == 3
-        with pytest.raises(StopIteration) as stop:
-            generator.send(1)
-        assert stop.value.value == 8
-        CLOSED.clear()
-        generator = counting(5)
-        next(generator)
-        generator.close()
-        assert CLOSED == [5]
-        generator = counting(6)
-        next(generator)
-        with pytest.raises(ZeroDivisionError):
-            generator.throw(ZeroDivisionError())
-        assert CLOSED == [5, 6]
+def nothing(*args, **kwargs):
+    """A handler that changes nothing."""
 
 
-def test_items_may_be_handed_out_instead():
-    left = [1, 2, 3]
-
-    def instead(number, step=1):
-        if not left:
-            raise StopIteration("over")
-        return left.pop()
-
-    with handlers((instead, counting, "instead_next")):
-        generator = counting(100)
-        assert [next(generator), generator.send(7), next(generator)] == [3, 2, 1]
-        with pytest.raises(StopIteration) as stop:
-            next(generator)
-        assert stop.value.value == "over"
-        assert notes(stop.value) == ""
+def failing(*args, **kwargs):
+    raise ZeroDivisionError("of the handler")
 
 
-def test_what_is_sent_before_a_generator_was_asked_is_not_sent_to_it():
-    with handlers((lambda number, step=1: "instead", counting, "instead_next")):
-        generator = counting(3)
-        assert next(generator) == "instead"
-    assert generator.send(5) == 0
+# -- by whom ----------------------------------------------------------------------------------------
 
 
-def letters(number, step=1):
-    yield from "ab"
-    return "c"
+def of_the_process(call, *entries):
+    for entry in entries:
+        attach_handler(*entry)
+    try:
+        return call()
+    finally:
+        for handler, target, position in entries:
+            remove_handler(target, position, handler)
 
 
+def of_an_environment(call, *entries):
+    """The simulation calls it."""
+    env = aec_env(calling(call, CHOOSE), CHOOSE, plugins=entries)
+    try:
+        env.reset()
+    finally:
+        env.close()
+    return env.simulation.log[0]
+
+
+CHOOSE = decision()
+
+EVERYWHERE = pytest.mark.parametrize("with_handlers", [of_the_process, of_an_environment])
+"""Calls a function with handlers that are attached in one way or the other."""
+
+
+@EVERYWHERE
+@pytest.mark.parametrize("how", ["by name", "as itself"])
+@pytest.mark.parametrize(("name", "call", "result"), FORMS.values(), ids=FORMS)
+def test_whatever_is_importable_can_be_extended(name, call, result, how, with_handlers):
+    target, log = found(name, how), []
+    entries = [
+        (lambda *args, position=position, **kwargs: log.append(position), target, position)
+        for position in ("before", "after")
+    ]
+    assert with_handlers(call, *entries) == call() == result
+    assert log == ["before", "after"]
+
+
+# -- positions ------------------------------------------------------------------------------------
+
+
+@EVERYWHERE
+def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and_their_changes_chain(with_handlers):
+    function, seen = local(), []
+
+    def see(*args, **kwargs):
+        seen.append((args, kwargs))
+
+    entries = [
+        (lambda value, more=0: ChangedArgs(value * 2, more=5), function, "before"),
+        (see, function, "before"),
+        (lambda value, more=0: ChangedArgs(value + 1, more=more), function, "before"),
+        (see, function, "after"),
+        (lambda value, more=0, *, _result=None: ChangedResult(_result * 10), function, "after"),
+        (lambda *args, _result, **kwargs: ChangedResult(_result + 1), function, "after"),
+        (lambda value, more=0: seen.append("plain"), function, "after"),
+    ]
+    assert with_handlers(lambda: function(3), *entries) == (7 + 5) * 10 + 1
+    assert seen == [((6,), {"more": 5}), ((7,), {"more": 5, "_result": 12}), "plain"]
+    assert repr(ChangedArgs(1, b=2)) == "ChangedArgs(1, b=2)"
+    assert repr(ChangedResult("x")) == "ChangedResult('x')"
+    for other in (None, 0, False, "text", (1, 2)):
+        entries = [(lambda *args, other=other, **kwargs: other, function, position) for position in ("before", "after")]
+        assert with_handlers(lambda: function(1, 2), *entries) == 3
+
+
+@EVERYWHERE
 @pytest.mark.parametrize(
-    ("instead", "items", "value"),
+    ("args", "kwargs", "under_other_names"),
     [
-        (letters, ["a", "b"], "c"),
-        (lambda number, step=1: [7, 8], [7, 8], None),
-        (lambda number, step=1: None, [], None),
-        (lambda number, step=1: "ab", [], "ab"),
-        (lambda number, step=1: b"ab", [], b"ab"),
+        ((1,), {}, (1, 8, 9)),
+        ((1, 2), {}, (1, 2, 9)),
+        ((1,), {"more": 2}, (1, 2, 9)),
+        ((), {"value": 1}, (1, 8, 9)),
+        ((), {"more": 3, "value": 1}, (1, 3, 9)),
+        ((1,), {"most": 5}, (1, 2, 5)),
     ],
-    ids=["generator", "list", "nothing", "string", "bytes"],
+    ids=str,
 )
-def test_a_generator_may_be_replaced(instead, items, value):
-    with handlers((instead, counting, "instead")):
-        generator = counting(3)
-        assert [next(generator) for _ in items] == items
-        with pytest.raises(StopIteration) as stop:
-            next(generator)
-        assert stop.value.value == value
+def test_handlers_get_the_arguments_as_they_were_passed_whatever_they_call_them(
+    args, kwargs, under_other_names, with_handlers
+):
+    @expose_to_plugins
+    def function(value, more=2, most=3):
+        return value, more, most
+
+    seen = []
+    result = with_handlers(
+        lambda: function(*args, **kwargs),
+        (lambda *args, **kwargs: seen.append((args, kwargs)), function, "before"),
+        (lambda a, b=8, c=9: seen.append((a, b, c)), function, "before"),
+    )
+    assert result == function.__wrapped__(*args, **kwargs)
+    assert seen == [(args, kwargs), under_other_names]
 
 
-# -- coroutine functions --------------------------------------------------------------------------
+@EVERYWHERE
+def test_errors_of_the_call_are_the_functions_own(with_handlers):
+    function, log = local(), []
+    before = (lambda *args, **kwargs: log.append("before"), function, "before")
+    after = (lambda *args, **kwargs: log.append("after"), function, "after")
+    for wrong in (lambda: function(), lambda: function(1, 2, 3), lambda: function(1, other=3)):
+        with pytest.raises(TypeError):
+            with_handlers(wrong, before, after)
+    assert log == []
+    with pytest.raises(TypeError) as caught:
+        with_handlers(lambda: function("text", 1), before, after)
+    assert log == ["before"]
+    assert "handler" not in notes(caught.value)
 
 
-def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited():
-    log = []
+@EVERYWHERE
+def test_of_several_instead_the_latest_alone_runs_and_may_call_what_it_replaces(with_handlers):
+    function, log = local(), []
 
-    async def before(self, amount):
-        await asyncio.sleep(0)
-        log.append("before")
-        return ChangedArgs(self, amount + 1)
+    def tenfold(value, more=0):
+        return function.__wrapped__(value, more) * 10
 
-    async def instead(self, amount):
-        return "instead"
+    first, latest = (lambda *args: "first", function, "instead"), (tenfold, function, "instead")
+    around = [(lambda *args, **kwargs: log.append(1), function, position) for position in ("before", "after")]
+    assert with_handlers(lambda: function(2), *around, first, latest) == 20
+    assert with_handlers(lambda: function(2), *around, latest, first) == "first"
+    assert log == []
+    one = (lambda self, *_, **__: Trader.bid.__wrapped__(self, "tea") + 0.5, BID, "instead")
+    assert with_handlers(lambda: Trader().bid("tea", 7), one) == 5.5
 
-    async def fails(self, amount):
-        failing()
 
+@EVERYWHERE
+def test_handlers_may_come_and_go_while_the_function_runs_and_call_it_again(with_handlers):
+    function, log = local(), []
+
+    def before(value, more=0):
+        log.append(value)
+        if value == 1:
+            remove_handler(function, "after")
+            attach_handler(lambda *args: log.append("late"), function, "before")
+            function(0)
+
+    attach_handler(lambda *args: log.append("after"), function, "after")
+    with_handlers(lambda: function(1), (before, function, "before"))
+    assert sorted(log[1:-1], key=str) == [0, "late"]
+    assert (log[0], log[-1]) == (1, "after")
+    remove_handler(function, "before")
+
+
+# -- what is exposed ------------------------------------------------------------------------------
+
+
+def test_what_is_exposed_in_classes_is_so_in_either_order_and_for_that_class_alone():
+    held, log = vars(Trader), []
+
+    class Model(Trader):
+        over = expose_to_plugins(held["rounded"])
+        under = staticmethod(expose_to_plugins(held["rounded"].__func__))
+        class_over = expose_to_plugins(held["opening"])
+        class_under = classmethod(expose_to_plugins(held["opening"].__func__))
+        bid = expose_to_plugins(Trader.bid)
+
+    class Sub(Model):
+        fee = 6
+
+    class Sibling(Trader):
+        bid = expose_to_plugins(Trader.bid)
+
+    for name in ("over", "under", "class_over", "class_under"):
+        given, result = ((), 6) if name.startswith("class") else ((2.5,), 2)
+        with handlers((lambda *args: log.append(1), getattr(Model, name), "before")):
+            assert getattr(Sub(), name)(*given) == getattr(Sub, name)(*given) == result
+            assert len(log) == 2
+        assert getattr(Sub, name)(*given) == result
+        assert len(log) == 2
+        log.clear()
+    with handlers((lambda *args, **kwargs: "sub", Model.bid, "instead")):
+        assert [kind().bid("tea") for kind in (Trader, Sibling, Sub)] == [5, 5, "sub"]
+
+
+def test_exposing_again_gives_the_same():
+    held = expose_to_plugins(vars(Trader)["rounded"])
+    assert isinstance(held, staticmethod)
+    for thing in (local(), POOL, held):
+        assert expose_to_plugins(thing) is thing
+    assert isinstance(expose_to_plugins(expose_to_plugins(Trader.opening)), classmethod)
+
+
+@pytest.mark.parametrize("function", [Trader.bid, Trader.haggle, Trader.wire, market.price], ids=plainly)
+def test_an_exposed_function_keeps_its_looks(function):
+    exposed = expose_to_plugins(function)
+    assert exposed is not function
+    assert exposed.__wrapped__ is function
+    assert inspect.signature(exposed) == inspect.signature(function)
+    for name in ("__name__", "__qualname__", "__doc__", "__module__"):
+        assert getattr(exposed, name) == getattr(function, name)
+    for kind in (inspect.isgeneratorfunction, inspect.iscoroutinefunction, inspect.isfunction):
+        assert kind(exposed) == kind(function)
+
+
+@pytest.mark.parametrize("parameter", ["found", "rule", "args", "self", "SLOT"])
+def test_parameters_may_have_any_name(parameter):
+    scope, log = {"expose_to_plugins": expose_to_plugins}, []
+    exec(
+        f"class Model:\n    @staticmethod\n    @expose_to_plugins\n    def function({parameter}): return {parameter}",
+        scope,
+    )
+    function = scope["Model"].function
+    for attached in ([], [(lambda *args, **kwargs: log.append(1), function, "before")]):
+        with handlers(*attached):
+            assert function(3) == function(**{parameter: 4}) - 1 == 3
+    assert log == [1, 1]
+
+
+def test_what_has_no_dotted_name_can_be_exposed():
+    first, function, length = local(), local(), expose_to_plugins(len)
     with handlers(
-        (before, f"{HOUSE}.wire", "before"),
-        (lambda self, amount, _result: ChangedResult((amount, _result)), f"{HOUSE}.wire", "after"),
+        (lambda value, more=0: 9, f"{HERE}.local.<locals>.function", "instead"),
+        (lambda thing, **kwargs: ChangedResult(kwargs["_result"] + 1), length, "after"),
     ):
-        assert inspect.iscoroutinefunction(Greenhouse.wire)
-        coroutine = Greenhouse().wire(1)
-        assert log == []
-        assert asyncio.run(coroutine) == (2, 2)
-    with handlers((instead, f"{HOUSE}.wire", "instead")):
-        assert asyncio.run(Greenhouse().wire(1)) == "instead"
-    with handlers((fails, f"{HOUSE}.wire", "before")):
-        with pytest.raises(ZeroDivisionError) as caught:
-            asyncio.run(Greenhouse().wire(1))
-        assert "fails, attached before" in notes(caught.value)
+        assert (first(1), function(1)) == (1, 9)  # the latest of that name
+        assert length([1, 2]) == 3
+    assert length([1, 2]) == 2
 
 
-# -- iterables ------------------------------------------------------------------------------------
+@EVERYWHERE
+def test_a_modules_iterables_and_an_iterables_own_functions_are_targets(with_handlers):
+    pool, subjects, before = Pool(1, 2), [], dict(vars(Pool))
+
+    def items():
+        return list(pool), list(Deck()), list(POOL)
+
+    found = with_handlers(
+        items,
+        (subjects.append, f"{HERE}.Pool.__iter__", "before_next"),
+        (lambda thing, _result: ChangedResult(_result + 10), Pool.__iter__, "after_next"),
+        (lambda thing, _result: ChangedResult(_result + 20), f"{HERE}.Deck.__next__", "after"),
+        (lambda thing, _result: ChangedResult(_result + 30), f"{HERE}.POOL", "after_next"),
+    )
+    assert found == ([11, 12], [22, 21, 20], [31, 32])
+    assert subjects == [pool] * 3
+    assert items() == ([1, 2], [2, 1, 0], [1, 2])
+    assert dict(vars(Pool)) == before
+
+
+POOL = expose_to_plugins([1, 2])
+
+
+class Pool:
+    def __init__(self, *items):
+        self.items = items
+
+    def __iter__(self):
+        yield from self.items
+
+
+class Deck:
+    def __init__(self):
+        self.left = 3
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        if not self.left:
+            raise StopIteration
+        self.left -= 1
+        return self.left
 
 
 def test_an_exposed_list_is_one_in_all_respects():
     items = expose_to_plugins([3, 1, 2])
     assert isinstance(items, list)
-    assert isinstance(items, collections.abc.Iterable)
     assert not isinstance(items, collections.abc.Iterator)
     items.append(4)
     assert (len(items), items[0], items[1:3], 4 in items, items == [3, 1, 2, 4]) == (4, 3, [1, 2], True, True)
-    assert [*items] == sorted(items, key=[3, 1, 2, 4].index) == [3, 1, 2, 4]
-    assert list(reversed(items)) == [4, 2, 1, 3]
+    assert [*items] == sorted(items, key=[3, 1, 2, 4].index) == list(reversed(items))[::-1] == [3, 1, 2, 4]
     seen, numbers = [], iter([7, 8])
     with handlers(
         (lambda thing: seen.append(thing is items), items, "before_next"),
         (lambda thing, _result: ChangedResult(_result * 10), items, "after_next"),
     ):
         assert [*items] == [30, 10, 20, 40]
-        assert [item for item in items] == [30, 10, 20, 40]  # noqa: C416
-    assert seen == [True] * 10
+    assert seen == [True] * 5
     with handlers((lambda thing: next(numbers), items, "instead_next")):
         assert list(items) == [7, 8]
     assert [*items] == [3, 1, 2, 4]
@@ -711,65 +432,754 @@ def test_copies_of_an_exposed_iterable_have_its_handlers():
     assert type(restored) is type(items)
 
 
-POOL = expose_to_plugins([1, 2])
+def test_models_of_a_patched_class_are_copied_and_pickled():
+    deck = Deck()
+    with handlers((lambda self: 9, f"{HERE}.Deck.__next__", "instead")):
+        for copied in (copy.deepcopy(deck), pickle.loads(pickle.dumps(deck))):
+            assert (copied.left, next(copied)) == (3, 9)
+        assert pickle.loads(pickle.dumps(Deck.__next__)) is Deck.__next__
+    assert next(copied) == 2
 
 
-class Pool:
-    def __init__(self, *items):
-        self.items = items
-
-    def __iter__(self):
-        yield from self.items
+# -- what is refused ------------------------------------------------------------------------------
 
 
-class Deck:
-    def __init__(self):
-        self.left = 3
-
-    def __iter__(self):
-        return self
-
-    def __next__(self):
-        if not self.left:
-            raise StopIteration
-        self.left -= 1
-        return self.left
+def two(a, b):
+    return a, b
 
 
-def test_an_iterables_own_functions_and_a_modules_iterables_are_targets():
-    pool, subjects, before = Pool(1, 2), [], dict(vars(Pool))
-    with handlers(
-        (subjects.append, f"{HERE}.Pool.__iter__", "before_next"),
-        (lambda thing, _result: ChangedResult(_result + 10), Pool.__iter__, "after_next"),
-        (lambda thing, _result: ChangedResult(_result + 20), f"{HERE}.Deck.__next__", "after"),
-        (lambda thing, _result: ChangedResult(_result + 30), f"{HERE}.POOL", "after_next"),
+@pytest.mark.parametrize(
+    ("entry", "error"),
+    [
+        ((print, "nowhere", "before"), UnknownTargetError),
+        ((print, f"{MARKET}.Trader.quote", "before"), PatchError),
+        ((print, f"{MARKET}.OPEN", "before_next"), PatchError),
+        ((print, "math.sqrt", "before"), PatchError),
+        ((print, "datetime.datetime.now", "before"), PatchError),
+        ((print, len, "before"), PatchError),
+        ((print, [1, 2], "before_next"), PatchError),
+        ((print, Trader().bid, "before"), PatchError),
+        ((print, Trader, "before_next"), PatchError),
+        ((print, two, "during"), HandlerError),
+        ((print, two, None), HandlerError),
+        ((print, two, "before_next"), HandlerError),
+        ((print, POOL, "before"), HandlerError),
+        ((None, two, "before"), HandlerError),
+        ((lambda: None, two, "before"), HandlerError),
+        ((lambda a, b, c: None, two, "before"), HandlerError),
+        ((lambda a, *, b: None, two, "before"), HandlerError),
+        ((lambda a, b, _result: None, two, "before"), HandlerError),
+        ((lambda a, b, _result: None, two, "instead"), HandlerError),
+        ((lambda **kwargs: None, two, "before"), HandlerError),
+        ((lambda good: None, f"{MARKET}.price", "before"), HandlerError),
+        ((lambda good, *, discount=0: None, f"{MARKET}.price", "before"), HandlerError),
+        ((lambda self, good: None, BID, "before"), HandlerError),
+        ((lambda good, limit: None, BID, "after"), HandlerError),
+        ((print, BID), HandlerError),
+        (BID, HandlerError),
+    ],
+    ids=plainly,
+)
+def test_what_cannot_work_is_refused_when_it_is_attached(entry, error):
+    good = (nothing, f"{HERE}.two", "before")
+    with pytest.raises(error) as caught, handlers(good, entry):
+        raise AssertionError
+    assert isinstance(caught.value, SimEnvError)
+    assert hook_of(two) is None
+    for make in (single_env, generate_env):
+        with pytest.raises(error):
+            make(House, House.water, plugins=[good, entry])
+    if len(entry) == 3:
+        with pytest.raises(error):
+            attach_handler(*entry)
+
+
+@pytest.mark.parametrize("plugins", ["text", 3, {BID: print}])
+def test_plugins_are_a_list(plugins):
+    for make in (single_env, generate_env):
+        with pytest.raises(OptionValueError):
+            make(House, House.water, plugins=plugins)
+
+
+async def flow():
+    yield 1
+
+
+@pytest.mark.parametrize(
+    ("thing", "why"),
+    [(Pool, "expose one of its"), (int, "expose one of its"), (flow, "async generator"), (3, "neither")],
+)
+def test_what_cannot_be_extended_cannot_be_exposed(thing, why):
+    with pytest.raises(PatchError, match=why):
+        expose_to_plugins(thing)
+
+
+def test_whatever_can_be_called_with_the_arguments_is_accepted():
+    good = [lambda a, b: None, lambda x, y: None, lambda *args, **kwargs: None, lambda *args: None]
+    good += [lambda a, *rest: None, lambda a, b, c=0: None, lambda a, b, /: None, Trader().bid, print]
+    for handler in good:
+        with handlers((handler, two, "before")):
+            assert two(1, b=2) == two(a=1, b=2) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("target", "position", "handler"),
+    [(two, "before", None), (two, "before", print), (two, "during", None), (BID, "after", None)],
+    ids=plainly,
+)
+def test_removing_what_is_not_attached_is_refused(target, position, handler):
+    with handlers((two, two, "after")), pytest.raises(HandlerError, match="handlers are attached") as caught:
+        remove_handler(target, position, handler)
+    assert ("no handler is attached" in str(caught.value)) is (handler is None)
+
+
+def test_a_slip_of_the_pen_gets_a_hint():
+    with pytest.raises(UnknownTargetError, match=r"did you mean .*counting"):
+        attach_handler(print, f"{HERE}.countin", "before")
+
+
+# -- for a while ----------------------------------------------------------------------------------
+
+
+def test_handlers_are_there_for_as_long_as_the_block_runs():
+    one, broken = (lambda *args, **kwargs: 1, BID, "instead"), (failing, BID, "instead")
+    with handlers(one):
+        assert Trader().bid("tea") == 1
+        assert attached_handlers() == [one]
+    with pytest.raises(ZeroDivisionError), handlers(broken):
+        Trader().bid("tea")
+    assert Trader().bid("tea") == 5
+
+
+def test_blocks_may_overlap_and_remove_nothing_but_their_own():
+    function, log = local(), []
+
+    def see(value, more=0):
+        log.append(value)
+
+    see_it = (see, function, "before")
+    for _ in range(2):
+        attach_handler(*see_it)
+    one, two = handlers(see_it), handlers(see_it)
+    one.__enter__()
+    two.__enter__()
+    function(1)
+    one.__exit__(None, None, None)
+    remove_handler(function, "before", see)
+    function(2)
+    remove_handler(function, "before")  # all of them
+    two.__exit__(None, None, None)
+    function(3)
+    assert log == [1] * 4 + [2] * 2
+
+
+# -- errors ---------------------------------------------------------------------------------------
+
+
+@EVERYWHERE
+@pytest.mark.parametrize(
+    ("position", "target"), [("before", BID), ("after", BID), ("instead", BID), ("before_next", f"{HERE}.counting")]
+)
+def test_a_handlers_error_is_its_own_and_says_where_it_was_attached(position, target, with_handlers):
+    def call():
+        return next(counting(3)) if position == "before_next" else Trader().bid("tea")
+
+    log, expected = [], call()
+    with pytest.raises(ZeroDivisionError, match="of the handler") as caught:
+        with_handlers(call, (failing, target, position))
+    said, *rest = notes(caught.value).splitlines()
+    assert said == f"simenv_marl: in the handler failing, attached {position} {target}"
+    assert rest == [] or with_handlers is of_an_environment
+    assert with_handlers(call, (lambda *args, **kwargs: log.append(1), target, "before")) == expected
+    assert log == [1]
+
+
+# -- generator and coroutine functions ------------------------------------------------------------
+
+
+@EVERYWHERE
+def test_handlers_of_a_generator_function_see_its_arguments_its_items_and_what_it_returns(with_handlers):
+    log = []
+
+    def call():
+        generator = counting(2)
+        assert log == []
+        return list(generator)
+
+    items = with_handlers(
+        call,
+        (lambda number, step=1: ChangedArgs(number + 1, 10), counting, "before"),
+        (lambda number, step=1, *, _result: log.append((number, step, _result)), counting, "after"),
+        (lambda number, step=1: log.append(number), counting, "before_next"),
+        (lambda number, step=1, *, _result: ChangedResult(_result + 100), counting, "after_next"),
+        (lambda number, step=1, *, _result: ChangedResult(_result * 2), counting, "after_next"),
+    )
+    assert items == [200, 220, 240]
+    assert log == [3, 3, 3, 3, (3, 10, 0)]
+    assert inspect.isgeneratorfunction(counting)
+
+
+@EVERYWHERE
+@pytest.mark.parametrize("positions", [(), ("before",), ("after_next",)])
+def test_what_is_sent_and_thrown_reaches_the_generator(positions, with_handlers):
+    def call():
+        generator = counting(4)
+        seen = [next(generator), generator.send(5), generator.throw(KeyError()), generator.send(7)]
+        assert seen == [0, 1, 2, 3]
+        with pytest.raises(StopIteration) as stop:
+            generator.send(1)
+        assert stop.value.value == 8
+        CLOSED.clear()
+        generator = counting(5)
+        next(generator)
+        generator.close()
+        assert CLOSED == [5]
+        generator = counting(6)
+        next(generator)
+        with pytest.raises(ZeroDivisionError):
+            generator.throw(ZeroDivisionError())
+        assert CLOSED == [5, 6]
+
+    with_handlers(call, *[(nothing, counting, position) for position in positions])
+
+
+def left_ones(number, step=1):
+    if not LEFT:
+        raise StopIteration("over")
+    return LEFT.pop()
+
+
+LEFT = []
+
+
+def letters(number, step=1):
+    yield from "ab"
+    return "c"
+
+
+@EVERYWHERE
+@pytest.mark.parametrize(
+    ("instead", "position", "items", "value"),
+    [
+        (left_ones, "instead_next", [3, 2, 1], "over"),
+        (letters, "instead", ["a", "b"], "c"),
+        (lambda number, step=1: [7, 8], "instead", [7, 8], None),
+        (lambda number, step=1: None, "instead", [], None),
+        (lambda number, step=1: "ab", "instead", [], "ab"),
+        (lambda number, step=1: b"ab", "instead", [], b"ab"),
+    ],
+    ids=["items", "generator", "list", "nothing", "string", "bytes"],
+)
+def test_a_generator_and_its_items_may_be_replaced(instead, position, items, value, with_handlers):
+    LEFT[:] = [1, 2, 3]
+
+    def call():
+        generator = counting(100)
+        assert [next(generator) for _ in items] == items
+        with pytest.raises(StopIteration) as stop:
+            next(generator)
+        assert (stop.value.value, notes(stop.value)) == (value, "")
+
+    with_handlers(call, (instead, counting, position))
+
+
+def test_what_is_sent_before_a_generator_was_asked_is_not_sent_to_it():
+    with handlers((lambda number, step=1: "instead", counting, "instead_next")):
+        generator = counting(3)
+        assert next(generator) == "instead"
+        assert generator.send(7) == "instead"
+    assert generator.send(5) == 0
+
+
+@EVERYWHERE
+@pytest.mark.parametrize("position", ["before", "instead"])
+def test_handlers_of_a_generator_function_end_no_items(position, with_handlers):
+    def stopping(*args, **kwargs):
+        raise StopIteration("a slip")
+
+    with pytest.raises(RuntimeError, match="StopIteration") as caught:
+        with_handlers(lambda: list(counting(3)), (stopping, counting, position))
+    assert f"stopping, attached {position}" in notes(caught.value.__cause__)
+
+
+def test_errors_of_a_generator_that_is_closed_are_raised():
+    @expose_to_plugins
+    def items():
+        try:
+            yield 1
+        finally:
+            raise LookupError("while it was closed")
+
+    with handlers((nothing, items, "before_next")):
+        generator = items()
+        assert next(generator) == 1
+        with pytest.raises(LookupError, match="while it was closed"):
+            generator.close()
+
+
+@EVERYWHERE
+def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited(with_handlers):
+    name, log = f"{MARKET}.Trader.wire", []
+
+    async def before(self, amount):
+        await asyncio.sleep(0)
+        log.append("before")
+        return ChangedArgs(self, amount + 1)
+
+    async def instead(self, amount):
+        return "instead"
+
+    async def fails(self, amount):
+        failing()
+
+    def call():
+        coroutine = Trader().wire(1)
+        assert inspect.iscoroutinefunction(Trader.wire)
+        assert log == []
+        return asyncio.run(coroutine)
+
+    after = (lambda self, amount, _result: ChangedResult((amount, _result)), name, "after")
+    assert with_handlers(call, (before, name, "before"), after) == (2, 2)
+    log.clear()
+    assert with_handlers(call, (instead, name, "instead")) == "instead"
+    with pytest.raises(ZeroDivisionError) as caught:
+        with_handlers(call, (fails, name, "before"))
+    assert "fails, attached before" in notes(caught.value)
+
+
+# -- seeing what happens --------------------------------------------------------------------------
+
+
+def test_what_is_exposed_and_attached_is_listed():
+    gc.collect()  # other tests have exposed functions, too
+    function, items, choose = local(), expose_to_plugins({1}), decision()
+    name = f"{HERE}.local.<locals>.function"
+    assert exposed_functions().count("an iterable set") == 1
+    assert name in exposed_functions()
+    assert BID not in exposed_functions()
+    with handlers((print, function, "before"), (failing, BID, "instead")):
+        assert BID in exposed_functions()
+        assert attached_handlers() == [(failing, BID, "instead"), (print, name, "before")]
+    assert "tests.worlds.models.decision.<locals>.choose" in decision_points()
+    assert (choose(), list(items)) == ("rule", [1])
+
+
+def test_calls_are_traced_in_the_order_in_which_they_begin():
+    function = local()
+    with (
+        handlers((lambda value, more=0: market.price("tea", rebate=value) and None, function, "before")),
+        trace(function, f"{MARKET}.price", counting, f"{MARKET}.Trader.wire") as calls,
     ):
-        assert list(pool) == [11, 12]
-        assert list(Deck()) == [22, 21, 20]
-        assert list(POOL) == [31, 32]
-    assert subjects == [pool] * 3
-    assert (list(pool), list(Deck()), list(POOL)) == ([1, 2], [2, 1, 0], [1, 2])
-    assert dict(vars(Pool)) == before
+        function(3, more=4)
+        list(counting(2))
+        asyncio.run(Trader().wire(8))
+        with pytest.raises(TypeError):
+            function([])
+    shown = [(call.target.rpartition(".")[2], call.arguments.partition(" object at")[0], call.result) for call in calls]
+    assert shown[:4] == [
+        ("function", "3, more=4", "7"),
+        ("price", "'tea', rebate=3", "7"),
+        ("counting", "2", "0"),
+        ("wire", f"<{MARKET}.Trader", "8"),
+    ]
+    assert [target for target, *_ in shown[4:]] == ["function", "price"]
+    assert shown[4][2].startswith("raised TypeError")
+    with handlers((nothing, BID, "before")), trace() as everything:  # which is what is exposed, or has handlers
+        function(1)
+        Trader().bid("tea")
+        Trader.rounded(2.5)
+    assert [call.target for call in everything] == [f"{HERE}.local.<locals>.function", BID]
+    assert len(calls) == 6
 
 
-@pytest.mark.parametrize("kind", [Pool, int])
-def test_classes_are_no_iterables(kind):
-    with pytest.raises(PatchError, match="expose one of its functions"):
-        expose_to_plugins(kind)
+def test_calls_of_an_episode_are_traced():
+    env = single_env(House, House.water, plugins=[says("mine")])
+    with trace(WORD, House.water) as calls:
+        env.reset()
+        env.step(7)
+    waters = [call for call in calls if call.target.endswith("water")]
+    assert [call.result for call in waters] == ["7", None]
+    assert {call.result for call in calls if call not in waters} == {"'mine'"}
+    assert calls[-1].result == "'mine'"
+    env.close()
+    assert waters[-1].result.startswith("raised SimulationExit")
 
 
-# -- decision points ------------------------------------------------------------------------------
+# -- one environment alone ------------------------------------------------------------------------
+
+
+class House:
+    """A greenhouse whose ventilation nobody has thought of as a decision."""
+
+    step, render_modes = 0, ("ansi",)
+
+    def __init__(self):
+        self.log = []
+
+    def word(self):
+        return "plain"
+
+    def note(self):
+        self.log.append(self.word())
+
+    stop = note
+
+    def reset(self, seed=None):
+        self.note()
+
+    def run(self):
+        for self.step in range(3):
+            self.note()
+            self.water()
+            self.note()
+
+    @define(agent="waterer_0", observation_space_mapping=lambda self: [len(self.word()), self.step])
+    def water(self):
+        return 0
+
+    def time(self):
+        self.word()
+        return float(self.step)
+
+    def state(self):
+        return [len(self.word())]
+
+    def render(self, mode):
+        return self.word()
+
+
+WORD = f"{HERE}.House.word"
+
+
+def says(word):
+    return (lambda self: word, WORD, "instead")
+
+
+def test_plugins_apply_wherever_the_environments_simulation_is_at_work():
+    env = single_env(House, House.water, plugins=[says("mine")], render_mode="ansi")
+    simulation = env.unwrapped.simulation
+    assert env.reset()[0].tolist() == [4, 0]
+    assert simulation.word() == "plain"
+    assert env.step(1)[0].tolist() == [4, 1]
+    assert simulation.word() == "plain"
+    assert env.render() == "mine"
+    assert env.unwrapped.state().tolist() == [4]
+    env.close()
+    assert simulation.log == ["mine"] * 5
+    assert simulation.word() == "plain"
+    assert simulate(House, points=House.water, plugins=[says("mine")]).log == ["mine"] * 7
+
+
+@pytest.mark.parametrize(
+    "make", [aec_env, parallel_env, single_env, joint_env, lambda *args, **kwargs: generate_env(*args, **kwargs)()]
+)
+def test_environments_with_opposite_plugins_are_interleaved_in_every_view(make):
+    words = {"one": [says("one")], "two": [says("two")], "plain": []}
+    envs = {word: make(House, House.water, plugins=plugins) for word, plugins in words.items()}
+    for word, env in envs.items():
+        env.reset(seed=1)
+        assert [entry[1:] for entry in attached_handlers(env)] == [(WORD, "instead")] * (word != "plain")
+    for _ in range(2):
+        for env in envs.values():
+            step(env, 1, "waterer_0")
+            assert House().word() == "plain"
+    for word, env in envs.items():
+        assert env.unwrapped.simulation.log == [word] * 6
+        env.close()
+
+
+def test_handlers_of_the_process_run_before_the_environments():
+    log = []
+    entries = [
+        (lambda self, name=name, position=position: log.append((position, name)), WORD, position)
+        for name in ("process", "environment")
+        for position in ("before", "after")
+    ]
+    env = single_env(House, House.water, plugins=entries[2:])
+    own = single_env(House, House.water, plugins=[says("environment")])
+    with handlers(*entries[:2]):
+        env.reset()
+    assert log[:4] == [(position, name) for position in ("before", "after") for name in ("process", "environment")]
+    with handlers(says("process")):
+        for each, word in ((env, "process"), (own, "environment")):
+            each.reset()
+            assert each.unwrapped.simulation.log[-1] == word
+        assert House().word() == "process"
+    env.close()
+    own.close()
+
+
+def test_an_environment_stepped_from_inside_another_one_sees_its_own_plugins_alone():
+    plain, mine = (single_env(House, House.water, plugins=plugins) for plugins in ([], [says("inner")]))
+    for env in (plain, mine):
+        env.reset()
+
+    def main(simulation):
+        simulation.log.append(House().word())
+        other()
+        for env in (plain, mine):
+            env.step(1)
+        House.water(House())
+        simulation.log.append(House().word())
+        other()
+
+    other = decision(agent="other_0")
+    policies = {House.water: lambda *_: plain.step(1) and 1}
+    env = aec_env(script(main), [other, House.water], plugins=[says("mine")], policies=policies)
+    env.reset()
+    env.step(1)
+    assert env.unwrapped.simulation.log == ["mine", "mine"]
+    assert plain.unwrapped.simulation.log == ["plain"] * 6
+    assert mine.unwrapped.simulation.log == ["inner"] * 4
+    for each in (env, plain, mine):
+        each.close()
+
+
+def test_a_plugins_error_surfaces_from_step_the_next_reset_works_and_nothing_is_left_behind():
+    number = itertools.count()
+
+    def fail(self):
+        if next(number) == 4:
+            raise ZeroDivisionError
+
+    env = single_env(House, House.water, plugins=[(fail, WORD, "before")])
+    before = stacks()
+    env.reset()
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(1)
+    assert "in the handler" in notes(caught.value)
+    assert "waterer_0" in notes(caught.value)
+    del caught
+    for _ in range(2):
+        env.reset()
+        env.step(1)
+        env.close()
+    env.reset()
+    del env
+    assert alive(House) == 0
+    assert stacks() <= before
+    assert nobody_is_asked()
+    assert hook_of(vars(House)["water"]).interceptors == EVALUATING == {}
+
+
+def test_environments_may_be_collected_at_any_moment():
+    """Also while handlers are made ready, which looks through those that environments have."""
+
+    def look(frame, event, arg):
+        nonlocal left
+        left -= event == "call" and "/hooks/" in frame.f_code.co_filename
+        if left == 0:
+            gc.collect()
+
+    choose = decision()
+    left = number = 0
+    gc.disable()
+    try:
+        while left <= 0:  # until there are no more calls
+            env = aec_env(calling(lambda: Trader().bid("tea"), choose), choose, plugins=[(nothing, BID, "before")])
+            env.reset()
+            env.itself = env
+            del env
+            number += 1
+            left = number
+            sys.setprofile(look)
+            with handlers((nothing, BID, "before")):
+                assert Trader().bid("tea") == 5
+            sys.setprofile(None)
+            gc.collect()
+    finally:
+        sys.setprofile(None)
+        gc.enable()
+    assert number > 10
+
+
+def test_nothing_is_patched_but_while_there_is_an_environment():
+    before = vars(House)["word"]
+    made = generate_env(House, House.water, plugins=[says("mine")])
+    assert vars(House)["word"] is before
+    one, two = made(), made(plugins=[])
+    assert vars(House)["word"] is not before
+    two.reset()
+    assert set(two.unwrapped.simulation.log) == {"plain"}
+    two.close()
+    one.reset()
+    one.close()
+    assert vars(House)["word"] is before
+    one.reset()
+    assert set(one.unwrapped.simulation.log[-2:]) == {"mine"}
+    del one
+    gc.collect()
+    assert vars(House)["word"] is before
+    House.word = expose_to_plugins(House.word)  # which the class of environments outlives
+    try:
+        env = made()
+        env.reset()
+        assert set(env.unwrapped.simulation.log) == {"mine"}
+    finally:
+        House.word = before
+    env.step(1)
+    assert env.unwrapped.simulation.log[-2:] == ["plain", "plain"]
+    env.close()
+    assert vars(House)["word"] is before
+
+
+def test_the_simulations_own_methods_can_be_extended():
+    def run(self):
+        self.log += [CHOOSE(), CHOOSE()]
+        return TRUNCATED
+
+    plugins = [
+        (run, f"{HERE}.House.run", "instead"),
+        (lambda self, seed=None: ChangedArgs(self, seed=77), f"{HERE}.House.reset", "before"),
+        (lambda self, seed=None: self.log.append(seed), f"{HERE}.House.reset", "after"),
+        (lambda self: self.log.append("made"), f"{HERE}.House.__init__", "after"),
+    ]
+    env = aec_env(House, CHOOSE, plugins=plugins)
+    turns = play(env, 3)
+    assert env.unwrapped.simulation.log == ["made", "plain", 77, 3, 3]
+    assert turns[-1].truncated
+    env.close()
+
+
+# -- handlers and decisions -------------------------------------------------------------------------
+
+
+@define(agent="ventilator_0", observation_space_mapping=lambda self: [self.step, 0])
+def ventilate(self):
+    return "rule"
+
+
+def asked(self):
+    return f"asked {ventilate(self)}"
+
+
+def test_a_plugin_may_decide_or_call_what_decides():
+    for handler, prefix in ((ventilate, ""), (asked, "asked ")):
+        points, plugins = [House.water, ventilate], [(handler, WORD, "instead")]
+        env = aec_env(House, points, plugins=plugins)
+        turns = play(env, {"waterer_0": 1, "ventilator_0": 7})
+        assert decisions(turns) == ["ventilator_0", "waterer_0", "ventilator_0"] * 3
+        log = env.unwrapped.simulation.log
+        assert log[0] == f"{prefix}rule"  # during reset the rule decides
+        assert [str(word) for word in log[1:]] == [f"{prefix}7"] * 6
+        env.close()
+        together = joint_env(House, points, plugins=plugins)
+        together.reset()
+        *_, info = together.step({"waterer_0": 1, "ventilator_0": 7})
+        assert info["acted"] == {"waterer_0": True, "ventilator_0": True}
+        together.close()
+
+
+@pytest.mark.parametrize("how", ["handlers first", "points first", "environment", "exposed"])
+def test_handlers_lie_outside_the_decision(how, monkeypatch):
+    seen, decided = [], []
+
+    def before(self, good, limit=5):
+        return ChangedArgs(self, good.upper(), limit=limit + 1)
+
+    def after(self, good, limit=5, *, _result):
+        decided.append(_result)
+        return ChangedResult(_result * 10)
+
+    points = {BID: define(observation_space_mapping=lambda self, good, limit=5: seen.append((good, limit)) or [0, 0])}
+    entries = [(before, BID, "before"), (after, BID, "after")]
+    bids = calling(lambda: Trader().bid("tea"), lambda: Broker().bid("tea", limit=6))
+    if how == "exposed":
+        monkeypatch.setattr(Trader, "bid", expose_to_plugins(Trader.bid))
+    if how == "points first":
+        env = aec_env(bids, points)
+        env.reset()
+        seen.clear()
+    with handlers(*entries) if how != "environment" else nullcontext():
+        if how != "points first":
+            env = aec_env(bids, points, plugins=entries if how == "environment" else ())
+        play(env, 4)
+    assert env.unwrapped.simulation.log == [40, 40]
+    assert decided == [4, 4]
+    assert {("TEA", 6), ("TEA", 7)} <= {*seen}
+    env.close()
+    assert Trader().bid("tea") == 5
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_whoever_comes_and_goes_nobody_is_in_anothers_way(seed):
+    random, live, log = Random(seed), [], []
+    calls = {name: (call, result) for name, call, result in FORMS.values()}
+
+    def log_as(name):
+        return lambda *args, **kwargs: log.append(name)
+
+    def attach(name):
+        block = handlers((log_as(name), name, "before"))
+        block.__enter__()
+        return "handlers", name, lambda: block.__exit__(None, None, None)
+
+    def environment(name):
+        plugins = [(log_as("plugin"), other, "after") for other in random.sample(sorted(calls), 3)]
+        env = aec_env(calling(calls[name][0]), {name: define()}, plugins=plugins)
+        return env, name, env.close
+
+    for _ in range(60):
+        if live and random.random() < 0.5:
+            *_, leave = live.pop(random.randrange(len(live)))
+            leave()
+        else:
+            live.append(random.choice([attach, environment])(random.choice(sorted(calls))))
+        attached = [name for what, name, _ in live if what == "handlers"]
+        for name, (call, result) in calls.items():
+            log.clear()
+            assert call() == result
+            base = name.replace("Broker", "Trader")  # which a broker's call goes on to
+            assert log == [name] * attached.count(name) + [base] * attached.count(base) * (base != name)
+        for env, name, _ in random.sample(live, min(len(live), 2)):
+            for action, result in ((4, 4), (RULE, calls[name][1])) if env != "handlers" else ():
+                log.clear()
+                play(env, action)
+                assert env.unwrapped.simulation.log == [result]
+                assert log.count(name) == attached.count(name)
+    for *_, leave in live:
+        leave()
+
+
+def test_points_find_functions_that_handlers_stand_in_front_of():
+    class Shed(House):
+        pass
+
+    model = calling(lambda: Broker().bid("tea"))
+    with handlers(*[(nothing, target, "before") for target in (BID, f"{MARKET}.Broker.bid", Shed.water)]):
+        envs = [aec_env(model, {point: define()}) for point in (Trader.bid, Broker.bid)]
+        fetched = Trader.bid
+        env = aec_env(Shed, Shed.water)  # with the definition that it has inherited
+        assert decisions(play(env, 1)) == ["waterer_0"] * 3
+        env.close()
+    for env in (*envs, aec_env(model, {fetched: define()})):
+        play(env, 3)
+        assert env.unwrapped.simulation.log == [3]
+        env.close()
+
+
+def test_decision_functions_can_be_named_whether_they_are_exposed_before_or_after():
+    def choose():
+        return "rule"
+
+    over, under, log = expose_to_plugins(define()(choose)), define(agent="under_0")(expose_to_plugins(choose)), []
+    assert inspect.unwrap(over) is inspect.unwrap(under) is choose
+    for point, agent in ((over, "choose_0"), (under, "under_0")):
+        env = aec_env(calling(point), point)
+        with handlers((lambda _result: log.append(_result), point, "after")):
+            assert decisions(play(env, 4)) == [agent]
+        env.close()
+    assert log == [4, 4]
 
 
 def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside():
-    original = vars(Trader)["bid"]
-    log = []
+    original, log = vars(Trader)["bid"], []
     try:
-        with handlers((lambda *args, **kwargs: log.append(1), f"{MARKET}.Trader.bid", "before")):
+        with handlers((lambda *args, **kwargs: log.append(1), BID, "before")):
             Trader.bid = define()(Trader.bid)
             assert Trader().bid("tea") == 5
         with handlers(
-            (lambda *args, **kwargs: log.append(2), f"{MARKET}.Trader.bid", "before"),
+            (lambda *args, **kwargs: log.append(2), BID, "before"),
             (lambda *args, **kwargs: log.append(3), Trader.bid, "before"),
         ):
             env = aec_env(calling(lambda: Trader().bid("tea")), Trader.bid)
@@ -781,87 +1191,109 @@ def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside()
         Trader.bid = original
 
 
-# -- copies ---------------------------------------------------------------------------------------
+@pytest.mark.parametrize("end", ["close", "reset", "collect"])
+def test_an_episode_that_ends_inside_an_exposed_call_passes_its_handlers(end):
+    log = []
 
-
-def test_models_of_a_patched_class_are_copied_and_pickled():
-    house = Greenhouse(7)
-    with handlers((lambda self, amount, *, twice=False: 1, f"{HOUSE}.water", "instead")):
-        for copied in (copy.deepcopy(house), pickle.loads(pickle.dumps(house))):
-            assert (copied.humidity, copied.water(5)) == (7, 1)
-        assert pickle.loads(pickle.dumps(Greenhouse.water)) is Greenhouse.water
-    assert copied.water(5) == 5
-
-
-# -- seeing what happens --------------------------------------------------------------------------
-
-
-def test_what_is_exposed_and_attached_is_listed():
-    gc.collect()  # other tests have exposed functions, too
-    function, items, choose = local(), expose_to_plugins([1]), decision()
-    name = f"{HERE}.local.<locals>.function"
-    assert exposed_functions().count("an iterable list") == 1
-    assert name in exposed_functions()
-    assert f"{MARKET}.Trader.bid" not in exposed_functions()
-    with handlers((print, function, "before"), (failing, f"{MARKET}.Trader.bid", "instead")):
-        assert f"{MARKET}.Trader.bid" in exposed_functions()
-        assert attached_handlers() == [(failing, f"{MARKET}.Trader.bid", "instead"), (print, name, "before")]
-    assert "tests.worlds.models.decision.<locals>.choose" in decision_points()
-    assert (choose(), list(items)) == ("rule", [1])
-
-
-def test_calls_are_traced_in_the_order_in_which_they_begin():
-    function = local()
-    with (
-        handlers((lambda value, more=0: Trader().bid("tea", limit=value) and None, function, "before")),
-        trace(function, f"{MARKET}.Trader.bid", counting, f"{HOUSE}.wire") as calls,
-    ):
-        function(3, more=4)
-        list(counting(2))
-        asyncio.run(Greenhouse().wire(8))
-        with pytest.raises(TypeError):
-            function("x")
-    shown = [(call.target.rpartition(".")[2], call.arguments.partition(" object at")[0], call.result) for call in calls]
-    assert shown[:4] == [
-        ("function", "3, more=4", "7"),
-        ("bid", f"<{MARKET}.Trader", "3"),
-        ("counting", "2", "0"),
-        ("wire", "Greenhouse(50), 8", "8"),
-    ]
-    assert shown[4][:2] == ("function", "'x'")
-    assert shown[4][2].startswith("raised TypeError")
-    length = len(calls)
-    with trace() as everything:  # which is what is exposed
-        function(1)
-        Trader().bid("tea")
-    assert [call.target for call in everything] == [f"{HERE}.local.<locals>.function"]
-    assert len(calls) == length
-
-
-# -- what is nearly an item, an end or a name -------------------------------------------------------
-
-
-@pytest.mark.parametrize("position", ["before", "instead"])
-def test_handlers_of_a_generator_function_end_no_items(position):
-    def stopping(*args, **kwargs):
-        raise StopIteration("a slip")
-
-    with handlers((stopping, counting, position)):
-        with pytest.raises(RuntimeError, match="StopIteration") as caught:
-            list(counting(3))
-        assert f"stopping, attached {position}" in notes(caught.value.__cause__)
-
-
-def test_errors_of_a_generator_that_is_closed_are_raised():
     @expose_to_plugins
-    def items():
+    def day():
         try:
-            yield 1
+            return CHOOSE()
         finally:
-            raise LookupError("while it was closed")
+            log.append("unwound")
 
-    with handlers((lambda: None, items, "before_next")):
-        generator = items()
-        assert next(generator) == 1
-        with pytest.raises(LookupError, match="while it was closed"):
-            generator.close()
+    plugins = [(lambda position=position: log.append(position), day, position) for position in ("before", "after")]
+    env = aec_env(calling(day), CHOOSE, plugins=plugins)
+    with handlers((lambda: log.append("everybody"), day, "after")):
+        env.reset()
+        assert log == ["before"]
+        if end == "reset":
+            env.reset()
+        if end != "collect":
+            env.close()
+        del env
+        gc.collect()
+    assert log == ["before", "unwound"] * (2 if end == "reset" else 1)
+
+
+def test_generators_and_iterables_suspended_over_decisions_have_their_environments_plugins():
+    @expose_to_plugins
+    def days(number):
+        for day in range(number):
+            yield (day, CHOOSE())
+
+    class Shelf:
+        """Its iterable is copied with it."""
+
+        def __init__(self):
+            self.items = expose_to_plugins([1, 2, 3])
+
+        def reset(self):
+            self.log = []
+
+        def run(self):
+            for (day, action), item in zip(days(3), self.items, strict=False):
+                self.log.append((day, item, action))
+
+    shelf, envs = Shelf(), {}
+    for factor in (10, 100, 1):
+        after = [
+            (lambda _, _result, by=factor: ChangedResult((_result[0] * by, _result[1])), days, "after_next"),
+            (lambda _, _result, by=factor: ChangedResult(_result * by), shelf.items, "after_next"),
+        ]
+        envs[factor] = aec_env(shelf, CHOOSE, plugins=after if factor > 1 else ())
+        envs[factor].reset()
+    for action in (7, 8, 9):
+        for env in envs.values():
+            env.step(action)
+    for factor, env in envs.items():
+        assert env.unwrapped.simulation.log == [(day * factor, (day + 1) * factor, day + 7) for day in range(3)]
+
+
+class Sheep:
+    def __init__(self, name):
+        self.name = name
+
+    def remove(self):
+        pass
+
+    @define(agent=lambda self: self.name, removed_by=f"{HERE}.Sheep.remove")
+    def graze(self):
+        return 0
+
+
+@pytest.mark.parametrize("how", ["process", "environment"])
+def test_a_removal_may_have_handlers(how):
+    def main(simulation):
+        one, two = Sheep("sheep_1"), Sheep("sheep_2")
+        one.graze()
+        one.remove()
+        two.graze()
+
+    removed = []
+    entries = [(lambda self: removed.append(self.name), f"{HERE}.Sheep.remove", "after")]
+    env = aec_env(script(main), Sheep.graze, plugins=entries if how == "environment" else ())
+    with handlers(*entries) if how == "process" else nullcontext():
+        turns = play(env, 1)
+    assert [(turn.agent, turn.terminated) for turn in turns] == [
+        ("sheep_1", False),
+        ("sheep_1", True),
+        ("sheep_2", False),
+        ("sheep_2", True),
+    ]
+    assert removed == ["sheep_1"]
+    env.close()
+    assert hook_of(Sheep.remove) is None
+
+
+def test_mappings_of_vector_environments_see_the_plugins_too(monkeypatch):
+    monkeypatch.setattr(agent_module, "DIFFERENCES", [])  # as long as no difference was made, less is entered
+    reward = {House.water: define(agent="a_0", reward_mapping=lambda self: len(self.word()))}
+    envs = vector_env(House, reward, num_envs=2, plugins=[says("mine")])
+    envs.reset()
+    assert envs.step(np.zeros(2, np.int64))[1].tolist() == [4, 4]
+    envs.close()
+    envs = vector_env(House, House.water, num_envs=2, plugins=[says("mine")])
+    assert envs.reset()[0].tolist() == [[4, 0]] * 2
+    assert envs.step(np.zeros(2, np.int64))[0].tolist() == [[4, 1]] * 2
+    envs.close()

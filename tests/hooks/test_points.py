@@ -1,6 +1,5 @@
 """Sections 3 and 4: what ``points=`` names, and what that does to models which nobody has decorated."""
 
-import asyncio
 import gc
 import subprocess
 import sys
@@ -12,14 +11,12 @@ import pytest
 
 import simenv_marl
 from simenv_marl import RULE, SimEnvError, generate_env
-from simenv_marl.errors import AgentError, DefinitionError, PatchError, UnknownPointError
-from simenv_marl.hooks.places import resolve
+from simenv_marl.errors import AgentError, DefinitionError, NoDecisionError, PatchError, UnknownPointError
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
+from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
 from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play
 from tests.worlds.undone import left_as_they_were
-
-MARKET = "tests.foreign.market"
 
 # Traders and brokers decide under one name here: it is about functions, and not about agents.
 pytestmark = pytest.mark.filterwarnings("ignore:several objects decide")
@@ -36,7 +33,7 @@ def aec_env(simulation, points=None):
 
 @pytest.fixture(autouse=True)
 def _nothing_stays_patched():
-    with left_as_they_were(market, shop, Trader, Broker, Junior, Dealer, Cautious):
+    with left_as_they_were(*PLACES):
         yield
         for env in list(OPEN):  # a failed test keeps its environments alive
             env.close()
@@ -70,6 +67,9 @@ class Home:
     @classmethod
     def light(cls):
         return "light"
+
+    def dry(self):
+        return "dry"
 
 
 def home():
@@ -107,32 +107,14 @@ def test_without_points_the_simulation_names_them(where):
     class Own(Script):
         def __init__(self):
             super().__init__(lambda simulation: [Home().heat(), Home().cool()])
+            if where == "factory":
+                self.points = {Home.cool: define()}
 
-    if where == "class":
-        Own.points = [Home.cool]
-        source = Own
-    elif where == "instance":
-        source = Own()
-        source.points = f"{HOME}.cool"
-    else:
-
-        def source():
-            made = Own()
-            made.points = {Home.cool: define()}
-            return made
-
+    source = {"class": Own, "instance": Own(), "factory": lambda: Own()}[where]
+    if where != "factory":
+        source.points = f"{HOME}.cool" if where == "instance" else [Home.cool]
     assert decisions(play(aec_env(source))) == ["cool_0"]
     assert decisions(play(aec_env(source, Home.heat))) == ["heat_0"]
-
-
-def in_a_new_process(tmp_path, *, main, **modules):
-    for name, text in modules.items():
-        (tmp_path / f"{name}.py").write_text(dedent(text))
-    result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", dedent(main)], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 0, result.stderr
-    return result.stdout.split()
 
 
 MODEL = """
@@ -170,11 +152,13 @@ def test_without_points_all_registered_ones_of_one_package_are_meant(tmp_path):
         import other
         with pytest.raises(UnknownPointError, match="model.*other|other.*model"):
             aec_env(Simulation)
-        env = single_env(Simulation, first)
-        env.reset()
+        single_env(Simulation, first).reset()
     """
-    other = "from model import define\n@define\ndef third(): return 0\n"
-    assert in_a_new_process(tmp_path, main=main, model=MODEL, other=other) == ["second_0", "first_0", "first_0"]
+    (tmp_path / "model.py").write_text(dedent(MODEL))
+    (tmp_path / "other.py").write_text("from model import define\n@define\ndef third(): return 0\n")
+    command = [sys.executable, "-W", "error", "-c", dedent(main)]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (0, "second_0 first_0 first_0\n"), result.stderr
 
 
 # -- what is refused ------------------------------------------------------------------------------
@@ -183,26 +167,23 @@ def test_without_points_all_registered_ones_of_one_package_are_meant(tmp_path):
 @pytest.mark.parametrize(
     ("points", "error", "match"),
     [
-        ("nowhere", UnknownPointError, None),
-        ("", UnknownPointError, None),
-        (".", UnknownPointError, None),
+        ("nowhere", UnknownPointError, "dotted name"),
+        ("", UnknownPointError, "dotted name"),
+        (".", UnknownPointError, "dotted name"),
         (MARKET, PatchError, None),
-        (f"{MARKET}.Trader.missing", UnknownPointError, None),
         (f"{HOME}.haet", UnknownPointError, r"Home\.heat"),
         ([], UnknownPointError, None),
         ({}, UnknownPointError, None),
         ([Home.heat, f"{HOME}.heat"], UnknownPointError, "twice"),
         ({f"{MARKET}.price": define(agent="a_0"), shop.cost: define(agent="b_0")}, UnknownPointError, "twice"),
         ({Home.heat: define(agent="pump_0"), Home.cool: define(agent="pump_0")}, AgentError, "pump_0"),
-        (f"{MARKET}.Trader.bid", DefinitionError, None),
+        (BID, DefinitionError, None),
         (Trader.bid, DefinitionError, None),
         ({Trader.bid: None}, DefinitionError, None),
         ({Trader.bid: lambda action: action}, DefinitionError, None),
         ({Home.heat: "heat"}, DefinitionError, None),
         ({Trader.bid: define(), f"{MARKET}.Trader.quote": define()}, PatchError, "not a function written"),
         ({f"{MARKET}.Trader.fee": define()}, PatchError, None),
-        ({f"{MARKET}.Trader": define()}, PatchError, None),
-        ({f"{MARKET}.OPEN": define()}, PatchError, None),
         ({f"{MARKET}.cached_price": define()}, PatchError, None),
         ({"math.sqrt": define()}, PatchError, None),
         ({"builtins.list.append": define()}, PatchError, None),
@@ -233,23 +214,17 @@ def test_if_one_place_cannot_be_set_none_is(error, raised):
         def open(self):
             return "rule"
 
-    def make():
-        made = simenv_marl.aec_env(
-            calling(lambda: Vault().open()),
-            {f"{MARKET}.price": define(), Vault.open: define()},
-            plugins=[(lambda *args: None, f"{MARKET}.Trader.bid", "before")],
-        )
-        return opened(made)
-
+    points = {f"{MARKET}.price": define(), Vault.open: define()}
+    made = generate_env(calling(lambda: Vault().open()), points, plugins=[(lambda *args: None, BID, "before")])
     sealed, bid, before = [True], vars(Trader)["bid"], vars(Vault)["open"]
     with pytest.raises(raised, match="sealed"):
-        make()
+        made()
     gc.collect()
     assert vars(Trader)["bid"] is bid
     assert vars(Vault)["open"] is before
     assert not hasattr(market.price, "__wrapped__")
     sealed.clear()
-    env = make()
+    env = opened(made())
     assert log_of(env) == [9]
     env.close()
     assert vars(Vault)["open"] is before
@@ -258,64 +233,19 @@ def test_if_one_place_cannot_be_set_none_is(error, raised):
 # -- undecorated models ---------------------------------------------------------------------------
 
 
-def exhaust(generator):
-    try:
-        next(generator)
-        generator.send(1)
-    except StopIteration as stop:
-        return stop.value
-
-
 @pytest.mark.parametrize("how", ["by name", "as itself"])
-@pytest.mark.parametrize(
-    ("name", "call", "rule"),
-    [
-        ("Trader.bid", lambda: Trader().bid("tea"), 5),
-        ("Trader.bid", lambda: Broker().bid("tea", limit=6), 6),
-        ("Trader.bid", lambda: Cautious().bid("tea") + 1, 5),
-        ("Trader.rounded", lambda: Trader.rounded(2.5), 2),
-        ("Trader.opening", lambda: Trader.opening(), 1),
-        ("Trader.opening", lambda: Junior().opening(), 3),
-        ("Trader.haggle", lambda: exhaust(Trader().haggle("tea")), 51),
-        ("Trader.wire", lambda: asyncio.run(Trader().wire(8)), 8),
-        ("Trader._Trader__hidden", lambda: Trader().look(), 7),
-        ("price", lambda: market.price("tea", rebate=2), 8),
-        ("price", lambda: shop.total("tea"), 10),
-        ("price", lambda: shop.total_cost("tea"), 9),
-        ("Broker.bid", lambda: Broker().bid("tea"), 5),
-        ("Broker.rounded", lambda: Junior().rounded(2.5), 2),
-        ("Broker.opening", lambda: Junior.opening(), 3),
-        ("Broker.haggle", lambda: exhaust(Broker().haggle("tea")), 51),
-        ("Broker.wire", lambda: asyncio.run(Broker().wire(8)), 8),
-    ],
-)
+@pytest.mark.parametrize(("name", "call", "rule"), FORMS.values(), ids=FORMS)
 def test_a_plain_function_becomes_a_decision_point(name, call, rule, how):
-    if how == "as itself":
-        owner, attribute = resolve(f"{MARKET}.{name}", UnknownPointError)
-        point = getattr(owner, attribute)
-    else:
-        point = f"{MARKET}.{name}"
-    env = aec_env(calling(call, call), {point: define()})
+    env = aec_env(calling(call, call), {found(name, how): define()})
     env.reset()
     assert call() == rule  # for everybody else
     env.step(9)
     env.step(RULE)
-    assert env.unwrapped.simulation.log in ([9, rule], [10, rule])  # 10: by the call's own + 1
+    assert env.unwrapped.simulation.log == [9, rule]
     assert call() == rule
 
 
-def test_the_standard_library_can_be_decided_too():
-    import statistics
-
-    before = statistics.mean
-    env = aec_env(calling(lambda: statistics.mean([1, 2, 3])), {"statistics.mean": define(agent="mean_0")})
-    assert log_of(env) == [9]
-    assert statistics.mean([1, 2, 3]) == 2
-    env.close()
-    assert statistics.mean is before
-
-
-BASE, SUB = {f"{MARKET}.Trader.bid": define()}, {f"{MARKET}.Broker.bid": define()}
+BASE, SUB = {BID: define()}, {f"{MARKET}.Broker.bid": define()}
 
 
 def test_what_is_inherited_is_decided_for_the_class_that_is_named_and_gets_the_class_that_was_called():
@@ -340,10 +270,14 @@ class Cellar(Home):
     pass
 
 
+Kitchen.dry = define(action_space_mapping=lambda action: ("kitchen", action))(Kitchen.dry)
+Cellar.dry = define(action_space_mapping=lambda action: ("cellar", action))(Cellar.dry)
+
+
 def test_base_and_subclass_may_both_be_points():
     env = aec_env(
         calling(lambda: Trader().bid("tea"), lambda: Broker().bid("tea")),
-        {f"{MARKET}.Trader.bid": define(agent="trader_0"), f"{MARKET}.Broker.bid": define(agent="broker_0")},
+        {BID: define(agent="trader_0"), f"{MARKET}.Broker.bid": define(agent="broker_0")},
     )
     # RULE for the broker runs what it has inherited, which is a decision of its own.
     turns = play(env, {"broker_0": RULE, "trader_0": 7})
@@ -359,18 +293,14 @@ def opened(env):
 BIDDERS = (Trader, Broker, Junior, Dealer, Cautious)
 
 
-def bids():
-    return calling(*[lambda kind=kind: kind().bid("tea") for kind in BIDDERS])
-
-
 @pytest.mark.parametrize(("first", "second"), [(BASE, SUB), (SUB, BASE)], ids=["base-first", "subclass-first"])
 @pytest.mark.parametrize("closed", [0, 1])
 def test_environments_of_a_base_class_and_of_a_subclass_get_along(first, second, closed):
-    envs, classes = [], []
+    bids, envs, classes = calling(*[lambda kind=kind: kind().bid("tea") for kind in BIDDERS]), [], []
     expected = [[9, 9, 9, 9, 8] if points is BASE else [5, 9, 9, 5, 4] for points in (first, second)]
     for points in (first, second):  # the second ones are made while the first environment is there
-        envs.append(aec_env(bids(), points))
-        classes.append(generate_env(bids(), points, view="aec"))
+        envs.append(aec_env(bids, points))
+        classes.append(generate_env(bids, points, view="aec"))
     assert [log_of(env) for env in envs] == expected
     for number in (closed, 1 - closed):
         envs[number].close()
@@ -381,41 +311,26 @@ def test_environments_of_a_base_class_and_of_a_subclass_get_along(first, second,
         gc.collect()
     assert [kind().bid("tea") for kind in BIDDERS] == [5, 5, 5, 5, 4]
     assert "bid" not in vars(Broker)
-    assert [log_of(opened(env_class())) for env_class in classes] == expected
-    assert [log_of(env) for env in envs] == expected
-
-
-class Animal:
-    def move(self):
-        return "rule"
-
-
-class Wolf(Animal):
-    pass
-
-
-class Sheep(Animal):
-    pass
-
-
-Wolf.move = define(action_space_mapping=lambda action: ("wolf", action))(Wolf.move)
-Sheep.move = define(action_space_mapping=lambda action: ("sheep", action))(Sheep.move)
 
 
 @pytest.mark.parametrize(
     ("points", "log"),
     [
-        (Wolf.move, ["rule", ("wolf", 9), "rule"]),
-        (Sheep.move, ["rule", "rule", ("sheep", 9)]),
-        (f"{__name__}.Wolf.move", ["rule", ("wolf", 9), "rule"]),
-        (f"{__name__}.Sheep.move", ["rule", "rule", ("sheep", 9)]),
-        ([f"{__name__}.Sheep.move", Wolf.move], ["rule", ("wolf", 9), ("sheep", 9)]),
+        (Kitchen.dry, ["dry", ("kitchen", 9), "dry"]),
+        (f"{__name__}.Cellar.dry", ["dry", "dry", ("cellar", 9)]),
+        ([Cellar.dry, f"{__name__}.Kitchen.dry"], ["dry", ("kitchen", 9), ("cellar", 9)]),
     ],
-    ids=["wolf", "sheep", "wolf-by-name", "sheep-by-name", "both"],
+    ids=["one", "one by name", "both"],
 )
 def test_siblings_may_each_decorate_what_they_have_inherited(points, log):
-    animals = calling(*[lambda kind=kind: kind().move() for kind in (Animal, Wolf, Sheep)])
-    assert log_of(aec_env(animals, points)) == log
+    rooms = calling(*[lambda kind=kind: kind().dry() for kind in (Home, Kitchen, Cellar)])
+    assert log_of(aec_env(rooms, points)) == log
+
+
+def test_a_point_that_is_never_called_is_named():
+    env = aec_env(calling(lambda: Trader().bid("tea")), SUB)
+    with pytest.raises(NoDecisionError, match=r"without a decision of .*Broker\.bid; does the simulation call"):
+        env.reset()
 
 
 # -- restoring ------------------------------------------------------------------------------------
@@ -428,22 +343,20 @@ def test_siblings_may_each_decorate_what_they_have_inherited(points, log):
         ("Trader.bid", Trader),
         ("Trader.rounded", Trader),
         ("Trader.opening", Trader),
+        ("Broker.bid", Broker),
         ("price", market),
         ("price", shop),
     ],
 )
 def test_patches_last_until_the_last_environment_is_gone(name, place, end):
     attribute = name.rpartition(".")[2]
-    before = vars(place)[attribute]
-    calls = [
-        lambda: Trader().bid("tea"),
-        lambda: Trader.rounded(2.5),
-        lambda: Trader.opening(),
-        lambda: shop.total("tea"),
-    ]
-    envs = [aec_env(calling(*calls), {f"{MARKET}.{name}": define()}) for _ in range(3)]
+    before = vars(place).get(attribute)
+    simulation = calling(Trader().day, lambda: Broker().bid("tea"), lambda: shop.total("tea"))
+    envs = [aec_env(simulation, {f"{MARKET}.{name}": define()}) for _ in range(3)]
     while envs:
-        assert vars(place)[attribute] is not before
+        patched = vars(place)[attribute]
+        assert patched is not before
+        assert place in (market, shop) or type(patched) is type(vars(Trader)[attribute])
         env = envs.pop(1 if len(envs) > 1 else 0)
         if end == "collect in mid-episode":
             env.reset()
@@ -452,12 +365,12 @@ def test_patches_last_until_the_last_environment_is_gone(name, place, end):
             env.close()
         del env
         gc.collect()
-    assert vars(place)[attribute] is before
+    assert vars(place).get(attribute) is before
 
 
 def test_a_closed_environment_patches_again_when_it_is_reset():
     before = Trader.bid
-    env_class = generate_env(calling(lambda: Trader().bid("tea")), {f"{MARKET}.Trader.bid": define()}, view="aec")
+    env_class = generate_env(calling(lambda: Trader().bid("tea")), BASE, view="aec")
     assert Trader.bid is before
     env = opened(env_class())
     for _ in range(3):
@@ -480,22 +393,17 @@ def test_modules_that_are_imported_between_reset_and_step_decide_and_are_restore
     assert before is late.asked is market.price is shop.price is shop.cost
 
 
-PRICES = [f"{MARKET}.price", "tests.foreign.shop.price", "tests.foreign.shop.cost"]
-
-
 @pytest.mark.parametrize("first", range(3))
 def test_one_function_under_many_names_is_one_point(first):
     before = market.price
     calls = [lambda: market.price("tea"), lambda: shop.total("tea"), lambda: shop.total_cost("tea")]
-    names = PRICES[first:] + PRICES[:first]
-    classes = [generate_env(calling(*calls), {name: define()}, view="aec") for name in names]
+    names = [f"{MARKET}.price", "tests.foreign.shop.price", "tests.foreign.shop.cost"]
+    classes = [generate_env(calling(*calls), {name: define()}, view="aec") for name in names[first:] + names[:first]]
     envs = [opened(env_class()) for env_class in classes]
-    for env in envs:
-        assert log_of(env) == [9, 9, 9]
+    assert [log_of(env) for env in envs] == [[9, 9, 9]] * 3
     for env in envs:
         env.close()
-        assert log_of(envs[-1]) == [9, 9, 9]
-        assert log_of(envs[0]) == [9, 9, 9]
+        assert log_of(envs[-1]) == log_of(envs[0]) == [9, 9, 9]
     for env in envs:
         env.close()
     assert before is market.price is shop.price is shop.cost
@@ -508,12 +416,11 @@ def test_one_function_under_many_names_is_one_point(first):
 def test_environments_of_the_same_undecorated_model_have_their_own_points_and_definitions():
     other = decision()
     traders = calling(lambda: Trader().bid("tea"), other)
-    one = aec_env(traders, {f"{MARKET}.Trader.bid": define(action_space_mapping=lambda action: ("one", action))})
+    one = aec_env(traders, {BID: define(action_space_mapping=lambda action: ("one", action))})
     two = aec_env(traders, {Trader.bid: define(action_space_mapping=lambda action: ("two", action), agent="b_0")})
-    neither = aec_env(traders, other)
     one.reset()
     two.reset()
-    assert log_of(neither) == [5, 9]
+    assert log_of(aec_env(traders, other)) == [5, 9]
     one.step(1)
     two.step(2)
     assert one.unwrapped.simulation.log == [("one", 1), "rule"]

@@ -10,7 +10,6 @@ import textwrap
 import time
 
 import joblib
-import numpy as np
 import pytest
 from joblib._parallel_backends import ThreadingBackend
 
@@ -20,10 +19,11 @@ from simenv_marl.errors import InvalidActionError, WorkerError
 from simenv_marl.experiments import Variant
 from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
+from tests.contract.test_simulate_many import ones
 from tests.processes import alone, descriptors
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
-from tests.worlds.models import PAIR, decision, define, notes, script
+from tests.worlds.models import PAIR, calling, decision, define, notes, script
 
 # Where work is given up, joblib empties its queue of work while a thread of its own may be about to take from it, and
 # ends that thread in any case.
@@ -45,10 +45,6 @@ def policy(observations):
     return [RULE if number == 5 else number for number in (observations.sum(axis=1) % 6).astype(int).tolist()]
 
 
-def ones(observations):
-    return np.ones(len(observations), np.int64)
-
-
 def traces(**arguments):
     policies = {Creature.act: policy, "overseer_0": policy}
     return simulate_many(lambda: Colony(DESIGN), policies, points=POINTS, collect=lambda s: s.trace, **arguments)
@@ -60,27 +56,16 @@ def test_workers_find_the_same_in_the_same_order(arguments):
 
 
 def test_the_work_is_shared():
-    found = simulate_many(script(lambda simulation: None), seeds=range(4), workers=2, collect=lambda s: os.getpid())
+    found = simulate_many(calling(), seeds=range(4), workers=2, collect=lambda s: os.getpid())
     assert len(found) == 4
     assert os.getpid() not in found
 
 
 def test_collected_episodes_are_the_same():
     policies = {Creature.act: lambda observations: (policy(observations), {"sums": observations.sum(axis=1)})}
-    policies["overseer_0"] = policies[Creature.act]
-    policies["creature_99"] = ones  # who is never born
-    alone, shared = (
-        collect_episodes(
-            lambda: Colony(DESIGN),
-            policies,
-            points=POINTS,
-            seeds=range(9),
-            collect=lambda simulation: simulation.trace,
-            batch_size=2,
-            workers=workers,
-        )
-        for workers in (0, 2)
-    )
+    policies |= {"overseer_0": policies[Creature.act], "creature_99": ones}  # who is never born
+    given = {"points": POINTS, "seeds": range(9), "collect": lambda simulation: simulation.trace, "batch_size": 2}
+    alone, shared = (collect_episodes(lambda: Colony(DESIGN), policies, **given, workers=number) for number in (0, 2))
     assert alone["creature_99"].collected == tuple(traces(seeds=range(9)))
     assert list(alone) == list(shared) == list(policies)
     for key, found in alone.items():
@@ -140,16 +125,15 @@ def test_functions_that_are_defined_anywhere_reach_the_workers():
 def test_undecorated_models_variants_and_closures_reach_the_workers():
     number, before = 7, vars(Creature)["act"]
     points = {Creature.act: colony_points(overseen=False)[Creature.act]}
-    variant = Variant(
-        "mine", Colony, parameters={"design": DESIGN}, points=points, policies={"creature_0": lambda o: 3}
-    )
+    own = {"creature_0": lambda observation: 3}
+    variant = Variant("mine", Colony, parameters={"design": DESIGN}, points=points, policies=own)
 
     def of_many(observations):
         return [number % 5] * len(observations)
 
-    arguments = {"seeds": range(4), "collect": lambda simulation: simulation.trace}
-    alone = simulate_many(variant, {Creature.act: of_many}, **arguments)
-    assert simulate_many(variant, {Creature.act: of_many}, workers=2, **arguments) == alone
+    given = {"seeds": range(4), "collect": lambda simulation: simulation.trace}
+    alone, shared = (simulate_many(variant, {Creature.act: of_many}, **given, workers=workers) for workers in (0, 2))
+    assert shared == alone
     assert vars(Creature)["act"] is before
 
 
@@ -167,8 +151,6 @@ LocalError, raising = local_error()
 
 
 class PickyError(Exception):
-    """Cannot be pickled, nor made again."""
-
     def __init__(self, one, two):
         super().__init__(one)
         self.held = (number for number in ())
@@ -201,15 +183,15 @@ def test_errors_surface_as_themselves(raised, policy, error, match, told):
 
 def test_what_nobody_wants_any_more_is_cancelled(monkeypatch):
     """An interrupt while results arrive: the rest is given up, and nothing is in the way of the next call."""
+
+    def interrupted(parcel):
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
         patch.setattr("simenv_marl.many.parallel.unpack_outcome", interrupted)
         with pytest.raises(KeyboardInterrupt):
             traces(seeds=range(40), workers=2, batch_size=1)
     assert len(traces(seeds=range(2), workers=2)) == 2
-
-
-def interrupted(parcel):
-    raise KeyboardInterrupt
 
 
 SCRIPT = """
@@ -240,27 +222,21 @@ SCRIPT = """
                     time.sleep(60)
 
     if __name__ == "__main__":
-        for workers in (2, 0):
-            try:
-                print(simulate_many(Model, {Model.decide: lambda levels: levels + 1}, seeds=range(3), workers=workers,
-                                    collect=lambda model: model.level))
-            except KeyboardInterrupt:
-                print("interrupted")
-                break
+        given = {"seeds": range(3), "collect": lambda model: model.level}
+        try:
+            for workers in (2, 0):
+                print(simulate_many(Model, {Model.decide: lambda levels: levels + 1}, workers=workers, **given))
+        except KeyboardInterrupt:
+            print("interrupted")
 """
 
 
-def test_scripts_need_no_module(tmp_path):
+def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path):
     """What a script defines has no name under which workers could import it."""
-    path = tmp_path / "script.py"
+    path, begun = tmp_path / "script.py", tmp_path / "begun"
     path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
     done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.splitlines() == ["[7, 15, 23]"] * 2, done.stderr
-
-
-def test_an_interrupt_ends_all_processes(tmp_path):
-    path, begun = tmp_path / "script.py", tmp_path / "begun"
-    path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
     command = [sys.executable, path, begun]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True) as process:
         for _ in range(600):
@@ -295,26 +271,18 @@ def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkey
     assert sorted(sizes) == [1, 2, 2, 2, 2]
 
 
-def test_what_is_collected_of_lots_in_which_nobody_decides():
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("seeds", [range(4), range(8)])
+def test_what_is_collected_of_lots_in_which_nobody_decides(seeds, workers):
     ant = decision(agent="ant_0")
-
-    def main(simulation):
-        if simulation.seed == 5:
-            ant()
-
-    for seeds in (range(4), range(8)):
-        for workers in (0, 2):
-            found = collect_episodes(
-                script(main), {ant: ones}, seeds=seeds, batch_size=2, workers=workers, collect=lambda s: s.seed * 10
-            )[ant]
-            assert found.seeds == tuple(seeds)
-            assert found.collected == tuple(10 * seed for seed in seeds)
-            assert found.episodes.tolist() == ([5] if 5 in seeds else [])
+    given = {"seeds": seeds, "batch_size": 2, "workers": workers, "collect": lambda simulation: simulation.seed * 10}
+    found = collect_episodes(script(lambda simulation: ant() if simulation.seed == 5 else None), {ant: ones}, **given)
+    assert found[ant].seeds == tuple(seeds)
+    assert found[ant].collected == tuple(10 * seed for seed in seeds)
+    assert found[ant].episodes.tolist() == ([5] if 5 in seeds else [])
 
 
 class Ending:
-    """A factory of simulations that ends all other processes."""
-
     def __init__(self):
         self.process = os.getpid()
 
@@ -329,7 +297,6 @@ def test_a_worker_that_cannot_work_leaves_no_descriptors(what):
 
 
 def work_in_vain(what: str) -> None:
-    """Simulate with workers that cannot work, again and again, and look for what is left open."""
     loky = joblib.externals.loky
 
     def refuse(process):

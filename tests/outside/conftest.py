@@ -3,7 +3,7 @@
 import pytest
 
 from tests.conftest import DRIVERS
-from tests.outside.compiling import SOURCES, compiled
+from tests.outside.compiling import HERE, compiled
 
 
 def pytest_generate_tests(metafunc) -> None:
@@ -36,4 +36,4 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="session")
 def probe(folder):
     """The program that plays what an option names."""
-    return compiled(SOURCES / "probe.cpp", folder)
+    return compiled(HERE / "probe.cpp", folder)

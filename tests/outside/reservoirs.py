@@ -96,9 +96,6 @@ def plays_by_its_rule(env, seed=1, **options) -> bool:
     return env.unwrapped.simulation.result == by_its_rule(seed, **options)
 
 
-# -- the same model in this process ---------------------------------------------------------------
-
-
 class Here(SimulationInterface):
     """The model in this process: what its process is to be indistinguishable from."""
 

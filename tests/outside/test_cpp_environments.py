@@ -54,9 +54,6 @@ def code_of_the_page():
     return names, printed.getvalue()
 
 
-# -- the page -------------------------------------------------------------------------------------
-
-
 def test_the_pages_code_prints_what_the_model_prints_by_itself(program):
     plain = subprocess.run([program, "7"], check=True, capture_output=True, text=True, timeout=20).stdout
     assert code_of_the_page()[1] == plain
@@ -93,13 +90,9 @@ def test_the_page_names_all_that_a_client_has():
     assert {name for name in names if not re.search(rf"client\.{name}[(<]", PAGE)} == set()
 
 
-# -- what goes wrong ------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def env(make_env, probe):
-    points = dict.fromkeys(("probe.count", "probe.echo", "probe.deaf"), POINT)
-    return make_env(aec_env, ProcessSimulation(probe, points, timeout=10.0))
+    return make_env(aec_env, ProcessSimulation(probe, {"a": POINT}, timeout=10.0))
 
 
 def begin(env, play, **options):
@@ -125,5 +118,5 @@ def test_a_model_that_is_given_up_unwinds_and_its_process_plays_on(env, play):
 
 
 def test_arrays_and_nested_values_are_decisions(probe):
-    done = simulate(ProcessSimulation(probe, {"probe.echo": POINT}), {"probe.echo": lambda observation: 1}, seed=1)
+    done = simulate(ProcessSimulation(probe, {"a": POINT}), {"a": lambda observation: 1}, seed=1)
     assert repr(done.result) == repr({"array": [0.0, 1.0, 2.0], "nested": [None, {"x": float("nan")}], "whole": 3})

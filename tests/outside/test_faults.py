@@ -340,8 +340,6 @@ def test_an_end_that_follows_a_stop_is_not_the_next_episode(make_env):
     env.reset(seed=2)
 
 
-# -- interrupts, and what runs out ----------------------------------------------------------------
-
 INTERRUPTS = """
 import os, signal, sys, time
 reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))

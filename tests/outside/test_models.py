@@ -3,39 +3,29 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 from collections.abc import Callable
 from contextlib import closing
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 from examples.jvm_market import build as building
 from examples.jvm_market import env as town
-from examples.jvm_market.compare import CONTENDERS, METRICS, by_the_granary
-from examples.jvm_market.compare import compare as compare_farmers
-from examples.jvm_market.env import PRICE, PRICES, SOW
 from examples.ns3_senders import env as network
-from examples.ns3_senders.train import POINT, Linear, compare, learn
-from pettingzoo import test as kit
+from examples.ns3_senders.train import POINT, Linear, compare
 
-from simenv_marl import RULE, branch, simulate, simulate_many
 from simenv_marl.remote.check import check_wire
 from tests.outside.compiling import ROOT
 from tests.outside.reservoirs import child
 from tests.outside.wire import exactly
-from tests.worlds.models import play
+from tests.worlds.models import follow_the_rule, play
 
 EMPTY = 2
 """The seed of a town in which there is no shop any more after some weeks."""
 
-FARMS = [f"farm_{number}" for number in range(1, 9)]
-SHOPS = [f"shop_{number}" for number in range(9, 15)]
 BRIEF = {"seconds": 5.0}
-
 WATCHFUL = Linear((-0.35, -1.65, 0.62, 0.61, 0.06))
 """Keeps its queue short."""
 
@@ -52,19 +42,6 @@ def plain_network(seed: int, **options: Any) -> Any:
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
 
 
-class Model(NamedTuple):
-    """One of the two."""
-
-    missing: Callable[[], str]
-    simulation: Callable[[], Any]
-    raw_env: Callable[..., Any]
-    parallel_env: Callable[..., Any]
-    plain: Callable[..., Any]
-    episodes: list[tuple[int, dict[str, Any]]]
-    brief: dict[str, Any]
-    short: dict[str, Any]
-
-
 def no_java() -> str:
     """Why the town cannot be built."""
     try:
@@ -74,25 +51,21 @@ def no_java() -> str:
     return ""
 
 
-TOWN = Model(
-    missing=no_java,
-    simulation=town.market,
-    raw_env=town.raw_env,
-    parallel_env=town.parallel_env,
-    plain=plain_town,
-    episodes=[(seed, {}) for seed in (3, 4, 5, EMPTY)],
-    brief={},
-    short={"weeks": 12},
-)
+class Model(NamedTuple):
+    """One of the two."""
+
+    missing: Callable[[], str]
+    raw_env: Callable[..., Any]
+    plain: Callable[..., Any]
+    episodes: list[tuple[int, dict[str, Any]]]
+
+
+TOWN = Model(no_java, town.raw_env, plain_town, [(seed, {}) for seed in (3, 4, 5, EMPTY)])
 NETWORK = Model(
-    missing=network.missing,
-    simulation=network.senders,
-    raw_env=network.raw_env,
-    parallel_env=network.parallel_env,
-    plain=plain_network,
-    episodes=[(7, {}), (8, {"hosts": 3}), (7, BRIEF), (2**40, BRIEF), (7, {})],
-    brief=BRIEF,
-    short={},
+    network.missing,
+    network.raw_env,
+    plain_network,
+    [(7, {}), (8, {"hosts": 3}), (7, BRIEF), (2**40, BRIEF), (7, {})],
 )
 
 of_the_town = pytest.mark.parametrize("model", [TOWN], ids=["town"], indirect=True)
@@ -114,24 +87,11 @@ def env(model):
         yield env
 
 
-def by_rule(env, seed, **options):
-    """What the model tells where all is left to its rule."""
-    env.reset(seed=seed, options=options)
-    return finished(env)
-
-
-def finished(env, number=0):
-    """What the model tells where the rule goes on."""
-    play(env, reset=False)
-    return env.simulation.result
-
-
-# -- the models stay what they are ----------------------------------------------------------------
-
-
 def test_by_its_rule_each_episode_is_the_plain_model(model, env):
     for seed, options in model.episodes:  # in one process
-        assert exactly(by_rule(env, seed, **options)) == exactly(model.plain(seed, **options))
+        env.reset(seed=seed, options=options)
+        play(env, reset=False)
+        assert exactly(env.simulation.result) == exactly(model.plain(seed, **options))
 
 
 def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(model, env):
@@ -141,41 +101,8 @@ def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(model, env):
             agent = env.agent_selection
             env.step(None if env.terminations[agent] else env.action_space(agent).sample())
         number = child(env)
-        assert exactly(by_rule(env, 4, **model.brief)) == exactly(model.plain(4, **model.brief))
+        assert exactly(follow_the_rule(env, 4).result) == exactly(model.plain(4))
         assert child(env) == number, "the model unwinds, and its process plays on"
-
-
-def test_in_rounds_and_without_an_environment_it_is_the_plain_model_too(model):
-    with closing(model.parallel_env()) as env:
-        env.reset(seed=4, options=model.brief)
-        while env.agents:
-            env.step(dict.fromkeys(env.agents, RULE))
-        assert exactly(env.simulation.result) == exactly(model.plain(4, **model.brief))
-    assert exactly(simulate(model.simulation, seed=4).result) == exactly(model.plain(4))
-
-
-def test_the_chance_that_lies_ahead_is_drawn_anew_in_branches(model, env):
-    env.reset(seed=4, options=model.brief)
-    for _ in range(5):
-        env.step(RULE)
-    (same,) = branch(env, finished)
-    one, again, other = branch(env, finished, 3, seeds=[1, 1, 2])
-    assert exactly(same) == exactly(model.plain(4, **model.brief))
-    assert exactly(one) == exactly(again)
-    assert len({exactly(each) for each in (same, one, other)}) == 3
-
-
-def test_the_kit_of_pettingzoo(model):
-    raw_env, parallel_env = (partial(make, **model.short) for make in (model.raw_env, model.parallel_env))
-    with closing(raw_env()) as env:
-        kit.api_test(env, num_cycles=300)
-    with closing(parallel_env()) as env:
-        kit.parallel_api_test(env, num_cycles=100)
-    kit.seed_test(raw_env, num_cycles=50)
-    kit.parallel_seed_test(parallel_env, num_cycles=50)
-
-
-# -- the town -------------------------------------------------------------------------------------
 
 
 @of_the_town
@@ -194,75 +121,11 @@ def test_towns_differ_and_one_of_them_is_empty_in_the_end(model):
 def test_lives_begin_and_end_in_mid_episode(model, env):
     ends = {turn.agent: (turn.terminated, turn.truncated) for turn in play(env, seed=3)}
     result = env.simulation.result
-    assert set(FARMS + SHOPS) < set(ends)
+    assert {f"farm_{number}" for number in range(1, 9)} | {f"shop_{number}" for number in range(9, 15)} < set(ends)
     assert len(ends) == result["founded"]
     assert sum(terminated for terminated, _ in ends.values()) == result["closed"] < len(ends)
     assert all(terminated != truncated for terminated, truncated in ends.values())
     assert not any(turn.truncated for turn in play(env, seed=EMPTY))
-
-
-@of_the_town
-def test_rewards_are_what_was_earned_and_lost(model, env):
-    """A farm that sows nothing has its upkeep to pay, four weeks at a time, until its money is gone."""
-    turns = play(env, lambda agent, env: 0 if agent in FARMS else RULE, seed=3)
-    lost = set()
-    for farm in FARMS:
-        _, *rewards = [turn.reward for turn in turns if turn.agent == farm]
-        assert rewards[1:-1] == pytest.approx([-16.0] * (len(rewards) - 2))  # the first has the harvest of before
-        lost.add(round(rewards[-1], 6))
-    assert {-4.0, -8.0} & lost <= lost <= {0.0, -4.0, -8.0, -12.0}  # some give up in the week in which they decide
-
-
-@of_the_town
-def test_the_last_reward_is_of_the_last_week(model):
-    """Shops that ask too much sell nothing: they pay their rent, and what they have baked."""
-    dearly = np.array([PRICES[1]], np.float32)
-    with closing(town.env(weeks=2, possible_agents={SOW: FARMS, PRICE: SHOPS}, undeclared="rule")) as env:
-        turns = play(env, lambda agent, env: dearly if agent in SHOPS else RULE, seed=3)
-        assert env.possible_agents == FARMS + SHOPS
-        assert env.action_space("farm_1").n == 21
-        assert env.action_space("shop_9").contains(dearly)
-    for shop in SHOPS:
-        *_, last = [turn for turn in turns if turn.agent == shop]
-        _, price, baked, sold, wheat_price, _ = last.observation
-        assert (price, sold) == (4.0, 0)
-        assert last.reward == pytest.approx(-8 - baked * wheat_price)
-    assert turns[-1].truncated
-
-
-@pytest.mark.greenlet("what is compared is tested with both")
-@of_the_town
-def test_other_farmers_are_compared_with_the_rule(model):
-    found = compare_farmers(range(3), weeks=30)
-    assert list(found.values().columns) == list(CONTENDERS)
-    assert found.values("loaves")["by the granary"].mean() > found.values("loaves")["rule"].mean()
-    assert set(METRICS) < set(found.frame.columns)
-    assert by_the_granary([0, 0, 0, 0.0, 0]) == 20
-    assert by_the_granary([0, 0, 0, 1e4, 0]) == 0
-
-
-@pytest.mark.greenlet("no environment takes part")
-@of_the_town
-def test_errors_of_the_compiler_are_told_and_what_is_compiled_is_kept(model, tmp_path):
-    source = tmp_path / "Town.java"
-    out = tmp_path / "out"
-
-    def built(houses, time):
-        source.write_text(f"class Town {{ int houses() {{ return {houses}; }} }}")
-        os.utime(source, (time, time))
-        building.build(out, [source])
-        return (out / "Town.class").stat().st_mtime_ns
-
-    first = built("1", 1e9)
-    assert built("1", 1e9) == first
-    second = built("2", 3e9)
-    assert second > first
-    with pytest.raises(RuntimeError, match="cannot find symbol"):
-        built("none", 4e9)
-    assert (out / "Town.class").stat().st_mtime_ns == second
-
-
-# -- the network ----------------------------------------------------------------------------------
 
 
 @of_the_network
@@ -274,39 +137,7 @@ def test_the_code_of_its_page(model, capsys):
 
 
 @of_the_network
-def test_who_leaves_terminates_and_who_is_there_in_the_end_is_truncated(model, env):
-    ends = {turn.agent: (turn.terminated, turn.truncated) for turn in play(env, seed=7)}
-    assert set(ends.values()) == {(True, False), (False, True)}
-    assert len(ends) <= plain_network(7)["senders"], "some leave before they have decided"
-
-
-@of_the_network
-def test_observations_and_rewards_are_numbers_in_their_spaces(model, env):
-    for turn in play(env, lambda agent, env: env.action_space(agent).sample(), seed=9):
-        assert env.observation_space(turn.agent).contains(turn.observation)
-        assert np.isfinite(turn.observation).all()
-        assert np.isfinite(turn.reward)
-        assert 0 <= turn.info["time"] <= 30
-
-
-@of_the_network
-def test_many_at_once_as_one_by_one(model):
-    seeds = range(6)
-    alone = compare({"watchful": {POINT: WATCHFUL}}, seeds, workers=0)
-    rows = partial(map, WATCHFUL)
-    policies = {POINT: lambda observations: np.stack(list(rows(observations)))}
-    many = simulate_many(network.senders, policies, seeds=seeds)
-    assert [one.result["megabits"] for one in many] == alone.values("megabits")["watchful"].tolist()
-
-
-@of_the_network
 def test_who_watches_its_queue_does_better_than_the_rule(model):
     found = compare({"rule": {}, "watchful": {POINT: WATCHFUL}}, range(12), workers=0, baseline="rule")
     assert found.summary().loc["watchful", "difference_low"] > 0
     assert found.summary("queueing").loc["watchful", "difference_high"] < 0
-
-
-@of_the_network
-def test_it_learns(model):
-    policy = learn(1, workers=0, episodes=1)
-    assert len(policy.weights) == 1 + network.POINTS[POINT].observation_space.shape[0]

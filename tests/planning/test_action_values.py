@@ -5,19 +5,10 @@ import random
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.wrappers import TimeLimit, TransformAction, TransformReward
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformReward
 from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, BaseParallelWrapper, OrderEnforcingWrapper
 
-from simenv_marl import (
-    RULE,
-    SimulationInterface,
-    aec_env,
-    difference,
-    joint_env,
-    parallel_env,
-    single_env,
-    vector_env,
-)
+from simenv_marl import RULE, aec_env, difference, joint_env, parallel_env, single_env, vector_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
@@ -31,40 +22,43 @@ from simenv_marl.errors import (
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.planning.rollouts import Rollouts
 from tests.conftest import DRIVERS
-from tests.worlds.duels import LEFT, SPACE, Duel, Unseeded, points, worth
+from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
 from tests.worlds.models import define
 
 METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
 VIEWS = ("aec", "parallel", "single", "agent")
 
 
-def made(view, model=Duel, **options):
-    """An environment whose pending decision is that of the one on the left, reset."""
-    if view == "single":
-        env = single_env(model, {LEFT: points()[LEFT]}, **options)
-    elif view == "agent":
-        env = single_env(model, points(), agent="left", **options)
-    else:
-        env = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env}[view](model, points(), **options)
-    env.reset(seed=5)
+def begun(env, seed=5):
+    env.reset(seed=seed)
     return env
 
 
+def made(view, model=Duel, **options):
+    """An environment whose pending decision is that of the one on the left, reset."""
+    given = {LEFT: points()[LEFT]} if view == "single" else points()
+    make = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env}.get(view, single_env)
+    return begun(make(model, given, **options, **{"agent": "left"} if view == "agent" else {}))
+
+
 def futures_of(env, number, seed=None):
-    """The seeds of an environment's futures."""
     return Rollouts(env, RolloutPolicy([RULE], seed=seed)).seeds(number)
 
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):
-    """Of each action what it is worth in each future."""
-    return np.array(
-        [[worth(agent, action, future, **given) for future in futures_of(env, number)] for action in actions]
-    )
+    seeds = futures_of(env, number)
+    return np.array([[worth(agent, action, future, **given) for future in seeds] for action in actions])
 
 
 def greedy(observation):
-    """A base: it depends on what it sees."""
     return int(observation[1]) % 3
+
+
+def down(observation):
+    return 2 - int(observation[0]) % 3
+
+
+BASES = {"left": greedy, "right": down}
 
 
 @METHODS
@@ -98,13 +92,12 @@ def test_a_decision_in_mid_episode(view):
 @pytest.mark.parametrize("view", VIEWS)
 def test_the_environment_does_not_move(view):
     env, other = made(view), made(view)
-    action_values(env, futures=2)
-    action_values(env, futures=2, method="replay")
+    for method in ("fork", "replay"):
+        action_values(env, futures=2, method=method)
 
     def go_on(env):
-        if view == "parallel":
-            return [repr(env.step(dict.fromkeys(env.agents, 2))) for _ in range(3)], env.simulation.value
-        return [repr(env.step(2)) for _ in range(3)], env.simulation.value
+        told = [repr(env.step(dict.fromkeys(env.agents, 2) if view == "parallel" else 2)) for _ in range(3)]
+        return told, env.simulation.value
 
     assert go_on(env) == go_on(other)
 
@@ -122,7 +115,6 @@ def test_the_environment_does_not_move(view):
 )
 @pytest.mark.parametrize("view", [*VIEWS, "joint"])
 def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, told):
-    """At a horizon the state has its value, unless the episode is over."""
     env, joint = made(view), view == "joint"
     actions = [{"left": action, "right": 1} for action in range(3)] if joint else None
     value = {"terminal_value": lambda env: 10 + env.unwrapped.simulation.value}
@@ -147,36 +139,31 @@ def test_the_base_is_a_policy_of_the_agent(view, method):
 @pytest.mark.parametrize("view", ["aec", "parallel"])
 def test_the_base_is_policies_by_agent(view, method):
     env = made(view)
-    bases = {"left": greedy, "right": lambda observation: 2 - int(observation[0]) % 3}
-    told = action_values(env, futures=3, base=bases, method=method)
-    assert told.returns == pytest.approx(expected(env, "left", bases=bases))
-    told = action_values(env, futures=3, base=bases | {"left": RULE}, method=method)
-    assert told.returns == pytest.approx(expected(env, "left", bases={"right": bases["right"]}))
+    for base, bases in ((BASES, BASES), (BASES | {"left": RULE}, {"right": down})):
+        told = action_values(env, futures=3, base=base, method=method)
+        assert told.returns == pytest.approx(expected(env, "left", bases=bases))
 
 
 @METHODS
 def test_joint_views_sum_up_and_have_joint_bases(method):
     env = made("joint")
-    actions = [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}]
+    actions, first = [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}], {"left": 2, "right": 1}
+    table = expected(env, "left", (2, 1, 0), both=True)
     told = action_values(env, actions, futures=3, method=method)
-    assert told.returns == pytest.approx(expected(env, "left", (2, 1, 0), both=True))
+    assert told.returns == pytest.approx(table)
     assert told.best is actions[2]
-    bases = {"left": greedy, "right": lambda observation: 2 - int(observation[0]) % 3}
-    first = {"left": 2, "right": 1}
     told = action_values(env, [first], futures=3, base={"left": greedy}, method=method)
     assert told.returns == pytest.approx(expected(env, "left", (2,), both=True, bases={"left": greedy}))
     # A round: the one on the right decides by what was seen before the other one has moved.
-    whole = action_values(env, [first], futures=3, base=lambda seen: {n: bases[n](seen[n]) for n in bases})
-    parts = action_values(env, [first], futures=3, base=bases)
+    whole = action_values(env, [first], futures=3, base=lambda seen: {n: BASES[n](seen[n]) for n in BASES})
+    parts = action_values(env, [first], futures=3, base=BASES)
     assert whole.returns == pytest.approx(parts.returns)
     with pytest.raises(OptionValueError, match="without flatten"):
-        action_values(made("joint", flatten=True), [[1, 1]], base=bases)
-    env = TransformReward(env, lambda reward: -reward)
-    env.reset(seed=5)
+        action_values(made("joint", flatten=True), [[1, 1]], base=BASES)
+    env = begun(TransformReward(env, lambda reward: -reward))
     with pytest.raises(InvalidActionError, match="not in"):
         action_values(env, [{"left": 3, "right": RULE}])
-    told = action_values(env, actions, futures=3, method=method)
-    assert told.returns == pytest.approx(-expected(env, "left", (2, 1, 0), both=True))
+    assert action_values(env, actions, futures=3, method=method).returns == pytest.approx(-table)
 
 
 def test_policies_of_the_environment_stay():
@@ -215,15 +202,13 @@ GRAZING = {
 
 @METHODS
 def test_others_of_a_single_view_follow_the_base_by_agent(method):
-    env = single_env(Herd, GRAZING, agent="one")
-    env.reset(seed=1)
+    env = begun(single_env(Herd, GRAZING, agent="one"), 1)
     assert action_values(env, [0, 3], futures=1, method=method).means.tolist() == [5.0, 8.0]
     told = action_values(env, [0, 3], futures=1, method=method, base={"other": lambda seen: int(seen[0])})
     assert told.means.tolist() == [2 + 1 + 3 + 5, 2 + 4 + 3 + 5]
     with pytest.raises(UnknownAgentError, match="'right'"):  # at a point that is not the environment's
         action_values(made("agent"), base={"right": RULE})
-    declared = single_env(Herd, GRAZING, agent="one", possible_agents=["one", "other"])
-    declared.reset(seed=1)
+    declared = begun(single_env(Herd, GRAZING, agent="one", possible_agents=["one", "other"]), 1)
     with pytest.raises(UnknownAgentError, match="'third'"):
         action_values(declared, base={"third": RULE})
 
@@ -235,25 +220,20 @@ class Mortal(Duel):
 @METHODS
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
 def test_agents_that_die_on_the_way(view, method):
-    env = made(view, Mortal)
-    told = action_values(env, futures=8, base=lambda observation: 2, terminal_value=lambda env: 1e6, method=method)
-    table = expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2})
-    assert told.returns == pytest.approx(table)
-    endless = expected(env, "left", number=8, bases={"left": lambda seen: 2})
+    env, given = made(view, Mortal), {"futures": 8, "base": lambda observation: 2, "terminal_value": lambda env: 1e6}
+    table, endless = (
+        expected(env, "left", number=8, model=model, bases={"left": lambda seen: 2}) for model in (Mortal, Duel)
+    )
+    assert action_values(env, **given, method=method).returns == pytest.approx(table)
     assert not np.allclose(table, endless)  # the last reward counts, and none after it
-    told = action_values(env, futures=8, horizon=5, base=lambda observation: 2, terminal_value=lambda env: 1e6)
-    assert told.means.max() < 1e3
+    assert action_values(env, **given, horizon=5).means.max() < 1e3
 
 
 @pytest.mark.parametrize("view", ["aec", "parallel"])
 def test_agents_that_die_and_stay_for_the_learner(view):
-    env = pad_agents(made(view, Mortal))
-    env.reset(seed=5)
+    env = begun(pad_agents(made(view, Mortal)))
     told = action_values(env, futures=8, base=lambda observation: 2)
     assert told.returns == pytest.approx(expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2}))
-
-
-# -- common futures -------------------------------------------------------------------------------
 
 
 @METHODS
@@ -283,8 +263,6 @@ def test_futures_are_those_of_the_decision():
 
 
 class Global(Duel):
-    """Its chance is that of Python's global generator."""
-
     reseed = None
 
     def reset(self, seed=None):
@@ -306,8 +284,6 @@ def test_global_generators_are_common_too(method):
 @pytest.mark.parametrize("model", [Duel, Unseeded])
 @pytest.mark.filterwarnings("ignore:Unseeded cannot draw")
 def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
-    """In each of many futures, and in the one exact one."""
-
     def draws(observation):
         return random.randrange(3) if observation[0] % 2 else int(np.random.randint(3))
 
@@ -337,9 +313,6 @@ def test_one_exact_future_and_a_warning(view, method):
     assert told.returns == pytest.approx(np.array([[worth("left", action, None)] for action in range(3)]))
 
 
-# -- wrappers -------------------------------------------------------------------------------------
-
-
 class Doubled(BaseParallelWrapper):
     def step(self, actions):
         observations, rewards, *rest = self.env.step(dict(actions))
@@ -349,10 +322,8 @@ class Doubled(BaseParallelWrapper):
 def test_wrappers_of_single_views():
     env = made("single")
     table = expected(env, "left", horizon=3)
-    limited = TimeLimit(env, 3)
-    limited.reset(seed=5)
-    told = action_values(limited, futures=3, terminal_value=lambda env: 1e6)
-    assert told.returns == pytest.approx(table)
+    limited = begun(TimeLimit(OrderEnforcing(PassiveEnvChecker(env)), 3))  # as gymnasium.make does
+    assert action_values(limited, futures=3, terminal_value=lambda env: 1e6).returns == pytest.approx(table)
     wrapped = TransformReward(TransformAction(env, lambda action: 2 - action, spaces.Discrete(3)), lambda r: 10 * r)
     wrapped.reset(seed=5)
     told = action_values(wrapped, futures=3, horizon=3)  # with RULE as base, which no wrapper is to meet
@@ -364,46 +335,34 @@ def test_wrappers_of_single_views():
 
 @METHODS
 def test_wrappers_of_pettingzoo(method):
-    env = OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec")))
-    env.reset(seed=5)
+    env = begun(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec"))))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(expected(env, "left"))
-    env = Doubled(made("parallel"))
-    env.reset(seed=5)
+    env = begun(Doubled(made("parallel")))
     told = action_values(env, [RULE, 2], futures=3, method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
 
 
-# -- what cannot be -------------------------------------------------------------------------------
+WRONG = [
+    *(({"actions": actions}, OptionValueError, "list of candidates") for actions in ([], "12", 1)),
+    *(({"futures": futures}, OptionValueError, "futures") for futures in (0, 2.5, True)),
+    *(({"horizon": horizon}, OptionValueError, "horizon") for horizon in (0, 1.5)),
+    ({"horizon": 0.0, "horizon_by": "time"}, OptionValueError, "horizon"),
+    ({"horizon_by": "days"}, OptionValueError, "horizon_by"),
+    ({"discount_by": "step"}, OptionValueError, "discount_by"),
+    *(({"discount": discount}, OptionValueError, "discount") for discount in (1.1, float("nan"))),
+    ({"terminal_value": 3.0}, OptionValueError, "terminal_value"),
+    ({"terminal_value": lambda env: None, "horizon": 1}, OptionValueError, "finite number"),
+    *(({"base": base}, OptionValueError, "base must be") for base in (1, {"left": 1})),
+    ({"base": {"middle": RULE}}, UnknownAgentError, "'middle'"),
+    ({"base": lambda observation: 7}, InvalidActionError, "7"),
+    ({"actions": [0, 3]}, InvalidActionError, "3 of 'left' is not in its action space"),
+    ({"seed": -1}, OptionValueError, "seed"),
+    ({"method": "spoon"}, OptionValueError, "method"),
+]
 
 
-@pytest.mark.parametrize(
-    ("given", "error", "match"),
-    [
-        ({"actions": [0, 3]}, InvalidActionError, "3 of 'left' is not in its action space"),
-        ({"actions": []}, OptionValueError, "list of candidates"),
-        ({"actions": "12"}, OptionValueError, "list of candidates"),
-        ({"actions": 1}, OptionValueError, "list of candidates"),
-        ({"futures": 0}, OptionValueError, "futures"),
-        ({"futures": 2.5}, OptionValueError, "futures"),
-        ({"futures": True}, OptionValueError, "futures"),
-        ({"horizon": 0}, OptionValueError, "horizon"),
-        ({"horizon": 1.5}, OptionValueError, "horizon"),
-        ({"horizon": 0.0, "horizon_by": "time"}, OptionValueError, "horizon"),
-        ({"horizon_by": "days"}, OptionValueError, "horizon_by"),
-        ({"discount_by": "step"}, OptionValueError, "discount_by"),
-        ({"discount": 1.1}, OptionValueError, "discount"),
-        ({"discount": float("nan")}, OptionValueError, "discount"),
-        ({"terminal_value": 3.0}, OptionValueError, "terminal_value"),
-        ({"terminal_value": lambda env: None, "horizon": 1}, OptionValueError, "finite number"),
-        ({"base": 1}, OptionValueError, "base must be"),
-        ({"base": {"left": 1}}, OptionValueError, "base must be"),
-        ({"base": {"middle": RULE}}, UnknownAgentError, "'middle'"),
-        ({"base": lambda observation: 7}, InvalidActionError, "7"),
-        ({"seed": -1}, OptionValueError, "seed"),
-        ({"method": "spoon"}, OptionValueError, "method"),
-    ],
-)
+@pytest.mark.parametrize(("given", "error", "match"), WRONG)
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
 def test_what_cannot_be(view, given, error, match):
     env = made(view)
@@ -434,49 +393,37 @@ def test_no_decision_is_pending():
 
 
 def test_candidates_must_be_listed_unless_they_are_discrete():
-    point = define(action_space=spaces.Box(0, 2, (1,), np.float64), action_space_mapping=np.sum, agent="left",
-                   observation_space=SPACE, observation_space_mapping=lambda duel: [duel.turn, duel.value],
-                   reward_mapping=lambda duel: duel.value)  # fmt: skip
-    env = single_env(Duel, {LEFT: point})
-    env.reset(seed=5)
-    with pytest.raises(OptionValueError, match="Discrete"):
-        action_values(env)
+    amount = points(action_space=spaces.Box(0, 2, (1,), np.float64), action_space_mapping=np.sum)
+    env = begun(single_env(Duel, {LEFT: amount[LEFT]}))
+    for other in (env, made("joint")):
+        with pytest.raises(OptionValueError, match="Discrete"):
+            action_values(other)
     assert action_values(env, np.array([[0.0], [2.0], [1.0]]), futures=2).best.tolist() == [2.0]
-    with pytest.raises(OptionValueError, match="Discrete"):
-        action_values(made("joint"))
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, lambda env: TransformReward(env, float)])
 def test_masked_candidates(wrapper):
     given = points(action_mask_mapping=lambda duel: [1, 1, duel.turn % 2])
-    env = wrapper(single_env(Duel, {LEFT: given[LEFT]}))
-    env.reset(seed=5)
+    env = begun(wrapper(single_env(Duel, {LEFT: given[LEFT]})))
     assert action_values(env, futures=2).actions == (0, 1)
     with pytest.raises(InvalidActionError, match="masked"):
         action_values(env, [1, 2])
 
 
-class Timeless(SimulationInterface):
-    def reset(self, seed=None):
-        self.left = 3
-
-    def reseed(self, seed):
-        pass
+class Timeless(Duel):
+    time = None
 
     def run(self):
-        while self.left:
-            self.left -= self.choose()
-
-    @define(action_space=spaces.Discrete(3, start=1), reward_mapping=lambda model: -1.0)
-    def choose(self):
-        return 1
+        for self.turn in range(3):
+            self.value += self.left()
 
 
 def test_time_needs_a_clock():
-    env = single_env(Timeless, Timeless.choose)
-    env.reset(seed=1)
-    assert action_values(env, futures=2).actions == (1, 2, 3)
-    assert action_values(env, futures=2).means.tolist() == [-3.0, -2.0, -1.0]
+    point = points(action_space=spaces.Discrete(3, start=1))[LEFT]
+    env = begun(single_env(Timeless, {LEFT: point}), 1)
+    told = action_values(env, futures=2)
+    assert told.actions == (1, 2, 3)
+    assert told.means.tolist() == [3.0, 4.0, 5.0]
     for given in ({"discount_by": "time"}, {"horizon_by": "time", "horizon": 1}):
         with pytest.raises(OptionValueError, match=r"time\(\)"):
             action_values(env, **given)
@@ -513,8 +460,7 @@ def test_branches_are_not_shown():
         def render(self, mode):
             self.pictures += 1
 
-    env = single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human")
-    env.reset(seed=5)
+    env = begun(single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human"))
 
     def pictures(env):
         return float(env.unwrapped.simulation.pictures)

@@ -47,7 +47,6 @@ def test_planned_over_a_poor_rule():
 
 
 def test_values_are_those_of_the_model():
-    """Of the last day nothing but chance is left; the estimates agree with the induction within their errors."""
     env = single_env(Shop, Shop.order)
     env.reset(seed=3)
     for _ in range(11):

@@ -8,43 +8,24 @@ import sys
 import textwrap
 import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    aec_env,
-    branch,
-    joint_env,
-    parallel_env,
-    simulate,
-    simulate_many,
-    single_env,
-    vector_env,
-)
-from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
+from simenv_marl import RULE, aec_env, branch, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset
 from simenv_marl.envs import pad_agents
-from simenv_marl.errors import (
-    BranchError,
-    CopyError,
-    InvalidActionError,
-    OptionValueError,
-    ReentrancyError,
-)
+from simenv_marl.errors import BranchError, CopyError, InvalidActionError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, action_values
 from tests.conftest import DRIVERS
-from tests.planning.test_action_values import GRAZING, Herd, Mortal, greedy, made
+from tests.planning.test_action_values import GRAZING, METHODS, Global, Herd, Mortal, begun, greedy, made
 from tests.worlds.duels import LEFT, RIGHT, Duel, Unseeded, points, worth
-from tests.worlds.models import define
-
-METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
+from tests.worlds.models import define, step
 
 
 class Noted:
-    """A policy that notes what another one answers."""
-
     def __init__(self, policy):
         self.policy, self.answers, self.base = policy, [], policy.base
 
@@ -62,19 +43,28 @@ def tame(**changes):
     return points(reward_mapping=lambda duel: -abs(duel.value - 3), **changes)
 
 
-def by_hand(seed=5, policy=None, model=Duel, **options):
+def by_hand(seed=5):
     """What a planner does in a single view whose user asks it: its actions, and what the model has come to."""
-    env = single_env(model, tame(), agent="left", **options)
-    env.reset(seed=seed)
-    policy, actions, over = policy or planner(), [], False
+    env = begun(single_env(Duel, tame(), agent="left"), seed)
+    actions, over = [], False
     while not over:
-        actions.append(policy.choose(env).best)
+        actions.append(planner().choose(env).best)
         over = any(env.step(actions[-1])[2:4])
-    env.close()
     return actions, env.simulation.value
 
 
-# -- sequential halving ---------------------------------------------------------------------------
+def test_seeds_tell_planners_apart():
+    env = made("single")
+    one, same, other = (RolloutPolicy(futures=3, seed=seed).choose(env).means.tolist() for seed in (None, None, 1))
+    assert one == same
+    assert one[2] != other[2]
+
+
+def test_one_future_is_tried_once():
+    with pytest.warns(UserWarning, match="foresees"):
+        told = RolloutPolicy(futures=5).choose(made("single", Unseeded))
+    assert told.counts.tolist() == [1, 1, 1]
+    assert told.best == 2
 
 
 class Wide:
@@ -97,9 +87,7 @@ class Wide:
 
 @pytest.fixture
 def wide():
-    env = single_env(Wide, Wide.choose)
-    env.reset(seed=1)
-    return env
+    return begun(single_env(Wide, Wide.choose), 1)
 
 
 def test_the_budget_is_divided_among_rounds(wide):
@@ -122,7 +110,6 @@ def test_the_budget_is_divided_among_rounds(wide):
     ids=str,
 )
 def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
-    """By default it is that of all candidates in all futures."""
     counts = RolloutPolicy(**given).choose(wide).counts
     assert budget - 1 <= counts.sum() <= budget
     assert counts.min() >= 1
@@ -139,18 +126,9 @@ def test_candidates_of_a_round_meet_the_same_futures(wide):
     assert np.isnan(told.means).all()
 
 
-def test_one_future_is_tried_once():
-    env = made("single", Unseeded)
-    with pytest.warns(UserWarning, match="foresees"):
-        told = RolloutPolicy(futures=5).choose(env)
-    assert told.counts.tolist() == [1, 1, 1]
-    assert told.best == 2
-
-
 def test_masked_candidates_are_left_out():
     given = points(action_mask_mapping=lambda duel: [duel.turn % 2, 1, 1])
-    env = single_env(Duel, {LEFT: given[LEFT]})
-    env.reset(seed=5)
+    env = begun(single_env(Duel, {LEFT: given[LEFT]}))
     told = RolloutPolicy([0, 1], futures=2).choose(env)
     assert told.actions == (1,)
     with pytest.raises(InvalidActionError, match="all candidates"):
@@ -162,8 +140,7 @@ def test_masked_candidates_are_left_out():
 @pytest.mark.parametrize(
     ("given", "match"),
     [
-        ({"budget": 0}, "budget"),
-        ({"budget": 1.5}, "budget"),
+        *(({"budget": budget}, "budget") for budget in (0, 1.5)),
         ({"budget": 2}, "3 candidates once"),
         ({"futures": 0}, "futures"),
         ({"horizon": 0}, "horizon"),
@@ -176,37 +153,32 @@ def test_what_cannot_be(given, match):
         RolloutPolicy(**given).choose(made("single"))
 
 
-# -- all places where it serves -------------------------------------------------------------------
-
-
 @METHODS
 @pytest.mark.parametrize("key", ["left", LEFT])
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_simulate(driver, key, method):
-    if driver == "thread" and method == "fork":
-        method = None
-    noted = Noted(planner(method=method))
-    simulation = simulate(Duel, {key: noted}, points=tame(), seed=5, driver=driver)
-    assert (noted.answers, simulation.value) == by_hand()
-    assert len(set(noted.answers)) > 1
+    noted, found = Noted(planner(method=None if driver == "thread" and method == "fork" else method)), []
+
+    def work():
+        found.append(simulate(Duel, {key: noted}, points=tame(), seed=5, driver=driver).value)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join(60)
+    work()
+    actions, value = by_hand()
+    assert found == [value] * 2
+    assert noted.answers == actions * 2
+    assert len(set(actions)) > 1
 
 
-@pytest.mark.parametrize("method", ["fork", "replay"])
-@pytest.mark.parametrize("view", ["aec", "parallel", "joint", "single"])
-def test_policies_of_environments(view, method):
+@METHODS
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+def test_policies_of_environments(make, method):
     noted = Noted(planner(method=method))
-    make = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env, "single": single_env}[view]
-    env = make(Duel, tame(), policies={"left": noted})
-    env.reset(seed=5)
-    over = False
-    while not over:
-        if view == "aec":
-            env.step(1)
-            over = env.terminations["right"]
-        elif view == "parallel":
-            over = env.step({"right": 1})[2]["right"]
-        else:
-            over = env.step({"right": 1} if view == "joint" else 1)[2]
+    env = begun(make(Duel, tame(), policies={"left": noted}))
+    while not step(env, 1, "right"):
+        pass
     assert noted.answers == by_hand()[0]
 
 
@@ -241,23 +213,17 @@ def test_batch_policies_of_others_go_on_in_branches(method):
         return values[-1].best
 
     collect_episodes(Duel, {"left": left, "right": downwards}, points=points(), seeds=[5])
-    other = []
-
-    def single(observation, info, *, _environment):
-        other.append(action_values(_environment, base=greedy, futures=2, method=method))
-        return other[-1].best
-
-    simulate(Duel, {"left": single, "right": alone}, points=points(), seed=5)
-    assert other[0].returns == pytest.approx(values[0].returns)
+    simulate(Duel, {"left": left, "right": alone}, points=points(), seed=5)
+    assert len(values) == 12
+    assert values[0].returns == pytest.approx(values[6].returns)
 
 
 def test_compare_with_rule():
-    given = tame(rule_action_mapping=lambda decision: decision)
-    plain = compare_with_rule(Duel, {"left": lambda seen: np.ones(len(seen), int)}, points=given, seeds=[5])["left"]
+    given = {"points": tame(rule_action_mapping=lambda decision: decision), "seeds": [5, 6]}
+    plain = compare_with_rule(Duel, {"left": lambda seen: np.ones(len(seen), int)}, **given)["left"]
     assert plain.agreement == 1
-    told = compare_with_rule(Duel, {"left": planner()}, points=given, seeds=[5, 6])["left"]
-    env = single_env(Duel, given, agent="left")
-    wanted = []
+    told = compare_with_rule(Duel, {"left": planner()}, **given)["left"]
+    env, wanted = single_env(Duel, given["points"], agent="left"), []
     for seed in (5, 6):
         env.reset(seed=seed)
         for _ in range(6):
@@ -267,9 +233,16 @@ def test_compare_with_rule():
     assert told.trajectories.actions.tolist() == [1] * 12
 
 
+def test_data_sets_are_recorded_of_planners(monkeypatch):
+    saved = Mock()
+    monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
+    monkeypatch.setattr("simenv_marl.data.demonstrations.save_dataset", saved)
+    record_dataset("duels-v0", Duel, {"left": planner()}, points=tame(), seeds=[5])
+    assert saved.call_args.args[1].actions.tolist() == by_hand()[0]
+
+
 def test_a_vector_environment():
-    envs = vector_env(Duel, tame(), num_envs=2, policies={"right": planner()})
-    envs.reset(seed=5)
+    envs = begun(vector_env(Duel, tame(), num_envs=2, policies={"right": planner()}))
     for _ in range(3):
         envs.step(np.array([1, 1]))
     assert [env.unwrapped.simulation.turn for env in envs.envs] == [3, 3]
@@ -279,9 +252,6 @@ def test_a_vector_environment():
 def test_a_mixture_cannot_ask_it():
     with pytest.raises(OptionValueError, match="asks for the environment"):
         Mixture({RULE: 1, planner(): 1})
-
-
-# -- what a policy gets ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("view", ["simulate", "aec", "parallel", "collect"])
@@ -311,10 +281,9 @@ def test_the_environment_of_a_policy(view):
     elif view == "collect":
         collect_episodes(Duel, {"left": left}, points=points(), seeds=[5])
     else:
-        env = (aec_env if view == "aec" else parallel_env)(Duel, points(), policies={"left": left})
-        env.reset(seed=5)
-        while env.agents and not (view == "aec" and env.terminations["right"]):
-            env.step(1 if view == "aec" else {"right": 1})
+        env = begun((aec_env if view == "aec" else parallel_env)(Duel, points(), policies={"left": left}))
+        while not step(env, 1, "right"):
+            pass
     assert len(seen) == 12
     for forked, replayed in zip(seen[::2], seen[1::2], strict=True):
         assert repr(forked) == repr(replayed)
@@ -326,22 +295,20 @@ def test_the_environment_of_a_policy(view):
             assert came_to == min(turn + 1, 5)
 
 
-def test_agents_that_die_while_their_policy_plans():
+@METHODS
+def test_agents_that_die_while_their_policy_plans(method):
+    given = {"base": lambda observation: 2, "futures": 4, "method": method}
+    values = []
+
     def left(observation, info, *, _environment):
-        told = action_values(_environment, base=lambda observation: 2, futures=4, terminal_value=lambda env: 1e6)
-        values.append(told)
+        values.append(action_values(_environment, **given, terminal_value=lambda env: 1e6))
         return 1
 
-    for method in ("fork", "replay"):
-        values = []
-        env = made("single", Mortal)
-        first = action_values(env, base=lambda observation: 2, futures=4, method=method)
-        simulate(Mortal, {"left": left}, points=points(), seed=5)
-        assert values[0].returns == pytest.approx(first.returns)
+    simulate(Mortal, {"left": left}, points=points(), seed=5)
+    assert values[0].returns == pytest.approx(action_values(made("single", Mortal), **given).returns)
 
 
 def test_entities_plan_each_for_itself():
-    """Who is called on has a policy by its point; the others of the point plan as well, and not in branches."""
     point = f"{Herd.__module__}.Herd.graze"
     told = simulate(Herd, {point: RolloutPolicy(futures=1)}, points=GRAZING, seed=1)
     assert told.sum == 6 * 9
@@ -360,7 +327,6 @@ def test_entities_plan_each_for_itself():
 
 @METHODS
 def test_two_planners_at_once(method):
-    """In the branches of the one the other follows its base."""
     values = []
 
     def noting(observation, info, *, _environment):
@@ -369,11 +335,9 @@ def test_two_planners_at_once(method):
             values.append(told)
         return 1
 
-    def down(observation):
-        return 2
-
-    simulate(Duel, {"left": noting, "right": RolloutPolicy(base=down, method=method)}, points=points(), seed=5)
-    simulate(Duel, {"left": noting, "right": down}, points=points(), seed=5)
+    down = lambda observation: 2  # noqa: E731
+    for right in (RolloutPolicy(base=down, method=method), down):
+        simulate(Duel, {"left": noting, "right": right}, points=points(), seed=5)
     assert values[0].returns.tolist() == values[6].returns.tolist()
 
 
@@ -403,17 +367,14 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
 
     simulate(Duel, {"left": plan, "right": plan}, points=points(), seed=5)
     assert [told.counts.tolist() for told in plans] == [[2, 2, 2]] * 12
-    env = aec_env(Duel, points(), policies={"right": plan})
-    env.reset(seed=5)
+    env = begun(aec_env(Duel, points(), policies={"right": plan}))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(action_values(made("aec"), futures=3, method=method).returns)
     assert len(plans) == 12
 
 
 def test_the_users_own_branches_are_exact():
-    """There a planner plans as it would."""
-    env = aec_env(Duel, tame(), policies={"left": planner()})
-    env.reset(seed=5)
+    env = begun(aec_env(Duel, tame(), policies={"left": planner()}))
     env.step(1)
 
     def ahead(twin, number):
@@ -429,11 +390,10 @@ def test_errors_surface_from_where_the_policy_is_asked():
     def fails(observation):
         raise LookupError("no idea")
 
-    with pytest.raises(LookupError, match="no idea"):
-        simulate(Duel, {"left": RolloutPolicy(base=fails, futures=1)}, points=points(), seed=5)
-    env = aec_env(Duel, points(), policies={"left": RolloutPolicy(base=fails, futures=1)})
-    with pytest.raises(LookupError, match="no idea"):
-        env.reset(seed=5)
+    given = {"policies": {"left": RolloutPolicy(base=fails, futures=1)}, "points": points()}
+    for ask in (lambda: simulate(Duel, seed=5, **given), lambda: aec_env(Duel, **given).reset(seed=5)):
+        with pytest.raises(LookupError, match="no idea"):
+            ask()
 
 
 def test_a_replay_of_a_branch_of_a_policy_is_refused():
@@ -444,53 +404,13 @@ def test_a_replay_of_a_branch_of_a_policy_is_refused():
         simulate(Duel, {"left": left}, points=points(), seed=5)
 
 
-def test_nothing_is_kept_where_no_policy_asks():
-    tapes = []
-
-    def left(observation):
-        frame = sys._getframe()
-        while type(frame.f_locals.get("self")).__name__ != "Session":
-            frame = frame.f_back
-        tapes.append(len(frame.f_locals["self"].episode.tape))
-        return 1
-
-    simulate(Duel, {"left": left}, points=points(), seed=5)
-    assert tapes == [0] * 6
-
-
-class GlobalDuel(Duel):
-    reseed = None
-
-    def reset(self, seed=None):
-        super().reset(seed)
-        self.random = random
-
-
 def test_global_generators_of_their_own():
-    noted = {}
-    for method in ("fork", "replay"):
-        noted[method] = Noted(RolloutPolicy(base=lambda seen: random.randrange(3), futures=3, method=method))
-        simulate(GlobalDuel, {"left": noted[method]}, points=tame(), seed=5, global_rng=True)
-    assert noted["fork"].answers == noted["replay"].answers
+    def answers(method):
+        noted = Noted(RolloutPolicy(base=lambda seen: random.randrange(3), futures=3, method=method))
+        simulate(Global, {"left": noted}, points=tame(), seed=5, global_rng=True)
+        return noted.answers
 
-
-def test_in_a_thread_of_its_own():
-    found = []
-
-    def work():
-        found.append(simulate(Duel, {"left": planner()}, points=tame(), seed=5).value)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join(60)
-    assert found == [by_hand()[1]]
-
-
-def test_seeds_tell_planners_apart():
-    env = made("single")
-    one, other = (RolloutPolicy(futures=3).choose(env) for _ in range(2))
-    assert one.means.tolist() == other.means.tolist()
-    assert one.means[2] != RolloutPolicy(futures=3, seed=1).choose(env).means[2]
+    assert answers("fork") == answers("replay")
 
 
 @pytest.mark.parametrize(
@@ -506,13 +426,11 @@ def test_seeds_tell_planners_apart():
 )
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_both_methods_do_alike_with_all_options(make, options):
-    """By either method a planner finds the same, and what it does is what comes of it."""
     given, found = points(action_mask_mapping=lambda duel: [1, duel.turn % 2, duel.turn % 2]), []
     for method in ("fork", "replay"):
         noted = Noted(RolloutPolicy(futures=2, horizon=2, method=method))
         env = make(Duel, given, policies={"left": noted}, **options)
-        env = env if options else pad_agents(env)
-        env.reset(seed=5)
+        env = begun(env if options else pad_agents(env))
         for _ in range(3):
             env.step(1 if make is aec_env else {"right": 1})
         found.append((noted.answers, env.unwrapped.simulation.value))
@@ -532,28 +450,11 @@ def test_max_steps_end_the_futures_of_the_one_agent_that_is_asked():
     collect_episodes(Duel, {"left": left}, points=points(), seeds=[5], max_steps=2)
     env = made("single", max_steps=2)
     assert told[0] == pytest.approx(action_values(env, [1], futures=1).means[0])
-    env = aec_env(Duel, points(), policies={"left": left}, max_steps=2)
-    env.reset(seed=5)
+    env = begun(aec_env(Duel, points(), policies={"left": left}, max_steps=2))
     assert told[-1] == pytest.approx(action_values(made("single"), [1], futures=1).means[0])
 
 
-def test_environments_of_the_registry(request):
-    import gymnasium
-
-    from simenv_marl import register_simulation
-
-    request.addfinalizer(lambda: [gymnasium.registry.pop(key) for key in [*gymnasium.registry] if "duelling" in key])
-    register_simulation(Duel, {LEFT: points()[LEFT]}, name="duelling")
-    env = gymnasium.make(next(key for key in gymnasium.registry if "duelling" in key), max_episode_steps=3)
-    env.reset(seed=5)
-    bare = single_env(Duel, {LEFT: points()[LEFT]})
-    bare.reset(seed=5)
-    told = action_values(env, futures=2)
-    assert told.returns == pytest.approx(action_values(bare, futures=2, horizon=3).returns)
-
-
 def test_a_simulation_without_environments_has_planners():
-    """No view is imported before the planner is asked."""
     code = """
         from simenv_marl import simulate
         from simenv_marl.planning import RolloutPolicy

@@ -11,62 +11,14 @@ from gymnasium import spaces
 from gymnasium.wrappers import TransformAction, TransformObservation, TransformReward
 from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 
-from simenv_marl import (
-    SimulationInterface,
-    aec_env,
-    branch,
-    difference,
-    joint_env,
-    make_step,
-    parallel_env,
-    single_env,
-)
+from simenv_marl import SimulationInterface, aec_env, branch, difference, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import BranchError, OptionValueError
 from simenv_marl.planning import RolloutPolicy, action_values
+from tests.planning.test_action_values import METHODS, Global, begun, expected, made
 from tests.processes import gone
-
-SPACE = spaces.Box(-99, 99, (2,), np.float32)
-
-
-def point(state, agent, earned):
-    """A decision point of an agent that sees its state and is paid what is earned."""
-    return make_step(
-        observation_space=SPACE,
-        observation_space_mapping=state,
-        action_space=spaces.Discrete(3),
-        action_space_mapping=int,
-        reward_mapping=difference(earned),
-        agent=agent,
-    )
-
-
-class Pair(SimulationInterface):
-    """Two who decide in turn; at the end of a round one has earned both actions, the other ten times its own."""
-
-    def reset(self, seed=None):
-        self.turn, self.both, self.own = 0, 0.0, 0.0
-
-    def reseed(self, seed):
-        pass
-
-    def run(self):
-        while self.turn < 4:
-            first, second = self.first(), self.second()
-            self.both += first + second
-            self.own += 10 * second
-            self.turn += 1
-
-    @point(lambda pair: [pair.turn, 1], "first", lambda pair: pair.both)
-    def first(self):
-        return 1
-
-    @point(lambda pair: [pair.turn, 2], "second", lambda pair: pair.own)
-    def second(self):
-        return 1
-
-
-POINTS = [Pair.first, Pair.second]
+from tests.worlds.duels import LEFT, RIGHT, SPACE, Duel, observe, points
+from tests.worlds.models import define
 
 
 class Births(SimulationInterface):
@@ -88,114 +40,100 @@ class Births(SimulationInterface):
                 self.earned[number] += action
             self.turn += 1
 
-    @point(
-        lambda births, number: [births.turn, number],
-        lambda births, number: f"born_{number}",
-        lambda births, number: births.earned[number],
+    @define(
+        action_space=spaces.Discrete(3),
+        reward_mapping=difference(lambda births, number: births.earned[number]),
+        agent=lambda births, number: f"born_{number}",
     )
     def act(self, number):
         return 1
 
 
-def begun(env):
-    env.reset(seed=1)
-    return env
-
-
 @pytest.mark.parametrize("view", [aec_env, parallel_env])
 def test_what_an_action_is_worth_reaches_to_the_next_decision(view):
     env = begun(view(Births, [Births.act]))
-    for horizon, means in ((1, [0, 1, 2]), (2, [1, 2, 3]), (None, [3, 4, 5])):
-        assert action_values(env, futures=1, horizon=horizon).means.tolist() == means
-    assert action_values(env, futures=1, discount=0.5).means.tolist() == [0.875, 1.875, 2.875]
-    turn = action_values(env, futures=1, horizon=1, terminal_value=lambda env: 100 * env.unwrapped.simulation.turn)
-    assert turn.means.tolist() == [100, 101, 102]
+    turn = {"horizon": 1, "terminal_value": lambda env: 100 * env.unwrapped.simulation.turn}
+    for given, means in (
+        ({"horizon": 1}, [0, 1, 2]),
+        ({"horizon": 2}, [1, 2, 3]),
+        ({}, [3, 4, 5]),
+        ({"discount": 0.5}, [0.875, 1.875, 2.875]),
+        (turn, [100, 101, 102]),
+        (turn | {"terminal_value": lambda env: np.array([7.0])}, [7, 8, 9]),
+    ):
+        assert action_values(env, futures=1, **given).means.tolist() == means
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
 def test_the_first_of_padded_rounds(wrapper):
-    env = begun(wrapper(parallel_env(Pair, POINTS, possible_agents=["first", "second"])))
-    assert action_values(env, futures=1, horizon=1).means.tolist() == [1, 2, 3]
-    assert RolloutPolicy(futures=1, horizon=1).choose(env).best == 2
+    class Unannounced(Duel):
+        def expected_calls(self, point):
+            return []
+
+    env = begun(wrapper(parallel_env(Unannounced, points(), possible_agents=["left", "right"])))
+    assert action_values(env, futures=3, horizon=1).returns == pytest.approx(expected(env, "left", horizon=1))
+    planner = RolloutPolicy((number for number in range(3)), futures=1, horizon=1)
+    assert [planner.choose(env).best for _ in range(2)] == [2, 2]
 
 
 def test_wrappers_that_look_at_masks_see_legal_actions():
     masked = {
         "observation_space": spaces.Dict(observation=SPACE, action_mask=spaces.Box(0, 1, (6,), np.int8)),
-        "observation_space_mapping": lambda pair: {"observation": [pair.turn, 1]},
+        "observation_space_mapping": lambda duel: {"observation": observe(duel)},
         "action_space": spaces.Discrete(6),
-        "action_space_mapping": int,
-        "action_mask_mapping": lambda pair: [0, 1, 0, 1, 0, 0],
-        "reward_mapping": difference(lambda pair: pair.both),
+        "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0],
+        "reward_mapping": difference(lambda duel: duel.value),
     }
-    points = {f"{__name__}.Pair.{name}": make_step(**masked, agent=name) for name in ("first", "second")}
-    env = begun(aec_env(Pair, points))
-    wrapped = begun(TerminateIllegalWrapper(aec_env(Pair, points), -1))
+    given = {LEFT: define(**masked, agent="left"), RIGHT: define(**masked, agent="right")}
+    env = begun(aec_env(Duel, given))
+    wrapped = begun(TerminateIllegalWrapper(aec_env(Duel, given), -1))
     assert action_values(wrapped, futures=2).returns.tolist() == action_values(env, futures=2).returns.tolist()
 
 
+def high(observation):
+    return 2 if observation[0] > 1 else 0
+
+
 @pytest.mark.parametrize(
-    ("view", "candidate"), [(aec_env, 1), (parallel_env, 1), (joint_env, {"first": 1, "second": 1})]
+    ("view", "candidate"), [("aec", 1), ("parallel", 1), ("joint", {"left": 1, "right": 1})], ids=str
 )
 def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
-    def own(observation):
-        return 2 if observation[1] == 2 else 0
-
-    means = [
-        action_values(begun(view(Pair, POINTS)), [candidate], base={"second": base}, futures=1).means.tolist()
-        for base in (own, RolloutPolicy(base=own))
-    ]
-    assert means[0] == means[1]
+    plain, planned = (
+        action_values(made(view), [candidate], base={"right": base}, futures=1).means.tolist()
+        for base in (high, RolloutPolicy(base=high))
+    )
+    assert plain == planned
 
 
 def test_the_base_of_a_planner_sees_what_wrappers_let_through():
-    def shifted(observation):
-        return 2 if observation[0] > 500 else 0
-
-    env = TransformObservation(single_env(Pair, POINTS, agent="first"), lambda observation: observation + 1000, None)
-    begun(env)
-    plain, planned = (action_values(env, base=base, futures=1).means for base in (shifted, RolloutPolicy(base=shifted)))
-    assert plain.tolist() == planned.tolist()
+    env = begun(TransformObservation(made("agent"), lambda observation: observation + 1000, None))
+    told = [action_values(env, base=base, futures=1).means.tolist() for base in (high, RolloutPolicy(base=high))]
+    assert told[0] == told[1] == action_values(made("agent"), base=lambda observation: 2, futures=1).means.tolist()
 
 
 def test_parts_of_joint_actions_that_are_left_to_the_rule_go_around_wrappers_alone():
-    space = joint_env(Pair, POINTS).action_space
-
     def turned(action):
         return {name: 2 - part for name, part in action.items()}
 
-    env = begun(TransformAction(joint_env(Pair, POINTS), turned, space))
-    bases = ({"first": lambda observation: 0, "second": lambda observation: 1}, {"first": lambda observation: 0})
-    both, one = (action_values(env, [{"first": 1, "second": 1}], base=base, futures=1).means[0] for base in bases)
+    joint = made("joint")
+    env = begun(TransformAction(joint, turned, joint.action_space))
+    bases = ({"left": lambda observation: 0, "right": lambda observation: 1}, {"left": lambda observation: 0})
+    both, one = (action_values(env, [{"left": 1, "right": 1}], base=base, futures=1).means[0] for base in bases)
     assert both == one
 
 
 def test_candidates_that_are_clipped():
-    amount = make_step(
-        observation_space=SPACE,
-        observation_space_mapping=lambda pair: [pair.turn, 1],
-        action_space=spaces.Box(0, 1, (1,), np.float32),
-        action_space_mapping=lambda action: action[0],
-        reward_mapping=difference(lambda pair: pair.both),
-        agent="first",
-    )
-    env = single_env(Pair, {f"{__name__}.Pair.first": amount}, clip_actions=True)
-    for made in (env, TransformReward(env, lambda reward: reward)):
-        assert action_values(begun(made), [[5.0]], futures=1).means.tolist() == [8.0]
+    amount = points(action_space=spaces.Box(0, 2, (1,), np.float32), action_space_mapping=np.sum)
+    env = single_env(Duel, {LEFT: amount[LEFT]}, clip_actions=True)
+    for wrapped in (env, TransformReward(env, lambda reward: reward)):
+        told = action_values(begun(wrapped), [[5.0]], futures=3)
+        assert told.returns == pytest.approx(expected(env, "left", (2,)))
 
 
 @pytest.mark.filterwarnings("ignore:.*draws from the global generator", "ignore:.*cannot draw new random numbers")
 def test_replays_leave_the_generators_of_the_process_alone():
-    class Lucky(Pair):
-        reseed = None
-
-        def run(self):
-            while self.turn < 4:
-                self.both += self.first() * random.random()
-                self.turn += 1
-
-    random.seed(5)
-    env = begun(single_env(Lucky, [Pair.first]))
+    unlucky = points(observation_space_mapping=lambda duel: [duel.turn, 0])[LEFT]
+    env = begun(single_env(Global, {LEFT: unlucky}))
     env.step(1)
     before = random.getstate()
     found = action_values(env, [1, 1, 1], futures=1, method="replay").returns.ravel().tolist()
@@ -204,13 +142,11 @@ def test_replays_leave_the_generators_of_the_process_alone():
 
 
 def test_branches_are_not_nested_for_ever():
-    env = begun(single_env(Pair, [Pair.first]))
-
     def deeper(twin, number):
         return branch(twin, deeper, 1)
 
     with pytest.raises(BranchError, match="nested 4 deep"):
-        branch(env, deeper, 1)
+        branch(made("single"), deeper, 1)
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say")
@@ -219,7 +155,7 @@ def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
         (tmp_path / str(os.getpid())).touch()
         time.sleep(600)
 
-    env = begun(single_env(Pair, [Pair.first]))
+    env = made("single")
     for limit in (0.5, 2.0, 8.0, 32.0):  # until the branch in the branch begins within it
         with pytest.raises(BranchError, match="longer than"):
             branch(env, lambda twin, number: branch(twin, slow, 1, method="fork"), 1, method="fork", time_limit=limit)
@@ -229,15 +165,10 @@ def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
     assert all(map(gone, inner))
 
 
-def test_time_limits_candidates_and_terminal_values():
-    env = begun(single_env(Pair, [Pair.first]))
-    for limit in (0, -1.0, float("nan")):
-        with pytest.raises(OptionValueError, match="time_limit"):
-            branch(env, lambda twin, number: None, time_limit=limit)
-    planner = RolloutPolicy((number for number in range(3)), futures=1, horizon=1)
-    assert [planner.choose(env).best for _ in range(2)] == [2, 2]
-    told = action_values(env, futures=1, horizon=1, terminal_value=lambda env: np.array([7.0]))
-    assert told.means.tolist() == [8, 9, 10]
+@pytest.mark.parametrize("limit", [0, -1.0, float("nan")])
+def test_time_limits_that_cannot_be(limit):
+    with pytest.raises(OptionValueError, match="time_limit"):
+        branch(made("single"), lambda twin, number: None, time_limit=limit)
 
 
 @dataclass(frozen=True)
@@ -247,13 +178,13 @@ class Unchanging(Exception):
     value: int
 
 
-@pytest.mark.parametrize("method", ["fork", "replay"])
+@METHODS
 def test_errors_come_as_themselves_and_say_which_candidate_was_tried_in_which_future(method):
-    class Fragile(Pair):
+    class Fragile(Duel):
         def run(self):
-            raise Unchanging(1) if self.first() == 0 else ZeroDivisionError
+            raise Unchanging(1) if self.left() == 0 else ZeroDivisionError
 
-    env = begun(single_env(Fragile, [Pair.first]))
+    env = made("single", Fragile)
     with pytest.raises(Unchanging):
         action_values(env, futures=1, method=method)
     with pytest.raises(ZeroDivisionError) as raised:

@@ -23,9 +23,6 @@ from tests.worlds.models import define
 HERE = __name__
 
 
-# -- entities -------------------------------------------------------------------------------------
-
-
 class Being:
     """An entity that decides by ``act`` and goes by ``leave``."""
 
@@ -121,9 +118,6 @@ def hunters() -> dict[Any, Any]:
     return beings(
         choices=lambda being: list(being.hunt.beings.values()), action_space=spaces.Discrete(4), removed_by=()
     )
-
-
-# -- a colony -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

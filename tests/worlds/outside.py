@@ -68,9 +68,6 @@ class Reservoirs:
         return {"levels": self.levels, "price": self.price, "log": self.log}
 
 
-# -- the wire -------------------------------------------------------------------------------------
-
-
 def finite(value: Any) -> Any:
     """Numbers that are not finite, as they travel."""
     if isinstance(value, float) and not isfinite(value):

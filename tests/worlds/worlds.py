@@ -76,9 +76,6 @@ answers = seeds.map(lambda seed: random.Random(seed).choices([*range(10), RULE],
 """Answers in the order of the decisions; an integer becomes legal by its remainder. There are enough of them."""
 
 
-# -- what holds for both --------------------------------------------------------------------------
-
-
 def agent_of(kind: str, point: int, entity: int) -> str | None:
     """Who decides a call."""
     if kind == "sometimes" and entity == 0:
@@ -109,9 +106,6 @@ def advised(observation: Any, info: Any) -> int:
 def legal(answer: Any, info: Any) -> Any:
     """An answer among those that a mask allows: the first ones, or any of ten."""
     return answer if answer is RULE else answer % (int(info["action_mask"].sum()) if info else 10)
-
-
-# -- the model ------------------------------------------------------------------------------------
 
 
 class Entity:
@@ -234,9 +228,6 @@ def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
     if kind == "apply":
         changes["apply"] = lambda action, world: action + world.random.randrange(3)
     return define(**changes)(rule)
-
-
-# -- the reference --------------------------------------------------------------------------------
 
 
 @dataclass

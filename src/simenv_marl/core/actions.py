@@ -114,7 +114,12 @@ def _box_check(space: spaces.Box, clips: bool) -> Check:
             return ILLEGAL
         if array.dtype.kind not in kinds or (array.shape != shape and not (scalar and array.shape == ())):
             return ILLEGAL
-        if clips:
+        if clips and kinds == "iu":  # one by one, because NumPy has no integer type for both int64 and uint64
+            values = [
+                min(max(low, value), high) for low, value, high in zip(lows, array.ravel().tolist(), highs, strict=True)
+            ]
+            array = np.array(values, dtype).reshape(array.shape)
+        elif clips:
             array = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape))
         if kinds == "iu" and not legal(array):  # before the cast, because the cast may wrap integers around
             return ILLEGAL

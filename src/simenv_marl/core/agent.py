@@ -6,13 +6,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from math import isfinite
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 import numpy as np
 from greenlet import getcurrent
 
 from ..errors import AgentError, MaskError, RewardError, short_repr
+from ..hooks.hook import BOUND
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
 from .actions import MASK, only_choice
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
     from .episode import Episode
     from .plan import Plan
     from .point import Point
-
-_NOTHING: Final[dict[str, Any]] = {}
-"""The keyword arguments of calls without any. Nothing writes to this dict."""
 
 
 class Agent:
@@ -78,7 +76,7 @@ class Agent:
         self.now: float | None = None
         self.answered_at: float | None = None
         self.rest: tuple[Any, ...] | None = None
-        self.kwargs: dict[str, Any] = _NOTHING
+        self.kwargs: dict[str, Any] = BOUND
 
     # -- decisions --------------------------------------------------------------------------------
 
@@ -204,7 +202,7 @@ class Agent:
             self.point.updates[0](self, args, self.kwargs, last=True)
         self.reward, self.carried = self.reward + self.carried, 0.0
         self.entity = self.rest = self.answered_at = None
-        self.kwargs = _NOTHING
+        self.kwargs = BOUND
 
     # -- infos ------------------------------------------------------------------------------------
 

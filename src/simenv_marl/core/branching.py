@@ -143,7 +143,7 @@ def branch(
             if separate is not None:
                 separate()
             twin = getattr(continuation, "unwrapped", continuation)
-            twin.begin_branch()
+            twin._begin_branch()
             if seeds is not None:
                 seed_globals(int(seeds[number]), PROCESS)
                 twin._session.reseed(int(seeds[number]))
@@ -160,9 +160,9 @@ def branch(
 def pending_view(env: Any, user: str) -> Any:
     """Return the unwrapped environment whose decision is pending, for a user named in errors."""
     view = getattr(env, "unwrapped", env)
-    if not hasattr(view, "begin_branch"):
+    if not hasattr(view, "_begin_branch"):
         raise ViewError(f"{user} needs an environment of one simulation, not {short_repr(env)}")
-    view.check_pending()
+    view._check_pending()
     return view
 
 
@@ -172,7 +172,7 @@ def pending_view(env: Any, user: str) -> Any:
 def _call_in_replay(env: Any, view: Any, function: Callable[[Any, int], Result], number: int) -> Result:
     """Call a function on a copy of an environment whose simulation repeats the episode."""
     with preserve_generators():  # the model may draw from the process's generators, then and now
-        twin = view.replayed()
+        twin = view._replayed()
         try:
             result = function(copy.deepcopy(env, {id(view): twin}), number)  # copies each wrapper with its state
         except BaseException as error:

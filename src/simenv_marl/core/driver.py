@@ -14,21 +14,26 @@ that sends an event and carries out the reply. It also notes which threads, proc
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from contextvars import Context, copy_context
 from functools import partial, wraps
+from gc import collect, get_referrers
+from linecache import getlines
 from multiprocessing.process import BaseProcess
 from socket import socket
 from subprocess import Popen
 from threading import Thread, local
+from traceback import walk_tb
 from types import coroutine
 from typing import Any, Final
 from weakref import WeakSet, ref
 
 from greenlet import getcurrent, greenlet
 
-from ..errors import SimulationError, WrongThreadError, annotate
-from ..hooks.hook import Hook
+from ..errors import SimulationError, WrongThreadError, annotate, error_text
+from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import LOCK, STACKS, Interceptor, spawner_of, stack_of
 from ..simulation import TRUNCATED, Sentinel
 
@@ -43,23 +48,47 @@ UNWINDING_TRIES: Final = 1000
 """How often ``SimulationExit`` is raised in a simulation. A SimPy model loses one of its processes at each try."""
 
 
-class SimulationExit(SystemExit):
-    """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it.
+class SimulationExit(BaseException):
+    """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it."""
 
-    It is a ``SystemExit``, because event loops pass that on at once, and keep others for who awaits the task.
-    """
+    # It is no ``SystemExit``: C code that prints what a callback raises would end the process.
+    def __init__(self, text: str = "SimulationExit: the environment was closed, reset or dropped") -> None:
+        """Say what it is in its text, because some engines keep only the text of what they catch."""
+        super().__init__(text)
+
+
+class LoopExit(SimulationExit, KeyboardInterrupt):
+    """A ``SimulationExit`` for code in an event loop, which keeps all but exits and interrupts for who awaits it."""
 
 
 def is_exit(error: BaseException | None) -> bool:
-    """Whether an error is a ``SimulationExit``, was caused by one, or is an exception group of only such errors."""
+    """Whether an error is a ``SimulationExit``, has one as its cause or in its text, or was raised by its ``except``.
+
+    A group is one if all its errors are. What only arises while the exit passes (a ``finally``) is not.
+    """
     seen = set()  # causes may be cyclic
     while error is not None and id(error) not in seen:
-        if isinstance(error, SimulationExit):
+        if isinstance(error, SimulationExit) or SimulationExit.__name__ in error_text(error):
             return True
-        if isinstance(error, BaseExceptionGroup) and all(map(is_exit, error.exceptions)):
-            return True
+        if isinstance(error, BaseExceptionGroup):
+            return all(map(is_exit, error.exceptions))
         seen.add(id(error))
-        error = error.__cause__
+        error = error.__cause__ or (error.__context__ if _is_replacement(error) else None)
+    return False
+
+
+def _is_replacement(error: BaseException) -> bool:
+    """Whether an error was raised, or the process ended, by the ``except`` that has caught the error's context."""
+    frames, caught = [*walk_tb(error.__traceback__)], getattr(error.__context__, "__traceback__", None)
+    if not frames or caught is None or caught.tb_frame is not frames[-1][0]:
+        return False
+    frame, line = frames[-1]
+    kind = ast.stmt if isinstance(error, SystemExit) else ast.Raise
+    with suppress(SyntaxError, ValueError):  # bytecode does not tell an ``except`` from a ``finally``
+        tree = ast.parse("".join(getlines(frame.f_code.co_filename, frame.f_globals)))
+        handlers = [node for node in ast.walk(tree) if isinstance(node, ast.ExceptHandler)]
+        nodes = [node for handler in handlers for node in ast.walk(handler) if isinstance(node, kind)]
+        return any(node.lineno <= line <= (node.end_lineno or line) for node in nodes)
     return False
 
 
@@ -118,8 +147,8 @@ class Driver:
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_refused", "_stack", "caller", "ended",
-        "events", "forked", "given_up", "idle", "opened", "plugins",
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_past", "_refused", "_stack", "caller",
+        "ended", "events", "forked", "given_up", "idle", "opened", "plugins",
     )  # fmt: skip
 
     resume: Any
@@ -135,6 +164,7 @@ class Driver:
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.events: Mapping[Hook, Any] = {}
         self._stack: greenlet | None = None
+        self._past: Callable[[], greenlet | None] = lambda: None  # a weak reference to the stack, after its end
         self._home = ref(THREAD.identity)  # the thread of the stack
         self.caller: greenlet | None = None
         self.opened: WeakSet[Any] | None = None
@@ -163,6 +193,15 @@ class Driver:
     def lost(self) -> bool:
         """Whether the thread of the stack has ended, or does not exist in this forked process."""
         return self._home() is None
+
+    @property
+    def outlived(self) -> bool:
+        """Whether the model has kept greenlets that belong to the stack, which has ended: they can decide nowhere."""
+        if self._past() is not None:
+            collect()  # what only waits for the garbage collector was not kept
+        stack = self._past()  # of a thread that has just ended, greenlet may still hold it
+        kept = () if stack is None else get_referrers(stack)
+        return any(isinstance(other, greenlet) and other.parent is stack for other in kept)
 
     def run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
         """Run a job to its end, during which decision functions run their rule; return its result."""
@@ -233,7 +272,7 @@ class Driver:
             if isinstance(error, SimulationExit):
                 return self.refusal()
             annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
-        if type(error) is SimulationExit and not self._exiting:
+        if type(error) in (SimulationExit, LoopExit) and not self._exiting:
             stray = SimulationError(
                 "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of"
                 " that episode has kept; end all of these with their episode (cancel them in stop or in a finally)"
@@ -246,6 +285,8 @@ class Driver:
         """Unregister the stack. From now on it takes no part in decisions."""
         self.ended = True
         stack, self._stack = self._stack, None
+        if stack is not None:
+            self._past = ref(stack)
         self.leave_hooks(stack)
         self.events = {}
         STACKS.pop(stack, None)  # type: ignore[arg-type]
@@ -281,8 +322,8 @@ class Driver:
         rule = hook.rule
         if event.report is not None:
             report = _report if hook.kind == "function" else _report_later
-            rule = partial(report, rule, self._decider(None, event.report, away))
-        decide: Interceptor = self._decider(rule, event, away)
+            rule = partial(report, rule, self._decider(hook, None, event.report, away), hook)
+        decide: Interceptor = self._decider(hook, rule, event, away)
         return decide
 
     def refuse(self, hook: Hook, where: str, args: Any, kwargs: Any) -> Any:
@@ -305,17 +346,17 @@ class Driver:
         return error
 
 
-def _report(rule: Any, report: Interceptor, /, *args: Any, **kwargs: Any) -> Any:
-    """Run a rule, and pass its decision to an interceptor."""
+def _report(rule: Any, report: Interceptor, hook: Hook, /, *args: Any, **kwargs: Any) -> Any:
+    """Run a rule, and pass its decision and the bound call to an interceptor."""
     decision = rule(*args, **kwargs)
-    report((decision, args, kwargs), {})
+    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
     return decision
 
 
 @coroutine
-def _report_later(rule: Any, report: Interceptor, /, *args: Any, **kwargs: Any) -> Any:
+def _report_later(rule: Any, report: Interceptor, hook: Hook, /, *args: Any, **kwargs: Any) -> Any:
     decision = yield from rule(*args, **kwargs)
-    report((decision, args, kwargs), {})
+    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
     return decision
 
 

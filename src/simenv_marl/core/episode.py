@@ -31,19 +31,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from math import inf
+from threading import current_thread
 from typing import TYPE_CHECKING, Any, Final
 
 from greenlet import getcurrent
 
 from ..errors import AgentError, InvalidActionError, NoDecisionError, UnknownAgentError, short_repr, warn_user
-from ..hooks.hook import Hook
+from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
 from .driver import WAIT
 from .planner import two_arguments
-from .points import declared_agents
+from .points import declared_agents, overrides
 from .run import Run
 from .spaces import duplicate
 
@@ -185,7 +186,7 @@ class Episode(Run):
         in_rounds, expected = self.in_rounds, getattr(self.simulation, "expected_calls", None)
         for agent, call in () if expected is None else self.announced(expected).items():
             if agent is not following and (in_rounds or not agent.decided):
-                agent.keep(self, call, {})
+                agent.keep(self, *call)
         if truncated:
             self.finish(truncated=True)
             return
@@ -235,16 +236,16 @@ class Episode(Run):
         args = None if agent is None else agent.arguments()  # to exclude a freed entity that had the same id
         return agent.name if agent is not None and args and args[0] is entity else None
 
-    def announced(self, expected_calls: Any) -> dict[Agent, tuple[Any, ...]]:
-        """The live agents that ``expected_calls`` announces, with the arguments of the first call of each."""
-        announced: dict[Agent, tuple[Any, ...]] = {}
+    def announced(self, expected_calls: Any) -> dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]]:
+        """The live agents that ``expected_calls`` announces, with the bound arguments of the first call of each."""
+        announced: dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]] = {}
         for point in self.plan.active:
             for call in expected_calls(point.point.name):
-                args = call if type(call) is tuple else tuple(call)
-                name = point.agent or point.name_agent(*args)
+                args, kwargs = point.point.bind(call, BOUND) or (tuple(call), BOUND)
+                name = point.agent or point.name_agent(*args, **kwargs)
                 agent = None if name is None else self.agent_for(point, name)
                 if agent is not None and not agent.delegated:
-                    announced.setdefault(agent, args)
+                    announced.setdefault(agent, (args, kwargs))
         return announced
 
     def end_agent(self, agent: Agent) -> None:
@@ -316,7 +317,16 @@ class Episode(Run):
     def _without_decision(self) -> NoDecisionError:
         """Make the error for an episode that ended without a decision for the environment's user."""
         expected = ", ".join(point.point.name for point in self.plan.active)
+        overriding = [name for point in self.plan.active for name in overrides(point.point)]
         hint = "does the simulation call the decision functions as attributes of their class or module?"
+        if overriding:
+            hint = f"these override it and are called instead: {listed(overriding)}; name them as decision points"
+        threads = {name for point in self.plan.active for name in point.point.threads} - {current_thread().name}
+        if threads:
+            hint = (
+                f"the rule has decided in threads that are not the simulation's: {listed(sorted(threads))}; call it"
+                " where run() runs, and pass the decision on"
+            )
         if self.others:
             expected = f"{self.plan.one_agent!r} at {expected}" if self.plan.one_agent else expected
             hint = f"these have decided: {listed(self.others)}"

@@ -11,9 +11,10 @@ from typing import Any, Final
 from greenlet import GreenletExit, getcurrent, greenlet
 
 from ..errors import WrongThreadError
+from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import RULE
-from .driver import THREAD, Driver, Event, SimulationExit, is_exit
+from .driver import THREAD, Driver, Event, LoopExit, SimulationExit, is_exit
 
 
 class GreenletDriver(Driver):
@@ -81,11 +82,17 @@ class GreenletDriver(Driver):
         finally:
             self._forget_stack()
 
-    def _decider(self, rule: Any, event: Any, away: bool) -> Interceptor:
+    def _decider(self, hook: Hook, rule: Any, event: Any, away: bool) -> Interceptor:
         """Make the function that sends an event for the calls of a hook, and carries out the replies."""
-        deliver, driver = event.deliver, self
+        deliver, bind, driver = event.deliver, hook.bind, self
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            bound, named = args, kwargs
+            if kwargs is not BOUND:
+                call = bind(args, kwargs)
+                if call is None:  # a handler has changed the arguments
+                    return rule(*args, **kwargs)
+                bound, named = call
             if away:
                 driver.resume = getcurrent().switch
             leave, running = driver._leave, driver._running_loop
@@ -95,12 +102,13 @@ class GreenletDriver(Driver):
             if looped:
                 driver._loop = _swap_loop(driver._users_loop)
             try:
-                reply = leave(event, args, kwargs)
-            except BaseException:
+                reply = leave(event, bound, named)
+            except BaseException as error:
                 if not driver.ended:  # once the driver has ended, the stack unwinds by itself
                     driver.resume = driver._body.switch
                     driver._enter_loop()
-                    silence_unwound_tasks()
+                    if isinstance(error, SimulationExit):
+                        raise make_exit() from None
                 raise
             if away:
                 driver.resume = driver._body.switch
@@ -108,7 +116,7 @@ class GreenletDriver(Driver):
                 driver._enter_loop()
             if reply is RULE:
                 return rule(*args, **kwargs) if kwargs else rule(*args)
-            return reply if deliver is None else deliver(reply, *args, **kwargs)
+            return reply if deliver is None else deliver(reply, *bound, **named)
 
         return decide
 
@@ -140,12 +148,27 @@ def _swap_loop(state: Any) -> Any:
     return present
 
 
-def silence_unwound_tasks() -> None:
-    """Stop the running loop from reporting tasks that are unwound, because no code can await them any more."""
+def make_exit() -> SimulationExit:
+    """Return the exit to raise here. The loop here will not report it, because no code awaits its tasks any more.
+
+    A ``LoopExit`` ends a loop at once. But where asyncio closes its loop already, it must go on to the other tasks.
+    """
+    hub: Any = getcurrent()
+    while hub is not None and hub not in STACKS and not hasattr(hub, "NOT_ERROR"):
+        hub = hub.parent
+    if hasattr(hub, "NOT_ERROR"):  # of gevent, which has spawned this greenlet
+        hub.NOT_ERROR = (*{*hub.NOT_ERROR, SimulationExit},)  # all others are printed
+        return LoopExit()
     loop = modules[_ASYNCIO]._get_running_loop() if _ASYNCIO in modules else None
-    before = None if loop is None else loop.get_exception_handler()
-    if loop is not None and not isinstance(before, partial):  # else it was silenced in an earlier episode
+    if loop is None:
+        return SimulationExit()
+    before = loop.get_exception_handler()
+    if not isinstance(before, partial):  # else it was silenced in an earlier episode
         loop.set_exception_handler(partial(_report_task, before or type(loop).default_exception_handler))
+    frame: Any = sys._getframe()
+    while frame is not None and frame.f_code is not modules["asyncio"].Runner.close.__code__:
+        frame = frame.f_back
+    return LoopExit() if frame is None else SimulationExit()
 
 
 def _report_task(report: Callable[..., Any], loop: Any, context: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ Objects that can be imported are pickled by reference, all others by value, such
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import sys
 import traceback
@@ -69,7 +70,13 @@ class _Pickler(cloudpickle.Pickler):
             reduced = _reduce_function(obj)
         elif isinstance(obj, BaseException):
             reduced = _reduce_error(obj)
-        return super().reducer_override(obj) if reduced is None else reduced
+        if reduced is not None:
+            return reduced
+        reduced = super().reducer_override(obj)
+        if not isinstance(obj, type) or not isinstance(reduced, tuple) or len(reduced) < 6:
+            return reduced
+        make, args, state, *_, restore = reduced  # a class that is pickled by value
+        return make, args, (_origin(), restore, state), None, None, _restore_class
 
 
 # -- errors ---------------------------------------------------------------------------------------
@@ -136,6 +143,24 @@ def _rebuild_error(kind: Any, args: tuple[Any, ...], members: dict[str, Any], at
             BaseException.__setattr__(error, name, value)
     vars(error).update(attributes)
     return error
+
+
+# -- classes --------------------------------------------------------------------------------------
+
+_HERE: Final = uuid4().hex
+
+
+def _origin() -> tuple[str, int]:
+    """What tells this process from all others, also from those that it has forked."""
+    return _HERE, os.getpid()
+
+
+def _restore_class(made: type, sent: tuple[Any, Any, Any]) -> None:
+    """Give a class its attributes, unless it has them: it was never away, or an environment has patched some here."""
+    origin, restore, (attributes, slots) = sent
+    if origin != _origin():
+        patched = {name for name, value in vars(made).items() if getattr(hook_of(value), "owner", None) is made}
+        restore(made, ({name: value for name, value in attributes.items() if name not in patched}, slots))
 
 
 # -- functions ------------------------------------------------------------------------------------

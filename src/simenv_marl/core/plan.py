@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 from weakref import finalize
@@ -21,6 +22,7 @@ from ..errors import (
     UnknownPointError,
     did_you_mean,
     short_repr,
+    warn_user,
 )
 from ..hooks.handlers import Handler
 from ..hooks.hook import Hook
@@ -142,12 +144,16 @@ class Plan:
 
     def _resolve(self) -> Plan:
         """Check the options against the simulation and its points, and find out which policy answers where."""
-        options, modes = self.options, self.render_modes
-        if options.render_mode is not None and options.render_mode not in modes:
-            raise OptionValueError(
-                f"render_mode {short_repr(options.render_mode)} is not one of the simulation's:"
-                f" {modes or 'it has none'}{did_you_mean(options.render_mode, modes)}"
+        mode, modes = self.options.render_mode, self.render_modes
+        if not isinstance(mode, str | None):
+            raise OptionValueError(f"render_mode must be a string or None, not {short_repr(mode)}")
+        if mode is not None and mode.removesuffix("_list") not in modes:
+            warn_user(
+                f"render_mode {mode!r} is not one of the simulation's ({', '.join(modes) or 'it has none'}), and is"
+                f" ignored{did_you_mean(mode, modes)}"
             )
+            self.options = replace(self.options, render_mode=None)
+        options = self.options
         self._by_point, self.policies, self._definitions = resolve_policies(
             options.policies or {}, self._named, self._own
         )

@@ -25,7 +25,7 @@ from ..errors import (
     short_repr,
 )
 from ..hooks.hook import unwrap
-from ..hooks.places import PlacedHook, find_hook, is_importable, raw_attribute, resolve
+from ..hooks.places import PlacedHook, all_classes, find_hook, is_importable, raw_attribute, resolve
 from ..simulation import RULE
 from .planner import two_arguments
 
@@ -74,6 +74,13 @@ def owner_class(point: DecisionPoint) -> type | None:
     except (UnknownPointError, PatchError):
         return None
     return owner if isinstance(owner, type) else None
+
+
+def overrides(point: DecisionPoint) -> list[str]:
+    """Return the dotted names of the functions by which derived classes override a point."""
+    owner, attribute = owner_class(point), point.name.rpartition(".")[2]
+    derived = [] if owner is None else [kind for kind in all_classes(owner) if kind is not owner]
+    return [f"{kind.__module__}.{kind.__qualname__}.{attribute}" for kind in derived if attribute in vars(kind)]
 
 
 # -- points with their definitions ----------------------------------------------------------------

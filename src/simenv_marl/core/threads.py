@@ -9,11 +9,11 @@ from threading import Thread
 from typing import Any, Final
 
 from ..errors import WrongThreadError
-from ..hooks.hook import Hook
+from ..hooks.hook import BOUND, Hook
 from ..hooks.stacks import SIMULATION, Interceptor
 from ..simulation import RULE, Sentinel
 from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event, SimulationExit
-from .greenlets import silence_unwound_tasks
+from .greenlets import make_exit
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
@@ -129,18 +129,23 @@ class ThreadDriver(Driver):
         self.idle = True
         self._arrived.put(event)
 
-    def _decider(self, rule: Any, event: Any, away: bool) -> Interceptor:
+    def _decider(self, hook: Hook, rule: Any, event: Any, away: bool) -> Interceptor:
         """Make the function that sends an event for the calls of a hook, and carries out the replies."""
-        deliver, ask, answer = event.deliver, self._arrived.put, self._replies.get
+        deliver, bind, ask, answer = event.deliver, hook.bind, self._arrived.put, self._replies.get
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-            ask((event, args, kwargs))
+            bound, named = args, kwargs
+            if kwargs is not BOUND:
+                call = bind(args, kwargs)
+                if call is None:  # a handler has changed the arguments
+                    return rule(*args, **kwargs)
+                bound, named = call
+            ask((event, bound, named))
             reply = answer()
             if reply is RULE:
                 return rule(*args, **kwargs)
             if reply is _EXIT:
-                silence_unwound_tasks()
-                raise SimulationExit
-            return reply if deliver is None else deliver(reply, *args, **kwargs)
+                raise make_exit()
+            return reply if deliver is None else deliver(reply, *bound, **named)
 
         return decide

@@ -57,7 +57,7 @@ def generate_env(
     """
     plan = Plan(simulation, points, options)
     base = view_class(plan, view)
-    base.adapt(plan)  # raises errors at once
+    base._adapt(plan)  # raises errors at once
 
     def initialise(self: Any, **changes: Any) -> None:
         current = Plan(simulation, points, options) if plan.stale else plan
@@ -67,7 +67,7 @@ def generate_env(
         "__init__": initialise,
         "__doc__": f"A view of {plan.name}: {', '.join(point.point.name for point in plan.active)}.",
         "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
-        "metadata": base.metadata_of(plan),
+        "metadata": base._metadata_of(plan),
     }
     return type(f"{plan.name}Env", (base,), attributes)
 

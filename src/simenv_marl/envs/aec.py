@@ -75,7 +75,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             self._clear_rewards()
         self._record(episode)
         if self._shows:
-            self.render()
+            self._show()
 
     def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Return what ``agent_selection`` needs to decide.

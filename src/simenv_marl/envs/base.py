@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..core.agent import Agent
 from ..core.episode import Episode
+from ..core.packing import pack, unpack
 from ..core.plan import Plan
 from ..core.point import Point
 from ..core.provenance import describe
@@ -48,22 +49,25 @@ class View:
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the view of a plan, of a session that its owner closes, or else of a new session."""
-        adapted = self.adapt(plan)
+        adapted = self._adapt(plan)
         super().__init__()
         self._plan = plan
         self._session = Session(adapted) if session is None else session
         if session is None:
             self._finalizer = weakref.finalize(self, self._session.abandon)
-        self.metadata = self.metadata_of(plan)
+        self.metadata = self._metadata_of(plan)
         self.render_mode = plan.options.render_mode
-        self._shows = self.render_mode == "human"  # render after every reset and step
+        self._mode = (self.render_mode or "").removesuffix("_list")
+        self._collects = self.render_mode not in (None, self._mode)
+        self._shows = self._collects or self._mode == "human"  # after every reset and step
+        self._frames: list[Any] = []
         self._roster: Mapping[str, Point] = self._session.plan.roster  # of agents that are known beforehand
         self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}  # of observations and of actions, by agent
         self._clear()
         self._set_up()
 
     @classmethod
-    def adapt(cls, plan: Plan) -> Plan:
+    def _adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
         for option, view in (("flatten", "joint"), ("agent", "single")):
             if getattr(plan.options, option) and option != cls._option:
@@ -71,9 +75,11 @@ class View:
         return plan
 
     @classmethod
-    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
+    def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": plan.render_fps}
+        chosen = [plan.options.render_mode] if plan.options.render_mode else []
+        modes = [*plan.render_modes, *(mode for mode in chosen if mode not in plan.render_modes)]
+        return {"name": f"{plan.name.lower()}_v0", "render_modes": modes, "render_fps": plan.render_fps}
 
     @property
     def simulation(self) -> Any:
@@ -167,7 +173,8 @@ class View:
     def render(self) -> Any:
         """Render the simulation in ``render_mode``. Without a render mode, warn and return None.
 
-        In the mode "human", every ``reset`` and ``step`` renders by itself.
+        In the mode "human", every ``reset`` and ``step`` renders by itself. With ``_list`` at the end of a mode, these
+        are collected; return the list of those since the last ``render`` or ``reset``.
         """
         if self.render_mode is None:
             warn_user(
@@ -175,8 +182,21 @@ class View:
                 f" {self._plan.render_modes}"
             )
             return None
+        if self._collects:
+            frames, self._frames = self._frames, []
+            return frames
         with self._session.context():
-            return self.simulation.render(self.render_mode)
+            return self.simulation.render(self._mode)
+
+    def _show(self, *, begins: bool = False) -> None:
+        """Render after a step, or after the reset with which an episode ``begins``."""
+        if begins:
+            self._frames = []
+        if not self._collects:
+            self.render()
+            return
+        with self._session.context():
+            self._frames.append(self.simulation.render(self._mode))
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.
@@ -189,7 +209,7 @@ class View:
     def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
         """Begin another episode, which ends if the environment is abandoned. Return the results of the reset."""
         session = self._session
-        with session.lock or nullcontext():
+        with session.exclusive:
             seed = checked_seed(seed)
             self._end(session.end)
             if self._finalizer is not None and not self._finalizer.alive:
@@ -200,7 +220,7 @@ class View:
             for agent in self._spaces:
                 self._seed_spaces(agent, seed)
             if self._shows:
-                self.render()
+                self._show(begins=True)
             return results
 
     def _step_alone(self, step: Callable[..., Any], action: Any) -> Any:
@@ -212,15 +232,16 @@ class View:
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode, and forget its records unless that was refused."""
-        try:
-            end()
-        finally:
-            episode = self._session.episode
-            if episode is None or episode.over:
-                self._clear()
-            if self._finalizer is not None and self._session.idle:
-                # It would keep the session alive, and with it an environment that its own parts refer to.
-                self._finalizer.detach()
+        with self._session.exclusive:
+            try:
+                end()
+            finally:
+                episode = self._session.episode
+                if episode is None or episode.over:
+                    self._clear()
+                if self._finalizer is not None and self._session.idle:
+                    # It would keep the session alive, and with it an environment that its own parts refer to.
+                    self._finalizer.detach()
 
     def _clear(self) -> None:
         """Forget the records of the episode."""
@@ -251,13 +272,16 @@ class View:
         return made
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset."""
+        """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset.
+
+        Functions without names, such as lambdas, are pickled by value, also by the standard library's ``pickle``.
+        """
         view: Any = type(self)
         try:
             pickle.dumps(view)
         except Exception:  # a class that generate_env made and that its name does not lead to
             view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-        return object.__new__, (view,), self._state()
+        return _unpickled, (pack((view, self._state())),)
 
     def _state(self) -> dict[str, Any]:
         """Return what a copy takes over."""
@@ -279,19 +303,27 @@ class View:
 
     # -- branches and planners --------------------------------------------------------------------
 
-    def check_pending(self) -> None:
+    def _check_pending(self) -> None:
         """Check that a decision is pending, or raise ``ResetNeededError`` or ``ReentrancyError``."""
         if self.episode.pending is None:
             raise self._session.refusal()
 
-    def replayed(self) -> Any:
+    def _replayed(self) -> Any:
         """Make an environment in exactly the same state in mid-episode, or raise as ``Session.replay``."""
         made = type(self).__new__(type(self))
         made.__setstate__(copy.deepcopy(self._state()), self._session)
         return made
 
-    def begin_branch(self) -> None:
+    def _begin_branch(self) -> None:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
+
+
+def _unpickled(parcel: bytes) -> View:
+    """Make the environment that ``View.__reduce_ex__`` has pickled."""
+    view, state = unpack(parcel)
+    made: View = object.__new__(view)
+    made.__setstate__(state)
+    return made
 
 
 class AgentsView(View):
@@ -304,6 +336,14 @@ class AgentsView(View):
 
     agents: list[str]
 
+    def __getattr__(self, name: str) -> Any:
+        if name == "possible_agents":
+            raise AttributeError(
+                "there is no possible_agents, because not all agents are known beforehand; declare them with the option"
+                " possible_agents=, or name them by strings"
+            )
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
     def _set_up(self) -> None:
         if self._plan.possible_agents is not None:
             self.possible_agents = self._plan.possible_agents
@@ -313,9 +353,9 @@ class AgentsView(View):
             )
 
     @classmethod
-    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
+    def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments. The order of agents is an order of rounds only in rounds."""
-        return super().metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
+        return super()._metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The observation space of an agent. It is always the same object, and no other environment shares it.

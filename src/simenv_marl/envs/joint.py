@@ -160,7 +160,7 @@ class SimulationJointEnv(OneAgentView):
         joint = self.joint
         episode.step(joint.actions(episode, action))
         if self._shows:
-            self.render()
+            self._show()
         info = joint.inform(episode)
         return joint.observe(episode), joint.reward(episode), episode.terminated, episode.truncated, info
 

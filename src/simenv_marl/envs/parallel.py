@@ -76,7 +76,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         self.agents = [] if episode.over else list(episode.agents)
         results = self._begin(episode)
         if self._shows:
-            self.render()
+            self._show()
         return results
 
     def _begin(self, episode: Episode) -> Results:

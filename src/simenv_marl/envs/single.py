@@ -33,7 +33,7 @@ class SimulationEnv(OneAgentView):
             self._begin(self._session.episode)
 
     @classmethod
-    def adapt(cls, plan: Plan) -> Plan:
+    def _adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and put the goals of its point, if it has any, into the observations."""
         if plan.one_agent is None:
             points = ", ".join(point.point.name for point in plan.active)
@@ -44,7 +44,7 @@ class SimulationEnv(OneAgentView):
             )
         definition = plan.active[0].definition
         if definition.goal_space is None:
-            return super().adapt(plan)
+            return super()._adapt(plan)
         parts: dict[str, Any] = {
             "observation": definition.observation_space_mapping,
             "achieved_goal": definition.achieved_goal_mapping,
@@ -59,7 +59,7 @@ class SimulationEnv(OneAgentView):
         goal: Any = definition.goal_space
         space = spaces.Dict({"observation": definition.observation_space, "achieved_goal": goal, "desired_goal": goal})
         changed = replace(definition, observation_space=space, observation_space_mapping=observe)
-        return super().adapt(plan).redefined(plan.active[0].point, changed)
+        return super()._adapt(plan).redefined(plan.active[0].point, changed)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
@@ -76,7 +76,7 @@ class SimulationEnv(OneAgentView):
             return self._step_alone(SimulationEnv.step, action)  # type: ignore[no-any-return]
         episode.step(action)
         if self._shows:
-            self.render()
+            self._show()
         own: Agent = self._own
         if own.ended:
             return own.observation, own.reward, True, False, own.info
@@ -127,18 +127,18 @@ class PlannerEnv(SimulationEnv):
         self._shows = self._branched = False
 
     @classmethod
-    def adapt(cls, plan: Plan) -> Plan:
+    def _adapt(cls, plan: Plan) -> Plan:
         """Allow every plan: the agent is the one whose planner is being asked."""
         return plan
 
-    def begin_branch(self) -> None:
+    def _begin_branch(self) -> None:
         """Turn this environment into a branch that waits for the agent only."""
         if not self._branched:
             self._branched = True
             self._session.step_out()
             self.episode.single_out(self._own)
 
-    def check_pending(self) -> None:
+    def _check_pending(self) -> None:
         """Refuse a branch after the planner has returned its action."""
         episode = self.episode
         if (episode.pending or episode.consulted) is not self._own:

@@ -76,7 +76,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         part = range(0 if workers else self.num_envs)
         batch = SimulationBatch(simulation, points, options, view, self._mode, part)
         self.render_mode = batch.plan.options.render_mode
-        self.metadata = {**batch.view.metadata_of(batch.plan), "autoreset_mode": self._mode}
+        self.metadata = {**batch.view._metadata_of(batch.plan), "autoreset_mode": self._mode}
         self.single_observation_space = batch.observation_space
         self.single_action_space = batch.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

@@ -59,7 +59,7 @@ class SimulationBatch:
         self.joint: Joint | None = None
         self.view: type[OneAgentView] = SimulationJointEnv
         if view == "single":
-            self.view, self.view_plan, self.plan = SimulationEnv, plan, SimulationEnv.adapt(plan)
+            self.view, self.view_plan, self.plan = SimulationEnv, plan, SimulationEnv._adapt(plan)
             definition = self.plan.active[0].definition
             self.observation_space = deepcopy(definition.observation_space)
             self.action_space = deepcopy(definition.action_space)
@@ -75,7 +75,7 @@ class SimulationBatch:
         self.arguments = simulation, points, options, view, mode
         self._mode, self._part = mode, part
         self._agent = str(self.plan.one_agent)
-        self._shows = self.plan.options.render_mode == "human"
+        self._shows = (self.plan.options.render_mode or "").endswith(("human", "_list"))
         self._stack = stacker(self.observation_space, cast=True, other=concatenate)
         self._observations = create_empty_array(self.observation_space, len(part))
         self._observed: list[Any] = [None] * len(part)
@@ -172,7 +172,7 @@ class SimulationBatch:
             if info:
                 infos.append((self._part[number], info))
         for view in self.views if self._shows else ():
-            view.render()
+            view._show()
         return self._stacked(), rewards, terminations, truncations, ends, infos
 
     def _begin(self, number: int, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -181,7 +181,7 @@ class SimulationBatch:
         try:
             episode = session.start(seed, options, in_rounds=self.joint is not None)
             if self._shows:
-                self.views[number].render()
+                self.views[number]._show(begins=True)
             (self._observed[number],), _, (info,) = self._read([episode])
         except BaseException as error:
             self._fail(number, error)

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial, update_wrapper
-from threading import local
+from threading import current_thread, local
 from types import FunctionType
 from typing import Any, Final
 from weakref import WeakValueDictionary, finalize
@@ -34,6 +35,9 @@ _THREAD: Final = local()
 _ABSENT: Final = object()
 """The default of arguments that a call may leave out, because interceptors must get them as they were passed."""
 
+BOUND: Final[dict[str, Any]] = {}
+"""The keyword arguments of a call that passes each parameter by position, and so needs no binding."""
+
 _FILE: Final = "<wrapper of "
 
 _MADE_WITH: Final = "__simenv_marl__"
@@ -49,7 +53,7 @@ _RETURN = {"function": "return {}", "generator": "return (yield from {})", "coro
 _INCOMPLETE = """
     if {incomplete}:
         args = {passed}
-        if {rule} or ({doubtful}) and not fits(*args, **kwargs):
+        if {rule} or ({doubtful}) and fits(args, kwargs) is None:
             {rule_as_passed}
         {intercept_as_passed}"""
 _COMPLETE = """
@@ -83,6 +87,7 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
         for number, name in enumerate(names):
             passed = f"({', '.join(names[: number + 1])},) if {name} is not ABSENT else {passed}"
     given = ", ".join(names)
+    bound = "{}" if any(p.kind is p.KEYWORD_ONLY for p in parameters) else "BOUND"
     answer = _RETURN[hook.kind].format
     source = f"def wrapper({accepted}):" + template.format(
         incomplete=incomplete,
@@ -92,9 +97,32 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
         rule_as_passed=answer("rule(*args, **kwargs)"),
         intercept_as_passed=answer(f"{_INTERCEPT}(args, kwargs)"),
         rule_at_once=answer(f"rule({given})"),
-        intercept=answer(f"{_INTERCEPT}(({given + ',' if given else ''}), NOTHING)"),
+        intercept=answer(f"{_INTERCEPT}(({given + ',' if given else ''}), {bound})"),
     )
     return f"async {source}" if hook.kind == "coroutine" else source
+
+
+def _binder(signature: inspect.Signature) -> Callable[..., tuple[tuple[Any, ...], dict[str, Any]]]:
+    """Make a function with a signature that returns its arguments: by position where they can be, with defaults."""
+    parameters = signature.parameters.values()
+    prefixes: dict[Any, str] = {inspect.Parameter.VAR_POSITIONAL: "*", inspect.Parameter.VAR_KEYWORD: "**"}
+    # Short defaults, and no annotations: code can name neither. The defaults themselves are set below.
+    declared = [p.replace(annotation=p.empty, default=p.empty if p.default is p.empty else 0) for p in parameters]
+    names = {p.name: prefixes.get(p.kind, "") + p.name for p in parameters}
+    placed = [f"{names[p.name]}," for p in parameters if p.kind < inspect.Parameter.KEYWORD_ONLY]
+    keyed = [
+        names[p.name] if p.kind is p.VAR_KEYWORD else f"{p.name!r}: {p.name}"
+        for p in parameters
+        if p.kind >= inspect.Parameter.KEYWORD_ONLY
+    ]
+    found: dict[str, Any] = {}
+    source = f"def bind{inspect.Signature(declared)}: return ({' '.join(placed)}), {{{', '.join(keyed)}}}"
+    exec(source, found)
+    bind: FunctionType = found["bind"]
+    optional = [p for p in parameters if p.default is not p.empty]
+    bind.__defaults__ = tuple(p.default for p in optional if p.kind is not p.KEYWORD_ONLY)
+    bind.__kwdefaults__ = {p.name: p.default for p in optional if p.kind is p.KEYWORD_ONLY}
+    return bind
 
 
 def unbind(value: Any) -> Any:
@@ -159,6 +187,7 @@ class Hook:
         slot: Its handlers, as ``slots`` returns them. Empty while it has none.
         stale: Whether another object has replaced it while nothing was set in its place.
         permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
+        threads: The names of threads that called it before anything else, and where its rule decides.
         definition: The latest definition of a decision function, which its name means; None for all other functions.
         removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
     """
@@ -188,7 +217,9 @@ class Hook:
             p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
         ]
         self.alone = self.bound and len(first) == len(parameters) == 1
+        self._binder: Callable[..., tuple[tuple[Any, ...], dict[str, Any]]] | None = None  # made when it is needed
         self.interceptors = Interceptors(self)
+        self.threads: set[str] = set()
         self.definition: Any = None
         self.removed_by: dict[Any, Any] = {}
         self.slot: dict[Any, list[list[list[Handler]]]] = {}
@@ -215,8 +246,8 @@ class Hook:
     def make_wrapper(self, made_with: Any = None) -> FunctionType:
         """Make a wrapper of the hook's function, for which the function ``made_with`` returns that object."""
         scope: dict[str, Any] = {
-            "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors, "fits": self._fits,
-            "getcurrent": getcurrent, "intercept": self._intercept, "rule": self.function, "NOTHING": {},
+            "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors, "fits": self.bind,
+            "getcurrent": getcurrent, "intercept": self._intercept, "rule": self.function, "BOUND": BOUND,
         }  # fmt: skip
         exec(compile(_source(self, scope), f"{_FILE}{self.name}>", "exec"), scope)
         made: FunctionType = scope["wrapper"]
@@ -225,13 +256,16 @@ class Hook:
         vars(made)[_MADE_WITH] = self, made_with
         return made
 
-    def _fits(self, *args: Any, **kwargs: Any) -> bool:
-        """Return whether the function takes these arguments. If not, it is called, and raises Python's own error."""
+    def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
+        """Bind a call to the function's own signature, with defaults. None if the function does not take it."""
+        if self.signature is None:
+            return args, kwargs
+        if self._binder is None:
+            self._binder = _binder(self.signature)
         try:
-            self.signature.bind(*args, **kwargs)  # type: ignore[union-attr]
+            return self._binder(*args, **kwargs)
         except TypeError:
-            return False
-        return True
+            return None
 
     def _intercept(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Run a call for which the stack itself has no interceptor, or refuse it with a ``WrongThreadError``."""
@@ -247,6 +281,7 @@ class Hook:
                 _THREAD.mark = set()
                 finalize(_THREAD.mark, _ROOTS.discard, here)  # a root that outlives its thread makes greenlets crash
             _ROOTS.add(here)
+            self.threads.add(current_thread().name)
         return self.around(decide or self.run_rule, plugins)
 
     # -- who takes part ---------------------------------------------------------------------------

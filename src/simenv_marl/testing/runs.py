@@ -30,7 +30,7 @@ from greenlet import getcurrent
 
 from ..core.actions import MASK
 from ..core.context import GlobalRandom, environment_context
-from ..core.driver import SimulationExit
+from ..core.driver import LoopExit
 from ..core.plan import Plan
 from ..decision import DecisionPoint
 from ..errors import describe_error, error_notes
@@ -43,7 +43,7 @@ _WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appe
 """Texts in the warnings of environments that are findings."""
 
 
-class LimitReached(SimulationExit):
+class LimitReached(LoopExit):
     """Raised in a run that has reached its limit of decisions or of time."""
 
 
@@ -191,7 +191,7 @@ class Subject:
         states = global_generators()
         try:
             within(self.seconds, function)
-        except (Exception, SystemExit) as error:
+        except (Exception, SystemExit, LimitReached) as error:
             run.error = None if run.cut else error
             run.stuck = time.monotonic() - run.latest > self.seconds / 2
         run.drawn = {name for name, state in global_generators().items() if repr(state) != repr(states[name])}

@@ -1,0 +1,124 @@
+// Plays what the option "play" names; Probe.java plays the same in Java.
+
+#include <simenv.hpp>
+
+#include <iostream>
+#include <map>
+#include <stdexcept>
+
+using simenv::Client;
+using simenv::Episode;
+using simenv::Json;
+
+namespace {
+
+std::uint64_t seeded = 0;
+
+/// Decides and reports while the model is unwound, and says on stderr what came of it.
+struct Guard {
+    explicit Guard(Client& asked) : client(asked) {}
+    ~Guard() {
+        const int decision = client.decide("b", "last", {}, [] { return 7; });
+        client.update("b", "last", {{"i", 1}});
+        client.remove("b", "last");
+        std::cerr << "unwound by rule " << decision << std::endl;
+    }
+    Client& client;
+};
+
+Json echo(Client& client, const Episode& episode) {
+    Json value = episode.option<Json>("value", nullptr);
+    for (int i = 0, n = episode.option("times", 1); i < n; ++i)
+        value = client.decide("a", "ä", {{"value", value}}, [&] { return value; }, 0.25 * i);
+    return value;
+}
+
+Json types(Client& client) {
+    const auto rule = [](auto value) { return [=] { return value; }; };
+    const double number = client.decide("a", nullptr, {}, rule(0.5));
+    const int whole = client.decide("a", nullptr, {}, rule(3));
+    const bool flag = client.decide("a", nullptr, {}, rule(true));
+    const std::string text = client.decide("a", nullptr, {}, rule(std::string("rule")));
+    const auto vector = client.decide("a", nullptr, {}, rule(std::vector<double>{1.0, 2.0}));
+    return Json::Array{number, whole, flag, text, Json::Array(vector.begin(), vector.end()),
+                       client.decide("a", nullptr, {}, rule(Json()))};
+}
+
+void arguments(Client& client) {
+    const std::map<std::string, double> map{{"x", 1.0}, {"y", 0.1f}};
+    const std::vector<bool> flags{true, false};
+    client.decide("a", nullptr, map, [] { return 0; });
+    client.decide("a", 12, {{"flags", flags}, {"name", "b"}, {"half", 0.5f}, {"most", ~0ull}}, [] { return 0; });
+}
+
+void reports(Client& client) {
+    client.update("a", 12, {{"level", 0.5}}, 1.5);
+    client.remove("a", 12);
+    client.remove("a", "\"b\"");
+    client.update("a", nullptr, [] { return Json::Object{{"level", 1}}; });
+}
+
+int count(Client& client, const Episode& episode) {
+    Guard guard(client);
+    int sum = 0;
+    for (int i = 0, n = episode.option("times", 5); i < n; ++i) {
+        try {
+            sum += client.decide("a", "x", {{"sum", sum}}, [&] { return 1; });
+        } catch (const std::exception&) {  // what is no decision is none
+        }
+    }
+    return sum;
+}
+
+int deaf(Client& client, const Episode& episode) {
+    for (int most = episode.option("times", 3), heard = 0;;) {
+        try {
+            client.decide("a", "x", {}, [] { return 0; });
+        } catch (...) {
+            if (++heard == most) throw;
+        }
+    }
+}
+
+[[noreturn]] void fail() {
+    try {
+        throw std::out_of_range("the cause");
+    } catch (...) {
+        std::throw_with_nested(std::runtime_error("the pump is broken \xff"));
+    }
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    Client client({"a", "b"});
+    if (!std::getenv("PROBE_CANNOT_RESEED")) client.on_reseed([](std::uint64_t seed) { seeded = seed; });
+    Json result;
+    const auto model = [&](const Episode& episode) -> Json {
+        const std::string play = episode.option("play", "echo");
+        if (play == "echo") return result = echo(client, episode);
+        if (play == "types") return types(client);
+        if (play == "arguments") arguments(client);
+        if (play == "reports") reports(client);
+        if (play == "count") return result = count(client, episode);
+        if (play == "deaf") return deaf(client, episode);
+        if (play == "fail") fail();
+        if (play == "number") throw 3;
+        if (play == "seed") return episode.seed;
+        if (play == "reseed") return client.decide("a", "x", {}, [&] { return seeded; });
+        if (play == "optional") return client.ask<double>("a", "x", {}).value_or(-1.0);
+        if (play == "huge") return std::string(std::size_t{17} << 20, 'x');
+        if (play == "text") client.decide("a", "\xff", {}, [] { return 0; });
+        if (play == "name") client.remove("a", "\xc0\x80");
+        if (play == "truncated") client.end({{"reached", 3}}, true);
+        if (play == "shell") return std::system(episode.option("command", "true").c_str());
+        if (play == "crash") [&]() noexcept { fail(); }();
+        if (play == "leave") std::exit(episode.option("status", 0));
+        return nullptr;
+    };
+    Json::Object options{{"play", argc > 1 ? argv[1] : "echo"}};
+    if (argc > 2) options.emplace_back("value", Json::parse(argv[2]));
+    const int status = client.run(model, 7, options);
+    if (!client.connected()) std::cout << result.text() << std::endl;
+    return status;
+}

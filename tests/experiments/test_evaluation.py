@@ -190,7 +190,7 @@ def test_the_summary_says_why_there_is_no_interval():
     assert summary["note"].to_dict() == {"a": "", "same": "differences: all are equal", "some": ""}
     assert set(found.summary("one")["note"]) == {"all are equal"}
     assert np.isnan(found.seeds_needed(1.0)["same"])
-    assert str(found) == f"{found!r}\n{summary.to_string()}"
+    assert str(found) == f"{found!r}\n{summary.to_string(float_format='{:.6g}'.format)}"
     found = evaluate(Shop, contenders, seeds=[1], points=POINTS)
     assert set(found.summary()["note"]) == {"a single value"}
     found.plot()

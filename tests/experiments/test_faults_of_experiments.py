@@ -10,6 +10,7 @@ from functools import partial
 
 import joblib
 import numpy as np
+import pydoe
 import pytest
 
 from simenv_marl import evaluate, make_step, vector_env
@@ -50,23 +51,29 @@ def test_levels_are_compared_once():
     assert design({"x": [1, True, 1.0, [1], (1,)]})["x"].tolist() == [1, True, 1.0, [1], (1,)]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (({"x": (0, 10**5000)},), "that a float can hold"),
-        (({"x": (0.5, 10**400)},), "that a float can hold"),
-        (({"x": (0.0, 1.0)}, "full_factorial", 10**12), "rows"),
-    ],
-)
-def test_designs_that_cannot_be_are_refused_with_reasons(arguments, message):
-    with pytest.raises(OptionValueError, match=message):
-        design(*arguments)
+def test_designs_that_cannot_be_are_refused_with_reasons():
+    for bounds in ((0, 10**5000), (0.5, 10**400)):
+        with pytest.raises(OptionValueError, match="that a float can hold"):
+            design({"x": bounds})
+    with pytest.raises(OptionValueError, match="rows"):
+        design({"x": (0.0, 1.0)}, "full_factorial", 10**12)
 
 
 def test_one_sample_has_no_shares(tmp_path):
     frame = results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 1), tmp_path)
     with pytest.raises(OptionValueError, match="one sample tells nothing"):
         sobol_indices(frame, "y")
+
+
+def test_design_alone_needs_a_package_for_designs(monkeypatch):
+    expected = design({"x": (0.0, 1.0)}, "halton", 4)
+    monkeypatch.setitem(sys.modules, "pyDOE", pydoe)  # its name in releases for older NumPy
+    monkeypatch.setitem(sys.modules, "pydoe", None)
+    assert design({"x": (0.0, 1.0)}, "halton", 4).equals(expected)
+    monkeypatch.setitem(sys.modules, "pyDOE", None)
+    with pytest.raises(MissingExtraError, match=r"simenv-marl\[design\]"):
+        design({"x": (0.0, 1.0)}, "halton", 4)
+    evaluate(Shop, {"rule": {}}, seeds=[1, 2], points=POINTS).summary()
 
 
 # -- contenders -----------------------------------------------------------------------------------

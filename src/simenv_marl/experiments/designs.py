@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
+from importlib.util import find_spec
 from itertools import product
 from math import ceil, floor, prod
 from string import ascii_lowercase
@@ -187,6 +188,11 @@ def _is_same(one: Any, other: Any) -> bool:
 Columns = Sequence[Sequence[Any]]
 
 
+def _pydoe() -> Any:
+    """Return pyDOE. Its releases for NumPy before 2.2 have another name."""
+    return import_extra("pydoe" if find_spec("pydoe") else "pyDOE", "design")
+
+
 def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     steps = [factor.steps(n) for factor in factors]
     _rows(prod(map(len, steps)))
@@ -202,7 +208,7 @@ def _of_two_levels(factors: Sequence[Factor], matrix: Any) -> Columns:
 
 
 def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe, number = import_extra("pydoe", "design"), len(factors)
+    pydoe, number = _pydoe(), len(factors)
     least = 2 ** ceil(np.log2(number + 1))
     if n is None:
         n = least
@@ -239,7 +245,7 @@ def _generators(basic: int, number: int) -> str:
 
 
 def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe, number = import_extra("pydoe", "design"), len(factors)
+    pydoe, number = _pydoe(), len(factors)
     for columns in range(number, number + 8):  # pyDOE lacks some sizes; the next one may exist
         with suppress(ValueError):
             matrix = pydoe.pbdesign(columns)[:, :number]
@@ -252,7 +258,6 @@ def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Col
 
 
 def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe = import_extra("pydoe", "design")
     ranges = [factor for factor in factors if factor.levels is None]
     lists = [factor for factor in factors if factor.levels is not None]
     if len(ranges) < 2:
@@ -262,7 +267,7 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
     if n is not None and n != number:
         raise OptionValueError(f"a central composite design of these {len(factors)} factors has {number} runs, not {n}")
     # The centre occurs once: a simulation with the same seed would have the same result.
-    matrix = (pydoe.ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T + 1) / 2
+    matrix = (_pydoe().ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T + 1) / 2
     surface = list(zip(*map(Factor.scale, ranges, matrix), strict=True))
     names = [factor.name for factor in (*lists, *ranges)]
     rows = [dict(zip(names, (*own, *values), strict=True)) for own in product(*levels) for values in surface]
@@ -270,17 +275,16 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
 
 
 def _latin_hypercube(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    return _spread(factors, import_extra("pydoe", "design").lhs(len(factors), samples=_rows(n), seed=seed))
+    return _spread(factors, _pydoe().lhs(len(factors), samples=_rows(n), seed=seed))
 
 
 def _sobol(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe = import_extra("pydoe", "design")
-    points = pydoe.sobol_sequence(_rows(n), len(factors), scramble=True, seed=seed, use_pow_of_2=False)
+    points = _pydoe().sobol_sequence(_rows(n), len(factors), scramble=True, seed=seed, use_pow_of_2=False)
     return _spread(factors, points)
 
 
 def _halton(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe = import_extra("pydoe", "design")
+    pydoe = _pydoe()
     return _spread(factors, pydoe.cranley_patterson_shift(pydoe.halton_sequence(_rows(n), len(factors)), seed=seed))
 
 

@@ -140,7 +140,6 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    # Texts, if some levels are equal although their types differ.
     labels = {name: own if len(set(own)) == len(own) else list(map(repr, own)) for name, own in levels.items()}
     seeds = table["seed"].to_numpy()
     zero_or_one = is_proportion(table[metric].to_numpy())
@@ -242,8 +241,7 @@ def sobol_indices(
         ``total_error``.
 
     Raises:
-        OptionValueError: The frame has another design or a single sample, runs have failed, or the value is not a
-            number or does not vary.
+        OptionValueError: The design is another or has one sample, runs have failed, or the value is no number or equal.
         MissingExtraError: SALib is missing.
     """
     pandas = import_extra("pandas", "sobol_indices")

@@ -61,7 +61,7 @@ class Evaluation:
         return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
 
     def __str__(self) -> str:
-        return f"{self!r}\n{self.summary().to_string()}"
+        return f"{self!r}\n{self.summary().to_string(float_format='{:.6g}'.format)}"
 
     def values(self, metric: str = "return") -> "DataFrame":
         """Return the team's values: one row for each seed, one column for each contender."""

@@ -243,8 +243,7 @@ def _run_all(
                 list(spread(_run_part, work, [run], max(workers, 2), 1, bar))
             except BrokenExecutor:
                 with closing(Writer(folder, session)) as writer:
-                    died = "WorkerError: the worker died in this run, twice; retry_errors=True repeats the run"
-                    writer.write(run, died, {})
+                    writer.write(run, "WorkerError: the worker died in this run, twice; see retry_errors=", {})
         storage.read(keys, session)
         missing = [run for run in missing if run not in storage.runs]
 

@@ -27,7 +27,7 @@ import numpy as np
 from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from ..errors import MissingExtraError, OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 
-EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots"}
+EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots", "pyDOE": "design", "SALib": "design"}
 """The extra that installs a package. All other packages belong to ``experiments``."""
 
 

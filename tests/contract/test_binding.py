@@ -49,7 +49,8 @@ def recording(call, seen):
 @pytest.mark.parametrize(("call", "args", "kwargs"), CALLS.values(), ids=list(CALLS))
 def test_every_callable_gets_the_bound_arguments(call, args, kwargs):
     seen = {}
-    env = parallel_env(recording(call, seen))
+    simulation = recording(call, seen)
+    env = parallel_env(simulation, simulation.choose)
     env.reset()
     env.step({"ant": 1})
     model = env.unwrapped.simulation
@@ -84,7 +85,7 @@ def test_surplus_arguments_stay_behind_the_named_ones():
         def run(self):
             self.choose(2, 3, 4, other=5)
 
-    env = parallel_env(Model)
+    env = parallel_env(Model, Model.choose)
     env.reset()
     env.step({"ant": 0})
     assert seen[0] == ((2, 3, 4), {"key": None, "other": 5})
@@ -92,7 +93,8 @@ def test_surplus_arguments_stay_behind_the_named_ones():
 
 def test_a_call_that_does_not_bind_raises_the_error_of_python():
     seen = {}
-    env = parallel_env(recording(lambda model: model.choose(y=1), seen))
+    simulation = recording(lambda model: model.choose(y=1), seen)
+    env = parallel_env(simulation, simulation.choose)
     with pytest.raises(TypeError, match=r"missing 1 required positional argument: 'x'"):
         env.reset()
     assert seen == {}

@@ -110,15 +110,17 @@ def test_no_cent_is_lost_by_random_legal_actions_and_others_are_refused():
 
 def test_the_agent_of_a_client_ends_when_the_client_retires_leaves_or_dies(monkeypatch):
     gone = []
-    for name in ("retire", "vanish"):
-        original = getattr(Client, name)
 
-        def noted(client, *rest, original=original):
+    def noting(original):
+        def noted(client, *rest):
             if client.status in ("working", "away"):
                 gone.append(client.name)
             return original(client, *rest)
 
-        monkeypatch.setattr(Client, name, noted)
+        return noted
+
+    for name in ("retire", "vanish"):
+        monkeypatch.setattr(Client, name, noting(getattr(Client, name)))
     environment = premium_env(small())
     environment.reset(seed=4)
     decided, ended = set(), []

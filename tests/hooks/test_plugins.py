@@ -985,12 +985,14 @@ def test_environments_may_be_collected_at_any_moment():
             sys.setprofile(look)
             with handlers((nothing, BID, "before")):
                 assert Trader().bid("tea") == 5
+                found = hook_of(vars(Trader)["bid"])
             sys.setprofile(None)
             gc.collect()
     finally:
         sys.setprofile(None)
         gc.enable()
     assert number > 10
+    assert found.interceptors == hook_of(choose).interceptors == {}
 
 
 def test_nothing_is_patched_but_while_there_is_an_environment():

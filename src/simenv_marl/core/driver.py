@@ -296,8 +296,12 @@ class Driver:
         """Enter all hooks with the interceptors that they need now, unless another environment runs on the stack."""
         stack = self._stack
         if stack is not None and STACKS.get(stack) is self:
-            for hook in (*self.events, *self._handled):
+            hooks = (*self.events, *self._handled)
+            for hook in hooks:
                 hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
+            if STACKS.get(stack) is not self:  # garbage collection has ended it meanwhile
+                for hook in hooks:
+                    hook.leave(stack)
 
     def leave_hooks(self, here: greenlet | None) -> None:
         """Leave all hooks, so that the stack takes no part in calls until ``enter_hooks``."""

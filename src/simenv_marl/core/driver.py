@@ -164,7 +164,7 @@ class Driver:
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.events: Mapping[Hook, Any] = {}
         self._stack: greenlet | None = None
-        self._past: Callable[[], greenlet | None] = lambda: None  # a weak reference to the stack, after its end
+        self._past: ref[greenlet] | None = None  # the stack, after its end
         self._home = ref(THREAD.identity)  # the thread of the stack
         self.caller: greenlet | None = None
         self.opened: WeakSet[Any] | None = None
@@ -197,8 +197,9 @@ class Driver:
     @property
     def outlived(self) -> bool:
         """Whether the model has kept greenlets that belong to the stack, which has ended: they can decide nowhere."""
-        if self._past() is not None:
-            collect()  # what only waits for the garbage collector was not kept
+        if self._past is None or self._past() is None:
+            return False
+        collect()  # what only waits for the garbage collector was not kept
         stack = self._past()  # of a thread that has just ended, greenlet may still hold it
         kept = () if stack is None else get_referrers(stack)
         return any(isinstance(other, greenlet) and other.parent is stack for other in kept)

@@ -36,7 +36,7 @@ class Session:
         seed, options: The seed of the latest episode, and the options that the latest ``reset`` got.
         episode: The current or latest episode. None before the first one, and after it was closed.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
-        exclusive: The lock that lets one thread at a time begin and end episodes.
+        exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
         lock: The same lock, if steps need it, too. None if only the thread that began an episode can step it.
     """
 
@@ -127,25 +127,24 @@ class Session:
         Without a seed, one is drawn. An episode ``in_rounds`` updates all agents when a step returns. ``script`` is the
         tape of another episode to replay; ordinary episodes have none.
         """
-        with self.exclusive:
-            self.end()
-            self.state = "moving"
-            try:
-                self._close_simulation(last=False)
-                if self._installed is None or not self._installed.complete:
-                    self._installed = Installation(self.plan.patches)
-                self.options = options
-                if seed is None:
-                    seed = int(self.np_random.integers(2**31))
-                else:
-                    self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
-                self.seed = seed
-                if self._driver.given_up is not None or self._driver.outlived:
-                    self._make_simulation()  # code that still uses the old one must not meet another episode
-                    self._driver.given_up = None
-                return self._begin(seed, in_rounds, script)
-            finally:
-                self.state = "new" if self.episode is None else "over"
+        self.end()
+        self.state = "moving"
+        try:
+            self._close_simulation(last=False)
+            if self._installed is None or not self._installed.complete:
+                self._installed = Installation(self.plan.patches)
+            self.options = options
+            if seed is None:
+                seed = int(self.np_random.integers(2**31))
+            else:
+                self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
+            self.seed = seed
+            if self._driver.given_up is not None or self._driver.outlived:
+                self._make_simulation()  # code that still uses the old one must not meet another episode
+                self._driver.given_up = None
+            return self._begin(seed, in_rounds, script)
+        finally:
+            self.state = "new" if self.episode is None else "over"
 
     def _begin(self, seed: int, in_rounds: bool, script: Any) -> Episode:
         """Reset the simulation, and run it to its first decision."""
@@ -210,15 +209,14 @@ class Session:
 
     def end(self) -> None:
         """End the current episode, if there is one. Raise a ``ReentrancyError`` if that is not possible here."""
-        with self.exclusive:
-            if self.state == "moving":
-                raise refusal(self.state)
-            if self.episode is not None:
-                try:
-                    self.episode.close()
-                finally:
-                    if self.episode.over and not self.episode.running:
-                        self.episode = None
+        if self.state == "moving":
+            raise refusal(self.state)
+        if self.episode is not None:
+            try:
+                self.episode.close()
+            finally:
+                if self.episode.over and not self.episode.running:
+                    self.episode = None
 
     @property
     def idle(self) -> bool:
@@ -227,17 +225,16 @@ class Session:
 
     def close(self) -> None:
         """Unwind the simulation and remove the patches. For errors, see ``end``."""
-        with self.exclusive:
-            try:
-                self.end()
-            finally:
-                if self.episode is None and self.state != "moving":
-                    self.state = "moving"
-                    try:
-                        self._close_simulation(last=True)
-                    finally:
-                        self.state = "closed"
-                        self._put_away()
+        try:
+            self.end()
+        finally:
+            if self.episode is None and self.state != "moving":
+                self.state = "moving"
+                try:
+                    self._close_simulation(last=True)
+                finally:
+                    self.state = "closed"
+                    self._put_away()
 
     def abandon(self) -> None:
         """Unwind the simulation and remove the patches, from a finalizer. Warn of errors instead of raising them."""

@@ -204,7 +204,8 @@ class View:
         Raises:
             BaseException: Any exception of the simulation while it unwinds.
         """
-        self._end(self._session.close)
+        with self._session.exclusive:
+            self._end(self._session.close)
 
     def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
         """Begin another episode, which ends if the environment is abandoned. Return the results of the reset."""
@@ -232,16 +233,15 @@ class View:
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode, and forget its records unless that was refused."""
-        with self._session.exclusive:
-            try:
-                end()
-            finally:
-                episode = self._session.episode
-                if episode is None or episode.over:
-                    self._clear()
-                if self._finalizer is not None and self._session.idle:
-                    # It would keep the session alive, and with it an environment that its own parts refer to.
-                    self._finalizer.detach()
+        try:
+            end()
+        finally:
+            episode = self._session.episode
+            if episode is None or episode.over:
+                self._clear()
+            if self._finalizer is not None and self._session.idle:
+                # It would keep the session alive, and with it an environment that its own parts refer to.
+                self._finalizer.detach()
 
     def _clear(self) -> None:
         """Forget the records of the episode."""
@@ -326,6 +326,16 @@ def _unpickled(parcel: bytes) -> View:
     return made
 
 
+class _Undeclared:
+    """In place of ``possible_agents`` where not all are known. A ``__getattr__`` would make each attribute slower."""
+
+    def __get__(self, view: Any, kind: Any) -> Any:
+        raise AttributeError(
+            "there is no possible_agents, because not all agents are known beforehand; declare them with the option"
+            " possible_agents=, or name them by strings"
+        )
+
+
 class AgentsView(View):
     """A view with several agents: a PettingZoo environment.
 
@@ -335,14 +345,7 @@ class AgentsView(View):
     """
 
     agents: list[str]
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "possible_agents":
-            raise AttributeError(
-                "there is no possible_agents, because not all agents are known beforehand; declare them with the option"
-                " possible_agents=, or name them by strings"
-            )
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+    possible_agents: Any = _Undeclared()
 
     def _set_up(self) -> None:
         if self._plan.possible_agents is not None:

@@ -114,13 +114,11 @@ def _box_check(space: spaces.Box, clips: bool) -> Check:
             return ILLEGAL
         if array.dtype.kind not in kinds or (array.shape != shape and not (scalar and array.shape == ())):
             return ILLEGAL
-        if clips and kinds == "iu":  # one by one, because NumPy has no integer type for both int64 and uint64
-            values = [
-                min(max(low, value), high) for low, value, high in zip(lows, array.ravel().tolist(), highs, strict=True)
-            ]
-            array = np.array(values, dtype).reshape(array.shape)
-        elif clips:
-            array = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape))
+        if clips:
+            bounds = [bound.reshape(array.shape) for bound in (space.low, space.high)]
+            if kinds == "iu":  # as integers of Python, because NumPy has no type for both int64 and uint64
+                array, *bounds = (part.astype(object) for part in (array, *bounds))
+            array = np.clip(array, *bounds)
         if kinds == "iu" and not legal(array):  # before the cast, because the cast may wrap integers around
             return ILLEGAL
         with np.errstate(over="ignore"):

@@ -119,6 +119,7 @@ class Options:
             ("global_rng", isinstance(self.global_rng, bool), "True or False"),
             ("skip_forced", isinstance(self.skip_forced, bool), "True or False"),
             ("state_space", is_space, 'a gymnasium space or "observations"'),
+            ("render_mode", isinstance(self.render_mode, str | None), "a string or None"),
             ("max_steps", steps is None or is_count, "a positive integer or None"),
             ("policies", isinstance(policies, Mapping), "a dict from agents or points to callables"),
             ("plugins", _is_list(self.plugins), "a list of (handler, target, position)"),
@@ -136,6 +137,16 @@ class Options:
         elif agents is not None:
             object.__setattr__(self, "possible_agents", list(agents))
         object.__setattr__(self, "plugins", tuple(self.plugins))
+
+    @property
+    def picture_mode(self) -> str | None:
+        """The mode in which the simulation renders: ``render_mode`` without the ``_list`` of collected pictures."""
+        return self.render_mode and self.render_mode.removesuffix("_list")
+
+    @property
+    def shows(self) -> bool:
+        """Whether each reset and step renders: for people, or to collect pictures."""
+        return self.picture_mode == "human" or self.picture_mode != self.render_mode
 
     def amended(self, options: Mapping[str, Any]) -> Options:
         """The same options, but for those that are given; raise an error for an unknown name or a wrong value."""

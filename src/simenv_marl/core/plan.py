@@ -145,9 +145,7 @@ class Plan:
     def _resolve(self) -> Plan:
         """Check the options against the simulation and its points, and find out which policy answers where."""
         mode, modes = self.options.render_mode, self.render_modes
-        if not isinstance(mode, str | None):
-            raise OptionValueError(f"render_mode must be a string or None, not {short_repr(mode)}")
-        if mode is not None and mode.removesuffix("_list") not in modes:
+        if mode is not None and self.options.picture_mode not in modes:
             warn_user(
                 f"render_mode {mode!r} is not one of the simulation's ({', '.join(modes) or 'it has none'}), and is"
                 f" ignored{did_you_mean(mode, modes)}"

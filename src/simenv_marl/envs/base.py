@@ -57,9 +57,7 @@ class View:
             self._finalizer = weakref.finalize(self, self._session.abandon)
         self.metadata = self._metadata_of(plan)
         self.render_mode = plan.options.render_mode
-        self._mode = (self.render_mode or "").removesuffix("_list")
-        self._collects = self.render_mode not in (None, self._mode)
-        self._shows = self._collects or self._mode == "human"  # after every reset and step
+        self._picture_mode, self._shows = plan.options.picture_mode, plan.options.shows
         self._frames: list[Any] = []
         self._roster: Mapping[str, Point] = self._session.plan.roster  # of agents that are known beforehand
         self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}  # of observations and of actions, by agent
@@ -77,8 +75,7 @@ class View:
     @classmethod
     def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
-        chosen = [plan.options.render_mode] if plan.options.render_mode else []
-        modes = [*plan.render_modes, *(mode for mode in chosen if mode not in plan.render_modes)]
+        modes = list(dict.fromkeys(filter(None, [*plan.render_modes, plan.options.render_mode])))
         return {"name": f"{plan.name.lower()}_v0", "render_modes": modes, "render_fps": plan.render_fps}
 
     @property
@@ -182,21 +179,21 @@ class View:
                 f" {self._plan.render_modes}"
             )
             return None
-        if self._collects:
+        if self._picture_mode != self.render_mode:
             frames, self._frames = self._frames, []
             return frames
         with self._session.context():
-            return self.simulation.render(self._mode)
+            return self.simulation.render(self._picture_mode)
 
     def _show(self, *, begins: bool = False) -> None:
         """Render after a step, or after the reset with which an episode ``begins``."""
         if begins:
             self._frames = []
-        if not self._collects:
+        if self._picture_mode == self.render_mode:
             self.render()
             return
         with self._session.context():
-            self._frames.append(self.simulation.render(self._mode))
+            self._frames.append(self.simulation.render(self._picture_mode))
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.

@@ -75,7 +75,7 @@ class SimulationBatch:
         self.arguments = simulation, points, options, view, mode
         self._mode, self._part = mode, part
         self._agent = str(self.plan.one_agent)
-        self._shows = (self.plan.options.render_mode or "").endswith(("human", "_list"))
+        self._shows = self.plan.options.shows
         self._stack = stacker(self.observation_space, cast=True, other=concatenate)
         self._observations = create_empty_array(self.observation_space, len(part))
         self._observed: list[Any] = [None] * len(part)

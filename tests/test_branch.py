@@ -1,14 +1,13 @@
-"""Branches: exact continuations of an episode that is going on."""
+"""Branches: exact continuations of an episode that is going on; with ``seeds=``, the chance ahead is drawn anew."""
 
 import asyncio
-import multiprocessing
 import os
 import random
+import select
 import signal
 import socket
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 import types
@@ -33,13 +32,13 @@ from simenv_marl.errors import (
     ReentrancyError,
     ViewError,
 )
+from tests.core.test_global_rng import world
 from tests.worlds import exactness, filing
 from tests.worlds.copied import Walk
-from tests.worlds.models import decision, define, script
+from tests.worlds.models import decision, define, notes, script
 
 ROOT = Path(__file__).parent.parent
 METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
-VIEWS = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 POINTS = {
     Walk.choose: None,
     f"{Walk.__module__}.Walk.drift": define(
@@ -49,6 +48,9 @@ POINTS = {
         reward_mapping=difference(lambda walk: walk.place),
     ),
 }
+VIEWS = pytest.mark.parametrize(
+    ("make", "points"), [(aec_env, POINTS), (parallel_env, POINTS), (single_env, Walk.choose), (joint_env, POINTS)]
+)
 
 
 def begun(env, seed=3):
@@ -77,8 +79,7 @@ def rest_of(env, number=0):
 
 @METHODS
 @VIEWS
-def test_branches_are_what_the_environment_would_have_done(make, method):
-    points = Walk.choose if make is single_env else POINTS
+def test_branches_are_what_the_environment_would_have_done(make, points, method):
     for taken in range(5):
         env = begun(make(lambda: Walk(6), points))
         for _ in range(taken):
@@ -180,17 +181,14 @@ def test_a_branch_that_dies_says_so_and_leaves_the_environment_whole(function, m
     assert children() == before
 
 
-def test_errors_that_are_not_made_of_their_arguments_or_cannot_be_pickled():
+def test_an_error_that_cannot_be_pickled_is_told_of():
     def fail(twin, number):
         error = Unpicklable(1, 2)
-        if number:
-            error.held = (step for step in ())
+        error.held = (step for step in ())
         raise error
 
-    with pytest.raises(Unpicklable):
-        branch(going_on(), fail, 1, method="fork")
     with pytest.raises(BranchError, match="cannot be pickled: Unpicklable: 1") as caught:
-        branch(going_on(), lambda twin, number: fail(twin, 1), 1, method="fork")
+        branch(going_on(), fail, 1, method="fork")
     assert "in fail" in str(caught.value.__cause__)
 
 
@@ -208,9 +206,17 @@ def test_simulations_that_are_random_for_themselves():
         def reset(self, seed=None):
             super().reset()
 
+        def run(self):
+            try:
+                super().run()
+            finally:
+                ended.append(self)
+
+    ended = []
     env = going_on(Dice)
-    with pytest.raises(BranchError, match=r"the same seed and the same actions[\s\S]*fork"):
+    with pytest.raises(BranchError, match=r"the same seed and the same actions[\s\S]*fork") as caught:
         branch(env, short, 1, method="replay")
+    assert (len(ended), ended[0] is env.unwrapped.simulation) == (1, False), caught  # which keeps the replay
     found = branch(env, short, 2, method="fork")
     assert found[0] == found[1] == rest_of(env)
 
@@ -243,11 +249,16 @@ def test_what_cannot_be_continued(method):
     with pytest.raises(NotResetError, match="no episode yet"):
         branch(env, calls, method=method)
     env.reset()
-    for wrong in (-1, 2.0, True, False, "1", None):
+    for wrong in (-1, 2.0, True, None):
         with pytest.raises(OptionValueError, match="n must be a non-negative integer"):
             branch(env, calls, wrong, method=method)
+    for limit in (0, float("nan"), "1"):
+        with pytest.raises(OptionValueError, match="time_limit"):
+            branch(env, calls, method=method, time_limit=limit)
     with pytest.raises(OptionValueError, match="method"):
         branch(env, calls, method="clone")
+    with pytest.raises(OptionValueError, match=r'needs .* driver="greenlet"[\s\S]*"replay"'):
+        branch(going_on(driver="thread"), calls, method="fork")
     assert branch(env, calls, 0, method=method) == []
     env.step(1)
     with pytest.raises(EpisodeOverError, match="begin the next one"):
@@ -255,13 +266,6 @@ def test_what_cannot_be_continued(method):
     with pytest.raises(ViewError, match="branch needs an environment of one simulation"):
         branch("env", calls, method=method)
     assert called == []
-
-
-def test_threads_are_not_forked():
-    env = going_on(steps=0, driver="thread")
-    with pytest.raises(OptionValueError, match="replay"):
-        branch(env, short, method="fork")
-    env.close()
 
 
 def test_not_from_inside_its_own_mappings():
@@ -302,6 +306,7 @@ def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
 
     def alone(twin, number):
         (tmp_path / str(number)).touch()
+        time.sleep(0.1)
         there = len(list(tmp_path.iterdir()))
         (tmp_path / str(number)).unlink()
         return there
@@ -312,16 +317,6 @@ def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
         assert branch(env, alone, 6, method="fork") == [1] * 6
     finally:
         os.sched_setaffinity(0, cores)
-
-
-def test_forked_branches_leave_torchs_threads_behind(monkeypatch):
-    """Those of a library whose threads do not come along would be waited for."""
-    told = []
-    torch = types.ModuleType("torch")
-    torch.set_num_threads = told.append
-    monkeypatch.setitem(sys.modules, "torch", torch)
-    assert branch(going_on(), lambda twin, number: told, 1, method="fork") == [[1]]
-    assert told == []
 
 
 def test_what_was_decided_is_replayed_as_it_was_given():
@@ -376,9 +371,8 @@ def a_socket(model):
 
 @contextmanager
 def a_child(model):
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE):
         yield
-        child.communicate(b"\n")
 
 
 @contextmanager
@@ -391,18 +385,9 @@ def a_thread(model):
     thread.join()
 
 
-@contextmanager
-def a_worker(model):
-    worker = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
-    worker.start()
-    yield
-    worker.kill()
-    worker.join()
-
-
 @pytest.mark.parametrize(
     ("held", "name"),
-    [(a_socket, "a socket"), (a_child, "a child process"), (a_worker, "a child process"), (a_thread, "a thread")],
+    [(a_socket, "a socket"), (a_child, "a child process"), (a_thread, "a thread")],
 )
 def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(held, name):
     env = begun(single_env(type("Model", (Holding,), {"open": held}), filing.choose), 4)
@@ -414,45 +399,17 @@ def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(held, name):
     env.close()
 
 
-def in_a_process(code, *options, **streams):
-    command = [sys.executable, *options, "-c", textwrap.dedent(code)]
-    return subprocess.run(command, cwd=ROOT, check=True, timeout=60, **streams)
-
-
 def test_what_the_user_has_opened_is_no_obstacle():
-    in_a_process("""
-        import os, socket, subprocess, sys
-        from simenv_marl import branch, single_env
-        from tests.worlds.models import calling, decision
-
-        one, other = socket.socketpair()
-        choose = decision()
-        env = single_env(calling(choose, choose), choose)
-        env.reset(seed=1)
-        two, another = socket.socketpair()
-        child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-        assert branch(env, lambda env, number: os.getpid(), method="fork") != [os.getpid()]
-        child.communicate(b"\\n")
-    """)
+    env, (one, other) = going_on(), socket.socketpair()
+    with one, other, subprocess.Popen(["cat"], stdin=subprocess.PIPE):
+        assert branch(env, lambda twin, number: os.getpid(), method="fork") != [os.getpid()]
 
 
-class Clerks(Holding):
-    async def clerk(self, number):
-        for _ in range(3):
-            await asyncio.sleep(0)
-            self.log.append((number, filing.choose(), self.chance.random()))
-        asyncio.get_running_loop().call_soon_threadsafe(self.log.append, number)
-        await asyncio.sleep(0.002)
-
-    async def all(self):
-        await asyncio.gather(self.clerk(1), self.clerk(2))
-
+class Listening(Holding):
     def run(self):
-        asyncio.run(self.all())
+        asyncio.run(self.listen())
 
-
-class Listening(Clerks):
-    async def all(self):
+    async def listen(self):
         loop, (reading, writing) = asyncio.get_running_loop(), os.pipe()
         for number in range(3):
             heard = loop.create_future()
@@ -465,54 +422,39 @@ class Listening(Clerks):
         os.close(writing)
 
 
-def test_event_loops_of_asyncio_go_on_in_a_fork():
+def test_event_loops_of_asyncio_go_on_in_a_fork(monkeypatch):
     env = begun(single_env(Listening, filing.choose))
     env.step(1)
     assert branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
-    env = begun(single_env(Clerks, filing.choose), 4)
-    for _ in range(3):
-        found = branch(env, filing.left, 2, method="fork")
-        env.step(3)
-    assert found[0] == found[1] == filing.left(env)
-
-
-def test_where_asyncio_is_not_imported_there_are_no_event_loops(monkeypatch):
-    monkeypatch.delitem(sys.modules, "asyncio.selector_events")
+    monkeypatch.delitem(sys.modules, "asyncio.selector_events")  # as where asyncio is not imported
     assert loops_on({0}) == []
 
 
-@pytest.mark.parametrize("modes", [["w"], ["a", "w"], ["r+"], ["a", "r"]])
-def test_copies_of_files_are_what_they_were(tmp_path, modes):
-    path = tmp_path / "letters"
+class Polling(Holding):
+    """Waits for a pipe that can be read at once, of which it is told once."""
 
-    class Model(Holding):
-        def run(self):
-            path.write_text("abcdefghij")
-            files = [open(path, mode) for mode in modes]  # noqa: SIM115 - closed below
-            files[-1].seek(4)
-            for number in range(6):
+    def run(self):
+        reading, writing = os.pipe()
+        os.write(writing, b"x")
+        with select.epoll() as poll:
+            poll.register(reading, select.EPOLLIN | select.EPOLLONESHOT)
+            for _ in range(2):
                 filing.choose()
-                for file in files:
-                    if file.writable():
-                        file.write(f"{number}line")
-                        file.flush()
-                    self.log += [file.tell(), os.fstat(file.fileno()).st_size, file.read(3) if file.readable() else ""]
-            for file in files:
-                file.close()
+                self.log.append(len(poll.poll(0)))
+        os.close(reading)
+        os.close(writing)
 
-    env = begun(single_env(Model, filing.choose))
-    for _ in range(3):
-        before = path.read_text()
-        found = branch(env, filing.left, 2, method="fork")
-        assert path.read_text() == before
-        env.step(1)
-    assert found[0] == found[1] == filing.left(env)
+
+@pytest.mark.skipif(not hasattr(select, "epoll"), reason="only Linux has epoll")
+def test_selectors_of_branches_take_no_events_from_the_environment():
+    env = begun(single_env(Polling, filing.choose))
+    assert branch(env, filing.left, 2, method="fork") == [[1, 0]] * 2
+    assert filing.left(env) == [1, 0]
 
 
 @pytest.mark.parametrize("flush", [False, True])
-def test_what_a_branch_prints_is_printed_once(flush, tmp_path):
-    path = tmp_path / "out"
-    code = f"""
+def test_what_a_branch_prints_is_printed_once(flush):
+    code = f"""if True:
         from simenv_marl import branch, single_env
         from tests.worlds.models import calling, decision
 
@@ -523,7 +465,182 @@ def test_what_a_branch_prints_is_printed_once(flush, tmp_path):
         branch(env, lambda env, number: print("in", number, flush={flush}), method="fork")
         print("after", flush={flush})
     """
-    with path.open("w") as out:
-        ran = in_a_process(code, "-W", "error", stdout=out, stderr=subprocess.PIPE)
-    assert path.read_text().splitlines() == ["before", "in 0", "after"]
-    assert ran.stderr == b""
+    command = [sys.executable, "-W", "error", "-c", code]
+    ran = subprocess.run(command, cwd=ROOT, check=True, timeout=60, capture_output=True, text=True)
+    assert ran.stdout.splitlines() == ["before", "in 0", "after"]
+    assert ran.stderr == ""
+
+
+class Reseeded(Walk):
+    """A walk whose chance can be drawn anew."""
+
+    def reseed(self, seed):
+        self.random.seed(seed)
+        self.place += 1000  # seen by those who look whether it was called
+        self.chosen = self.choose()
+
+
+class Gambling(Walk):
+    """One that draws from the global generators."""
+
+    def drift(self):
+        return random.random() + np.random.standard_normal()
+
+
+class Both(Gambling):
+    def reseed(self, seed):
+        self.random.seed(seed)
+
+
+def reseedable(make=single_env, points=Walk.choose, simulation=Reseeded, **options):
+    env = make(lambda: simulation(6), points, **options)
+    env.reset(seed=3)
+    move(env)
+    return env
+
+
+def drawn(env, number):
+    """What a base that draws from the global generators would draw."""
+    return random.random(), random.gauss(0, 1), np.random.random(), np.random.standard_normal()
+
+
+@pytest.mark.parametrize(("simulation", "options"), [(Reseeded, {}), (Gambling, {"global_rng": True})])
+@VIEWS
+def test_the_same_seeds_are_the_same_futures(make, points, simulation, options):
+    """By either method and driver, and whatever has been drawn before; other seeds are other futures."""
+    env = reseedable(make, points, simulation, **options)
+    threaded = reseedable(make, points, simulation, driver="thread", **options)
+    seeds = [5, 6, 5, 2**70]
+    forked, replayed = (branch(env, short, 4, method=method, seeds=seeds) for method in ("fork", "replay"))
+    random.random()
+    assert forked == replayed == branch(env, short, 4, seeds=np.array(seeds, object))
+    assert forked == branch(threaded, short, 4, seeds=seeds)
+    assert forked[0] == forked[2]
+    assert len({repr(each) for each in forked}) == 3
+    assert branch(env, short, 1, seeds=[6]) == forked[1:2]
+    threaded.close()
+
+
+@METHODS
+@VIEWS
+def test_the_present_stays_what_it_is(make, points, method):
+    env = reseedable(make, points)
+
+    def present(twin, number):
+        pending, simulation = twin.unwrapped._session.episode.pending, twin.unwrapped.simulation
+        return pending.name, pending.observation.tolist(), simulation.steps, simulation.place
+
+    *seen, place = present(env, 0)
+    assert branch(env, present, 2, method=method, seeds=[1, 2]) == [(*seen, place + 1000)] * 2
+
+
+@METHODS
+@pytest.mark.parametrize(("simulation", "options"), [(Reseeded, {}), (Both, {"global_rng": True})])
+@VIEWS
+def test_neither_the_environment_nor_the_generators_of_its_user_move(make, points, simulation, options, method):
+    env = reseedable(make, points, simulation, **options)
+    random.gauss(0, 1)
+    np.random.standard_normal()
+    (ahead,), before = branch(env, short, 1, method=method), world()
+    branch(env, short, 2, method=method, seeds=[1, 2])
+    with pytest.raises(ZeroDivisionError):
+        branch(env, lambda twin, number: 1 / 0, 1, method=method, seeds=[1])
+    assert world() == before
+    assert rest_of(env) == ahead
+
+
+@METHODS
+def test_the_generators_of_the_process_are_seeded_for_each_future(method):
+    """Those of a base policy: alike for the same seeds, and not with the simulation's numbers."""
+    env, own = reseedable(simulation=Both, global_rng=True), []
+
+    def base(twin, number):
+        with twin._session.context():
+            own.append(drawn(twin, number))
+        return drawn(twin, number), own[-1], twin.simulation.random.random()
+
+    found = branch(env, base, 3, method=method, seeds=[7, 8, 7])
+    assert found[0] == found[2] != found[1]
+    assert found[0][2] != found[1][2]  # the simulation is reseeded, too
+    assert found == branch(env, base, 3, seeds=[7, 8, 7])
+    assert len({value for each in found[:2] for part in each[:2] for value in part}) == 16
+    plain = [random.Random(7).random(), np.random.RandomState(7).random(), np.random.default_rng(7).random()]
+    for child in np.random.SeedSequence(7).spawn(3):
+        plain += [np.random.default_rng(part).random() for part in (child, *child.spawn(3))]
+    assert not {*plain} & {value for part in found[0][:2] for value in part}
+
+
+@METHODS
+def test_another_kind_of_generator_behind_numpys_functions(method):
+    """It is seeded whatever its kind, and put back as it was."""
+    env, kept, mine = reseedable(), np.random.get_bit_generator(), np.random.PCG64(5)
+    try:
+        np.random.set_bit_generator(mine)
+        state, sequence = mine.state, mine.seed_seq
+        expected = branch(env, drawn, 2, method="fork", seeds=[1, 2])
+        assert branch(env, drawn, 2, method=method, seeds=[1, 2]) == expected
+        assert np.random.get_bit_generator() is mine
+        assert (mine.state, mine.seed_seq) == (state, sequence)
+    finally:
+        np.random.set_bit_generator(kept)
+
+
+@METHODS
+def test_torchs_generator_is_seeded_too_and_forks_use_none_of_its_threads(monkeypatch, method):
+    """The threads do not come along, and torch would wait for them."""
+    threads = []
+    generator = types.SimpleNamespace(state=0, get_state=lambda: generator.state)
+    generator.set_state = generator.manual_seed = lambda state: setattr(generator, "state", state)
+    torch = types.ModuleType("torch")
+    torch.set_num_threads, torch.default_generator = threads.append, generator
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    found = branch(reseedable(), lambda *_: (generator.state, threads), 3, method=method, seeds=[1, 2, 1])
+    assert 0 != found[0][0] == found[2][0] != found[1][0] != 0
+    assert found[0][1] == ([1] if method == "fork" else [])
+    assert (generator.state, threads) == (0, [])
+
+
+@METHODS
+def test_decisions_of_reseed_are_the_rules(method):
+    env = reseedable()
+    found = branch(env, lambda twin, number: twin.simulation.chosen, 8, method=method, seeds=range(8))
+    assert found == [random.Random(seed).choice([-1, 1]) for seed in range(8)]
+
+
+@METHODS
+def test_who_cannot_draw_anew_is_told_what_to_do(monkeypatch, method):
+    env = reseedable(simulation=Walk)
+    monkeypatch.setattr(os, "fork", None)
+    with pytest.raises(BranchError, match=r"Walk[\s\S]*reseed\(seed\)[\s\S]*global_rng=True"):
+        branch(env, short, 2, method=method, seeds=[1, 2])
+    env.simulation.reseed = None
+    with pytest.raises(BranchError, match="reseed"):
+        branch(env, short, 1, method=method, seeds=[1])
+    env.step(1)
+
+
+@pytest.mark.parametrize(
+    "seeds", [[], [1], [1, 2, 3], [1, True], [1, -1], [1, 2.0], [1, None], [1, "2"], "12", 1, {1, 2}, iter([1, 2])]
+)
+def test_seeds_are_one_integer_for_each_branch(seeds):
+    with pytest.raises(OptionValueError, match="seeds must be n = 2 non-negative integers"):
+        branch(reseedable(), short, 2, seeds=seeds)
+    assert branch(reseedable(), short, 0, seeds=[]) == []
+    with pytest.raises(NotResetError):
+        branch(single_env(lambda: Reseeded(6), Walk.choose), short, 1, seeds=[1])
+
+
+class Failing(Walk):
+    def reseed(self, seed):
+        return 1 / (1 - seed)
+
+
+@METHODS
+def test_an_error_of_reseed_surfaces_as_itself(method):
+    env, before = reseedable(simulation=Failing), random.getstate()
+    with pytest.raises(ZeroDivisionError) as caught:
+        branch(env, short, 2, method=method, seeds=[0, 1])
+    assert "reseeded; seed 1" in notes(caught.value)
+    assert "in branch 1" in notes(caught.value)
+    assert random.getstate() == before
+    env.step(1)

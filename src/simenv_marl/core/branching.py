@@ -302,10 +302,10 @@ descriptors that share the offset."""
 def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
     """Return a function that separates forked children, in which the event loops continue, from this process.
 
-    ``fork`` copies the memory, but parent and child share the offsets and contents of open files and the sockets of
-    event loops, and Python reseeds its global generator in the child.
+    ``fork`` copies the memory, but parent and child share the offsets and contents of open files, the events of epoll
+    objects, and the sockets of event loops. And Python reseeds its global generator in the child.
     """
-    python, files = random.getstate(), _open_files()
+    python, (files, polls) = random.getstate(), _open_files()
 
     def separate() -> None:
         random.setstate(python)  # Python reseeds it after a fork
@@ -315,6 +315,8 @@ def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
                 _reopen(openings)
         for loop in loops:
             _separate_loop(loop)
+        for number in polls:
+            _separate_poll(number)
         torch = sys.modules.get("torch")
         if torch is not None:
             torch.set_num_threads(1)  # its threads do not exist here, and torch would wait for them
@@ -359,13 +361,30 @@ def _separate_loop(loop: Any) -> None:
     shared.close()
 
 
-def _open_files() -> Files:
-    """Return the open regular files of this process, except for files that are also standard streams."""
+def _separate_poll(number: int) -> None:
+    """Put an epoll object of this process, which waits for the same events, behind a descriptor."""
+    with suppress(OSError), select.epoll() as own, open(f"/proc/self/fdinfo/{number}", encoding="ascii") as entries:
+        watched = [entry.split() for entry in entries if entry.startswith("tfd:")]
+        # Only those of Python have the descriptors as data. C libraries find out themselves that they were forked.
+        if all(int(entry[1]) == int(entry[5], 16) for entry in watched):
+            for entry in watched:
+                own.register(int(entry[1]), int(entry[3], 16))
+            os.dup2(own.fileno(), number, inheritable=os.get_inheritable(number))
+
+
+def _open_files() -> tuple[Files, list[int]]:
+    """Return the open regular files of this process, except for standard streams, and its epoll objects."""
     files: Files = {}
+    polls: list[int] = []
     standard = [_inode(number) for number in range(3)]  # which branches share with their parent
     for number in sorted(map(int, os.listdir(_DESCRIPTORS))):
         inode = _inode(number)
-        if inode is None or inode in standard or not stat.S_ISREG(os.fstat(number).st_mode):
+        if inode is None or inode in standard:
+            continue
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            with suppress(OSError):
+                if os.readlink(f"{_DESCRIPTORS}/{number}") == "anon_inode:[eventpoll]":
+                    polls.append(number)
             continue
         with suppress(OSError):  # a descriptor that only stands for a path
             flags, offset = fcntl.fcntl(number, fcntl.F_GETFL) & _FLAGS, os.lseek(number, 0, os.SEEK_CUR)
@@ -376,7 +395,7 @@ def _open_files() -> Files:
                     break
             else:
                 openings.append((flags, offset, [number]))
-    return files
+    return files, polls
 
 
 def _inode(number: int) -> tuple[int, int] | None:

@@ -9,8 +9,7 @@ from gymnasium import spaces
 
 from simenv_marl import RULE, simulate_many
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset, save_dataset
-from simenv_marl.data.collect import _random_numbers
-from simenv_marl.errors import DefinitionError, InvalidActionError, MissingExtraError, OptionValueError
+from simenv_marl.errors import DefinitionError, MissingExtraError, OptionValueError
 from tests.contract.test_simulate_many import ones
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, plainly, script
@@ -38,18 +37,6 @@ def test_mixtures_leave_each_decision_to_one_of_their_policies():
     assert logs == [[[1, 2, "rule"][own] for own in component[start : start + 20]] for start in (0, 20)]
 
 
-def test_a_mixture_draws_by_splitmix():
-    def mixed(state):
-        state = (state + 0x9E3779B97F4A7C15) % 2**64
-        state = (state ^ (state >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
-        state = (state ^ (state >> 27)) * 0x94D049BB133111EB % 2**64
-        return state ^ (state >> 31)
-
-    identities = [(0, 0), (7, 3), (2**64 - 1, 9), (2**31, 10**6)]
-    expected = [(mixed((mixed(seed) + turn) % 2**64) >> 11) * 2.0**-53 for seed, turn in identities]
-    assert _random_numbers(identities).tolist() == expected
-
-
 def test_mixtures_draw_by_seed_and_decision_alone():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     mixture = Mixture(iter([(ones, 0.5), (twos, 0.5)]))
@@ -65,14 +52,18 @@ def test_mixtures_draw_by_seed_and_decision_alone():
 
     together = actions([5, 6, 2**70])
     assert together == actions([2**70, 5, 6], batch_size=1) == actions([5, 6], batch_size=2) | actions([2**70])
-    assert len({tuple(together[seed, turn] for turn in range(20)) for seed in (5, 6, 2**70)}) == 3
+    drawn = ["".join(str(together[seed, turn]) for turn in range(20)) for seed in (5, 6, 2**70)]
+    assert drawn == [
+        "22222212122121111111",
+        "21122111121121121212",
+        "21221121222212111122",
+    ]  # by SplitMix64, in any version
 
 
 def test_mixtures_give_policies_what_is_theirs():
     seen, mask = [], [0, 1, 1] + [0] * 7
 
     def informed(observations, infos, identities):
-        assert len(observations) == len(infos) == len(identities)
         masks = [info["action_mask"].tolist() for info in infos]
         seen.extend(zip(observations[:, 0].tolist(), masks, identities, strict=True))
         return [1] * len(observations), {"dropped": np.zeros(len(observations))}
@@ -95,15 +86,12 @@ def test_mixtures_work_with_composite_spaces():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), what=spaces.Discrete(3))
     observed = {"observation_space": space, "observation_space_mapping": lambda: {"how": [1, 2], "what": 1}}
     ant = decision(agent="ant_0", action_space=space, **observed)
-
-    def stacked(observations):
-        return {"how": observations["how"] * 2, "what": observations["what"] + 1}
-
-    found = collect_episodes(calling(*[ant] * 9), {ant: Mixture({stacked: 1, RULE: 1})}, seeds=[1, 2])[ant]
-    chosen = ~found.by_rule
-    assert 0 < chosen.sum() < 18
-    assert np.array_equal(found.actions["how"][chosen], np.tile([2, 4], (chosen.sum(), 1)))
-    assert (found.actions["what"][chosen] == 2).all()
+    policies = {ant: Mixture({(lambda observations: observations): 1, RULE: 1})}
+    found = collect_episodes(calling(*[ant] * 9), policies, seeds=[1, 2])[ant]
+    own = ~found.by_rule
+    assert 0 < own.sum() < 18
+    assert found.actions["how"][own].tolist() == [[1, 2]] * own.sum()
+    assert found.actions["what"][own].tolist() == [1] * own.sum()
 
 
 @pytest.mark.parametrize(
@@ -117,13 +105,6 @@ def test_mixtures_work_with_composite_spaces():
 def test_mixtures_that_cannot_be(parts):
     with pytest.raises(OptionValueError, match=r"mixture|weight"):
         Mixture(parts)
-
-
-@pytest.mark.parametrize(("answer", "match"), [([1, 2], "1 decisions"), (None, "None")])
-def test_policies_of_mixtures_answer_each_decision(answer, match):
-    ant = decision(agent="ant_0")
-    with pytest.raises(InvalidActionError, match=match):
-        collect_episodes(calling(ant), {ant: Mixture({(lambda observations: answer): 1})}, seeds=[1])
 
 
 def test_without_minari_the_extra_is_named(monkeypatch):
@@ -147,7 +128,6 @@ def test_without_minari_the_extra_is_named(monkeypatch):
         ("both-v0", "2 policies"),
         ({"ant_0": "same-v0", "bee_0": "same-v0"}, "own"),
         ({"cat_0": "cats-v0"}, "cat_0"),
-        ({}, "dataset_id"),
         (None, "dataset_id"),
         ({"ant_0": 3}, "dataset_id"),
     ],
@@ -243,11 +223,6 @@ def test_actions_of_all_kinds_are_compared():
     found = compare_with_rule(calling(*[ant] * 5), {ant: lambda seen: [next(answers)]}, seeds=[1])[ant]
     assert found.agreements.tolist() == [True, False, False, False, True]
     assert found.policy_actions[1].tolist() == ["hello", "hello", "hell", "hello", "hello"]
-    space = spaces.Sequence(spaces.Box(0, 9, (2,), np.float32))
-    ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: (np.array([1, 2], "f"),))
-    several = [(np.array([1, 2], "f"),), (np.array([1, 3], "f"),)]
-    found = compare_with_rule(calling(ant), {ant: lambda seen: several}, seeds=range(2))[ant]
-    assert found.agreements.tolist() == [True, False]
 
 
 def test_comparisons_of_several_policies_and_of_nobody():

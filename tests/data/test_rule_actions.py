@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, aec_env, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl import RULE, aec_env, parallel_env, single_env
 from simenv_marl.data import collect_episodes
-from simenv_marl.errors import DefinitionError, InvalidActionError
-from tests.worlds.models import calling, decision, define, notes, play, script
+from simenv_marl.errors import InvalidActionError
+from tests.worlds.lives import life
+from tests.worlds.many_worlds import beings
+from tests.worlds.models import calling, decision, notes, play, script
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
@@ -53,20 +55,6 @@ def test_the_next_info_tells_the_rules_action_and_only_that_of_the_latest_decisi
     assert env.simulation.log == [10, 7, 20, 30]
 
 
-def test_a_mapping_may_take_the_bound_arguments_of_the_call():
-    seen = []
-
-    def mapping(decided, *args, **kwargs):
-        seen.append((decided, args, kwargs))
-        return 1
-
-    function = decision(lambda step=10: step + 1, rule_action_mapping=mapping)
-    env = begun(script(lambda simulation: [function(5), function(step=7), function()].clear()), function)
-    for _ in range(3):
-        env.step(RULE)
-    assert seen == [(6, (5,), {}), (8, (7,), {}), (11, (10,), {})]
-
-
 @pytest.mark.parametrize(
     ("mapping", "error", "match", "note"),
     [
@@ -105,10 +93,12 @@ def test_decisions_within_rules_do_not_take_each_others_place():
     assert "of 'wrong_0'" in notes(caught.value)
 
 
-@pytest.mark.parametrize("wrong", [3, "name"])
-def test_what_is_no_mapping_is_refused(wrong):
-    with pytest.raises(DefinitionError, match="rule_action_mapping"):
-        decision(rule_action_mapping=wrong)
+def test_entities_are_told_each_their_own():
+    points, names = beings(rule_action_mapping=lambda decided, being: being.number), ["being_0", "being_1", "being_2"]
+    env = parallel_env(life("0 acts, 1 acts, 2 acts, 0 acts"), points, possible_agents=names)
+    env.reset(seed=0)
+    infos = env.step({"being_0": RULE, "being_1": 4, "being_2": RULE})[4]
+    assert [infos[agent].get("rule_action") for agent in names] == [0, None, 2]
 
 
 def test_arrays_are_cast_and_nobody_elses():
@@ -124,27 +114,19 @@ def test_arrays_are_cast_and_nobody_elses():
 
 
 def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
-    class Tank:
-        level = 0
+    tank = {"level": 0}
 
-        def fill(self) -> None:
-            self.level += 3
+    def fill():
+        tank["level"] += 3
 
-    point = define(
-        observation_space=spaces.Discrete(100),
-        observation_space_mapping=lambda tank: tank.level,
-        apply=lambda action, tank: setattr(tank, "level", tank.level + action),
-        rule_action_mapping=lambda nothing, tank: tank.level % 10,
-    )
-    Tank.fill = point(Tank.fill)
+    fill = decision(fill, apply=lambda action: None, rule_action_mapping=lambda nothing: tank["level"])
 
     def main(simulation):
-        tank = Tank()
         for _ in range(3):
-            tank.fill()
-        tank.level = 50  # what comes after is not looked at
+            fill()
+        tank["level"] = 5  # what comes after is not looked at
 
-    env = begun(script(main), Tank.fill)
+    env = begun(script(main), fill)
     assert [env.step(RULE)[4]["rule_action"] for _ in range(3)] == [3, 6, 9]
 
 
@@ -177,79 +159,6 @@ def test_generators_and_coroutines(driver):
     told = [(turn.agent, turn.info.get("rule_action")) for turn in play(env, RULE, seed=0)]
     assert told == [("slow_0", None), ("slow_0", 4), ("late_0", None), ("late_0", 5), ("slow_0", 4), ("late_0", 5)]
     assert env.simulation.log == [3, 3, "wait", "wait", 4, 4]
-
-
-class Sheep:
-    def __init__(self, number: int) -> None:
-        self.name, self.number = f"sheep_{number}", number
-
-    def move(self) -> int:
-        return self.number * 10
-
-
-class Herd:
-    def __init__(self, number: int = 3) -> None:
-        self.number = number
-
-    def reset(self) -> None:
-        self.log: list[Any] = []
-
-    def run(self) -> None:
-        self.flock = [Sheep(number) for number in range(self.number)]
-        for _ in range(2):
-            self.log += [each.move() for each in self.flock]
-
-
-ROSTER = ["sheep_0", "sheep_1", "sheep_2"]
-SHEEP = {
-    f"{__name__}.Sheep.move": define(
-        observation_space=spaces.Discrete(10),
-        observation_space_mapping=lambda sheep: sheep.number,
-        action_space_mapping=lambda action: 10 * action,
-        agent=lambda sheep: sheep.name,
-        rule_action_mapping=lambda decided: decided // 10,
-    )
-}
-
-
-def test_rounds_tell_it_too():
-    env = parallel_env(Herd, SHEEP, possible_agents=ROSTER)
-    env.reset(seed=0)
-    infos = env.step({"sheep_0": RULE, "sheep_1": 4, "sheep_2": RULE})[4]
-    assert [infos[agent].get("rule_action") for agent in ROSTER] == [0, None, 2]
-    env = joint_env(Herd, SHEEP, possible_agents=ROSTER)
-    env.reset(seed=0)
-    env.step(RULE)
-    assert env.simulation.log == [0, 10, 20]
-
-
-def test_simulations_and_vectors_run_as_they_did():
-    function = decision(counting(), rule_action_mapping=lambda tens: 1)
-    assert simulate(four(function), {function: lambda observation: RULE}, seed=0).log == [10, 20, 30, 40]
-    envs = vector_env(four(function), function, num_envs=2)
-    envs.reset(seed=0)
-    for _ in range(3):
-        assert envs.step([1, 2])[4] == {}
-    assert [simulation.log for simulation in envs.get_attr("simulation")] == [[], []]
-    envs.step([1, 2])
-    assert [simulation.log for simulation in envs.get_attr("simulation")] == [[1] * 4, [2] * 4]
-    envs.close()
-
-
-def test_batched_policies_get_it_in_their_infos_as_single_ones_do():
-    seen = []
-
-    def alone(observation, info):
-        seen.append(info.get("rule_action"))
-        return RULE
-
-    def batched(observations, infos):
-        return [alone(None, info) for info in infos]
-
-    for run, own, seeds in ((simulate_many, batched, {"seeds": [0]}), (simulate, alone, {"seed": 0})):
-        function = decision(counting(), rule_action_mapping=lambda tens: tens // 10)
-        run(four(function), {function: own}, **seeds)
-    assert seen == [None, 1, 2, 3] * 2
 
 
 MOVES = {0: "stay", 1: "north", 2: "south"}
@@ -288,21 +197,3 @@ def test_a_policy_may_decide_some_of_them():
     assert found.actions.tolist() == [1, 9, 2, 8]
     assert found.by_rule.tolist() == [True, False, True, False]
     assert found.known.all()
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_entities_that_were_collected(workers):
-    (herds,) = collect_episodes(
-        Herd, dict.fromkeys(SHEEP, RULE), points=SHEEP, seeds=range(5), workers=workers
-    ).values()
-    assert herds.known.all()
-    assert herds.actions.tolist() == herds.observations.tolist() == [0, 0, 1, 1, 2, 2] * 5
-
-
-@pytest.mark.parametrize(
-    ("actions", "told"), [(RULE, [0, 1, 0, 1]), ({"sheep_0": RULE, "sheep_1": 3}, [0, None, 0, None])]
-)
-def test_entities_are_told_each_their_own(actions, told):
-    turns = play(aec_env(lambda: Herd(2), SHEEP), actions, seed=0)
-    found = [(turn.agent, turn.info.get("rule_action")) for turn in turns]
-    assert found == list(zip(["sheep_0", "sheep_1"] * 3, [None, None, *told], strict=True))

@@ -14,39 +14,23 @@ from hypothesis import strategies as st
 
 from simenv_marl import RULE, aec_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
-from simenv_marl.errors import AgentError, UnknownAgentError, ViewError
+from simenv_marl.errors import UnknownAgentError, ViewError
 from tests.worlds.lives import life
-from tests.worlds.many_worlds import (
-    ROSTER,
-    Announcing,
-    Answered,
-    Colony,
-    answer,
-    beings,
-    colony_points,
-    designs,
-    seeds,
-)
-from tests.worlds.models import decision, notes, script
+from tests.worlds.many_worlds import ROSTER, Announcing, Answered, Colony, answer, beings, colony_points, designs, seeds
+from tests.worlds.models import decision, script
 
 EVERYBODY = st.tuples(designs, seeds, st.sampled_from([Colony, Announcing]))
 
 
 def colony(design, kind, view, padded=False):
     overseen = bool(design.overseen)
-    env = view(lambda: kind(design), colony_points(overseen=overseen), possible_agents=roster(overseen))
+    roster = {f"{Colony.__module__}.Creature.act": ROSTER} if overseen else ROSTER
+    env = view(lambda: kind(design), colony_points(overseen=overseen), possible_agents=roster)
     return pad_agents(env) if padded else env
-
-
-def roster(overseen):
-    return {f"{Colony.__module__}.Creature.act": ROSTER} if overseen else ROSTER
 
 
 def is_blank(env, agent, observation):
     return env.observation_space(agent).contains(observation) and not np.any(observation)
-
-
-# -- turns ------------------------------------------------------------------------------------------
 
 
 @settings(deadline=None)
@@ -91,9 +75,6 @@ def test_turns_are_those_of_the_living_and_all_else_stands_by(world):
     assert env.agents == []
 
 
-# -- rounds -----------------------------------------------------------------------------------------
-
-
 @settings(deadline=None)
 @given(EVERYBODY)
 def test_rounds_have_everybody_and_are_those_of_the_living(world):
@@ -130,13 +111,8 @@ def test_rounds_have_everybody_and_are_those_of_the_living(world):
     bare.close()
 
 
-# -- what stands by ---------------------------------------------------------------------------------
-
-
 NAMES = ["being_1", "being_2"]
 VIEWS = [(parallel_env, {"being_1": 3, "being_2": 4}), (aec_env, 3)]
-
-
 GENERATIONS = life("1 acts, 1 health 7, 1 leaves, 2 health 1, 2 acts, 2 acts")
 
 
@@ -201,18 +177,13 @@ def test_masks_are_open_and_clocks_go_on():
     assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_errors_surface_and_the_next_episode_is_as_ever():
-    program = life("1 acts, 1 leaves, 1 acts")
-    env = pad_agents(parallel_env(program, beings(), possible_agents=NAMES))
-    env.reset(seed=0)
-    with pytest.raises(AgentError, match="after its end"):
-        env.step({"being_1": 1, "being_2": 1})
+def test_an_error_surfaces_and_the_next_episode_is_as_ever():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
     env = pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES))
     env.reset(seed=0)
-    with pytest.raises(ZeroDivisionError) as caught:
+    with pytest.raises(ZeroDivisionError):
         env.step(1)
-    assert "being_2" in notes(caught.value)
+    assert env.agents == []
     env.reset(seed=0)
     assert sorted(env.agents) == NAMES
 
@@ -224,17 +195,6 @@ def test_padding_needs_a_view_of_many_agents_and_a_roster():
     function = decision()
     with pytest.raises(ViewError, match="aec_env or parallel_env"):
         pad_agents(single_env(script(lambda simulation: function()), function))
-
-
-def test_results_stand_in_the_order_of_the_roster():
-    names = ["being_0", "being_1", "being_2"]
-    env = pad_agents(parallel_env(life("2 acts, 0 acts, 2 acts, 0 acts"), beings(), possible_agents=names))
-    told = env.reset()
-    while env.agents:
-        assert env.agents == names
-        assert [list(part) for part in told] == [names] * len(told)
-        told = env.step(dict.fromkeys(names, 1))
-    assert [list(part) for part in told] == [names] * 5
 
 
 @pytest.mark.parametrize(("view", "action"), VIEWS)

@@ -6,8 +6,8 @@ import copy
 import gc
 import multiprocessing
 import pickle
-import threading
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gymnasium
@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, TRUNCATED, joint_env, register_simulation, single_env, vector_env
+from simenv_marl import RULE, joint_env, single_env, vector_env
 from simenv_marl.errors import (
     ClosedError,
     CopyError,
@@ -31,10 +31,8 @@ from simenv_marl.errors import (
     ViewError,
     WrongThreadError,
 )
-from simenv_marl.plugins import ChangedResult
-from tests.conftest import DRIVERS
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
-from tests.worlds.many_worlds import Being, beings
+from tests.worlds.many_registered import IDS, Voyage
 from tests.worlds.models import decision, notes, script, stacks
 from tests.worlds.worlds import FuseError, designs, seeds
 
@@ -76,45 +74,12 @@ def begun(envs, seed=0):
     return envs
 
 
-def amount(what, most, agent):
-    return definition(
-        observation_space=spaces.Box(-99, 99, (1,), np.float64),
-        observation_space_mapping=lambda self: [getattr(self, what)],
-        action_space=spaces.Box(-most, most, (1,), np.float64),
-        action_space_mapping=lambda action: float(action[0]),
-        reward_mapping=lambda self: getattr(self, what),
-        agent=agent,
-    )
-
-
-class Pair:
-    def reset(self, seed: int | None = None) -> None:
-        self.random = np.random.default_rng(seed)
-        self.level = self.size = 0
-
-    def run(self) -> None:
-        for _ in range(int(self.random.integers(2, 5))):
-            self.level += self.steer()
-            self.size += self.grow()
-
-    @amount("level", 1, "steerer")
-    def steer(self) -> float:
-        return 0.0
-
-    @amount("size", 2, "grower")
-    def grow(self) -> float:
-        return 0.0
-
-
-PAIR = [Pair.steer, Pair.grow]
-
-
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("flatten", [False, True])
 def test_matches_sync_vector_env_over_joint_views(flatten, mode):
-    given = {"num_envs": 3, "flatten": flatten, "autoreset_mode": mode}
-    ours, workers = vector_env(Pair, PAIR, **given), vector_env(Pair, PAIR, **given, workers=2, context=FORK)
-    theirs = SyncVectorEnv([lambda: joint_env(Pair, PAIR, flatten=flatten)] * 3, autoreset_mode=mode)
+    given = {"num_envs": 3, "max_steps": 3, "flatten": flatten, "autoreset_mode": mode}
+    ours, workers = (vector_env(Voyage, **given, workers=number, context=FORK) for number in (0, 2))
+    theirs = SyncVectorEnv([lambda: joint_env(Voyage, max_steps=3, flatten=flatten)] * 3, autoreset_mode=mode)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     agree(ours, theirs, 20, np.random.default_rng(0))
@@ -125,24 +90,7 @@ def test_matches_sync_vector_env_over_joint_views(flatten, mode):
 def test_the_view_can_be_chosen():
     assert isinstance(vector_env(Counter, POINT, num_envs=2, view="joint").single_action_space, spaces.Dict)
     with pytest.raises(ViewError, match="needs one active decision point"):
-        vector_env(Pair, PAIR, num_envs=2, view="single")
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"driver": "thread"},
-        {"max_steps": 2},
-        {"plugins": [(lambda model, _result: ChangedResult((_result + 1) // 2), Counter.decide, "after")]},
-    ],
-    ids=lambda options: next(iter(options)),
-)
-def test_options_mean_what_they_mean_to_one_environment(options):
-    ours = vector_env(Counter, Counter.decide, num_envs=3, **options)
-    theirs = SyncVectorEnv([lambda: single_env(Counter, Counter.decide, **options)] * 3)
-    agree(ours, theirs, 20, np.random.default_rng(0))
-    ours.close()
-    theirs.close()
+        vector_env(Voyage, num_envs=2, view="single")
 
 
 def seeds_of(envs: Any) -> list[int | None]:
@@ -250,20 +198,19 @@ def test_one_illegal_action_moves_nobody(processes):
 
 
 def test_one_illegal_action_in_a_joint_view_moves_nobody():
-    envs = vector_env(Pair, PAIR, num_envs=2)
-    observations, _ = envs.reset(seed=0)
-    legal = {agent: np.zeros((2, 1)) for agent in observations}
+    envs = begun(vector_env(Voyage, num_envs=2))
+    legal = {"helm_0": np.ones((2, 1)), "sail_0": np.ones((2, 1))}
     for illegal in (
-        {**legal, "steerer": np.array([[0.0], [3.0]])},
-        {**legal, "grower": np.array([[0.0], [np.nan]])},
-        {**legal, "steerer": [np.zeros(1), RULE]},
-        {"steerer": np.zeros((2, 1))},
-        {agent: np.zeros((1, 1)) for agent in observations},
+        {**legal, "helm_0": np.array([[0.0], [3.0]])},
+        {**legal, "sail_0": np.array([[0.0], [np.nan]])},
+        {**legal, "helm_0": [np.zeros(1), RULE]},
+        {"helm_0": np.zeros((2, 1))},
+        {agent: np.zeros((1, 1)) for agent in legal},
         RULE,
     ):
         with pytest.raises(InvalidActionError):
             envs.step(illegal)
-    assert [simulation.level for simulation in envs.get_attr("simulation")] == [0, 0]
+    assert [simulation.boat.place for simulation in envs.get_attr("simulation")] == [0, 0]
     envs.step(legal)
 
 
@@ -315,12 +262,8 @@ def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(where, cul
             raise FuseError
         return [0, 0] if where.startswith("obs") else 1
 
-    def made() -> Any:
-        return vector_env(Counter, {POINT: definition(**{where: fail} if where != "run" else {})}, num_envs=3)
-
     stacks_before = stacks()
-    envs, fresh = made(), made()
-    envs.reset(seed=0)
+    envs = begun(vector_env(Counter, {POINT: definition(**{where: fail} if where != "run" else {})}, num_envs=3))
     envs.envs[culprit].simulation.failing = where == "run"
     with pytest.raises(FuseError) as caught:
         envs.step(np.where(np.arange(3) == culprit, 3, 1))
@@ -339,76 +282,56 @@ def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(where, cul
     envs.reset(seed=5)
     envs.step([1, 1, 1])
     assert counts(envs) == [1, 1, 1]
-    if where == "run":
-        agree(envs, fresh, 10, np.random.default_rng(0))
     envs.close()
-    fresh.close()
     assert stacks(stacks_before) == stacks_before
 
 
-def test_an_error_after_another_one_was_reset_or_in_a_reset_has_all_be_reset():
+def test_an_error_in_a_reset_and_a_closed_sub_environment_have_all_be_reset():
     class Fragile(Counter):
         def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
             super().reset(seed, options)
             if seed == 66:
                 raise FuseError
 
-    envs = vector_env(Fragile, {POINT: definition(action_space_mapping=lambda action: {1: 1}[action])}, num_envs=2)
+    envs = vector_env(Fragile, {POINT: definition()}, num_envs=2)
     with pytest.raises(FuseError) as caught:
         envs.reset(seed=65)
     assert "sub-environment 1" in notes(caught.value)
     with pytest.raises(NotResetError, match="no episode yet"):
         envs.step([1, 1])
-    goals = {seed: int(np.random.default_rng(seed).integers(3, 12)) for seed in range(10)}
-    envs.reset(seed=[max(goals, key=goals.__getitem__), min(goals, key=goals.__getitem__)])
-    over = np.zeros(2, bool)
-    while not over.any():
-        over = np.logical_or(*envs.step([1, 1])[2:4])
-    assert over.tolist() == [False, True]
-    with pytest.raises(KeyError) as caught:
-        envs.step([3, 1])
-    assert "sub-environment 0" in notes(caught.value)
-    with pytest.raises(EpisodeOverError, match="begin the next ones"):
-        envs.step([1, 1])
     envs.reset(seed=0)
     envs.step([1, 1])
+    envs.envs[1].close()
+    with pytest.raises(ResetNeededError, match="call reset"):
+        envs.step([1, 1])
 
 
-def test_inside_another_simulation_it_works_all_the_same():
-    inner, told = vector_env(Counter, {POINT: definition()}, num_envs=2), []
+def test_sub_environments_are_closed_if_another_one_cannot_be_made():
+    def make() -> Counter:
+        made.append(Counter())
+        if len(made) == 4:
+            raise FuseError
+        return made[-1]
 
-    class Outer(Counter):
-        def run(self) -> Any:
-            inner.reset(seed=0)
-            told.append(inner.step([1, 2])[0][:, 0].tolist())
-            return super().run()
-
-    vector_env(Outer, {POINT: definition()}, num_envs=2).reset(seed=0)
-    assert told == [[1, 2], [1, 2]]
+    made: list[Counter] = []
+    plain = Counter.decide
+    with pytest.raises(FuseError) as caught:
+        vector_env(make, {POINT: definition()}, num_envs=4)
+    assert "sub-environment 3" in notes(caught.value)
+    assert Counter.decide is plain  # while the error holds what has failed
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
-def test_another_thread_may_use_it_with_the_thread_driver_alone(driver):
+@pytest.mark.parametrize(("driver", "error"), [("greenlet", WrongThreadError), ("thread", None)])
+def test_another_thread_may_use_it_with_the_thread_driver_alone(driver, error):
     envs = begun(vector_env(Counter, Counter.decide, num_envs=2, driver=driver))
-    errors = []
-
-    def use() -> None:
-        for method in (lambda: envs.step([1, 1]), envs.reset, envs.close):
-            try:
-                method()
-            except WrongThreadError as error:
-                errors.append(error)
-            if driver == "thread":
-                break
-
-    thread = threading.Thread(target=use)
-    thread.start()
-    thread.join()
-    assert len(errors) == (0 if driver == "thread" else 3)
-    assert counts(envs) == ([1, 1] if driver == "thread" else [0, 0])
-    assert not envs.closed
-    envs.step([1, 1])
-    envs.close()
+    with ThreadPoolExecutor(1) as other:
+        for method in (lambda: envs.step([1, 1]), lambda: envs.reset(seed=0), envs.close):
+            assert type(other.submit(method).exception()) is (error or type(None))
+    assert envs.closed == (error is None)
+    if error is not None:
+        assert counts(envs) == [0, 0]
+        envs.step([1, 1])
+        envs.close()
 
 
 @PROCESSES
@@ -437,20 +360,6 @@ def test_sub_environments_can_be_asked_and_told(processes):
         with pytest.raises(AttributeError, match="nothing_of_that_name"):
             use("nothing_of_that_name")
     assert envs.unwrapped is envs
-
-
-def test_a_sub_environment_that_somebody_else_resets_is_stepped_where_it_then_stands():
-    envs = vector_env(Counter, POINT, num_envs=2)
-    envs.reset(seed=[5, 6])
-    for _ in range(2):
-        envs.step([1, 1])
-    assert envs.envs[1].reset(seed=6)[0][0] == 0
-    assert envs.step([1, 1])[0][:, 0].tolist() == [3, 1]
-    envs.envs[1].close()
-    with pytest.raises(ResetNeededError, match="call reset"):
-        envs.step([1, 1])
-    envs.reset(seed=[5, 6])
-    assert envs.step([1, 1])[0][:, 0].tolist() == [1, 1]
 
 
 def test_it_cannot_be_copied_or_pickled():
@@ -511,69 +420,17 @@ def test_one_that_is_dropped_unwinds_all():
     assert stacks(stacks_before) == stacks_before
 
 
-def test_gymnasium_makes_it_of_registered_ids():
-    ids = [identity for identity in register_simulation(Pair, PAIR, name="vectors") if identity in gymnasium.registry]
+@pytest.mark.parametrize("identity", IDS[:-1])
+def test_gymnasium_makes_it_of_registered_ids(identity):
     given = {"num_envs": 3, "max_steps": 3}
-    try:
-        for identity in ids:
-            ours = gymnasium.make_vec(identity, vectorization_mode="vector_entry_point", **given)
-            assert type(ours).__name__ == "SimulationVectorEnv"
-            assert ours.spec.id == identity
-            ours.spec.to_json()
-            theirs = gymnasium.make_vec(identity, vectorization_mode="sync", **given)
-            agree(ours, theirs, 12, np.random.default_rng(0))
-        assert len(ids) == 3
-        envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
-        assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-        envs.reset(seed=0)
-        envs.close()
-    finally:
-        for identity in ids:
-            gymnasium.registry.pop(identity)
-
-
-@pytest.mark.parametrize("view", ["single", "joint"])
-@pytest.mark.parametrize("mode", MODES)
-def test_an_agent_that_is_removed_terminates_and_is_not_truncated(view, mode):
-    class Brief:
-        def reset(self, seed: int | None = None) -> None:
-            self.being = Being(0)
-
-        def expected_calls(self, point: str) -> list[Any]:
-            return [(self.being,)]
-
-        def run(self) -> Any:
-            self.being.act()
-            self.being.leave()
-            return TRUNCATED
-
-    envs = vector_env(Brief, beings(agent="being_0"), num_envs=2, view=view, autoreset_mode=mode)
-    alone = (single_env if view == "single" else joint_env)(Brief, beings(agent="being_0"))
-    alone.reset(seed=0)
-    expected = alone.step(1 if view == "single" else {"being_0": 1})[2:4]
-    envs.reset(seed=0)
-    *_, terminated, truncated, _ = envs.step(np.ones(2, np.int64) if view == "single" else {"being_0": np.ones(2, int)})
-    assert list(zip(terminated.tolist(), truncated.tolist(), strict=True)) == [expected] * 2
-    if view == "single":
-        assert expected == (True, False)
-
-
-def test_what_is_reset_to_ask_for_the_agents_is_unwound():
-    class Announcing(Counter):
-        def run(self):
-            try:
-                super().run()
-            finally:
-                ended.append(self)
-
-        def expected_calls(self, point):
-            return [(self,)]
-
-    ended, points = [], {POINT: definition(agent=lambda self: "counter_0")}
-    ours = vector_env(Announcing, points, num_envs=2)
-    assert len(ended) == 1
-    theirs = SyncVectorEnv([lambda: joint_env(Announcing, points)] * 2)
-    agree(ours, theirs, 20, np.random.default_rng(0))
+    ours = gymnasium.make_vec(identity, vectorization_mode="vector_entry_point", **given)
+    assert type(ours).__name__ == "SimulationVectorEnv"
+    assert ours.spec.id == identity
+    ours.spec.to_json()
+    agree(ours, gymnasium.make_vec(identity, vectorization_mode="sync", **given), 12, np.random.default_rng(0))
+    envs = gymnasium.make_vec(identity, num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    envs.close()
 
 
 def test_neither_answers_nor_results_are_held_longer_than_they_are_used():

@@ -1,16 +1,10 @@
 """The pension fund: money, law and people on their own, its environments, and a training in a small way."""
 
-import ast
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
-import gymnasium
 import numpy as np
-import pettingzoo
 import pytest
-from examples.fin_base import blocks, company, economy, law, pension, people, train
+from examples.fin_base import train
 from examples.fin_base.env import PREMIUMS, TEAM, FundSim, premium_env, team_env
 from examples.fin_base.pension import Parameters
 from examples.fin_base.people import Client, clients_of
@@ -22,8 +16,6 @@ from simenv_marl.errors import InvalidActionError
 from simenv_marl.testing import check_simulation
 from tests.worlds.models import follow_the_rule
 
-ROOT = Path(__file__).parents[2]
-AGENTS = ["indexer_0", "planner_0", "manager_0", "regulator_0"]
 SMALL = Parameters(clients=60, coverage=1.0)  # poor enough for plans, cuts and demands
 MANAGER = {point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"}
 
@@ -48,26 +40,6 @@ def state(fund):
 
 def small(years=12):
     return FundSim(years, SMALL)
-
-
-@pytest.mark.parametrize("module", [blocks, company, economy, law, pension, people])
-def test_the_model_knows_nothing_of_environments(module):
-    imported = set()
-    for node in ast.walk(ast.parse(Path(module.__file__).read_text())):
-        if isinstance(node, ast.ImportFrom):
-            imported.add(node.module)
-        elif isinstance(node, ast.Import):
-            imported |= {alias.name for alias in node.names}
-    own = {"blocks", "company", "economy", "law", "people"}
-    assert {name.split(".")[0] for name in imported} <= set(sys.stdlib_module_names) | own
-
-
-def test_it_runs_on_its_own():
-    options = ["--seed", "1", "--clients", "100", "--years", "6"]
-    command = [sys.executable, "-W", "error", "-m", "examples.fin_base.pension", *options]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert "years a second" in done.stdout
 
 
 VIEWS = {
@@ -106,31 +78,6 @@ def test_no_cent_is_lost_by_random_legal_actions_and_others_are_refused():
             environment.step(None if terminated or truncated else action)
         environment.simulation.fund.world.check()
     assert refused
-
-
-def test_the_agent_of_a_client_ends_when_the_client_retires_leaves_or_dies(monkeypatch):
-    gone = []
-
-    def noting(original):
-        def noted(client, *rest):
-            if client.status in ("working", "away"):
-                gone.append(client.name)
-            return original(client, *rest)
-
-        return noted
-
-    for name in ("retire", "vanish"):
-        monkeypatch.setattr(Client, name, noting(getattr(Client, name)))
-    environment = premium_env(small())
-    environment.reset(seed=4)
-    decided, ended = set(), []
-    for agent in environment.agent_iter():
-        _, _, terminated, truncated, _ = environment.last()
-        ended += [agent] * terminated
-        decided.add(agent)
-        environment.step(None if terminated or truncated else RULE)
-    assert len(ended) == len(set(ended)) > 10
-    assert set(ended) == set(gone) & decided
 
 
 @pytest.mark.parametrize("points", [TEAM, MANAGER])
@@ -177,28 +124,6 @@ def test_pettingzoo_and_gymnasium_accept_the_environments():
 def test_the_librarys_check_finds_nothing(points):
     report = check_simulation(lambda: small(3), points, episodes=2)
     assert not [finding for finding in report.findings if finding.severity != "note"], report
-
-
-@pytest.mark.parametrize("name", ["ChooseIndexation", "ChooseCut", "ChooseMix", "ChooseDemand", "Joint"])
-def test_gymnasium_makes_the_teams_agents_by_their_ids(name):
-    environment = gymnasium.make(f"fin_base/{name}-v0", max_steps=2)
-    environment.reset(seed=1)
-    assert isinstance(environment.unwrapped.simulation, FundSim)
-    assert environment.unwrapped.step(RULE)[1] != 0
-    environment.close()
-
-
-@pytest.mark.skipif(not hasattr(pettingzoo, "aec_registry"), reason="this PettingZoo has no registry")
-@pytest.mark.parametrize(("kind", "name"), [("aec", "coop"), ("aec", "premium"), ("parallel", "coop")])
-def test_pettingzoo_makes_environments_by_their_ids(kind, name):
-    environment = pettingzoo.make(kind, f"fin_base/{name}_v0", max_steps=3)
-    if name == "coop":
-        assert environment.possible_agents == AGENTS
-    environment.reset(seed=1)
-    for _ in range(3):
-        environment.step(RULE if kind == "aec" else dict.fromkeys(environment.agents, RULE))
-    assert kind == "parallel" or all(environment.truncations.values())
-    environment.close()
 
 
 def test_training_is_determined_by_its_seed(capsys):

@@ -1,7 +1,5 @@
 """Each study runs from its command line to its figures, in a small way; those of learners are in ``tests/clients``."""
 
-import json
-
 import pytest
 from examples.greenhouse_coop import plan, train
 from examples.greenhouse_coop.env import DAYS, GreenhouseSim
@@ -16,24 +14,19 @@ def big(path):
     return path.stat().st_size > 10_000
 
 
-class Short(GreenhouseSim):
-    """A greenhouse that is nearly at its end when it begins."""
+def short(kind):
+    """A kind of greenhouses that are nearly at their end when they begin."""
 
-    def reset(self, seed=None):
-        super().reset(seed)
-        self.greenhouse.day = DAYS - 4
+    class Short(kind):
+        def reset(self, seed=None):
+            super().reset(seed)
+            self.greenhouse.day = DAYS - 4
 
-
-class ShortHouse(variants.House):
-    """The same for the matrix."""
-
-    def reset(self, seed=None):
-        super().reset(seed)
-        self.greenhouse.day = DAYS - 4
+    return Short
 
 
 def test_demo_draws_what_was_trained_and_what_was_planned(tmp_path, monkeypatch):
-    monkeypatch.setattr(plan, "GreenhouseSim", Short)
+    monkeypatch.setattr(plan, "GreenhouseSim", short(GreenhouseSim))
     train.main(["--budget", "1", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)])
     plan.main(["--seeds", "1", "--futures", "1", "--out", str(tmp_path)])
     for name in picture.TITLES:
@@ -44,7 +37,7 @@ def test_demo_draws_what_was_trained_and_what_was_planned(tmp_path, monkeypatch)
 def test_greenhouse_matrix_shows_what_it_has_found(tmp_path, capsys, monkeypatch):
     pytest.importorskip("seaborn")
     pytest.importorskip("statsmodels")
-    monkeypatch.setattr(variants, "House", ShortHouse)
+    monkeypatch.setattr(variants, "House", short(variants.House))
     table = matrix.main(["--quick", "--workers", "0", "--out", str(tmp_path)])
     assert set(table.status) == {"ok"}
     assert list(dict.fromkeys(table.contender)) == ["rule", "learned at home 1", "learned all over 1", "planned"]
@@ -55,7 +48,7 @@ def test_greenhouse_matrix_shows_what_it_has_found(tmp_path, capsys, monkeypatch
 
 
 def test_greenhouse_plans_draws_budgets_and_horizons(tmp_path, monkeypatch):
-    monkeypatch.setattr(plan, "GreenhouseSim", Short)
+    monkeypatch.setattr(plan, "GreenhouseSim", short(GreenhouseSim))
     plans.main(["--seeds", "1", "--horizons", "1", "--futures", "1", "--figures", str(tmp_path)])
     assert big(tmp_path / "plan-budget.png")
     assert big(tmp_path / "plan-horizon.png")
@@ -110,12 +103,3 @@ def test_pages_state_the_figures_of_the_finals():
 
     finals = pd.read_csv(results.DATA / "finals.csv", dtype={"library": str, "question": str})
     assert results.table(finals) == (results.FIGURES / "experiment.md").read_text()
-
-
-def test_results_of_the_shared_policy_are_those_of_its_page():
-    from studies.wolf_sheep import picture as drawn
-
-    results = json.loads((drawn.FIGURES / "shared-policy.json").read_text())
-    page = (drawn.FIGURES.parent / "shared-policy.md").read_text()
-    assert list(results["results"]) == list(drawn.STYLES)
-    assert drawn.table(results) in page

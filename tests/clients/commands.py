@@ -11,15 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def python(*arguments: object, **environment: str) -> str:
-    """Let another Python run something.
-
-    Args:
-        *arguments: Of its command line.
-        **environment: Variables of its process, beside those of this one.
-
-    Returns:
-        What it has printed.
-    """
+    """Let another Python run something, with more variables in its environment; return what it has printed."""
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
         cwd=ROOT,
@@ -31,8 +23,3 @@ def python(*arguments: object, **environment: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def module(name: str, *arguments: object, **environment: str) -> str:
-    """Run a module of the repository as the Makefile does; otherwise like ``python``."""
-    return python("-m", name, *arguments, **environment)

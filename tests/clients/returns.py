@@ -11,13 +11,7 @@ HELD_OUT = range(10_000, 10_030)
 
 
 def single_return(env: Any, act: Callable[[Any, dict[str, Any]], Any], seeds: Iterable[int] = HELD_OUT) -> float:
-    """The mean return of a Gymnasium environment.
-
-    Args:
-        env: The environment, which is left open.
-        act: The policy: a callable of the observation and the info.
-        seeds: An episode for each.
-    """
+    """The mean return of a Gymnasium environment, over an episode for each seed."""
     returns = []
     for seed in seeds:
         observation, info = env.reset(seed=seed)
@@ -30,13 +24,7 @@ def single_return(env: Any, act: Callable[[Any, dict[str, Any]], Any], seeds: It
 
 
 def parallel_return(env: Any, act: Callable[[str, Any, dict[str, Any]], Any], seeds: Iterable[int] = HELD_OUT) -> float:
-    """The mean over the episodes of a PettingZoo parallel environment of what all agents together have gained.
-
-    Args:
-        env: The environment, which is left open.
-        act: The policy of all agents: a callable of the agent's name, its observation and its info.
-        seeds: An episode for each.
-    """
+    """The mean of what all agents of a PettingZoo parallel environment together have gained."""
     returns = []
     for seed in seeds:
         observations, infos = env.reset(seed=seed)

@@ -19,7 +19,4 @@ def test_ppo_earns_more_than_the_rule(tmp_path):
     )
     assert rule == 977
     assert learned > rule + 100
-
-
-def test_the_page_tells_what_the_rule_earns():
     assert "rule earns 977 a quarter" in (DOCS / "quickstart.md").read_text(encoding="utf-8")

@@ -4,7 +4,7 @@ import gymnasium
 import pytest
 from examples.greenhouse_coop import env as greenhouse
 from sb3_contrib import MaskablePPO
-from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3 import PPO, SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
@@ -14,20 +14,11 @@ from simenv_marl import joint_env, single_env
 
 from . import page
 from .returns import single_return
-from .worlds import CraneSim, HerdSim, ReservoirSim, ShopSim, WorkbenchSim
-
-SMALL = {"net_arch": [32]}
+from .worlds import CraneSim, HerdSim, Shop, ShopSim
 
 
 def policy_of(model):
     return lambda observation, info: model.predict(observation, deterministic=True)[0]
-
-
-def gain(model, env, steps):
-    """What a policy is worth before and after training."""
-    before = single_return(env, policy_of(model))
-    model.learn(steps)
-    return before, single_return(env, policy_of(model))
 
 
 def rescaled(env):
@@ -39,7 +30,7 @@ def rescaled(env):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: single_env(ReservoirSim),
+        lambda: single_env(ShopSim, Shop.choose_display),
         lambda: single_env(CraneSim),
         lambda: joint_env(ShopSim, flatten=True),
         lambda: rescaled(greenhouse.watering_env()),
@@ -54,48 +45,12 @@ def test_check_env(make):
     env.close()
 
 
-def test_joint_actions_by_agent_are_refused():
-    """Observations may be dicts; actions may not, and are flattened."""
-    with pytest.raises(AssertionError, match="only supports"):
-        PPO("MultiInputPolicy", joint_env(ShopSim))
-
-
-def test_one_continuous_decision():
-    model = PPO(
-        "MlpPolicy",
-        single_env(ReservoirSim),
-        n_steps=200,
-        batch_size=50,
-        learning_rate=2e-3,
-        gamma=0.9,
-        policy_kwargs=SMALL,
-        seed=0,
-    )
-    before, after = gain(model, single_env(ReservoirSim), 4000)
-    assert before < -30
-    assert after > 15  # of 20
-
-
-def learner_of_shops(envs):
-    return PPO(
-        "MlpPolicy", envs, n_steps=100, batch_size=100, learning_rate=2e-3, gamma=0.5, policy_kwargs=SMALL, seed=0
-    )
-
-
-def test_both_decisions_of_the_shop_in_many_shops_at_once():
-    envs = make_vec_env(lambda: joint_env(ShopSim, flatten=True), n_envs=4)
-    before, after = gain(learner_of_shops(envs), joint_env(ShopSim, flatten=True), 6000)
-    envs.close()
-    assert before < 0
-    assert after > 25  # of 30
-
-
 def test_many_shops_in_processes_of_their_own():
     """They are told what they are told side by side in one process, and so learn the same."""
     learnt = []
     for kind in (DummyVecEnv, SubprocVecEnv):
         envs = make_vec_env(lambda: joint_env(ShopSim, flatten=True), n_envs=2, vec_env_cls=kind)
-        model = learner_of_shops(envs).learn(200)
+        model = PPO("MlpPolicy", envs, n_steps=100, batch_size=100, seed=0).learn(200)
         envs.close()
         learnt.append(single_return(joint_env(ShopSim, flatten=True), policy_of(model)))
     assert learnt[0] == learnt[1]
@@ -114,34 +69,10 @@ def test_a_goal_with_hindsight():
         policy_kwargs={"net_arch": [32, 32]},
         seed=0,
     )
-    before, after = gain(model, single_env(CraneSim), 1500)
-    assert before < -8
-    assert after > -3
-
-
-def test_masked_decisions():
-    """A masked action would be an error, so that none has been taken where training comes to its end."""
-    env = single_env(WorkbenchSim)
-    assert is_masking_supported(env)
-    model = MaskablePPO(
-        "MlpPolicy",
-        make_vec_env(lambda: single_env(WorkbenchSim), n_envs=2),
-        n_steps=125,
-        batch_size=50,
-        learning_rate=3e-3,
-        gamma=1.0,
-        policy_kwargs={"net_arch": [64]},
-        seed=0,
-    )
-
-    def act(observation, info):
-        masks = get_action_masks(env)
-        assert masks.tolist() == info["action_mask"].astype(bool).tolist()
-        return int(model.predict(observation, deterministic=True, action_masks=masks)[0])
-
-    before = single_return(env, act)
-    model.learn(4000)
-    assert single_return(env, act) > max(before + 0.8, -6.8)  # at best -6.7, and -8.3 by chance
+    env = single_env(CraneSim)
+    assert single_return(env, policy_of(model)) < -8
+    model.learn(1500)
+    assert single_return(env, policy_of(model)) > -3
 
 
 def test_masked_decisions_of_a_joint_view():

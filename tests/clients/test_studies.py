@@ -24,15 +24,15 @@ def test_imitation_of_the_rule(capsys):
 def test_imitation_of_plans(plainly):
     pytest.importorskip("minari"), pytest.importorskip("torchrl")
     options = "--budget", 2800, "--learners", 1, "--steps", 5, "--seeds", 1, "--workers", 2
-    assert "learner 1: " in commands.module("studies.imitation.plans", *options, *plainly)
+    assert "learner 1: " in commands.python("-m", "studies.imitation.plans", *options, *plainly)
 
 
 def test_learner_sweep_resumes(tmp_path):
     pytest.importorskip("optuna")
     line = ["--days", 250, "--seeds", 1, "--trials", 1, "--out", tmp_path]
-    told = commands.module("studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
+    told = commands.python("-m", "studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
     assert "found by Optuna: {'learning_rate': " in told
-    assert told == commands.module("studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
+    assert told == commands.python("-m", "studies.learner_sweep.sweep", *line, OMP_NUM_THREADS="1")
 
 
 def test_learner_sweep_has_the_table_of_its_page(tmp_path, monkeypatch):
@@ -54,13 +54,13 @@ def test_wolf_sheep_from_training_to_the_pictures(tmp_path):
 
     curves, path = tmp_path / "shared-policy-training.csv", tmp_path / "shared-policy.json"
     options = "--seeds", 2, "--decisions", 1, "--ticks", 5, "--out", tmp_path, "--curves", curves
-    commands.module("examples.wolf_sheep.train", *options)
+    commands.python("-m", "examples.wolf_sheep.train", *options)
     with curves.open(newline="") as file:
         assert {(row["sight"], row["seed"]) for row in csv.DictReader(file)} == {(s, n) for s in "12" for n in "01"}
-    commands.module("studies.wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
+    commands.python("-m", "studies.wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
     compared = json.loads(path.read_text())
     assert list(compared["results"]) == list(picture.STYLES)
-    told = commands.module("studies.wolf_sheep.picture", "--figures", tmp_path)
+    told = commands.python("-m", "studies.wolf_sheep.picture", "--figures", tmp_path)
     assert (tmp_path / "shared-policy.png").stat().st_size > 10_000
     assert (tmp_path / "shared-policy-training.png").stat().st_size > 10_000
     assert told.count("\n") == 2 + len(picture.STYLES)

@@ -3,7 +3,6 @@
 import copy
 import importlib
 
-import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
@@ -12,7 +11,7 @@ from stable_baselines3 import PPO
 
 from simenv_marl import TRUNCATED, aec_env, parallel_env
 from tests.worlds.counters import alike
-from tests.worlds.dials import ACTIONS, SEEN, Dial, DialEnv, dial_env, points, turned_by
+from tests.worlds.dials import ACTIONS, SEEN, Dial, points, turned_by
 
 from . import page
 from .returns import parallel_return
@@ -115,26 +114,23 @@ WRAPPERS = {
     "scale_actions_v0": ({"scale": 0.5}, "numbers"),
     "sticky_actions_v0": ({"repeat_action_probability": 0.5}, "numbers"),
 }
-OF_AGENTS = {"agent_indicator_v0", "pad_action_space_v0", "pad_observations_v0"}
-VECTORS = {
-    "black_death_v3",
-    "concat_vec_envs_v1",
-    "gym_vec_env_v0",
-    "pettingzoo_env_to_vec_env_v1",
-    "stable_baselines3_vec_env_v0",
-    "vectorize_aec_env_v0",
-}
-FOR_OTHERS = {"stable_baselines_vec_env_v0"}  # what came before Stable-Baselines3
-EVERY_WRAPPER = pytest.mark.parametrize("name", WRAPPERS)
 
 
-def test_no_wrapper_is_left_out():
-    versioned = {name for name in suit if name.rpartition("_v")[2].isdigit()}
-    assert versioned == WRAPPERS.keys() | VECTORS | FOR_OTHERS
+def story_around(env):
+    """Its spaces, and what it tells in some episodes of sampled actions."""
+    found = [env.observation_space(agent) for agent in HANDS] + [env.action_space(agent) for agent in HANDS]
+    sampled = copy.deepcopy(env.action_space("hand_0"))
+    sampled.seed(1)
+    told = [found, env.reset(seed=3)]
+    for number in range(14):
+        told.append(env.step({agent: sampled.sample() for agent in env.agents}))
+        if not env.agents:
+            told.append(env.reset(seed=number))
+    return told
 
 
-@EVERY_WRAPPER
-def test_around_turns(name):
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_wrappers_do_in_turns_and_rounds_what_they_do_around_environments_written_by_hand(name):
     arguments, seen = WRAPPERS[name]
 
     def make():
@@ -142,114 +138,8 @@ def test_around_turns(name):
 
     api_test(make(), num_cycles=20)
     seed_test(make, num_cycles=20)
-
-
-def story_around(name, env):
-    """Its spaces, and what it tells in some episodes of sampled actions."""
-    env = suit[name](env, **WRAPPERS[name][0])
-    if one := isinstance(env, gymnasium.Env):
-        found = [env.observation_space, env.action_space]
-    else:
-        found = [env.observation_space(agent) for agent in HANDS] + [env.action_space(agent) for agent in HANDS]
-    sampled = copy.deepcopy(found[-1] if one else env.action_space("hand_0"))
-    sampled.seed(1)
-    told = [found, env.reset(seed=3)]
-    for number in range(14):
-        told.append(env.step(sampled.sample() if one else {agent: sampled.sample() for agent in env.agents}))
-        if any(told[-1][2:4]) if one else not env.agents:
-            told.append(env.reset(seed=number))
-    return told
-
-
-@EVERY_WRAPPER
-def test_around_rounds(name):
-    seen = WRAPPERS[name][1]
-    assert alike(story_around(name, hands(parallel_env, seen)), story_around(name, HandsEnv(seen)))
-
-
-@pytest.mark.parametrize("name", WRAPPERS.keys() - OF_AGENTS)
-def test_around_one(name):
-    seen = WRAPPERS[name][1]
-    assert alike(story_around(name, dial_env(seen)), story_around(name, DialEnv(seen)))
-
-
-def herds(env, all_there):
-    """A few episodes, in which all go out every day: what they were paid, and in how many rounds."""
-    told = []
-    for seed in range(4):
-        env.reset(seed=seed)
-        paid, rounds = dict.fromkeys(FORAGERS, 0.0), 0
-        while env.agents:
-            assert list(env.agents) == FORAGERS or not all_there
-            observations, rewards, *_ = env.step(dict.fromkeys(env.agents, 1))
-            assert observations.keys() == set(FORAGERS) or not all_there
-            paid = {agent: paid[agent] + rewards.get(agent, 0.0) for agent in FORAGERS}
-            rounds += 1
-        told.append((paid, rounds))
-    return told
-
-
-def test_the_dead_go_on_as_black_death_has_it():
-    plain = herds(parallel_env(HerdSim, possible_agents=FORAGERS), all_there=False)
-    black = herds(suit["black_death_v3"](parallel_env(HerdSim, possible_agents=FORAGERS)), all_there=True)
-    # It notices the end a step later: by an environment that has nothing more to tell.
-    assert black == [(paid, rounds + 1) for paid, rounds in plain]
-
-
-def vectors_of(env, processes):
-    return suit["concat_vec_envs_v1"](suit["pettingzoo_env_to_vec_env_v1"](env), 3, num_cpus=processes)
-
-
-def story_of(envs, number):
-    sampled = copy.deepcopy(envs.action_space)
-    sampled.seed(1)
-    told = [envs.reset(seed=3)]
-    for _ in range(14):
-        told.append(envs.step(np.stack([sampled.sample() for _ in range(number)])))
-    envs.close()
-    return told
-
-
-@pytest.mark.parametrize("processes", [0, 2])
-def test_environments_of_many_hands(processes):
-    """Also of one that was reset before it is copied, as PettingZoo's tutorial does it."""
-    begun = hands(parallel_env)
-    begun.reset(seed=7)
-    theirs = story_of(vectors_of(HandsEnv(), processes), 6)
-    for env in (hands(parallel_env), begun):
-        assert alike(story_of(vectors_of(env, processes), 6), theirs)
-
-
-@pytest.mark.parametrize(
-    ("wrapper", "options", "reset"),
-    [
-        ("gym_vec_env_v0", {"multiprocessing": False}, {"seed": 1}),
-        ("gym_vec_env_v0", {"multiprocessing": True}, {"seed": 1}),
-        ("stable_baselines3_vec_env_v0", {}, {}),
-    ],
-    ids=["vector", "processes", "stable-baselines3"],
-)
-def test_many_single_views(wrapper, options, reset):
-    actions, told = np.full((2, 2), 0.5, np.float32), []
-    for env in (dial_env(), DialEnv()):
-        envs = suit[wrapper](env, 2, **options)
-        told.append([envs.reset(**reset), *(envs.step(actions) for _ in range(9))])
-        envs.close()
-    assert alike(*told)
-
-
-def test_many_environments_of_turns():
-    # In processes of their own it asks environments for `terms`, which none of PettingZoo's has.
-    envs = suit["vectorize_aec_env_v0"](hands(aec_env), 3)
-    envs.reset(seed=1)
-    turned = dict.fromkeys(HANDS, 0)
-    for agent in envs.agent_iter(12):
-        observations, *_, passes, _ = envs.last()
-        assert observations.shape == (3, 4)
-        assert not passes.any()
-        turned[agent] += observations[0, 1] == turned[agent]
-        envs.step(np.full((3, 2), 0.5, np.float32))
-    assert min(turned.values()) == 5
+    wrapped, by_hand = (suit[name](env, **arguments) for env in (hands(parallel_env, seen), HandsEnv(seen)))
+    assert alike(story_around(wrapped), story_around(by_hand))
 
 
 def test_one_policy_of_stable_baselines3_for_all_agents():
@@ -261,16 +151,10 @@ def test_one_policy_of_stable_baselines3_for_all_agents():
     np.random.seed(0)
     model = PPO("MlpPolicy", envs, n_steps=64, batch_size=256, gamma=0.5, learning_rate=3e-3)
 
-    def greedy(agent, observation, info):
-        return int(model.predict(observation, deterministic=True)[0])
-
-    def untrained(agent, observation, info):
-        return 1
-
     tested = parallel_env(HerdSim, possible_agents=FORAGERS)
     model.learn(10_000)
-    after = parallel_return(tested, greedy)
-    assert after > parallel_return(tested, untrained) + 5
+    after = parallel_return(tested, lambda agent, seen, info: int(model.predict(seen, deterministic=True)[0]))
+    assert after > parallel_return(tested, lambda agent, seen, info: 1) + 5
 
 
 def test_what_options_say_in_place_of_wrappers():

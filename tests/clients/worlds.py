@@ -14,48 +14,6 @@ from gymnasium import spaces
 
 from simenv_marl import TRUNCATED, SimulationInterface, make_step
 
-
-class Reservoir:
-    """A reservoir that is to be kept half full, whatever flows in."""
-
-    def __init__(self, seed: int | None) -> None:
-        self.random = Random(seed)
-        self.day = 0
-        self.level = self.random.uniform(3, 7)
-        self.inflow = self.random.uniform(0, 3)
-
-    # Worth learning: let out what has flowed in, and what the level is above 5.
-    @make_step(
-        observation_space=spaces.Box(-1, 1, (2,), np.float32),
-        observation_space_mapping=lambda reservoir: [reservoir.level / 5 - 1, reservoir.inflow / 1.5 - 1],
-        action_space=spaces.Box(-1, 1, (1,), np.float32),
-        action_space_mapping=lambda action: 2.0 * (float(np.asarray(action).item()) + 1),
-        reward_mapping=lambda reservoir: 1 - abs(reservoir.level - 5),
-        agent="keeper_0",
-    )
-    def choose_release(self) -> float:
-        return 1.5
-
-    def update_day(self) -> None:
-        self.level = min(max(self.level + self.inflow - self.choose_release(), 0.0), 10.0)
-        self.inflow = self.random.uniform(0, 3)
-        self.day += 1
-
-
-class ReservoirSim(SimulationInterface):
-    """Twenty days of a reservoir."""
-
-    points = (Reservoir.choose_release,)
-
-    def reset(self, seed: int | None = None) -> None:
-        self.reservoir = Reservoir(seed)
-
-    def run(self) -> Any:
-        while self.reservoir.day < 20:
-            self.reservoir.update_day()
-        return TRUNCATED
-
-
 NUMBER: dict[str, Any] = {
     "observation_space": spaces.Box(0, 1, (4,), np.float32),
     "observation_space_mapping": lambda shop: shop.observed(),
@@ -115,49 +73,6 @@ class ShopSim(SimulationInterface):
 
     def state(self) -> list[float]:
         return [*self.shop.observed(), self.shop.day / 10]
-
-
-SHOP_STATE = spaces.Box(0, 1, (5,), np.float32)
-
-
-class Workbench:
-    """Five jobs lie on a bench, and whoever brought one waits for it."""
-
-    def __init__(self, seed: int | None) -> None:
-        random = Random(seed)
-        self.jobs: list[float] = [random.uniform(0.1, 1.0) for _ in range(5)]  # hours; 0.0: done
-        self.waiting = 0.0  # hours that the owners have waited during the latest job
-
-    # Worth learning: the shortest of the jobs that are left.
-    @make_step(
-        observation_space=spaces.Box(0, 1, (5,), np.float32),
-        observation_space_mapping=lambda bench: bench.jobs,
-        action_space=spaces.Discrete(5),
-        action_space_mapping=lambda action: action,
-        action_mask_mapping=lambda bench: [job > 0 for job in bench.jobs],
-        reward_mapping=lambda bench: -bench.waiting,
-        agent="joiner_0",
-    )
-    def choose_job(self) -> int:
-        return next(number for number, job in enumerate(self.jobs) if job > 0)
-
-    def work(self) -> None:
-        while any(self.jobs):
-            chosen = self.choose_job()
-            self.waiting = self.jobs[chosen] * sum(job > 0 for job in self.jobs)
-            self.jobs[chosen] = 0.0
-
-
-class WorkbenchSim(SimulationInterface):
-    """A bench, until it is empty."""
-
-    points = (Workbench.choose_job,)
-
-    def reset(self, seed: int | None = None) -> None:
-        self.bench = Workbench(seed)
-
-    def run(self) -> Any:
-        self.bench.work()
 
 
 class Crane:

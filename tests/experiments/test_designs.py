@@ -1,13 +1,16 @@
 """Which combinations of factors are run."""
 
 import itertools
+import sys
+from fractions import Fraction
 
 import numpy as np
+import pydoe
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl.errors import OptionValueError
+from simenv_marl.errors import MissingExtraError, OptionValueError
 from simenv_marl.experiments import design
 
 SIZED = ("latin_hypercube", "sobol", "halton")
@@ -66,6 +69,17 @@ def test_a_full_factorial_has_all_combinations():
     expected = list(itertools.product([3, 1], "xyz", [0.0, 0.5, 1.0]))
     assert list(table.itertuples(index=False, name=None)) == expected
     assert values(design({"c": (1, 2)}, n=9), "c") == [1, 2]
+    assert values(design({"x": [1, True, 1.0, [1], (1,)]}), "x") == [1, True, 1.0, [1], (1,)]
+
+
+@pytest.mark.parametrize("bounds", [(0, 2**53 + 1), (-(2**63), 2**63 - 1), (0, 10**30), (-7, 7)], ids=str)
+def test_whole_ranges_stay_whole_and_reach_their_bounds(bounds):
+    low, high = bounds
+    for method, number in (("full_factorial", 3), ("one_at_a_time", 3), ("latin_hypercube", 64), ("sobol", 64)):
+        found = values(design({"x": bounds}, method, number), "x")
+        assert {type(value) for value in found} == {int}
+        assert low <= min(found) < max(found) <= high
+        assert "full" not in method or found == [low, round(Fraction(low + high, 2)), high]
 
 
 @pytest.mark.parametrize(
@@ -130,8 +144,9 @@ THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (
     [
         *(("must be a dict", (factors,)) for factors in ({}, [1])),
         ("has no levels", ({"a": []},)),
-        ("twice", ({"a": [1, 2, 1]},)),
+        *(("twice", ({"a": own},)) for own in ([1, 2, 1], [[1], [1]])),
         *(("a tuple is a range", ({"a": own},)) for own in ((1, 2, 3), ("x", "y"), (0.0, float("inf")))),
+        *(("that a float can hold", ({"a": own},)) for own in ((0, 10**5000), (0.5, 10**400))),
         ("is empty", ({"a": (2, 2)},)),
         *(("must be a range", ({"a": own},)) for own in ("levels", 3)),
         *(("must have an order", ({"a": own},)) for own in ({"x", "y"}, frozenset([1]))),
@@ -147,9 +162,20 @@ THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (
         ("has 18 runs, not 9", ({"a": (0, 1), "b": (0, 1), "c": ["x", "y"]}, "central_composite", 9)),
         ("more than 10,000,000", ({f"x{i}": (0, 1) for i in range(30)}, "central_composite")),
         ("more than 10,000,000", ({"a": (0, 1), "b": (0, 1)}, "saltelli", 2**22)),
+        ("more than 10,000,000", ({"a": (0.0, 1.0)}, "full_factorial", 10**12)),
         ("more than 10,000,000", ({f"x{i}": list(range(100)) for i in range(4)},)),
     ],
 )
 def test_what_cannot_be_is_refused(match, arguments):
     with pytest.raises(OptionValueError, match=match):
         design(*arguments)
+
+
+def test_pydoe_is_found_under_either_name_or_its_extra_is_told(monkeypatch):
+    expected = design({"x": (0.0, 1.0)}, "halton", 4)
+    monkeypatch.setitem(sys.modules, "pyDOE", pydoe)  # its name in releases for older NumPy
+    monkeypatch.setitem(sys.modules, "pydoe", None)
+    assert design({"x": (0.0, 1.0)}, "halton", 4).equals(expected)
+    monkeypatch.setitem(sys.modules, "pyDOE", None)
+    with pytest.raises(MissingExtraError, match=r"simenv-marl\[design\]"):
+        design({"x": (0.0, 1.0)}, "halton", 4)

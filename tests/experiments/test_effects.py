@@ -67,15 +67,6 @@ def test_all_that_is_missing_is_one_level(tmp_path):
     assert labels(found.plot().axes[1]) == ["1", "nan"]
 
 
-def test_levels_of_one_factor_are_not_taken_for_those_of_another(tmp_path):
-    table = pd.DataFrame({"flag": [True, False] * 3, "a": [0, 1, 2] * 2, "c": [None, "x", "y"] * 2}, dtype=object)
-    found = effects(results(table, tmp_path, lambda flag, a, c: Sum(a, float(flag)), seeds=[1]), "y")
-    types = [[type(level) for level in own] for own in found.levels.values()]
-    assert types == [[bool, bool], [int, int, int], [type(None), str, str]]
-    below = [labels(axes) for axes in found.plot().axes[:3]]
-    assert below == [["True", "False"], ["0", "1", "2"], ["None", "x", "y"]]
-
-
 def test_many_factors_are_drawn_in_rows(tmp_path):
     table = design({f"x{place}": [0, 1] for place in range(7)}, "plackett_burman")
     figure = effects(results(table, tmp_path, lambda **row: Sum(sum(row.values()), 0), seeds=[1]), "y").plot()
@@ -96,6 +87,7 @@ def test_what_cannot_be_is_refused(tmp_path):
     frame = results(design(factors, "sobol", 6), tmp_path)
     odd = {"text": lambda s: "x", "some": lambda s: s.y if s.a > 0.5 else None}
     whole = results(design(factors, "saltelli", 2), tmp_path / "odd", metric=odd)
+    single = results(design(factors, "saltelli", 1), tmp_path / "single")
     both = (effects, sobol_indices)
     for looks, tables, given, message in (
         (both, [None, frame["y"], frame[["a"]]], {}, "that run_experiment returned"),
@@ -106,37 +98,63 @@ def test_what_cannot_be_is_refused(tmp_path):
         ([sobol_indices], [frame], {"metric": "y"}, "saltelli"),
         ([sobol_indices], [whole], {"metric": "some"}, "'some' is missing or not finite"),
         ([sobol_indices], [whole], {"metric": "return"}, "no variance"),
+        ([sobol_indices], [single], {"metric": "y"}, "one sample tells nothing"),
     ):
         for look, table in itertools.product(looks, tables):
             with pytest.raises(OptionValueError, match=message):
                 look(table, **given)
 
 
-def row(a, seed, **more):
-    told = {"contender": "rule", "seed": seed, "agent": "team", "length": 1, "status": "ok", "error": None}
-    return {"a": a, **told, **more}
+def runs(rows):
+    """A table of results, of rows with a level ``a``, a seed, a return, and perhaps more factors."""
+    told = {"contender": "rule", "agent": "team", "length": 1, "status": "ok", "error": None}
+    return pd.DataFrame([{"a": a, **more, **told, "seed": seed, "return": value} for a, seed, value, more in rows])
 
 
 def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
     rows = [
-        row(a, seed, b=b) | {"return": 100 * b + noise * (seed - 1.5)}
+        (a, seed, 100 * b + noise * (seed - 1.5), {"b": b})
         for a, noise in (("quiet", 0), ("still", 0), ("loud", 4))
         for b in (0, 1)
         for seed in range(4)
     ]
-    found = effects(pd.DataFrame(rows)).main
+    found = effects(runs(rows)).main
     for a in ("quiet", "still"):
         assert found.loc[("a", a), "mean"] == 50
         assert found.loc[("a", a), ["low", "high"]].isna().all()  # the same on all seeds
     expected = stats.t.interval(0.95, 3, 50, stats.sem([44, 48, 52, 56]))
     assert found.loc[("a", "loud"), ["low", "high"]].tolist() == pytest.approx(expected)
-    alone = effects(pd.DataFrame([own for own in rows if own["seed"] == 1])).main
+    alone = effects(runs([own for own in rows if own[1] == 1])).main
     assert alone.loc[("a", "quiet"), "low"] < 50 < alone.loc[("a", "quiet"), "high"]
 
 
 def test_shares_have_the_intervals_of_shares():
-    rows = [row(a, seed, won=seed < 3 * a) | {"return": 0.0} for a in (0, 1) for seed in range(12)]
-    found = effects(pd.DataFrame(rows), "won").main
+    found = effects(runs([(a, seed, float(seed < 3 * a), {}) for a in (0, 1) for seed in range(12)])).main
     for a in (0, 1):
         expected = stats.binomtest(3 * a, 12).proportion_ci(0.95, method="wilson")
         assert found.loc[("a", a), ["low", "high"]].tolist() == pytest.approx(list(expected))
+
+
+def test_a_numeric_factor_most_of_whose_values_are_equal_is_grouped():
+    found = effects(runs([(a, seed, a + seed, {}) for a in [0] * 36 + [*range(1, 10)] for seed in range(2)])).main
+    assert found["count"].tolist() == [76, 4, 4, 6]
+    assert found["mean"].is_monotonic_increasing
+
+
+def test_levels_that_are_equal_but_of_other_types_stay_apart():
+    levels = [False, 0, True, 1, 1.0]
+    frame = runs([(a, seed, 10 * place + seed, {"b": b}) for place, a in enumerate(levels)
+                  for b in "xy" for seed in range(2)])  # fmt: skip
+    frame["a"] = np.repeat(np.array(levels, object), 4)
+    found = effects(frame)
+    assert found.main.loc["a", "mean"].to_dict() == {"False": 0.5, "0": 10.5, "True": 20.5, "1": 30.5, "1.0": 40.5}
+    assert [repr(level) for level in found.levels["a"]] == [repr(level) for level in levels]
+    assert found.cells("a", "b").loc["1.0"].tolist() == [40.5, 40.5]
+    assert "_cells" not in repr(found)
+
+
+def test_the_mean_lies_in_its_interval_where_runs_have_failed():
+    frame = runs([(a, seed, 100 * b + seed / 10 + a, {"b": b}) for a in (0, 1) for b in (0, 1) for seed in range(8)])
+    frame.loc[(frame["b"] == 1) & (frame["seed"] > 0), ["status", "return"]] = ["error", np.nan]
+    for _, row in effects(frame).main.loc["a"].iterrows():
+        assert row["mean"] == pytest.approx((row["low"] + row["high"]) / 2)

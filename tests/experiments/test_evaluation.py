@@ -3,20 +3,20 @@
 import subprocess
 import sys
 import threading
-import warnings
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
+from statsmodels.stats.power import TTestPower
+from tools.coverage_of_intervals import measure
 
 from simenv_marl import RULE, aec_env, evaluate, make_step, simulate
 from simenv_marl.data import Mixture
-from simenv_marl.data.plots import interval
+from simenv_marl.data.plots import interval, is_proportion
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
-from simenv_marl.experiments import Variant
-from simenv_marl.experiments.evaluation import seeds_needed
-from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy
-from simenv_marl.plugins import ChangedResult
+from simenv_marl.experiments import Evaluation, Variant
+from simenv_marl.planning import RolloutPolicy
 from tests.conftest import DRIVERS
 from tests.worlds.many_worlds import Colony, Design, colony_points
 from tests.worlds.models import notes
@@ -24,6 +24,15 @@ from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_o
 
 SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
+
+
+def of_teams(**returns):
+    """A table of the team's returns of contenders, by seed."""
+    return pd.DataFrame(
+        {"contender": name, "seed": seed, "agent": "team", "return": value, "length": 1}
+        for name, values in returns.items()
+        for seed, value in enumerate(values)
+    )
 
 
 def returns_by_hand(policies, seed, make=Shop, points=POINTS, **options):
@@ -62,10 +71,6 @@ def by_number(observation):
     return int(abs(observation.sum())) % 6
 
 
-def by_number_of_many(observations):
-    return list(map(by_number, observations))
-
-
 @pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents that did not appear")
 @pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
 @pytest.mark.parametrize("options", [{}, {"max_steps": 5}], ids=str)
@@ -76,17 +81,14 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
 
     points, seeds = colony_points(overseen=True), range(8)
     policies = dict.fromkeys(("creature_0", "creature_4", "overseer_0"), by_number)
-    contenders = {"rule": {}, "some": dict.fromkeys(policies, by_number_of_many) if batched else policies}
+    of_many = dict.fromkeys(policies, lambda observations: list(map(by_number, observations)))
+    contenders = {"rule": {}, "some": of_many if batched else policies}
     given = {"points": points, "possible_agents": ["creature_4"], "batched": batched, **options}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # not all are born in each episode
-        found = evaluate(make, contenders, seeds=seeds, baseline="rule", **given)
+    found = evaluate(make, contenders, seeds=seeds, baseline="rule", **given)
     for (name, seed), rows in found.frame.groupby(["contender", "seed"]):
         returns = dict(zip(rows["agent"], rows["return"], strict=True))
         total = returns.pop("team")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            expected = returns_by_hand({} if name == "rule" else policies, seed, make, points, **options)
+        expected = returns_by_hand({} if name == "rule" else policies, seed, make, points, **options)
         assert returns == {agent: value for agent, value in expected.items() if agent in returns}
         assert not any(value for agent, value in expected.items() if agent not in returns)
         assert total == pytest.approx(sum(returns.values()))
@@ -111,32 +113,23 @@ def test_the_same_comes_of_all_ways_to_run_it(arguments):
         assert max(asked) == len(SEEDS)
 
 
-@pytest.mark.parametrize(
-    "planner", [RolloutPolicy([0, 1, 2], futures=2, horizon=1), TreeSearchPolicy([0, 1, 2], budget=8)]
-)
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
-def test_planners_decide_as_they_do_in_simulate(planner, arguments):
+def test_planners_decide_as_they_do_in_simulate(arguments):
+    planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1)
     contenders = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
     found = evaluate(Shop, contenders, seeds=range(2), points=NEAR, metric=level, **arguments).values("metric")
     for name, policies in contenders.items():
         assert found[name].tolist() == [simulate(Shop, policies, points=NEAR, seed=seed).level for seed in range(2)]
 
 
+MIXED = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {"keeper": much_of_many}}
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_mixtures_decide_as_policies_of_many(workers):
-    contenders = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {"keeper": much_of_many}}
-    values = evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, batched=True, workers=workers).values()
+    values = evaluate(Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers).values()
     assert (values["mixed"] <= values["much"]).all()
     assert values["mixed"].mean() < values["much"].mean() - 2
-    refused("of 'keeper' in 'mixed', <Mixture.*batched=True", contenders=contenders)
-
-
-def test_points_and_options_that_can_be_asked_for_once_serve_all_contenders():
-    plugins = [(lambda shop, _result: ChangedResult(2 * _result), "tests.worlds.shops.Shop.sell", "after")]
-    expected, found = (
-        evaluate(Shop, {"a": {}, "b": {}}, seeds=SEEDS, points=POINTS, plugins=own) for own in (plugins, iter(plugins))
-    )
-    assert found.frame.equals(expected.frame)
 
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95])
@@ -158,15 +151,6 @@ def test_the_summary_is_paired_by_seed(confidence):
     assert np.isnan(evaluate(Shop, CONTENDERS, seeds=[1], **given).summary()["low"]).all()
 
 
-def test_intervals_are_those_of_scipy():
-    values = np.random.default_rng(3).exponential(size=40)
-    expected = stats.ttest_1samp(values, 0).confidence_interval(0.9)
-    assert interval(values, 0.9) == (pytest.approx(expected.low), pytest.approx(expected.high), "")
-    expected = stats.binomtest(1, 8).proportion_ci(0.9, method="wilson")
-    assert interval(np.array([0.0] * 7 + [1.0]), 0.9, proportion=True) == (*expected, "")
-    assert interval(np.zeros(8), 0.9, proportion=True)[1] > 0.1
-
-
 @pytest.mark.parametrize(
     ("values", "note", "proportion"),
     [
@@ -179,6 +163,27 @@ def test_some_values_have_no_interval(values, note, proportion):
     low, high, why = interval(np.array(values), 0.95, proportion=proportion)
     assert np.isnan([low, high]).all()
     assert note in why
+
+
+@pytest.mark.parametrize("number", [5, 16])
+@pytest.mark.parametrize(("name", "least"), [("normal", 0.93), ("lognormal", 0.78), ("0/1, p=0.5", 0.9)])
+def test_intervals_cover_and_equal_contenders_seldom_differ(name, least, number):
+    covered, unknown, different = measure(name, number, 600)
+    assert covered > least
+    assert unknown < 0.02
+    assert different < 0.08
+
+
+def test_events_that_were_not_seen_have_no_interval_of_zero_width():
+    covered, unknown, _ = measure("0/1, p=0.1", 5, 600)
+    assert covered > 0.8  # of those that are known; with Student's t it was 0.4
+    assert 0.25 < unknown < 0.45
+
+
+@pytest.mark.parametrize("values", [[1, 0, None], [True, False, None], [True, True], [np.nan, 1.0, 0.0]])
+def test_missing_values_do_not_hide_a_proportion(values):
+    assert is_proportion(np.array(values))
+    assert not is_proportion(np.array([*values, 2], object))
 
 
 def test_the_summary_says_why_there_is_no_interval():
@@ -197,20 +202,12 @@ def test_the_summary_says_why_there_is_no_interval():
 
 
 def test_shares_have_intervals_by_wilsons_score():
-    metric = {
-        "never": lambda shop: False,
-        "odd": lambda shop: shop.seed % 2 == 1,
-        "more": lambda shop: int(shop.seed < 3),
-        "count": lambda shop: 2 * (shop.seed < 3),
-    }
-    found = evaluate(Shop, {"rule": {}}, seeds=SEEDS, points=POINTS, metric=metric)
-    expected = {
-        name: stats.binomtest(number, 12).proportion_ci(0.95, method="wilson")
-        for name, number in (("never", 0), ("odd", 6), ("more", 3))
-    }
-    expected["count"] = stats.ttest_1samp(2.0 * (np.arange(12) < 3), 0).confidence_interval(0.95)
-    for name, bounds in expected.items():
-        assert found.summary(name).loc["rule", ["low", "high"]].tolist() == pytest.approx(list(bounds))
+    some_seeds = np.arange(12) < 3
+    wilson = stats.binomtest(3, 12).proportion_ci(0.95, method="wilson")
+    student = stats.ttest_1samp(2.0 * some_seeds, 0).confidence_interval(0.95)
+    for values, expected in ((some_seeds, wilson), (some_seeds.astype(int), wilson), (2 * some_seeds, student)):
+        low, high = Evaluation(of_teams(a=values), None, 0.95).summary().loc["a", ["low", "high"]]
+        assert (low, high) == pytest.approx(tuple(expected))
 
 
 def test_the_probability_of_improvement_counts_ties_half():
@@ -222,19 +219,26 @@ def test_the_probability_of_improvement_counts_ties_half():
     assert improvement.loc["same", ["low", "high"]].isna().all()
 
 
-def test_how_many_seeds_would_tell_a_difference():
-    contenders = {"rule": {}, "some": {"keeper": some}}
-    found = evaluate(Shop, contenders, seeds=range(40), points=POINTS, baseline="rule")
-    apart = (found.values()["some"] - found.values()["rule"]).std()
-    assert found.seeds_needed(apart / 2)["some"] == pytest.approx(34, abs=1)  # as tables of power have it
-    assert found.seeds_needed(apart / 2, power=0.99)["some"] > found.seeds_needed(apart / 2)["some"]
+@pytest.mark.parametrize("confidence", [0.8, 0.95])
+@pytest.mark.parametrize(("size", "power"), [(0.1, 0.5), (0.5, 0.8), (1.5, 0.99)])
+def test_the_number_of_seeds_is_that_of_the_paired_t_test(size, power, confidence):
+    apart = np.random.default_rng(1).normal(size=20)
+    found = Evaluation(of_teams(a=np.zeros(20), b=apart), "a", confidence)
+    expected = TTestPower().solve_power(effect_size=size, alpha=1 - confidence, power=power)
+    assert found.seeds_needed(size * apart.std(ddof=1), power=power)["b"] == np.ceil(expected)
+
+
+def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_wrong_ones_are_refused():
+    returns = of_teams(a=[0, 0, 0], b=[1, 2, 3], same=[0, 0, 0])
+    found = Evaluation(returns, "a", 0.95)
+    for difference, number in ((1e3, 2), (1e15, 2), (1e-12, np.inf)):
+        assert found.seeds_needed(difference)["b"] == number
+        assert np.isnan(found.seeds_needed(difference)["same"])
     for difference, power in ((0, 0.8), ("a", 0.8), (1, 1), (1, "a")):
         with pytest.raises(OptionValueError):
             found.seeds_needed(difference, power=power)
     with pytest.raises(OptionValueError, match="no baseline"):
-        evaluate(Shop, contenders, seeds=[1, 2], points=POINTS).seeds_needed(1)
-    assert np.isnan(seeds_needed(np.zeros(3), 0.5, 0.95, 0.8))
-    assert seeds_needed(np.arange(9.0), 1e-9, 0.95, 0.8) == float("inf")
+        Evaluation(returns, None, 0.95).seeds_needed(1)
 
 
 def test_it_stops_as_soon_as_intervals_are_narrow_enough():
@@ -251,16 +255,14 @@ def test_it_stops_as_soon_as_intervals_are_narrow_enough():
     assert float((summary["high"] - summary["low"]).iloc[0]) <= 2.0
 
 
-def of_those_that_have_decided(returns):
-    assert "keeper" in returns
-    assert "stranger" not in returns
-    assert returns["keeper"] in returns
-    assert dict(returns)["keeper"] == returns["keeper"] == max(returns.values())
-    return returns.get("stranger", returns["keeper"])
+def test_the_team_is_what_its_user_makes_of_the_returns():
+    def team(returns):
+        assert "keeper" in returns
+        assert "stranger" not in returns
+        assert returns["keeper"] in returns
+        assert dict(returns)["keeper"] == returns["keeper"] == max(returns.values()) == max(returns)
+        return returns.get("stranger", returns["keeper"])
 
-
-@pytest.mark.parametrize("team", [max, of_those_that_have_decided])
-def test_the_team_is_what_its_user_makes_of_the_returns(team):
     found = evaluate(Shop, {"much": {"keeper": much}}, seeds=[1], points=POINTS, team=team)
     rows = found.frame.set_index("agent")["return"]
     assert rows["team"] == rows["keeper"] > rows["helper"]
@@ -285,12 +287,13 @@ def test_what_fails_does_so_at_once_and_says_of_which_seed(match, contender, kee
 
 
 def test_what_is_no_number_has_no_mean():
-    given = {"day": lambda shop: "monday", "some": lambda shop: shop.level if shop.seed else None}
-    found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=given, baseline="rule")
+    metrics = {"day": lambda shop: "monday", "huge": lambda shop: 10**400, "some": lambda shop: shop.seed or None}
+    found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=metrics, baseline="rule")
     assert set(found.values("day")["rule"]) == {"monday"}
     for look in (found.summary, found.improvement, found.plot, lambda metric: found.seeds_needed(1, metric=metric)):
-        with pytest.raises(OptionValueError, match="'day' is not a column of numbers"):
-            look(metric="day")
+        for metric in ("day", "huge"):  # no float can hold the latter
+            with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
+                look(metric=metric)
     assert np.isnan(found.summary("some")["mean"]).all()
 
 
@@ -302,34 +305,22 @@ def test_a_variant_brings_its_own_points_and_policies():
     assert frame[frame.agent == "team"]["metric"].tolist() == expected
 
 
-def test_pairs_are_drawn_and_pictures_of_many_contenders_can_be_read():
-    def drawn(contenders, seeds, metric="return", **given):
-        return evaluate(Shop, contenders, seeds=seeds, points=POINTS, metric=level, **given).plot(metric)
+def test_pictures_show_each_seed_and_can_be_read():
+    def drawn(contenders, seeds, **given):
+        return evaluate(Shop, contenders, seeds=seeds, points=POINTS, metric=level, **given)
 
-    def slants(axes):
-        return {label.get_rotation() for label in axes.get_xticklabels()}
-
-    values, differences = drawn(CONTENDERS, SEEDS, "metric", baseline="rule").axes
+    values, differences = drawn(CONTENDERS, SEEDS, baseline="rule").plot("metric").axes
     assert sum(len(line.get_xdata()) == 2 for line in values.lines) == len(SEEDS)
     assert len(differences.collections[0].get_offsets()) == len(SEEDS)
-    figure = drawn({f"the contender of number {number}": {} for number in range(20)}, [1])
-    (axes,) = figure.axes
+    figure = drawn({f"the contender of number {number}": {} for number in range(20)}, [1]).plot()
     assert figure.get_figwidth() <= 14
-    assert (slants(axes), axes.get_title(loc="left")) == ({30}, "1 seed")
-    (axes,) = drawn({"rule": {}}, SEEDS).axes
-    assert axes.get_title(loc="left") == "12 seeds, each a dot"
-    axes = drawn(CONTENDERS, range(201), "metric").axes[0]
+    assert {label.get_rotation() for label in figure.axes[0].get_xticklabels()} == {30}
+    assert figure.axes[0].get_title(loc="left") == "1 seed"
+    assert drawn({"rule": {}}, SEEDS).plot().axes[0].get_title(loc="left") == "12 seeds, each a dot"
+    axes = drawn(CONTENDERS, range(201)).plot("metric").axes[0]
     assert (axes.get_title(loc="left"), axes.get_ylabel()) == ("201 seeds, lines for 200 of them", "metric")
-    assert slants(axes) == {0}
-
-
-def refused(match, error=OptionValueError, **arguments):
-    made = []
-    given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
-    with pytest.raises(error, match=match) as caught:
-        evaluate(lambda: made.append(1) or Shop(), given.pop("contenders"), **given)
-    assert len(made) <= len(given["points"])  # looked at, and not run
-    return caught.value
+    assert sum(len(line.get_xdata()) == 2 for line in axes.lines) == 200
+    assert {label.get_rotation() for label in axes.get_xticklabels()} == {0}
 
 
 @pytest.mark.parametrize(
@@ -341,6 +332,7 @@ def refused(match, error=OptionValueError, **arguments):
             ("must be a string", {1: {}}),
             ("must be a dict from agents", {"a": much}),
             ("must be a callable", {"a": {"keeper": 3}}),
+            ("stranger", {"rule": {}, "a": {"stranger": much}}),
         )),
         ("baseline 'x' is not one of the contenders: rule, much", {"baseline": "x"}),
         ("is not one of the contenders", {"baseline": ["rule"]}),
@@ -354,15 +346,15 @@ def refused(match, error=OptionValueError, **arguments):
         ("has the name of another column", {"metric": {"seed": level}}),
         ("workers", {"workers": -2}),
         ("policies of each contender", {"policies": {}}),
+        ("of 'keeper' in 'mixed', <Mixture.*batched=True", {"contenders": MIXED}),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_before_anything_runs(match, arguments):
-    refused(match, **arguments)
-
-
-def test_who_is_unknown_is_refused_before_anything_runs():
-    caught = refused("stranger", UnknownPointError, contenders={"rule": {}, "a": {"stranger": much}})
-    assert "of the contender 'a'" in notes(caught)
+    made = []
+    given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
+    with pytest.raises((OptionValueError, UnknownPointError), match=match):
+        evaluate(lambda: made.append(1) or Shop(), **given)
+    assert len(made) <= len(POINTS)  # looked at, and not run
 
 
 def test_an_agent_must_not_be_called_team():

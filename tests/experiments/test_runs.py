@@ -11,25 +11,24 @@ import subprocess
 import sys
 import textwrap
 import time
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import joblib
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from simenv_marl import evaluate
+from simenv_marl import evaluate, make_step, vector_env
 from simenv_marl.data import Mixture
-from simenv_marl.errors import OptionValueError, StoreError, UnknownPointError
+from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, StoreError, UnknownPointError
 from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.experiments import store as stores
-from simenv_marl.experiments.runner import Outcome
-from simenv_marl.planning import RolloutPolicy
 from simenv_marl.plugins import ChangedResult
-from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
-from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some, some_of_many
+from simenv_marl.remote import ProcessSimulation
+from tests.worlds.shops import OBSERVED, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 DESIGN = pd.DataFrame({"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]})
 ROOT = Path(__file__).parents[2]
@@ -49,19 +48,17 @@ def lines(store):
 def test_the_table_is_tidy_and_in_order(tmp_path):
     frame = run(tmp_path)
     factors, outcome = ["days", "price", "kind"], ["status", "error"]
-    others = ["contender", "seed", "agent", "return", "length", "level", *outcome]
-    assert list(frame.columns) == [*factors, *others]
+    assert list(frame.columns) == [*factors, "contender", "seed", "agent", "return", "length", "level", *outcome]
     assert frame[factors].dtypes.equals(DESIGN.dtypes)
     runs = frame[frame.agent == "team"]
-    names = ("rule", "much", "some")
-    expected = [[*row, name, seed] for row in DESIGN.values.tolist() for name in names for seed in range(4)]
+    contenders = {"rule": {}, "much": {"keeper": much}, "some": {"keeper": some}}
+    expected = [[*row, name, seed] for row in DESIGN.values.tolist() for name in contenders for seed in range(4)]
     assert runs[[*factors, "contender", "seed"]].values.tolist() == expected
     failed = runs[runs.status == "error"]
     assert set(zip(failed["kind"], failed["seed"], strict=True)) == {("faulty", 1), ("faulty", 3)}
     assert set(failed["error"]) == {"ZeroDivisionError: no change"}
     assert failed["return"].isna().all()
     good = frame[(frame["kind"] == "plain") & (frame["days"] == 2)].drop(columns=[*factors, *outcome])
-    contenders = {"rule": {}, "much": {"keeper": much}, "some": {"keeper": some}}
     given = {"seeds": range(4), "points": POINTS, "metric": {"level": level}}
     assert good.reset_index(drop=True).equals(evaluate(lambda: Shop(2, 2.0), contenders, **given).frame)
 
@@ -69,7 +66,7 @@ def test_the_table_is_tidy_and_in_order(tmp_path):
 @pytest.mark.parametrize(
     "arguments",
     [
-        *({"workers": workers} for workers in (1, 2, 4)),
+        *({"workers": workers} for workers in (1, 2)),
         *({"batched": True, **more} for more in ({}, {"workers": 2}, {"batch_size": 2})),
     ],
     ids=str,
@@ -83,34 +80,6 @@ def test_the_table_is_the_same_however_it_is_run(arguments, tmp_path, capsys):
     assert len({path.name.split("-")[2] for path in store.glob("*.jsonl")}) <= arguments.get("workers", 1)
     run(store, progress=True, seeds=range(5), **arguments)
     assert "45/45" in capsys.readouterr().err
-
-
-@pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents that did not appear")
-def test_the_table_is_the_same_whoever_is_born_and_dies(tmp_path):
-    def make(ticks):
-        return Colony(Design(initial=3, most=8, ticks=ticks))
-
-    contenders = {"one": {"creature_4": lambda observation: 5}, "all": {Creature.act: lambda observation: 3}}
-    given = {"contenders": contenders, "seeds": range(5), "points": colony_points(overseen=False)}
-    given["possible_agents"] = ["creature_4"]  # is not born in short episodes
-    alone, one, two = (
-        run_experiment(make, {"ticks": [1, 5]}, store=tmp_path / str(workers), workers=workers, **given)
-        for workers in (0, 1, 2)
-    )
-    assert one.equals(alone)
-    assert two.equals(alone)
-    assert set(alone["status"]) == {"ok"}
-    assert alone.groupby(["ticks", "contender", "seed"]).size().nunique() > 2
-
-
-@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
-def test_planners_are_contenders(arguments, tmp_path):
-    contenders = {"planned": {"helper": RolloutPolicy([0, 1, 2], futures=2, horizon=1)}}
-    given = {"seeds": range(2), "points": NEAR, "metric": level}
-    frame = run_experiment(Shop, {"days": [3]}, contenders=contenders, store=tmp_path, **given, **arguments)
-    assert set(frame["status"]) == {"ok"}
-    told = frame[(frame.contender == "planned") & (frame.agent == "team")]["metric"]
-    assert told.tolist() == evaluate(Shop, contenders, **given).values("metric")["planned"].tolist()
 
 
 @pytest.mark.parametrize(
@@ -166,18 +135,6 @@ def test_points_and_options_that_can_be_asked_for_once_serve_all(tmp_path):
     assert run(tmp_path / "b", points=iter(points), plugins=iter(plugins), **given).equals(expected)
 
 
-def test_points_may_differ_from_row_to_row(tmp_path):
-    class Own(Shop):
-        def __init__(self, who):
-            super().__init__()
-            self.points = {point: definition for point, definition in POINTS.items() if definition.agent != who}
-
-    design = pd.DataFrame({"who": ["helper", "keeper", "helper", "none"]})
-    frame = run_experiment(Own, design, seeds=[1, 2], store=tmp_path)
-    agents = frame[frame.seed == 1].groupby("who", sort=False)["agent"].agg(set).to_dict()
-    assert agents == {"helper": {"keeper", "team"}, "keeper": {"helper", "team"}, "none": {"keeper", "helper", "team"}}
-
-
 def test_each_run_is_a_line_with_its_provenance(tmp_path):
     run(tmp_path)
     known = lines(tmp_path)
@@ -223,44 +180,52 @@ def test_what_is_known_is_not_run_again(tmp_path):
         assert again([1, 2]).equals(first)
 
 
-def test_variants_may_have_any_parameters(tmp_path):
-    def make(days):
-        return Variant("v", lambda table: Shop(table[1]), parameters={"table": {1: days, (2, 3): np.float32(1)}})
-
-    frame = run(tmp_path, {"days": [1, 2]}, make=make, contenders={"same": {}})
-    assert set(frame["status"]) == {"ok"}
-    assert lines(tmp_path)[0]["provenance"]["parameters"] == {"table": {"1": 1, "[2, 3]": 1.0}}
-
-
-RUN = '{"factors": {"days": 1}, "contender": "rule", "seed": 0, '
+def damaged(line, **changes):
+    return json.dumps(json.loads(line) | changes).encode()
 
 
 @pytest.mark.parametrize(
-    "line",
+    "damage",
     [
-        *("3", "null", "[]", "{}", "", "\0\0", '{"factors": {"days": 1}}'),
-        RUN + '"status": "ok", "error": null, "returns": 3}',
-        RUN + '"status": "error", "error": "", "provenance": 3}',
+        lambda line: b"[" * 100_000,
+        lambda line: b'{"a":' * 100_000,
+        lambda line: b"\xff\xfe{}",
+        *(lambda line, text=text: text for text in (b"", b"{}", b"[]", b"3", b"null", b"\0\0", b"1" * 5000)),
+        lambda line: line.replace(b'"status":"ok"', b'"status:"ok"'),
+        lambda line: damaged(line, provenance={"options": "none"}),
+        lambda line: damaged(line, provenance=[1]),
+        lambda line: damaged(line, returns={"keeper": "much"}),
+        lambda line: damaged(line, returns={"keeper": 10**4000}),
+        lambda line: damaged(line, lengths={}),
+        lambda line: damaged(line, metrics={"level": [1]}),
+        lambda line: damaged(line, seed="one"),
     ],
 )
-def test_lines_that_are_no_runs_are_told_and_torn_ones_are_run_again(line, tmp_path):
+def test_a_line_that_is_no_run_is_a_run_that_is_missing(damage, tmp_path):
     def again():
-        return run(tmp_path, {"days": [1]}, contenders=None)
+        return run(tmp_path, {"days": [1]}, seeds=range(2), contenders=None)
 
     first = again()
     (path,) = tmp_path.glob("*.jsonl")
-    whole = path.read_bytes()
-    path.write_bytes(whole + f"{line}\n".encode())
-    with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
+    one, other = path.read_bytes().splitlines()
+    path.write_bytes(damage(one) + b"\n" + other + b"\n")
+    with pytest.warns(UserWarning, match="line 1 of .* cannot be read, so its run counts as missing"):
         assert again().equals(first)
-    path.write_bytes(whole.replace(b'"status":"ok"', b'"status:"ok"', 1))
-    with pytest.warns(UserWarning, match="line 1 of .* cannot be read"):
-        assert again().equals(first)
-    for cut in (1, 20, 700):
-        for other in set(tmp_path.glob("*.jsonl")):
-            other.unlink()
-        path.write_bytes(whole[:-cut])
-        assert again().equals(first)
+
+
+@pytest.mark.parametrize("cut", [1, 20, 700])
+def test_a_run_whose_line_is_torn_is_run_again(cut, tmp_path):
+    first = run(tmp_path)
+    (path,) = tmp_path.glob("*.jsonl")
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert run(tmp_path).equals(first)
+
+
+@pytest.mark.parametrize("text", [b"[" * 100_000, b"\xff\xfe[", b"{"])
+def test_a_damaged_head_of_a_store_is_told(text, tmp_path):
+    (tmp_path / "experiment.json").write_bytes(text)
+    with pytest.raises(StoreError, match=r"experiment\.json cannot be read"):
+        run(tmp_path)
 
 
 def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
@@ -282,35 +247,13 @@ def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
     assert again()["status"].tolist() == ["ok"] * 3
 
 
-numbers = (st.floats(width=32).map(np.float32), st.integers(-9, 9).map(np.int64))
-scalars = st.one_of(st.floats(), st.integers(), st.booleans(), st.none(), st.text(max_size=5), *numbers)
-
-
-@given(row=st.dictionaries(st.text(max_size=4), scalars, max_size=4), values=st.lists(scalars, max_size=4))
-def test_values_come_back_as_they_were(row, values, tmp_path_factory):
-    plain = [value.item() if isinstance(value, np.generic) else value for value in values]
-    row = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
-    outcome = Outcome({"a": 0.1}, {"a": 1}, dict(zip("abcd", plain, strict=False)))
-    folder = tmp_path_factory.mktemp("store")
-    place = stores.Store(folder, list(row), [])
-    place.create()
-    writer = stores.Writer(folder, "s")
-    writer.write((stores.to_json(row), "rule", 3), outcome, {"seed": 3})
-    writer.close()
-    place.read([])
-    (((key, contender, seed), known),) = place.runs.items()
-    assert (contender, seed) == ("rule", 3)
-    assert repr(json.loads(key)) == repr(row)
-    assert repr(known.metrics) == repr(outcome.metrics)
-
-
 def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
     class Holder(Shop):
         def __init__(self, thing):
             super().__init__()
             self.thing = thing
 
-    things = [1, 1.0, True, "1", None, math.inf, -0.0, 2**70]
+    things = [1, 1.0, True, "1", "\u00e9\n", None, math.inf, -0.0, 0.1, 2**70]
     given = {"seeds": [0], "points": POINTS, "metric": lambda shop: shop.thing, "store": tmp_path}
     frame = run_experiment(Holder, pd.DataFrame({"thing": pd.Series(things, dtype=object)}), **given)
     told = frame[frame.agent == "team"]
@@ -318,16 +261,12 @@ def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
         assert list(map(repr, told[column])) == list(map(repr, things))
 
 
-def one_argument(days):
-    return Shop(days)
-
-
 @pytest.mark.parametrize(
     ("match", "arguments"),
     [
-        ("cannot be called with the factors", {"make": one_argument}),
+        ("cannot be called with the factors", {"make": lambda days: Shop(days)}),
         ("must be a callable of the factors", {"make": Shop()}),
-        ("cannot be called with the parameters", {"make": Variant("v", one_argument)}),
+        ("cannot be called with the parameters", {"make": Variant("v", lambda days: Shop(days))}),
         ("factor 'seed' has the name of", {"design": {"seed": [1]}}),
         ("factor 'error' has the name of", {"design": {"error": [1]}}),
         ("metric 'days' has the name of", {"metric": {"days": level}}),
@@ -484,12 +423,190 @@ def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
     assert len(list((tmp_path / "shared").glob("*.jsonl"))) == 2
 
 
+class Harbour:
+    """Ships that decide under their own names; the last of them comes on the fifth day alone, and not with seed 0."""
+
+    def __init__(self, days=2):
+        self.days = days
+
+    def reset(self, seed):
+        self.seed = seed
+
+    def run(self):
+        for day in range(self.days):
+            for name in ("dispatcher", "tug", *(("late",) if day == 4 and self.seed else ())):
+                self.sail(name)
+
+    def sail(self, name):
+        return 0
+
+
+SHIPS = {
+    Harbour.sail: make_step(
+        **OBSERVED | {"observation_space_mapping": lambda harbour, name: [0.0]},
+        action_space_mapping=lambda action: action,
+        reward_mapping=lambda harbour, name: 1.0,
+        agent=lambda harbour, name: name,
+    )
+}
+
+
+@pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents")
+@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
+def test_a_name_that_no_agent_has_is_an_error_of_its_contender(arguments, tmp_path):
+    policy = much_of_many if arguments.get("batched") else much
+    given = {"seeds": range(3), "points": SHIPS, **arguments}
+    told = "'wrong' has a policy for 'dispatchr', but no agent .*decided: dispatcher, tug; did you mean dispatcher"
+    contenders = {"right": {"tug": policy}, "wrong": {"tug": policy, "dispatchr": policy}}
+    with pytest.raises(AgentError, match=told):
+        evaluate(Harbour, contenders, **given)
+    design = {"days": [2, 5]}
+    with pytest.raises(AgentError, match=told):
+        run_experiment(Harbour, design, contenders=contenders, store=tmp_path, **given)
+    assert "wrong" not in {line["contender"] for line in lines(tmp_path)}
+    contenders = {"right": {"tug": policy}, "late": {"late": policy}}
+    named = {"contenders": contenders, "possible_agents": ["late"], **given}  # it may come later, or not at all
+    evaluate(Harbour, **named)
+    assert set(run_experiment(Harbour, design, store=tmp_path / "named", **named)["status"]) == {"ok"}
+    contenders = {"late": {"late": policy}}  # stored as soon as it is there
+    frame = run_experiment(Harbour, {"days": [5]}, contenders=contenders, store=tmp_path / "late", **given)
+    assert frame[frame["agent"] == "late"]["return"].tolist() == [1.0] * 4
+
+
+SHARED = dict(POINTS)
+ONE = Shop()
+
+
+def make_by_shared_points(scale):
+    for point in POINTS:
+        SHARED[point] = replace(POINTS[point], reward_mapping=lambda shop: float(scale))
+    shop = Shop()
+    shop.points = SHARED
+    return shop
+
+
+@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
+def test_rows_have_definitions_and_simulations_of_their_own(arguments, tmp_path):
+    frame = run_experiment(make_by_shared_points, {"scale": [1, 10]}, seeds=[1, 2], store=tmp_path / "a", **arguments)
+    assert frame["return"].tolist() == [3, 3, 6] * 2 + [30, 30, 60] * 2
+    given = {"seeds": range(4), "points": POINTS}
+    frame = run_experiment(lambda day: ONE, {"day": [1, 2]}, store=tmp_path / "b", **given, **arguments)
+    expected = evaluate(Shop, {"rule": {}}, **given).frame["return"].tolist()
+    assert frame["return"].tolist() == 2 * expected
+
+
+CHILD = """
+import json, os
+reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
+lines, out = os.fdopen(reading), os.fdopen(writing, "w")
+def send(frame):
+    print(json.dumps(frame), file=out, flush=True)
+send({"hello": 1, "points": ["say"]})
+for line in lines:
+    if "start" in json.loads(line):
+        send({"end": {"result": [os.environ["HARBOUR"], os.getcwd(), os.getpid()]}})
+"""
+
+
+def test_a_process_is_kept_only_while_it_would_be_started_alike(tmp_path, monkeypatch):
+    def make(name, folder):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        monkeypatch.setenv("HARBOUR", name)
+        monkeypatch.chdir(tmp_path / folder)
+        return ProcessSimulation([sys.executable, "-c", CHILD], {"say": POINTS[Shop.sell]})
+
+    metric = {"seen": lambda s: "|".join(s.result[:2]), "pid": lambda s: s.result[2]}
+    rows = {"name": ["a", "b", "b"], "folder": ["c", "c", "d"]}
+    frame = run_experiment(make, rows, seeds=[1, 2], metric=metric, store=tmp_path / "store")
+    started = [f"a|{tmp_path / 'c'}", f"b|{tmp_path / 'c'}", f"b|{tmp_path / 'd'}"]
+    assert frame["seen"].tolist() == [one for one in started for seed in range(2)]
+    assert frame["pid"].nunique() == 3
+
+
+def test_vectors_workers_and_experiments_keep_nothing_of_each_other(tmp_path):
+    class Twice(Shop):
+        def order(self):
+            return 4
+
+    given = {"points": POINTS, "seeds": range(3)}
+    alone = {make: evaluate(make, {"rule": {}}, **given).frame["return"].tolist() for make in (Shop, Twice)}
+    by_ten = {point: replace(own, reward_mapping=lambda shop: 10.0) for point, own in POINTS.items()}
+    points = {Shop.order: POINTS[Shop.order]}
+    with closing(vector_env(Shop, points, num_envs=2)) as env:
+        env.reset(seed=3)
+        steps = [env.step(np.array([5, 5]))[1].tolist()]
+        for workers in (0, 2):
+            tens = run_experiment(Shop, {"days": [3]}, points=by_ten, seeds=range(3), store=tmp_path / str(workers),
+                                  workers=workers)  # fmt: skip
+            assert tens["return"].tolist() == [30, 30, 60] * 3
+            for make in (Twice, Shop):
+                assert evaluate(make, {"rule": {}}, workers=workers, **given).frame["return"].tolist() == alone[make]
+        steps.append(env.step(np.array([5, 5]))[1].tolist())
+    with closing(vector_env(Shop, points, num_envs=2)) as env:
+        env.reset(seed=3)
+        assert steps == [env.step(np.array([5, 5]))[1].tolist() for _ in range(2)]
+
+
+class Deadly(Shop):
+    def run(self):
+        if self.days == 2 and self.seed == 1:
+            os._exit(3)
+        super().run()
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_a_run_that_kills_its_worker_is_a_row_and_the_others_go_on(batched, tmp_path):
+    design = {"days": [1, 2, 3]}
+    given = {"seeds": range(4), "points": POINTS, "batched": batched}
+    frame = run_experiment(Deadly, design, store=tmp_path / "a", workers=2, **given)
+    whole = run_experiment(Shop, design, store=tmp_path / "b", **given)
+    failed = frame["status"] == "error"
+    assert frame.loc[failed, ["days", "seed"]].to_numpy().tolist() == [[2, 1]]
+    assert "worker died in this run, twice" in frame.loc[failed, "error"].item()
+    at = (whole["days"] == 2) & (whole["seed"] == 1)
+    assert frame.loc[~failed, "return"].tolist() == whole.loc[~at, "return"].tolist()
+    assert run_experiment(Deadly, design, store=tmp_path / "a", workers=2, **given).equals(frame)
+
+
+@pytest.mark.parametrize("lacks", ["joblib", "death"])
+def test_workers_that_cannot_be_are_refused_before_anything_runs(lacks, tmp_path, monkeypatch):
+    def make(**row):
+        raise AssertionError("nothing may run")
+
+    if lacks == "joblib":
+        monkeypatch.setitem(sys.modules, "joblib", None)
+        monkeypatch.setitem(sys.modules, "joblib.parallel", None)
+    with joblib.parallel_config(backend="multiprocessing" if lacks == "death" else "loky"):
+        with pytest.raises((MissingExtraError, OptionValueError), match="joblib"):
+            evaluate(make, {"rule": {}}, seeds=[1], workers=2)
+        with pytest.raises((MissingExtraError, OptionValueError), match="joblib"):
+            run_experiment(make, {"days": [1]}, seeds=[1], workers=2, store=tmp_path / "store")
+    assert not (tmp_path / "store").exists()
+
+
+HUGE = 10**5000
+
+
+def test_integers_that_no_line_can_hold_are_told(tmp_path):
+    given = {"seeds": [1], "points": POINTS, "metric": lambda shop: HUGE}
+    with pytest.raises(OptionValueError, match="'metric' must be a number of no more than 4,200 digits"):
+        evaluate(Shop, {"rule": {}}, **given)
+    frame = run_experiment(Shop, {"days": [1]}, store=tmp_path, **given)
+    assert frame["error"].str.contains("4,200 digits").all()
+    policy = partial(lambda observation, number: 5, number=HUGE)
+    for days, contenders in ((HUGE, {}), (1, {"huge": {"keeper": policy}})):
+        with pytest.raises(OptionValueError, match=r"4,200 digits|cannot be stored as JSON"):
+            run_experiment(
+                Shop, {"days": [days]}, seeds=[1], points=POINTS, store=tmp_path / "b", contenders=contenders
+            )
+
+
 SCRIPT = """
     import sys
     sys.path.insert(0, sys.argv[3])
     import pandas as pd
     from simenv_marl.experiments import run_experiment
-    from tests.worlds.shops import POINTS, Shop, level, some
+    from tests.worlds.shops import OBSERVED, POINTS, Shop, level, some
 
     if __name__ == "__main__":
         design = pd.DataFrame({"days": range(1, 9), "price": 0.5, "kind": ["slow"] * 7 + ["faulty"]})
@@ -540,16 +657,20 @@ def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_pa
 
 
 NAMED = """
-    import sys, numpy as np
+    import sys
     from gymnasium import spaces
-    from simenv_marl import evaluate, make_step
+    from simenv_marl import evaluate, make_step, vector_env
     from simenv_marl.experiments import run_experiment
 
-    class Sum:
+    class Pure:
         def __init__(self, a=1):
             self.a = a
         def reset(self, seed):
             self.y = seed
+        def run(self):
+            self.y += self.a
+
+    class Sum(Pure):
         def run(self):
             self.y += self.a * self.decide()
         def decide(self):
@@ -560,24 +681,16 @@ NAMED = """
         action_space=spaces.Discrete(9), action_space_mapping=int, reward_mapping=lambda model: model.y,
     )
 
-    class Own(Sum):
-        points = {"__main__.Sum.decide": decided}
-
-    class Pure(Sum):
-        def run(self):
-            self.y += self.a
-
     if __name__ == "__main__":
-        given = {"seeds": [5, 6], "workers": int(sys.argv[2])}
-        frame = run_experiment(Pure, {"a": [1, 2]}, metric=lambda model: model.y, store=f"{sys.argv[1]}/pure", **given)
+        store, given = sys.argv[1], {"seeds": [5, 6], "workers": int(sys.argv[2])}
+        frame = run_experiment(Pure, {"a": [1, 2]}, metric=lambda model: model.y, store=store + "/pure", **given)
         print(frame[["a", "seed", "agent", "return", "metric"]].values.tolist())
-        for make, points in ((Sum, {"__main__.Sum.decide": decided}), (Own, None)):
-            for key in ("a", "__main__.Sum.decide"):
-                contenders = {"four": {key: lambda observation: 4}}
-                print(evaluate(make, contenders, points=points, **given).values()["four"].tolist())
-                frame = run_experiment(make, {"a": [1, 2]}, contenders=contenders, points=points,
-                                       store=f"{sys.argv[1]}/{make.__name__}-{key}", **given)
-                print(frame[frame["agent"] == "team"]["return"].tolist())
+        given["points"] = {"__main__.Sum.decide": decided}
+        for key in ("a", "__main__.Sum.decide"):
+            contenders = {"four": {key: lambda observation: 4}}
+            print(evaluate(Sum, contenders, **given).values()["four"].tolist())
+            frame = run_experiment(Sum, {"a": [1, 2]}, contenders=contenders, store=f"{store}/{key}", **given)
+            print(frame[frame["agent"] == "team"]["return"].tolist())
 """
 
 
@@ -588,5 +701,5 @@ def test_what_a_script_names_is_found_in_its_workers_and_models_need_not_decide(
     command = [sys.executable, path, tmp_path, workers]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     pure = [[a, seed, "team", 0.0, a + seed] for a in (1, 2) for seed in (5, 6)]
-    named = ["[9.0, 10.0]", "[6.0, 7.0, 9.0, 10.0, 7.0, 8.0, 13.0, 14.0]"] * 4
+    named = ["[9.0, 10.0]", "[6.0, 7.0, 9.0, 10.0, 7.0, 8.0, 13.0, 14.0]"] * 2
     assert done.stdout.splitlines() == [str(pure), *named], done.stderr

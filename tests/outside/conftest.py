@@ -1,9 +1,26 @@
-"""What is outside Python is tested with every driver."""
+"""What is outside Python is tested with every driver. Programs in C++ are compiled for that."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
 
 import pytest
 
 from tests.conftest import DRIVERS
-from tests.outside.compiling import HERE, compiled
+
+HERE = Path(__file__).parent
+COMPILER = shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++")
+WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
+
+
+def compiled(source: Path, folder: Path) -> Path:
+    """Compile a program that includes the client; return where it lies."""
+    program, client = folder / source.stem, HERE.parents[1] / "clients" / "cpp"
+    command = [COMPILER, "-std=c++17", "-O1", *WARNINGS, f"-I{client}", source, "-o", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[:4000]
+    return program
 
 
 def pytest_generate_tests(metafunc) -> None:
@@ -25,15 +42,3 @@ def make_env():
     yield make
     for env in made:
         env.close()
-
-
-@pytest.fixture(scope="session")
-def folder(tmp_path_factory):
-    """Where programs in C++ are compiled."""
-    return tmp_path_factory.mktemp("cpp")
-
-
-@pytest.fixture(scope="session")
-def probe(folder):
-    """The program that plays what an option names."""
-    return compiled(HERE / "probe.cpp", folder)

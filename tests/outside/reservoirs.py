@@ -114,9 +114,6 @@ class Here(SimulationInterface):
     def time(self) -> float:
         return self.model.time
 
-    def reseed(self, seed: int) -> None:
-        self.model.random.seed(seed)
-
     def _decide(self, point, entity, time, arguments, rule):
         function = {"reservoir.inflow": inflow, "broker.price": price}[point]
         call = self.calls.setdefault((point, entity), Call())

@@ -2,11 +2,12 @@
 
 import gc
 import random
+from functools import cache
 
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, branch, parallel_env, simulate
+from simenv_marl import RULE, branch, simulate
 from tests.conftest import DRIVERS
 from tests.worlds.models import culprits, notes, play
 
@@ -26,21 +27,14 @@ def _silent(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.fixture(scope="module")
-def plain():
-    """What the model itself has written, by seed."""
-    found = {}
-
-    def run(seed):
-        if seed not in found:
-            simulation = zones.BuildingSim()
-            simulation.reset(seed)
-            simulation.run()
-            simulation.close()
-            found[seed] = simulation.results, simulation.building.cost
-        return found[seed]
-
-    return run
+@cache
+def plain(seed):
+    """What the model itself has written, and what it has cost."""
+    simulation = zones.BuildingSim()
+    simulation.reset(seed)
+    simulation.run()
+    simulation.close()
+    return simulation.results, simulation.building.cost
 
 
 def at(degrees):
@@ -58,25 +52,16 @@ def folder(env):
 
 
 @DRIVERS
-def test_by_the_rule_it_is_the_plain_run(driver, plain):
+def test_by_the_rule_it_is_the_plain_run(driver):
     env = zones.raw_env(driver=driver)
     for seed in (3, 4):
         turns = play(env, RULE, seed=seed)
         assert outcome(env) == plain(seed)
         assert sum(turn.reward for turn in turns) == pytest.approx(-plain(seed)[1])
     env.close()
-    rounds = parallel_env(zones.BuildingSim, possible_agents=zones.AGENTS, driver=driver)
-    rounds.reset(seed=3)
-    total = 0.0
-    while rounds.agents:
-        _, rewards, *_ = rounds.step(dict.fromkeys(rounds.agents, RULE))
-        total += sum(rewards.values())
-    assert total == pytest.approx(-plain(3)[1])
-    assert outcome(rounds) == plain(3)
-    rounds.close()
 
 
-def test_interleaved_runs_are_what_they_are_alone(plain):
+def test_interleaved_runs_are_what_they_are_alone():
     order, seeds = random.Random(0), [3, 4, 5, 3]
     envs = [zones.raw_env() for _ in seeds]
     for env, seed in zip(envs, seeds, strict=True):
@@ -94,7 +79,7 @@ def test_interleaved_runs_are_what_they_are_alone(plain):
 
 @DRIVERS
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
-def test_an_end_in_mid_episode_and_a_new_one(trigger, driver, plain):
+def test_an_end_in_mid_episode_and_a_new_one(trigger, driver):
     env = zones.raw_env(driver=driver)
     env.reset(seed=3)
     for _ in range(25):
@@ -119,7 +104,7 @@ def test_an_end_in_mid_episode_and_a_new_one(trigger, driver, plain):
 
 @DRIVERS
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
-def test_an_error_in_the_model_surfaces_from_step(error, driver, plain, monkeypatch):
+def test_an_error_in_the_model_surfaces_from_step(error, driver, monkeypatch):
     def account(self, hours):
         if self.building.steps == 200:
             raise error("in the model")
@@ -139,35 +124,13 @@ def test_an_error_in_the_model_surfaces_from_step(error, driver, plain, monkeypa
     env.close()
 
 
-@DRIVERS
-def test_an_error_of_a_mapping_surfaces_from_step(driver, plain):
-    env = zones.raw_env(driver=driver)
-    env.reset(seed=3)
-    for zone in env.unwrapped.simulation.building.zones:
-        del zone.other
-    with pytest.raises(AttributeError, match="other"):
-        env.step(RULE)
-    play(env, RULE, seed=3)
-    assert outcome(env) == plain(3)
-    env.close()
-
-
-def test_branches_go_on_exactly():
-    _branched("replay")
-
-
 @pytest.mark.greenlet("with threads there is no fork")
-def test_forked_branches_go_on_exactly():
-    _branched("fork")
-
-
-def _branched(method):
-    def begun():
-        env = zones.raw_env()
-        env.reset(seed=3)
-        for _ in range(101):
-            env.step(at(18.0))
-        return env
+@pytest.mark.parametrize("method", ["fork", "replay"])
+def test_branches_go_on_exactly(method):
+    env = zones.raw_env()
+    env.reset(seed=3)
+    for _ in range(101):
+        env.step(at(18.0))
 
     def rest(env, number=0):
         rewards = [turn.reward for turn in play(env, at(19.0), reset=False)]
@@ -175,18 +138,13 @@ def _branched(method):
         # A forked branch writes to copies of its own, which have no name by which they could be read.
         return rewards, cost, results if method == "replay" else None
 
-    unbranched = begun()
-    expected, results = rest(unbranched), outcome(unbranched)
-    unbranched.close()
-    env = begun()
-    assert branch(env, rest, 2, method=method) == [expected] * 2
+    found = branch(env, rest, 2, method=method)
     assert folder(env).exists()
-    assert rest(env) == expected
-    assert outcome(env) == results
+    assert found == [rest(env)] * 2
     env.close()
 
 
-def test_policies_back_in_the_model(plain):
+def test_policies_back_in_the_model():
     simulation = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, RULE), seed=3)
     assert simulation.results == plain(3)[0]
     other = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, by_presence), seed=3)

@@ -1,9 +1,10 @@
-"""A market town in Java and a network in ns-3: in environments they are what they are by themselves."""
+"""Models outside Python in environments: a town in Java, a network in ns-3, and what the pages on clients show."""
 
 from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 from collections.abc import Callable
 from contextlib import closing
@@ -14,10 +15,11 @@ import pytest
 from examples.jvm_market import build as building
 from examples.jvm_market import env as town
 from examples.ns3_senders import env as network
-from examples.ns3_senders.train import POINT, Linear, compare
 
+from simenv_marl import parallel_env
 from simenv_marl.remote.check import check_wire
-from tests.outside.compiling import ROOT
+from tests.clients.page import DOCS, blocks
+from tests.outside.conftest import COMPILER, compiled
 from tests.outside.reservoirs import child
 from tests.outside.wire import exactly
 from tests.worlds.models import follow_the_rule, play
@@ -26,8 +28,6 @@ EMPTY = 2
 """The seed of a town in which there is no shop any more after some weeks."""
 
 BRIEF = {"seconds": 5.0}
-WATCHFUL = Linear((-0.35, -1.65, 0.62, 0.61, 0.06))
-"""Keeps its queue short."""
 
 
 @cache
@@ -106,18 +106,6 @@ def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(model, env):
 
 
 @of_the_town
-def test_towns_differ_and_one_of_them_is_empty_in_the_end(model):
-    found = [plain_town(seed) for seed in (3, 4, 5)]
-    assert min(result["closed"] for result in found) > 10
-    assert len({result["trace"][-1][2] for result in found}) == 3
-    assert [town.plain(seed)["truncated"] for seed in (3, EMPTY)] == [True, False]
-    assert town.plain(3, weeks=5)["result"]["weeks"] == 5
-    report = check_wire(town.command(weeks=20))
-    assert report.ok, str(report)
-    assert len(report.findings) > 10
-
-
-@of_the_town
 def test_lives_begin_and_end_in_mid_episode(model, env):
     ends = {turn.agent: (turn.terminated, turn.truncated) for turn in play(env, seed=3)}
     result = env.simulation.result
@@ -130,14 +118,59 @@ def test_lives_begin_and_end_in_mid_episode(model, env):
 
 @of_the_network
 def test_the_code_of_its_page(model, capsys):
-    page = (ROOT / "docs" / "ns3.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (code,) = blocks("ns3.md")
     exec(code, {"__name__": "page"})
     assert capsys.readouterr().out == f"{plain_network(7, seconds=10)}\n"
 
 
-@of_the_network
-def test_who_watches_its_queue_does_better_than_the_rule(model):
-    found = compare({"rule": {}, "watchful": {POINT: WATCHFUL}}, range(12), workers=0, baseline="rule")
-    assert found.summary().loc["watchful", "difference_low"] > 0
-    assert found.summary("queueing").loc["watchful", "difference_high"] < 0
+def shown(page: str, language: str) -> list[str]:
+    """The page's blocks in another language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / page).read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """The folder of this process."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.greenlet("the page takes the driver as it is")
+@of_the_town
+def test_the_code_of_the_page_on_java(model, here, capsys):
+    page = "clients-java.md"
+    (here / "Reservoir.java").write_text(shown(page, "java")[0])
+    shutil.copy(building.CLIENT, here)
+    plain = subprocess.run(["sh", "-e"], input=shown(page, "sh")[0], capture_output=True, text=True, timeout=120)
+    assert plain.stderr == ""
+    exec(blocks(page, "A model and its environment")[0], {"__name__": "__main__"})
+    assert capsys.readouterr().out == plain.stdout != ""
+    names = {"__name__": "__main__"}
+    exec(blocks(page, "A town of farms and shops")[0], names)
+    earned = names["found"].values()
+    assert (earned["by the granary"] > earned["rule"]).mean() > 0.8
+    assert "by the granary" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed")
+def test_the_code_of_the_page_on_cpp(here, capsys):
+    whole, own_loop, *_ = shown("clients-cpp.md", "cpp")
+    (here / "ferries.cpp").write_text(whole, encoding="utf-8")
+    program = str(compiled(here / "ferries.cpp", here))
+    names = {"__name__": "page"}
+    exec(blocks("clients-cpp.md")[0], names)
+    plain = subprocess.run([program, "7"], check=True, capture_output=True, text=True, timeout=20).stdout
+    assert capsys.readouterr().out == plain
+    assert int(plain) > 0
+    gone = set()
+    with closing(parallel_env(names["ferries"])) as env:
+        env.reset(seed=7)
+        while env.agents:
+            _, _, terminated, truncated, _ = env.step(dict.fromkeys(env.agents, 1))
+            gone |= {name for name, ended in terminated.items() if ended and not truncated[name]}
+    assert gone == {"Aurora", "Borealis"}
+    assert check_wire([program]).ok
+    client = 'simenv::Client client({"ferry.departs"});\nconst std::uint64_t seed = 7;\n'
+    main = f"int main() {{\n{client}{own_loop}}}\n"
+    (here / "own.cpp").write_text(whole[: whole.index("int main")] + main, encoding="utf-8")
+    assert check_wire([str(compiled(here / "own.cpp", here))]).ok

@@ -1,6 +1,7 @@
-"""Lines and frames: what is sent arrives, and what is no frame is refused."""
+"""The wire: what is sent arrives, what is no frame is refused; and the check that authors of clients make of them."""
 
 import json
+import sys
 from math import inf, isnan, nan
 
 import numpy as np
@@ -8,8 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from simenv_marl.__main__ import main
 from simenv_marl.errors import WireError
+from simenv_marl.remote.check import check_wire
 from simenv_marl.remote.wire import decode, encode
+from tests.outside.reservoirs import EXITS_AFTER_STOP, changed, command
+
+pytestmark = pytest.mark.greenlet("no environment is made")
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -67,12 +73,92 @@ def test_what_is_no_json_is_refused_with_its_place(value, where):
         encode({"value": value})
 
 
-@pytest.mark.parametrize("line", [b"", b"NaN", b"[1]", b"3", b"{", b'{"a": Infinity}', b'{"a": "\xff"}', b"[" * 10**5])
+LONG = b'{"a": ' + b"1" * 10_000 + b"}"
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"NaN", b"[1]", b"3", b"{", b'{"a": Infinity}', b'{"a": "\xff"}', b"[" * 10**5, LONG]
+)
 def test_what_is_no_frame_is_refused(line):
     with pytest.raises(WireError):
         decode(line)
 
 
-def test_a_number_of_many_digits_is_refused():
-    with pytest.raises(WireError):
-        decode(b'{"a": ' + b"1" * 10_000 + b"}")
+def found(report):
+    return {finding.tried: finding.verdict for finding in report.findings}
+
+
+def test_nothing_is_wrong_with_a_simulator_that_does_well():
+    report = check_wire(command())
+    assert report.ok
+    assert len(report.findings) == 15
+    assert found(report).pop("a run without an environment") == "note"  # it wants a seed then
+    assert "nothing is wrong" in str(report)
+    assert check_wire(command("1"), timeout=10).ok  # one episode for each process
+
+
+def test_a_simulator_may_exit_after_a_stop(tmp_path):
+    report = check_wire(changed(tmp_path, EXITS_AFTER_STOP.format(code=0)))
+    assert report.ok, str(report)
+    stops = {tried: verdict for tried, verdict in found(report).items() if tried.startswith("stop")}
+    assert len(stops) == 3
+    assert set(stops.values()) == {"note"}
+
+
+def test_an_episode_that_does_not_end_is_broken_off():
+    report = check_wire(command(), options={"hours": 10_000}, decisions=20)
+    assert report.ok
+    assert found(report)["an episode by its own rule"] == "note"
+
+
+@pytest.mark.parametrize(
+    ("change", "tried"),
+    [
+        ("outside.Wire.play = lambda *_: None", "starts, and says hello"),
+        ("outside.POINTS = []", "starts, and says hello"),
+        ("outside.Reservoirs.run = lambda *_: None", "an episode by its own rule"),
+        ("outside.random.Random = lambda seed: outside.random", "two episodes in a row with the same seed"),
+        (
+            "stopped = outside.Stopped\n"
+            "class Stopped(Exception):\n"
+            "    def __init__(self): wire.send({'end': {}})\n"
+            "init = outside.Wire.__init__\n"
+            "def keep(self):\n    global wire\n    wire = self\n    init(self)\n"
+            "outside.Wire.__init__, outside.Stopped = keep, Stopped",
+            "stop in place of the answer to call 1",
+        ),
+        (EXITS_AFTER_STOP.format(code=3), "stop in place of the answer to call 1"),
+        (
+            "receive = outside.Wire.receive\n"
+            "def lenient(self):\n    answer = receive(self)\n"
+            "    return {**answer, 'act': self.number} if 'act' in answer else answer\n"
+            "outside.Wire.receive = lenient",
+            "an answer with the number of another call",
+        ),
+    ],
+)
+def test_what_is_wrong_is_found(tmp_path, change, tried):
+    report = check_wire(changed(tmp_path, change), timeout=10.0)
+    assert not report.ok
+    assert found(report)[tried] == "wrong", str(report)
+
+
+def test_a_reseed_that_changes_nothing_is_noted(tmp_path):
+    report = check_wire(changed(tmp_path, "outside.random.Random.seed = lambda *_: None"))
+    assert found(report)["reseed"] == "note"
+
+
+def test_the_command_line(capsys):
+    assert main(["wire-check", "--seed", "3", "--", *command()]) == 0
+    assert "nothing is wrong" in capsys.readouterr().out
+    assert main(["wire-check", "--json", "--options", '{"hours": 3}', *command()]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["ok"]
+    assert "broker.price 1" in told["findings"][1]["text"]
+    assert main(["wire-check", "--timeout", "5", sys.executable, "-c", "pass"]) == 1
+    assert "has exited with code 0" in capsys.readouterr().out
+    assert main(["wire-check"]) == 2
+    assert "needs a command" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["wire-check", "--options", "[1]", *command()])
+    assert "not a JSON object" in capsys.readouterr().err

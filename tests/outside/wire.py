@@ -15,58 +15,26 @@ from typing import Any
 PATIENCE = 30.0
 """Seconds that any wait may take."""
 
-
-VALUES = [
-    None,
-    True,
-    0,
-    -1,
-    2**63 - 1,
-    -(2**63),
-    2**64 - 1,
-    2**53 + 1,
-    0.0,
-    -0.0,
-    0.1,
-    1 / 3,
-    1.0,
-    5e-324,
-    2.2250738585072014e-308,
-    1.7976931348623157e308,
-    1e22,
-    1e23,
-    1e-7,
-    2e-3,
-    123456789.125,
-    9007199254740993.0,
-    "",
-    '\x00\x1f\x7f "quoted" \\ / \b\f\n\r\t',
-    "ä € 𝄞 \ufffd \u2028 \U0010ffff",
-    ["x" * 5000],
-    [],
-    {},
-    [[], {}, [[1, 2.5, "x"]], None],
-    {"": {"a": [1]}, "float": "nan ", "ü": [None, True, False]},
-    {"float": "nan"},
-    {"float": "inf"},
-    {"float": "-inf"},
-    {"float": "nan", "other": 1},
-    {"float": 1.0},
-]
+INTEGERS = [0, -1, 2**63 - 1, -(2**63), 2**64 - 1, 2**53 + 1]
+FLOATS = [0.0, -0.0, 0.1, 1 / 3, 1.0, 5e-324, 2.2250738585072014e-308, 1.7976931348623157e308, 1e22, 1e-7, 12345678.125]
+TEXTS = ["", '\x00\x1f\x7f "quoted" \\ / \b\f\n\r\t', "ä € 𝄞 \ufffd \u2028 \U0010ffff", "x" * 5000]
+NAMED = [{"float": "nan"}, {"float": "inf"}, {"float": "-inf"}, {"float": "nan", "other": 1}, {"float": 1.0}]
+NESTED = [[], {}, [[], {}, [[1, 2.5, "x"]], None], {"": {"a": [1]}, "float": "nan ", "ü": [None, True, False]}]
+VALUES = [None, True, *INTEGERS, *FLOATS, *TEXTS, *NAMED, *NESTED]
 """What a model can be sent, and sends back unchanged."""
 
 
 class Child:
     """A process that speaks the wire, whose frames are written and read by hand."""
 
-    def __init__(self, *command: str | Path, **environment: str) -> None:
+    def __init__(self, *command: str | Path) -> None:
         read_by_child, self.out = os.pipe()
         self.into, written_by_child = os.pipe()
         self.descriptors = (read_by_child, written_by_child)
         self._rest = b""
         self.process = subprocess.Popen(
             [str(part) for part in command],
-            env=os.environ | {"SIMENV_MARL_FDS": "{},{}".format(*self.descriptors)} | environment,
+            env=os.environ | {"SIMENV_MARL_FDS": "{},{}".format(*self.descriptors)},
             pass_fds=self.descriptors,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,

@@ -1,14 +1,37 @@
 """What candidate actions are worth: the same as by a reference that goes through the model by itself."""
 
+import os
 import random
+import time
 
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformReward
-from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, BaseParallelWrapper, OrderEnforcingWrapper
+from gymnasium.wrappers import (
+    OrderEnforcing,
+    PassiveEnvChecker,
+    TimeLimit,
+    TransformAction,
+    TransformReward,
+)
+from pettingzoo.utils.wrappers import (
+    AssertOutOfBoundsWrapper,
+    BaseParallelWrapper,
+    OrderEnforcingWrapper,
+    TerminateIllegalWrapper,
+)
 
-from simenv_marl import RULE, aec_env, difference, joint_env, parallel_env, single_env, vector_env
+from simenv_marl import (
+    RULE,
+    SimulationInterface,
+    aec_env,
+    branch,
+    difference,
+    joint_env,
+    parallel_env,
+    single_env,
+    vector_env,
+)
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
@@ -22,7 +45,8 @@ from simenv_marl.errors import (
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.planning.rollouts import Rollouts
 from tests.conftest import DRIVERS
-from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
+from tests.processes import gone
+from tests.worlds.duels import LEFT, RIGHT, SPACE, Duel, Unseeded, observe, points, worth
 from tests.worlds.models import define
 
 METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
@@ -89,19 +113,6 @@ def test_a_decision_in_mid_episode(view):
     assert told.best == 2
 
 
-@pytest.mark.parametrize("view", VIEWS)
-def test_the_environment_does_not_move(view):
-    env, other = made(view), made(view)
-    for method in ("fork", "replay"):
-        action_values(env, futures=2, method=method)
-
-    def go_on(env):
-        told = [repr(env.step(dict.fromkeys(env.agents, 2) if view == "parallel" else 2)) for _ in range(3)]
-        return told, env.simulation.value
-
-    assert go_on(env) == go_on(other)
-
-
 @pytest.mark.parametrize(
     ("given", "told"),
     [
@@ -127,21 +138,15 @@ def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, 
 
 @METHODS
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_base_is_a_policy_of_the_agent(view, method):
-    env = made(view)
-    told = action_values(env, futures=3, base=greedy, method=method)
-    assert told.returns == pytest.approx(expected(env, "left", bases={"left": greedy}))
-    told = action_values(env, futures=3, base=lambda observation, info: info["time"] > 2, method=method)
-    assert not np.allclose(told.returns, expected(env, "left"))
-
-
-@METHODS
-@pytest.mark.parametrize("view", ["aec", "parallel"])
-def test_the_base_is_policies_by_agent(view, method):
-    env = made(view)
-    for base, bases in ((BASES, BASES), (BASES | {"left": RULE}, {"right": down})):
+def test_the_base_is_a_policy_of_the_agent_or_policies_by_agent(view, method):
+    env, given = made(view), [(greedy, {"left": greedy})]
+    if view in ("aec", "parallel"):
+        given += [(BASES, BASES), (BASES | {"left": RULE}, {"right": down})]
+    for base, bases in given:
         told = action_values(env, futures=3, base=base, method=method)
         assert told.returns == pytest.approx(expected(env, "left", bases=bases))
+    told = action_values(env, futures=3, base=lambda observation, info: info["time"] > 2, method=method)
+    assert not np.allclose(told.returns, expected(env, "left"))
 
 
 @METHODS
@@ -236,15 +241,6 @@ def test_agents_that_die_and_stay_for_the_learner(view):
     assert told.returns == pytest.approx(expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2}))
 
 
-@METHODS
-def test_a_candidate_that_changes_nothing_has_the_same_values(method):
-    env = made("single")
-    told = action_values(env, [1, RULE, 1, 2], futures=4, method=method)
-    assert told.returns[0].tolist() == told.returns[1].tolist() == told.returns[2].tolist()
-    assert len(set(told.returns[0])) == 4
-    assert told.actions == (1, RULE, 1, 2)
-
-
 def test_futures_are_those_of_the_decision():
     env = made("single")
 
@@ -260,24 +256,6 @@ def test_futures_are_those_of_the_decision():
     assert not set(seeds) & set(futures_of(env, 4))
     env.reset(seed=6)
     assert not set(seeds) & set(futures_of(env, 4))
-
-
-class Global(Duel):
-    reseed = None
-
-    def reset(self, seed=None):
-        super().reset(seed)
-        self.random = random
-
-
-@METHODS
-def test_global_generators_are_common_too(method):
-    env = made("single", Global, global_rng=True)
-    state = random.getstate()
-    told = action_values(env, [1, RULE, 2], futures=3, method=method)
-    assert told.returns[0].tolist() == told.returns[1].tolist()
-    assert len(set(told.returns[0])) == 3
-    assert random.getstate() == state
 
 
 @METHODS
@@ -429,22 +407,9 @@ def test_time_needs_a_clock():
             action_values(env, **given)
 
 
-def test_time_limit_and_errors_in_a_branch():
-    env = made("single")
-
-    def hangs(observation):
-        while True:
-            pass
-
+def test_a_time_limit_ends_branches_that_hang():
     with pytest.raises(BranchError, match="longer than"):
-        action_values(env, futures=1, base=hangs, time_limit=0.2)
-
-    def fails(observation):
-        raise LookupError("no idea")
-
-    with pytest.raises(LookupError, match="no idea") as caught:
-        action_values(env, futures=1, base=fails)
-    assert "in branch" in "".join(caught.value.__notes__)
+        action_values(made("single"), futures=1, base=lambda observation: time.sleep(60), time_limit=0.2)
 
 
 def test_progress_on_request(capsys):
@@ -461,9 +426,125 @@ def test_branches_are_not_shown():
             self.pictures += 1
 
     env = begun(single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human"))
-
-    def pictures(env):
-        return float(env.unwrapped.simulation.pictures)
-
-    told = action_values(env, [1], futures=1, horizon=3, terminal_value=pictures)
+    told = action_values(env, [1], futures=1, horizon=3, terminal_value=lambda env: env.unwrapped.simulation.pictures)
     assert told.means[0] == pytest.approx(worth("left", 1, futures_of(env, 1)[0], horizon=3) + 1)
+
+
+class Births(SimulationInterface):
+    """One decides; a second one is born in the first round and decides at once; both are paid at its end."""
+
+    def reset(self, seed=None):
+        self.earned, self.turn = {0: 0.0}, 0
+
+    def reseed(self, seed):
+        pass
+
+    def run(self):
+        while self.turn < 4:
+            actions = {number: self.act(number) for number in list(self.earned)}
+            if self.turn == 0:
+                self.earned[1] = 0.0
+                actions[1] = self.act(1)
+            for number, action in actions.items():
+                self.earned[number] += action
+            self.turn += 1
+
+    @define(
+        action_space=spaces.Discrete(3),
+        reward_mapping=difference(lambda births, number: births.earned[number]),
+        agent=lambda births, number: f"born_{number}",
+    )
+    def act(self, number):
+        return 1
+
+
+@pytest.mark.parametrize("view", [aec_env, parallel_env])
+def test_what_an_action_is_worth_reaches_to_the_next_decision(view):
+    env = begun(view(Births, [Births.act]))
+    turn = {"horizon": 1, "terminal_value": lambda env: 100 * env.unwrapped.simulation.turn}
+    for given, means in (
+        ({"horizon": 1}, [0, 1, 2]),
+        ({"horizon": 2}, [1, 2, 3]),
+        ({}, [3, 4, 5]),
+        ({"discount": 0.5}, [0.875, 1.875, 2.875]),
+        (turn, [100, 101, 102]),
+        (turn | {"terminal_value": lambda env: np.array([7.0])}, [7, 8, 9]),
+    ):
+        assert action_values(env, futures=1, **given).means.tolist() == means
+
+
+@pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
+def test_the_first_of_padded_rounds(wrapper):
+    class Unannounced(Duel):
+        def expected_calls(self, point):
+            return []
+
+    env = begun(wrapper(parallel_env(Unannounced, points(), possible_agents=["left", "right"])))
+    assert action_values(env, futures=3, horizon=1).returns == pytest.approx(expected(env, "left", horizon=1))
+    planner = RolloutPolicy((number for number in range(3)), futures=1, horizon=1)
+    assert [planner.choose(env).best for _ in range(2)] == [2, 2]
+
+
+def test_wrappers_that_look_at_masks_see_legal_actions():
+    masked = {
+        "observation_space": spaces.Dict(observation=SPACE, action_mask=spaces.Box(0, 1, (6,), np.int8)),
+        "observation_space_mapping": lambda duel: {"observation": observe(duel)},
+        "action_space": spaces.Discrete(6),
+        "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0],
+        "reward_mapping": difference(lambda duel: duel.value),
+    }
+    given = {LEFT: define(**masked, agent="left"), RIGHT: define(**masked, agent="right")}
+    env = begun(aec_env(Duel, given))
+    wrapped = begun(TerminateIllegalWrapper(aec_env(Duel, given), -1))
+    assert action_values(wrapped, futures=2).returns.tolist() == action_values(env, futures=2).returns.tolist()
+
+
+def high(observation):
+    return 2 if observation[0] > 1 else 0
+
+
+@pytest.mark.parametrize(
+    ("view", "candidate"), [("aec", 1), ("parallel", 1), ("joint", {"left": 1, "right": 1})], ids=str
+)
+def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
+    plain, planned = (
+        action_values(made(view), [candidate], base={"right": base}, futures=1).means.tolist()
+        for base in (high, RolloutPolicy(base=high))
+    )
+    assert plain == planned
+
+
+def test_branches_are_not_nested_for_ever():
+    def deeper(twin, number):
+        return branch(twin, deeper, 1)
+
+    with pytest.raises(BranchError, match="nested 4 deep"):
+        branch(made("single"), deeper, 1)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say")
+def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
+    def slow(twin, number):
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(600)
+
+    env = made("single")
+    for limit in (0.5, 2.0, 8.0, 32.0):  # until the branch in the branch begins within it
+        with pytest.raises(BranchError, match="longer than"):
+            branch(env, lambda twin, number: branch(twin, slow, 1, method="fork"), 1, method="fork", time_limit=limit)
+        if inner := [int(path.name) for path in tmp_path.iterdir()]:
+            break
+    assert inner
+    assert all(map(gone, inner))
+
+
+@METHODS
+def test_errors_come_as_themselves_and_say_which_candidate_was_tried_in_which_future(method):
+    class Fragile(Duel):
+        def run(self):
+            return 1 / (self.left() - 2)
+
+    env = made("single", Fragile)
+    with pytest.raises(ZeroDivisionError) as raised:
+        action_values(env, [2], futures=2, method=method)
+    assert any("while 2 was tried out in future" in note for note in raised.value.__notes__)

@@ -10,6 +10,7 @@ CALLS = {
     "by keyword": (lambda model: model.choose(y=5, x=1), (1, 5), {"z": 3}),
     "with defaults": (lambda model: model.choose(1), (1, 2), {"z": 3}),
     "with a keyword-only argument": (lambda model: model.choose(1, z=4), (1, 2), {"z": 4}),
+    "with more than are named": (lambda model: model.choose(2, 3, 4, other=5), (2, 3, 4), {"z": 3, "other": 5}),
 }
 
 
@@ -34,8 +35,8 @@ def recording(call, seen):
             reward_mapping=noting("reward", 0.0),
             rule_action_mapping=noting("rule action", 1),
         )
-        def choose(self, x, y=2, *, z=3):
-            return x, y, z
+        def choose(self, x, y=2, *rest, z=3, **options):
+            return x, y, *rest, z
 
         def reset(self):
             self.decided = None
@@ -62,33 +63,6 @@ def test_every_callable_gets_the_bound_arguments(call, args, kwargs):
     assert seen == {name: ((*before.get(name, ()), model, *args), kwargs) for name in seen}
     assert len(seen) == 6
     env.close()
-
-
-def test_surplus_arguments_stay_behind_the_named_ones():
-    seen = []
-
-    class Model(SimulationInterface):
-        @make_step(
-            agent="ant",
-            observation_space=spaces.Discrete(2),
-            observation_space_mapping=lambda *args, **kwargs: seen.append((args[1:], kwargs)) or 0,
-            action_space=spaces.Discrete(2),
-            action_space_mapping=int,
-            reward_mapping=lambda *args, **kwargs: 0.0,
-        )
-        def choose(self, x=1, *rest, key=None, **options):
-            return x
-
-        def reset(self):
-            pass
-
-        def run(self):
-            self.choose(2, 3, 4, other=5)
-
-    env = parallel_env(Model, Model.choose)
-    env.reset()
-    env.step({"ant": 0})
-    assert seen[0] == ((2, 3, 4), {"key": None, "other": 5})
 
 
 def test_a_call_that_does_not_bind_raises_the_error_of_python():

@@ -5,16 +5,15 @@ import gc
 import shutil
 import subprocess
 import sys
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
 
 import pytest
 
-from simenv_marl import aec_env, branch, single_env
+from simenv_marl import single_env
 from simenv_marl.remote import CallbackGuard
-from tests.worlds.models import culprits, decision, notes, play, script, stacks
+from tests.worlds.models import culprits, decision, notes, script, stacks
 
 COMPARE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_int), ctypes.POINTER(ctypes.c_int))
 EACH = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int)
@@ -105,17 +104,6 @@ def test_an_error_of_stop_surfaces_with_the_first_error():
     assert isinstance(caught.value.__context__, ZeroDivisionError)
 
 
-def test_an_error_can_be_handled_at_the_inner_block():
-    def outer(one, other):
-        with suppress(ZeroDivisionError), guard:
-            sort(guard.callback(lambda *_: 1 // 0))
-        return one[0] - other[0]
-
-    guard = CallbackGuard()
-    with guard:
-        assert sort(guard.callback(outer)) == list(range(1, 10))
-
-
 def test_after_an_error_c_gets_the_result_and_no_callback_runs():
     guard, answers = CallbackGuard(), []
     divide = guard.callback(lambda number: 1 // number, result=-1)
@@ -137,14 +125,3 @@ def test_an_interrupt_while_c_runs_surfaces(during):
     env.reset()
     with pytest.raises(KeyboardInterrupt):
         env.step(1) if during == "step" else env.close()
-
-
-def test_replayed_branches_continue_below_c_code():
-    def rest(env, number=0):
-        return len(play(env, 0, reset=False)), env.unwrapped.simulation.log
-
-    decide = comparing(action_space_mapping=lambda action: 1 - action)
-    env = aec_env(sorting(decide, []), decide)
-    env.reset()
-    env.step(2)
-    assert branch(env, rest, 2, method="replay") == [rest(env)] * 2

@@ -1,22 +1,13 @@
 """The simulation's ``close``: once for each reset that has succeeded, after the last observations."""
 
 import gc
-import sqlite3
+import threading
 
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from simenv_marl import (
-    aec_env,
-    branch,
-    joint_env,
-    parallel_env,
-    simulate,
-    simulate_many,
-    single_env,
-    vector_env,
-)
+from simenv_marl import aec_env, branch, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
 from simenv_marl.data import collect_episodes
 from tests.worlds.models import define
 
@@ -25,7 +16,7 @@ LOG = []
 
 
 class Shop:
-    """Keeps its books in a database, which the last observation reads."""
+    """Keeps books, which the last observation reads; only the thread that has opened them may close them."""
 
     fails = False
 
@@ -33,14 +24,12 @@ class Shop:
         if seed == 13:
             raise ValueError("no shop today")
         LOG.append(("reset", seed))
-        self.seed = seed
-        self.books = sqlite3.connect(":memory:")
-        self.books.execute("create table sold (number integer)")
+        self.seed, self.books, self.thread = seed, [], threading.get_ident()
 
     def run(self):
         try:
             for _ in range(2):
-                self.books.execute("insert into sold values (?)", (self.book(),))
+                self.books.append(self.book())
         finally:
             LOG.append(("unwound", self.seed))
 
@@ -48,15 +37,10 @@ class Shop:
         return 1
 
     def sold(self):
-        if self.books is None:
-            raise AssertionError("observed after it was closed")
-        return self.books.execute("select sum(number) from sold").fetchone()[0] or 0
-
-    def state(self):
-        return np.array([self.sold()])
+        return sum(self.books)  # None after it was closed, which is an error
 
     def close(self):
-        self.books.close()
+        assert threading.get_ident() == self.thread
         self.books = None
         LOG.append(("close", self.seed))
         if self.fails:
@@ -72,22 +56,13 @@ def _log():
     LOG.clear()
 
 
-@pytest.fixture
-def books(_driver, request):
-    """The decision point. With the driver of threads, mappings cannot use what belongs to the simulation's thread."""
-    apart = "thread" in request.node.name
-
-    def sold(shop):
-        assert shop.books is not None
-        return 0 if apart else shop.sold()
-
-    return {
-        BOOK: define(
-            observation_space_mapping=lambda shop: [sold(shop), 0],
-            reward_mapping=sold,
-            agent="clerk",
-        )
-    }
+BOOKS = {
+    BOOK: define(
+        observation_space_mapping=lambda shop: [shop.sold(), 0],
+        reward_mapping=lambda shop: shop.sold(),
+        agent="clerk",
+    )
+}
 
 
 def fail(*_):
@@ -98,8 +73,8 @@ def of(what):
     return [seed for kind, seed in LOG if kind == what]
 
 
-def test_it_comes_before_the_next_reset_and_when_the_environment_is_closed(books):
-    env = single_env(Shop, books)
+def test_it_comes_before_the_next_reset_and_when_the_environment_is_closed():
+    env = single_env(Shop, BOOKS)
     env.reset(seed=1)
     env.step(3)
     *_, terminated, _, _ = env.step(4)
@@ -116,16 +91,16 @@ def test_it_comes_before_the_next_reset_and_when_the_environment_is_closed(books
 
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
-def test_an_environment_that_is_gone_closes_its_simulation(books, view):
-    env = view(Shop, books)
+def test_an_environment_that_is_gone_closes_its_simulation(view):
+    env = view(Shop, BOOKS)
     env.reset(seed=1)
     del env
     gc.collect()
     assert LOG == [("reset", 1), ("unwound", 1), ("close", 1)]
 
 
-def test_a_reset_that_fails_has_nothing_to_close(books):
-    env = single_env(Shop, books)
+def test_a_reset_that_fails_has_nothing_to_close():
+    env = single_env(Shop, BOOKS)
     for closed in ([], [1]):
         with pytest.raises(ValueError, match="no shop"):
             env.reset(seed=13)
@@ -136,8 +111,8 @@ def test_a_reset_that_fails_has_nothing_to_close(books):
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_vector_environments_close_each_before_it_begins_anew(books, mode):
-    env = vector_env(Shop, books, num_envs=2, autoreset_mode=mode)
+def test_vector_environments_close_each_before_it_begins_anew(mode):
+    env = vector_env(Shop, BOOKS, num_envs=2, autoreset_mode=mode)
     env.reset(seed=1)
     for _ in range(2):
         env.step(np.ones(2, np.int64))
@@ -151,28 +126,28 @@ def test_vector_environments_close_each_before_it_begins_anew(books, mode):
     assert len(of("close")) == len(of("reset")) == 4
 
 
-def test_runners_close_what_they_have_run_after_it_was_collected(books):
+def test_runners_close_what_they_have_run_after_it_was_collected():
     def collect(shop):
         assert shop.books is not None
         LOG.append(("collect", shop.seed))
 
     policies = {BOOK: lambda observations: np.ones(len(observations), np.int64)}
-    simulate_many(Shop, policies, seeds=[1, 2, 3], points=books, collect=collect, batch_size=2)
+    simulate_many(Shop, policies, seeds=[1, 2, 3], points=BOOKS, collect=collect, batch_size=2)
     assert sorted(of("close")) == sorted(of("collect")) == [1, 2, 3]
     LOG.clear()
-    collect_episodes(Shop, policies, seeds=[1, 2], points=books, collect=collect)
+    collect_episodes(Shop, policies, seeds=[1, 2], points=BOOKS, collect=collect)
     assert of("close") == of("collect") == [1, 2]
     LOG.clear()
-    simulate(Shop, {BOOK: lambda observation: 2}, points=books, seed=4)
+    simulate(Shop, {BOOK: lambda observation: 2}, points=BOOKS, seed=4)
     assert LOG == [("reset", 4), ("unwound", 4), ("close", 4)]
     LOG.clear()
     with pytest.raises(LookupError):
-        simulate_many(Shop, None, seeds=[1, 2], points=books, collect=fail)
+        simulate_many(Shop, None, seeds=[1, 2], points=BOOKS, collect=fail)
     assert of("close") == of("reset") != []
 
 
-def test_its_error_is_raised_by_the_next_reset_or_by_close(books):
-    env = single_env(Broken, books)
+def test_its_error_is_raised_by_the_next_reset_or_by_close():
+    env = single_env(Broken, BOOKS)
     env.reset(seed=1)
     with pytest.raises(ConnectionError):
         env.reset(seed=2)
@@ -184,12 +159,11 @@ def test_its_error_is_raised_by_the_next_reset_or_by_close(books):
     assert of("close") == [1, 3]
 
 
-@pytest.mark.filterwarnings("ignore:unclosed")
-def test_its_error_does_not_take_the_place_of_an_earlier_one(books):
+def test_its_error_does_not_take_the_place_of_an_earlier_one():
     with pytest.raises(LookupError, match="first") as caught:
-        simulate(Broken, {BOOK: fail}, points=books, seed=1)
+        simulate(Broken, {BOOK: fail}, points=BOOKS, seed=1)
     assert "books cannot be closed" in "".join(caught.value.__notes__)
-    env = single_env(Broken, books)
+    env = single_env(Broken, BOOKS)
     env.reset(seed=1)
     with pytest.raises(LookupError, match="first") as caught:
         branch(env, fail, 1, method="replay")
@@ -198,35 +172,17 @@ def test_its_error_does_not_take_the_place_of_an_earlier_one(books):
         env.close()
 
 
-def test_its_error_is_a_warning_where_nobody_can_catch_it(books):
-    envs = [single_env(Broken, books)]
+def test_its_error_is_a_warning_where_nobody_can_catch_it():
+    envs = [single_env(Broken, BOOKS)]
     envs[0].reset(seed=1)
     with pytest.warns(ResourceWarning, match="books cannot be closed"):
         envs.clear()
 
 
-def test_the_state_comes_before_it(books):
-    env = aec_env(Shop, books, driver="greenlet")
-    env.reset(seed=1)
-    env.step(3)
-    env.step(4)
-    assert env.state().tolist() == [7]
-    env.close()
-    assert of("close") == [1]
-
-
-def test_branches_end_without_it(books):
-    env = single_env(Shop, books, driver="greenlet")
+def test_branches_end_without_it():
+    env = single_env(Shop, BOOKS, driver="greenlet")
     env.reset(seed=1)
     results = branch(env, lambda twin, number: len(of("close")), 2, method="fork")
     assert results == [0, 0]
     assert of("close") == []
     env.close()
-
-
-@pytest.mark.filterwarnings("ignore:unclosed database", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_simulations_that_have_none_need_none(books):
-    env = single_env(type("Plain", (Shop,), {"close": None}), books)
-    env.reset(seed=1)
-    env.close()
-    assert of("close") == []

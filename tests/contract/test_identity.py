@@ -90,23 +90,6 @@ def test_the_views_agree_in_decisions_rewards_and_outcome(design, seed, options)
     assert {agent: totals_in_turns[agent] for agent in totals} == totals
 
 
-@given(designs, seeds)
-@settings(max_examples=100)
-def test_policies_for_the_others_decide_as_their_user_would(design, seed):
-    everybody = made(aec_env, design)
-    _, totals = played(everybody, seed)
-    others = {name: advised for name in POINTS if name not in PLAN}
-    env = single_env(lambda: Yard(design), POINTS, policies=others)
-    observation, _ = env.reset(seed=seed)
-    total, ended = 0.0, False
-    while not ended:
-        observation, reward, terminated, truncated, _ = env.step(advised(observation))
-        total += reward
-        ended = terminated or truncated
-    assert outcome(env.unwrapped.simulation) == outcome(everybody.unwrapped.simulation)
-    assert total == totals["planner"]
-
-
 # -- random use -----------------------------------------------------------------------------------
 
 

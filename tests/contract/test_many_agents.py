@@ -1,12 +1,11 @@
 """Agents that are entities: their names, rosters, births and deaths."""
 
-import gc
 from collections import Counter
 
 import pytest
 from hypothesis import given, settings
 
-from simenv_marl import RULE, TRUNCATED, SimEnvError, aec_env, parallel_env, single_env
+from simenv_marl import RULE, TRUNCATED, SimEnvError, SimulationInterface, aec_env, parallel_env, simulate, single_env
 from simenv_marl.errors import (
     AgentError,
     DefinitionError,
@@ -16,8 +15,7 @@ from simenv_marl.errors import (
     UnknownAgentError,
     UnknownPointError,
 )
-from tests.worlds.lives import Announcing as AnnouncingLife
-from tests.worlds.lives import life, story
+from tests.worlds.lives import Life, life, story
 from tests.worlds.many_worlds import (
     HERE,
     AnnouncedHunt,
@@ -48,13 +46,13 @@ IN_ORDER = "0 health 1, 0 acts, 1 health 1, 1 acts, 2 health 1, 2 acts, 3 health
 
 def test_an_agent_for_each_entity_joins_when_it_first_decides():
     env = aec_env(life("2 acts, 0 acts, 2 acts"), beings(removed_by=()))
-    env.reset()
-    assert env.agents == ["being_2"]
-    assert not hasattr(env, "possible_agents")
-    with pytest.raises(AttributeError):
-        _ = env.max_num_agents
-    env.step(1)
-    assert env.agents == ["being_2", "being_0"]
+    for _ in range(2):
+        env.reset()
+        assert env.agents == ["being_2"]
+        with pytest.raises(AttributeError):
+            _ = env.max_num_agents
+        env.step(1)
+        assert env.agents == ["being_2", "being_0"]
     assert decisions(play(env, 1)) == ["being_2", "being_0", "being_2"]
 
 
@@ -72,17 +70,11 @@ def test_spaces_of_all_possible_agents_are_dicts(make):
     assert not hasattr(without, "possible_agents")
 
 
-def test_an_empty_string_is_a_name_as_any_other():
-    env = aec_env(life("0 acts"), beings(agent=lambda being: ""))
-    env.reset()
-    assert env.agents == [""]
-
-
-def test_entities_of_one_name_are_one_agent():
+def test_entities_of_one_name_are_one_agent_even_if_it_is_empty():
     """The name is the agent: a model may replace the object behind it."""
-    named = beings(agent=lambda being: "hero")
+    named = beings(agent=lambda being: "")
     turns = play(aec_env(life("0 acts, 1 health 1, 1 acts, 2 health 2, 2 acts"), named), 1)
-    assert [(turn.agent, turn.observation[1]) for turn in turns] == [("hero", 0), ("hero", 1), ("hero", 2), ("hero", 2)]
+    assert [(turn.agent, turn.observation[1]) for turn in turns] == [("", 0), ("", 1), ("", 2), ("", 2)]
 
 
 def test_spaces_of_those_who_join_late_are_their_own_and_seeded():
@@ -113,7 +105,9 @@ def test_declared_agents_are_there_from_the_start():
     assert env.max_num_agents == 3
     assert env.observation_space("being_1") is env.observation_space("being_1")
     env.reset(seed=1)
-    assert sorted(env.agents) == NAMES
+    assert env.agents == NAMES
+    assert env.agents is not env.possible_agents
+    assert env.num_agents == 3
     assert env.agent_selection == "being_2"
     assert env.observe("being_1").tolist() == [0, 0]
     assert set(env.rewards) == set(env.infos) == set(NAMES)
@@ -138,8 +132,6 @@ def test_a_roster_is_declared_by_point_where_there_are_several():
     env = aec_env(script(main), points, possible_agents=rosters)
     assert sorted(env.possible_agents) == ["being_0", "being_1", "clerk_0", "other_0"]
     assert decisions(play(env, 1)) == ["other_0", "being_1", "clerk_0"]
-    env = aec_env(life("1 acts"), {clerk: define(agent="clerk_0"), **beings()}, possible_agents=["being_0", "being_1"])
-    assert sorted(env.possible_agents) == ["being_0", "being_1", "clerk_0"]
 
 
 @pytest.mark.parametrize(
@@ -182,22 +174,6 @@ def test_an_undeclared_agent_may_follow_its_rule():
         aec_env(life("5 acts"), beings(), **options).reset()
 
 
-@pytest.mark.parametrize("roster", [None, NAMES[:2]])
-def test_a_policy_answers_for_one_entity_even_when_that_is_removed(roster):
-    observed = []
-
-    def policy(observation, info):
-        observed.append(observation.tolist())
-        return 3
-
-    program = life("0 acts, 1 acts, 0 acts, 0 leaves, 1 acts")
-    env = aec_env(program, beings(), policies={"being_0": policy}, possible_agents=roster)
-    assert getattr(env, "possible_agents", None) == (roster and ["being_1"])
-    assert story(play(env, 7)) == "1 1 1+"
-    assert env.simulation.log == [3, 7, 3, 7]
-    assert observed == [[0, 0], [0, 0]]
-
-
 # -- who is expected ------------------------------------------------------------------------------
 
 
@@ -220,7 +196,6 @@ def test_announced_agents_join_and_are_observed_before_their_first_decision():
 @pytest.mark.parametrize(
     ("announced", "changes", "options", "agents", "log"),
     [
-        ([], {}, {}, [0], [1, 1, 1, 1]),
         (
             [0, 1, 2],
             {"agent": lambda being: being_of(being) if being.number != 1 else None},
@@ -231,7 +206,7 @@ def test_announced_agents_join_and_are_observed_before_their_first_decision():
         ([0, 1, 2], {}, {"policies": {"being_1": lambda observation: 5}}, [0, 2], [1, 5, 1, 1]),
         ([0, 3], {}, {"possible_agents": NAMES, "undeclared": "rule"}, [0, 1, 2], [1, 1, 1, "rule"]),
     ],
-    ids=["nobody", "nobody's agent", "a policy's agent", "an undeclared agent"],
+    ids=["nobody's agent", "a policy's agent", "an undeclared agent"],
 )
 def test_those_who_are_announced_join_if_their_decisions_are_the_users(announced, changes, options, agents, log):
     env = aec_env(life(IN_ORDER, announced=announced), beings(**changes), **options)
@@ -242,23 +217,19 @@ def test_those_who_are_announced_join_if_their_decisions_are_the_users(announced
 
 
 def test_announced_agents_that_never_decide_end_with_the_episode_or_when_they_are_removed():
-    program = life("0 acts, 2 health 8, 2 leaves, 1 acts", announced=[1, 2, 3])
+    program = life("0 acts, 2 health 8, 2 leaves, 1 acts, 3 health 4", announced=[1, 2, 3])
     turns = play(aec_env(program, beings()), 1)
     assert story(turns) == "0 2+ 1 0+ 1+ 3+"
     assert [turn.reward for turn in turns] == [0.0] * 6
     assert turns[1].observation.tolist() == [2, 8]
+    assert turns[-1].observation.tolist() == [3, 4]  # observed anew on the call that was to come
 
 
-def test_decision_functions_that_are_called_to_foresee_run_their_rule():
-    class Seer(AnnouncingLife):
-        def expected_calls(self, point):
-            self.log.append(self.beings[3].act())
-            return [(self.beings[1],)]
-
-    env = aec_env(lambda: Seer("0 acts", (), None, Being), beings())
+def test_of_several_announced_calls_of_an_agent_the_first_one_is_observed():
+    named = beings(agent=lambda being: "late" if being.number else "early")
+    env = aec_env(life("0 acts, 4 acts", announced=[4, 3, 0]), named)
     env.reset()
-    assert set(env.simulation.log) == {"rule"}
-    assert env.agents == ["being_0", "being_1"]
+    assert env.observe("late").tolist() == [4, 0]
 
 
 # -- deaths ---------------------------------------------------------------------------------------
@@ -282,55 +253,33 @@ def test_a_removed_agent_is_rewarded_and_observed_while_it_is_whole():
     assert story(play(env, reset=False)) == "1+"
 
 
-@pytest.mark.parametrize("action", [3, RULE])
-def test_the_decision_in_which_an_agent_is_removed_is_still_carried_out(action):
-    """By ``apply`` or by the rule."""
-
-    def apply(action, being):
-        being.health = 10 * action
+@pytest.mark.parametrize(("action", "answered"), [(3, "applied"), (RULE, "rule")])
+def test_the_decision_in_which_an_agent_is_removed_is_still_carried_out(action, answered):
+    def leave(being, says):
+        being.health = 30
         being.leave()
-        return "applied"
+        return says
 
     class Mortal(Being):
         def act(self):
-            self.health = 30
-            self.leave()
-            return "rule"
+            return leave(self, "rule")
 
-    points = {Mortal.act: beings(apply=apply)[Being.act]}
-    answered = ["rule" if action is RULE else "applied"]
-    program = life("0 acts, 1 acts", kind=Mortal)
-    env = aec_env(program, points)
+    points = {Mortal.act: beings(apply=lambda action, being: leave(being, "applied"))[Being.act]}
+    env = aec_env(life("0 acts, 1 acts", kind=Mortal), points)
     env.reset()
     env.step(action)
-    assert env.simulation.log == answered
+    assert env.simulation.log == [answered]
     assert env.agent_selection == "being_0"
     observation, reward, terminated, *_ = env.last()
     assert (observation.tolist(), reward, terminated) == ([0, 30], 30.0, True)
     env.step(None)
     assert env.agent_selection == "being_1"
-    env = parallel_env(program, points)
+    env = parallel_env(life("0 acts, 1 acts", kind=Mortal), points)
     env.reset()
-    observations, rewards, terminations, _, infos = env.step({"being_0": action})
-    assert env.simulation.log == answered
-    assert (observations["being_0"].tolist(), rewards) == ([0, 30], {"being_0": 30.0, "being_1": 0.0})
+    _, rewards, terminations, _, infos = env.step({"being_0": action})
+    assert rewards == {"being_0": 30.0, "being_1": 0.0}
     assert terminations == {"being_0": True, "being_1": False}
     assert infos["being_0"]["acted"] is True
-
-
-class Bound:
-    """A being that cannot be referred to weakly."""
-
-    __slots__ = ("health", "hunt", "number", "whole")
-
-    def __init__(self, number):
-        self.number, self.health, self.whole, self.hunt = number, 0, True, None
-
-    def act(self):
-        return "rule"
-
-    def leave(self):
-        pass
 
 
 def if_whole(being):
@@ -377,25 +326,12 @@ def test_removals(program, changes, options, expected):
     assert story(play(env, 1)) == expected
 
 
-def test_who_the_entity_was_is_known_of_those_that_cannot_be_referred_to_weakly():
-    points = {Bound.act: define(agent=if_whole, removed_by=f"{__name__}.Bound.leave")}
-    assert story(play(aec_env(life(RENAMED, kind=Bound), points), 1)) == "0 1 2 1+ 7 7+ 0 0+ 2+"
-    env = parallel_env(life(RENAMED, kind=Bound), points)
-    env.reset()
-    gone = []
-    while env.agents:
-        gone += [agent for agent, over in env.step(RULE)[2].items() if over]
-    assert gone[:2] == ["being_1", "being_7"]
-    assert sorted(gone) == ["being_0", "being_1", "being_2", "being_7"]
-
-
-@pytest.mark.parametrize("roster", [None, NAMES], ids=["no roster", "a roster"])
 @pytest.mark.parametrize("view", [aec_env, parallel_env])
-@pytest.mark.parametrize("agent", [being_of, "being_0"], ids=["by entity", "one name"])
+@pytest.mark.parametrize(("agent", "roster"), [(being_of, None), (being_of, NAMES), ("being_0", None)])
 @pytest.mark.parametrize("again", [0, 1], ids=["revived", "a namesake"])
-def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(roster, view, agent, again):
+def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(view, agent, roster, again):
     program = life(f"0 acts, 0 leaves, {again} number 0, {again} whole 1, {again} acts, 0 fails")
-    env = view(program, beings(agent=agent), possible_agents=roster if callable(agent) else None)
+    env = view(program, beings(agent=agent), possible_agents=roster)
     env.reset(seed=11)
     with pytest.raises(AgentError, match=r"being_0.*after its end") as caught:
         env.step({"being_0": 1} if view is parallel_env else 1)
@@ -429,54 +365,36 @@ class Leaver:
     def __init__(self, number):
         self.number = number
 
+    def leave(self):
+        pass
+
+
+class Young(Leaver):
     def go(self):
         return "rule"
 
     def come(self):
         return "rule"
 
-    def leave(self):
-        pass
 
-
-class Young(Leaver):
-    pass
-
-
-class Old(Leaver):
-    pass
-
-
-def test_one_removal_ends_the_agents_of_several_points():
+def test_an_inherited_removal_ends_the_agents_of_all_points_of_a_subclass_and_of_that_alone():
     leave = f"{__name__}.Leaver.leave"
     points = {
-        Leaver.go: define(agent=lambda it: f"goer_{it.number}", removed_by=leave),
-        Leaver.come: define(agent=lambda it: f"comer_{it.number}", removed_by=leave),
+        Young.go: define(agent=lambda it: f"goer_{it.number}", removed_by=leave),
+        Young.come: define(agent=lambda it: f"comer_{it.number}", removed_by=leave),
     }
 
     def main(simulation):
-        one, two = Leaver(1), Leaver(2)
+        one, two = Young(1), Young(2)
         one.go()
         one.come()
         two.come()
+        Leaver(2).leave()
         one.leave()
         two.come()
 
     told = story(play(aec_env(script(main), points), 1)).split()
     assert (sorted(told[3:5]), told[5:]) == (["comer_1+", "goer_1+"], ["comer_2", "comer_2+"])
-
-
-def test_a_removal_that_is_inherited_ends_agents_of_its_subclasses_alone():
-    def main(simulation):
-        young, old = Young(1), Old(1)
-        young.go()
-        old.leave()
-        young.go()
-        young.leave()
-
-    definition = define(agent=lambda it: f"young_{it.number}", removed_by=f"{__name__}.Leaver.leave")
-    turns = play(aec_env(script(main), {f"{__name__}.Young.go": definition}), 1)
-    assert story(turns) == "young_1 young_1 young_1+"
 
 
 @pytest.mark.parametrize(
@@ -503,11 +421,9 @@ def test_everybody_else_removes_as_ever():
     outside = Being(0)
     assert outside.act() == "rule"
     outside.leave()
-    assert not outside.whole
     assert env.agents == ["being_0"]
     env.close()
-    assert vars(Being)["leave"] is leave
-    assert vars(Being)["act"] is act
+    assert (vars(Being)["leave"], vars(Being)["act"]) == (leave, act)
 
 
 def test_the_single_view_is_over_when_its_agent_is_removed_though_the_simulation_runs_on():
@@ -519,19 +435,6 @@ def test_the_single_view_is_over_when_its_agent_is_removed_though_the_simulation
     assert env.simulation.beings[1].health == 7
 
 
-def test_points_that_were_named_while_another_environment_was_open():
-    """What ``Being.act`` is then stands for it as well, even when that environment is gone."""
-    first = aec_env(life("0 acts"), beings())
-    first.reset()
-    named = beings()
-    first.close()
-    del first
-    gc.collect()
-    env = aec_env(life("0 acts, 1 acts"), named)
-    assert decisions(play(env, 1)) == ["being_0", "being_1"]
-    assert env.simulation.log == [1, 1]
-
-
 @pytest.mark.parametrize(
     ("program", "error", "whose"),
     [
@@ -539,7 +442,6 @@ def test_points_that_were_named_while_another_environment_was_open():
         ("0 acts, 1 acts, 0 health -1, 0 leaves, 0 health 0", ValueError, "being_0"),
         ("0 acts, 1 acts, 0 leaves, 0 fails", ZeroDivisionError, "being_1"),
     ],
-    ids=["the last reward", "the reward when it is removed", "after a removal"],
 )
 def test_an_error_at_an_end_says_whose_it_was(program, error, whose):
     def pay(being):
@@ -569,6 +471,67 @@ def test_choices_keep_nobody_alive(make, simulation):
     plain.run()
     assert (0, 2, "rule") not in plain.log
     assert follow_the_rule(make(simulation, hunters())).log == plain.log
+
+
+# -- ends by name ---------------------------------------------------------------------------------
+
+
+class Ending(Life, SimulationInterface):
+    """A life in which "ends" ends an agent by its name, without any call that could be named."""
+
+    def happens(self, number, what, *value):
+        if what == "ends":
+            self.end_agent(None)  # nobody
+            self.end_agent(being_of(self.beings[number]))
+        else:
+            super().happens(number, what, *value)
+
+
+def ending(program):
+    return lambda: Ending(program, None, None, Being)
+
+
+BY_NAME = beings(removed_by=())
+
+
+def test_an_agent_that_is_ended_is_rewarded_and_observed_for_the_last_time_and_leaves():
+    program = "0 acts, 1 acts, 2 acts, 1 health 2, 1 ends, 7 ends, 1 health 9, 0 acts, 1 ends, 2 acts"
+    turns = play(aec_env(ending(program), BY_NAME), 1)
+    assert story(turns) == "0 1 2 1+ 0 2 0+ 2+"
+    assert (turns[3].observation.tolist(), turns[3].reward) == ([1, 2], 2.0)
+
+
+@pytest.mark.parametrize(
+    ("program", "paid"),
+    [
+        ("0 acts, 1 acts, 2 acts, 1 health 3, 1 ends, 0 acts, 2 acts", 3.0),
+        ("1 ends, 0 acts, 2 acts, 0 acts, 2 acts", 0.0),
+    ],
+    ids=["later", "during the reset"],
+)
+def test_in_rounds_an_agent_ends_in_the_round_in_which_it_is_out_or_else_in_the_first(program, paid):
+    env = parallel_env(ending(program), BY_NAME, possible_agents=NAMES)
+    env.reset()
+    _, rewards, terminations, _, _ = env.step(dict.fromkeys(NAMES, 3))
+    assert rewards == {"being_0": 0.0, "being_1": paid, "being_2": 0.0}
+    assert terminations == {"being_0": False, "being_1": True, "being_2": False}
+    assert env.agents == ["being_0", "being_2"]
+    with pytest.raises(UnknownAgentError, match="being_1"):
+        env.step({"being_1": 3})
+    assert set(env.step(dict.fromkeys(env.agents, 3))[0]) == {"being_0", "being_2"}
+
+
+def test_outside_an_environment_end_agent_does_nothing():
+    program = ending("0 acts, 0 ends, 0 acts")
+    env = aec_env(program, BY_NAME)
+    env.reset()
+    plain = program()
+    plain.reset()
+    plain.run()  # while an environment is in use, too
+    assert plain.log == simulate(program, points=BY_NAME).log == ["rule", "rule"]
+    assert env.agents == ["being_0"]
+    with pytest.raises(AgentError, match="after its end"):
+        env.step(1)
 
 
 # -- everything at once ---------------------------------------------------------------------------

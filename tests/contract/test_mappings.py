@@ -1,9 +1,7 @@
 """What mappings are given: the simulation, where they ask for it; a chosen answer, where there are choices."""
 
-import functools
 import gc
 import pickle
-import types
 import weakref
 
 import numpy as np
@@ -24,7 +22,6 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.data import collect_episodes
-from simenv_marl.errors import DefinitionError
 
 DEAL = f"{__name__}.Dealer.deal"
 LEAVE = f"{__name__}.Dealer.leave"
@@ -114,62 +111,48 @@ def played(env, seed=5):
     return told, env.unwrapped.simulation.log
 
 
-FIRST_DAY = [("market_0", [0, 5], 0.0, False), ("market_1", [0, 5], 0.0, False)]
+@pytest.mark.parametrize(
+    ("title", "pay", "earned"), [("here", pay, [0, 2, 4, 6]), ("there", difference(pay), [0, 2, 2, 2])]
+)
+def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay, earned) -> None:
+    other = aec_env(Market("elsewhere"), points())
+    other.reset()
+    told, log = played(aec_env(Market(title), points(reward_mapping=pay)))
+    assert [agent for agent, *_ in told] == [f"{title}_0", f"{title}_1"] * 3 + [f"{title}_1", f"{title}_0"]
+    mine = [(observation, reward) for agent, observation, reward, _ in told if agent == f"{title}_0"]
+    assert mine == list(zip([[0, 5], [1, 5], [2, 5], [2, 5]], earned, strict=True))
+    assert [ended for *_, ended in told] == [False] * 6 + [True] * 2
+    assert log == [(title, "low")] * 2 + [(title, "high")] * 4
+    other.step(0)
+    assert other.unwrapped.simulation.log == [("elsewhere", "low")]
 
 
-def test_each_kind_of_mapping_gets_the_simulation() -> None:
-    told, log = played(aec_env(Market, points()))
-    assert told[:3] == [*FIRST_DAY, ("market_0", [1, 5], 2.0, False)]
-    assert told[-2:] == [("market_1", [2, 5], 6.0, True), ("market_0", [2, 5], 6.0, True)]
-    assert log == [("market", "low")] * 2 + [("market", "high")] * 4
-
-
-def test_mappings_of_each_environment_get_its_own_simulation() -> None:
-    envs = [aec_env(Market(title), points()) for title in ("here", "there")]
-    for env in envs:
-        env.reset(seed=1)
-        env.step(0)
-    assert [env.agent_selection for env in envs] == ["here_1", "there_1"]
-    assert [env.unwrapped.simulation.log for env in envs] == [[("here", "low")], [("there", "low")]]
-
-
-def test_mappings_of_actions_masks_and_the_rule_get_the_simulation() -> None:
+def test_mappings_of_actions_masks_goals_and_the_rule_get_the_simulation() -> None:
     changes = {
         "choices": None,
         "apply": None,
         "action_space_mapping": lambda action, *, _simulation: (_simulation.name, int(action)),
         "action_mask_mapping": lambda dealer, offers, *, _simulation: [1, min(_simulation.day, 1)],
         "rule_action_mapping": lambda decision, *, _simulation: _simulation.day and 1,
+        "goal_space": spaces.Box(0, 9, (1,), np.float64),
+        "achieved_goal_mapping": lambda dealer, offers, *, _simulation: [_simulation.day],
+        "desired_goal_mapping": lambda dealer, offers: [2],
+        "compute_reward": lambda achieved, desired, info: 0.0,
     }
-    env = aec_env(Market, points(**changes))
-    env.reset(seed=1)
-    assert env.last()[-1]["action_mask"].tolist() == [1, 0]
-    env.step(0)
-    env.step(RULE)
-    env.step(RULE)
-    env.step(1)
-    assert env.unwrapped.simulation.log == [("market", 0), ("rule", "low"), ("rule", "low"), ("market", 1)]
-    assert env.last()[-1]["rule_action"] == 1
-
-
-def test_the_mapping_of_a_difference_gets_the_simulation() -> None:
-    told, _ = played(aec_env(Market, points(reward_mapping=difference(pay))))
-    assert [reward for agent, _, reward, _ in told if agent == "market_0"] == [0, 2, 2, 2]
-
-
-def test_mappings_of_goals_get_the_simulation() -> None:
-    goals = points(
-        goal_space=spaces.Box(0, 9, (1,), np.float64),
-        achieved_goal_mapping=lambda dealer, offers, *, _simulation: [_simulation.day],
-        desired_goal_mapping=lambda dealer, offers: [2],
-        compute_reward=lambda achieved, desired, info: 0.0,
-    )
-    env = single_env(Market, goals, agent="market_0")
-    env.reset(seed=4)
-    observation = env.step(0)[0]
+    env = single_env(Market, points(**changes), agent="market_0")
+    _, info = env.reset(seed=4)
+    assert info["action_mask"].tolist() == [1, 0]
+    observation, *_ = env.step(0)
     assert {key: value.tolist() for key, value in observation.items()} == {
-        "observation": [1, 4], "achieved_goal": [1], "desired_goal": [2],
-    }  # fmt: skip
+        "observation": [1, 4],
+        "achieved_goal": [1],
+        "desired_goal": [2],
+    }
+    *_, info = env.step(RULE)
+    assert info["rule_action"] == 1
+    env.step(1)
+    rule = ("rule", "low")
+    assert env.unwrapped.simulation.log == [("market", 0), rule, rule, rule, ("market", 1), rule]
 
 
 def test_mappings_get_the_simulation_in_every_view_and_runner() -> None:
@@ -210,15 +193,3 @@ def test_mappings_keep_no_simulation_alive(episodes) -> None:
     del env
     gc.collect()
     assert simulation() is None
-
-
-@functools.wraps(pay)
-def paid_elsewhere(dealer, offers):
-    return pay(dealer, offers, _simulation=types.SimpleNamespace(log=[1, 2, 3]))
-
-
-def test_a_wrapper_may_give_another_simulation_by_itself() -> None:
-    told, _ = played(aec_env(Market, points(reward_mapping=paid_elsewhere)))
-    assert {reward for _, _, reward, _ in told} == {0.0, 3.0}
-    with pytest.raises(DefinitionError, match="must be keyword-only"):
-        aec_env(Market, points(reward_mapping=lambda dealer, offers, _simulation=None: 0.0))

@@ -1,14 +1,9 @@
 """The single view of one named agent among many, and what it asks that agent."""
 
-import copy
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given
-from hypothesis import strategies as st
 
 from simenv_marl import (
     RULE,
@@ -20,7 +15,6 @@ from simenv_marl import (
     parallel_env,
     register_simulation,
     simulate,
-    simulate_many,
     single_env,
     vector_env,
 )
@@ -40,6 +34,7 @@ from tests.worlds.models import play
 
 NAMES = ("player_red", "player_blue")
 RED = {"agent": "player_red"}
+ROSTER = {"possible_agents": list(NAMES), "skip_forced": True}
 PLACE = f"{__name__}.Player"
 
 
@@ -71,6 +66,9 @@ class Game:
                 move = player.move(list(range(1, offered + 1)))
                 player.coins += move
                 self.log.append((player.name, move))
+
+    def time(self):
+        return 10.0 * len(self.log)
 
 
 class Forced(Game):
@@ -107,8 +105,8 @@ def definition(**changes):
     return make_step(**given | changes)
 
 
-def zeros(agents=NAMES):
-    return dict.fromkeys(agents, 0)
+def zeros():
+    return dict.fromkeys(NAMES, 0)
 
 
 def moves_of(env, agent):
@@ -129,12 +127,12 @@ class Casino(Game):
 NAMED = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(agent="better")}
 
 
-def episode(env, choose=lambda info: 0):
+def episode(env):
     """Play an episode of a Gymnasium environment; what each step has returned but for the info, and the offers."""
     observation, info = env.reset(seed=3)
     steps, offers = [], [int(info["action_mask"].sum())]
     while True:
-        observation, reward, terminated, truncated, info = env.step(choose(info))
+        observation, reward, terminated, truncated, info = env.step(0)
         steps.append((observation.item(), reward, terminated, truncated))
         if terminated or truncated:
             return steps, offers
@@ -160,12 +158,9 @@ def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) ->
         env.step(0)
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"possible_agents": ["mover", "better"], "policies": {"better": RULE}}], ids=["alone", "a roster"]
-)
-def test_an_agent_with_a_name_of_its_own_is_one_of_several_points(options) -> None:
+def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
     """Names of a roster and of policies that are left to the rule are no reason for a warning."""
-    env = single_env(Casino, NAMED, agent="mover", **options)
+    env = single_env(Casino, NAMED, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE})
     env.reset(seed=0)
     while not env.step(0)[2]:
         pass
@@ -177,7 +172,6 @@ def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
         f"{PLACE}.move": definition(),
         f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
     }
-
     with pytest.raises(AgentError, match="possible_agents"):
         single_env(Casino, named, agent="player_red")
     roster = {f"{PLACE}.move": NAMES, f"{PLACE}.bet": [f"{name}_bet" for name in NAMES]}
@@ -205,7 +199,6 @@ def simulated(simulation, points, **options):
     ("make", "simulation", "points", "options", "error", "match"),
     [
         (single_env, Game, MOVE, {}, ViewError, "agent="),
-        (single_env, Casino, NAMED, {}, ViewError, "agent="),
         (single_env, Casino, NAMED, {"agent": "mvoer"}, AgentError, "mover, better"),
         *((single_env, Game, MOVE, {"agent": agent}, OptionValueError, "agent") for agent in ("", 3, ("player_red",))),
         *((make, Game, MOVE, RED, UnknownOptionError, "single view") for make in (aec_env, parallel_env, joint_env)),
@@ -230,28 +223,12 @@ def test_all_that_makes_single_views_takes_the_name_of_the_agent() -> None:
     ids = register_simulation(Game, MOVE, name="one-agent", agent="player_blue")
     assert "one-agent/Move-v0" in ids
     assert episode(gymnasium.make("one-agent/Move-v0")) == alone
-    env = made()
-    for again in (copy.deepcopy(env), pickle.loads(pickle.dumps(env.unwrapped))):
-        assert episode(again) == alone
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_the_vector_view_of_one_agent_is_many_single_views(workers) -> None:
-    env = vector_env(Game, MOVE, agent="player_red", num_envs=2, workers=workers, context="fork" if workers else None)
-    env.reset(seed=3)
-    single, _ = episode(single_env(Game, MOVE, agent="player_red"))
-    for observation, reward, terminated, _ in single:
-        observations, rewards, terminations, _, _ = env.step(np.zeros(2, np.int64))
-        assert observations.ravel().tolist() == [observation] * 2
-        assert rewards.tolist() == [reward] * 2
-        assert terminations.tolist() == [terminated] * 2
-    env.close()
 
 
 # -- skip_forced= ---------------------------------------------------------------------------------
 
 
-def test_forced_moves_are_not_asked_for_and_their_rewards_add_up() -> None:
+def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up() -> None:
     steps, _ = episode(single_env(Game, MOVE, agent="player_red"))
     env = single_env(Game, MOVE, agent="player_red", skip_forced=True)
     skipped, offers = episode(env)
@@ -259,6 +236,8 @@ def test_forced_moves_are_not_asked_for_and_their_rewards_add_up() -> None:
     rewards = [step[1] for step in steps]
     assert [step[1] for step in skipped] == [sum(rewards[:3]), sum(rewards[3:])]
     assert moves_of(env, "player_red") == [1] * 6
+    env.reset()
+    assert [env.step(0)[-1]["elapsed"] for _ in range(2)] == [40.0, 60.0]
 
 
 def test_nobody_is_asked_for_a_forced_move_not_even_a_policy() -> None:
@@ -269,39 +248,27 @@ def test_nobody_is_asked_for_a_forced_move_not_even_a_policy() -> None:
         return 0
 
     def batched(observations, infos):
-        asked.extend(int(info["action_mask"].sum()) for info in infos)
-        return np.zeros(len(infos), np.int64)
+        return np.array([policy(None, info) for info in infos])
 
     simulate(Game, {f"{PLACE}.move": policy}, points=MOVE, skip_forced=True)
     assert asked == [3, 3, 2, 2]
     asked.clear()
-    simulate_many(Game, {f"{PLACE}.move": batched}, seeds=[0, 1], points=MOVE, skip_forced=True)
-    assert sorted(asked) == [2, 2, 2, 2, 3, 3, 3, 3]
+    (made,) = collect_episodes(Game, {f"{PLACE}.move": batched}, seeds=[0], points=MOVE, skip_forced=True).values()
+    assert sorted(asked) == [2, 2, 3, 3]
+    assert len(made.actions) == 4
+    # Each player is paid what it has after each move but the first, and forced moves are paid with the next.
+    assert made.rewards.sum() == 2 * sum(range(1, 7))
 
 
-def test_trajectories_have_no_forced_moves_and_all_rewards() -> None:
-    def collected(**options):
-        policies = {f"{PLACE}.move": lambda observations: np.zeros(len(observations), np.int64)}
-        (made,) = collect_episodes(Game, policies, seeds=[0], points=MOVE, **options).values()
-        return made
-
-    every, chosen = collected(), collected(skip_forced=True)
-    assert len(chosen.actions) == 4
-    assert chosen.rewards.sum() == every.rewards.sum()
-
-
-@pytest.mark.parametrize("make", [parallel_env, joint_env])
-def test_in_rounds_forced_moves_use_no_action(make) -> None:
-    env = make(Game, MOVE, possible_agents=list(NAMES), skip_forced=True)
+def test_in_rounds_forced_moves_use_no_action() -> None:
+    env, joint = parallel_env(Game, MOVE, **ROSTER), joint_env(Game, MOVE, **ROSTER)
     env.reset(seed=0)
+    joint.reset(seed=0)
     for ended in (False, True):
         *_, terminations, _, infos = env.step(zeros())
-        if make is parallel_env:
-            infos = {"acted": {name: info["acted"] for name, info in infos.items()}}
-            assert set(terminations.values()) == {ended}
-        else:
-            assert terminations == ended
-        assert infos["acted"] == dict.fromkeys(NAMES, True)
+        assert terminations == dict.fromkeys(NAMES, ended)
+        assert {name: info["acted"] for name, info in infos.items()} == dict.fromkeys(NAMES, True)
+        assert joint.step(zeros())[2] == ended
     assert [move for _, move in env.unwrapped.simulation.log] == [1] * 12
 
 
@@ -342,15 +309,14 @@ def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
     assert {turn.agent: turn[2:5] for turn in play(aec)} == dict.fromkeys(NAMES, (3.0, True, False))
     with pytest.raises(EpisodeOverError):
         aec.step(0)
-    roster = {"possible_agents": list(NAMES), "skip_forced": True}
-    parallel = parallel_env(Forced, MOVE, **roster)
+    parallel = parallel_env(Forced, MOVE, **ROSTER)
     parallel.reset(seed=0)
     assert parallel.agents == list(NAMES)
     assert parallel.step(zeros())[2] == dict.fromkeys(NAMES, True)
     actions = np.zeros(2, np.int64)
     for options, action, reward in (
         (RED | {"skip_forced": True}, actions, 3.0),
-        (roster | {"view": "joint"}, dict.fromkeys(NAMES, actions), 4.0),
+        (ROSTER | {"view": "joint"}, dict.fromkeys(NAMES, actions), 4.0),
     ):
         vector = vector_env(Forced, MOVE, num_envs=2, **options)
         vector.reset(seed=0)
@@ -364,6 +330,7 @@ def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
 # -- clip_actions= --------------------------------------------------------------------------------
 
 BOX = spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, np.inf], np.float32))
+CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 1)]))
 
 
 def flown(make, space, action, *, clip_actions=True):
@@ -374,26 +341,29 @@ def flown(make, space, action, *, clip_actions=True):
     )
     env = make(Game, {f"{PLACE}.move": made}, clip_actions=clip_actions)
     env.reset(seed=0)
-    env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
-    return taken[0]
+    try:
+        env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
+    except InvalidActionError:
+        assert taken == []
+        raise
+    finally:
+        env.close()
+    return taken[0] if make is not two else taken[1]
 
 
-ONE, HALF = spaces.Box(-1, 1, (1,), np.float32), spaces.Box(0.25, 0.5, (1,), np.float32)
-WHOLE = spaces.Box(0, 5, (1,), np.int8)
-CLIPPING_VIEWS = pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
-CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 1)]))
+def two(*given, **options):
+    """A vector of two environments."""
+    return vector_env(*given, num_envs=2, **options)
 
 
-@CLIPPING_VIEWS
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
 @pytest.mark.parametrize(
     ("space", "action", "expected"),
     [
         (BOX, np.array([-7.5, 1e30]), np.float32([-1.0, 1e30])),
-        (ONE, 3.5, 1.0),
-        (ONE, -2, -1),
-        (HALF, 7, 0.5),
-        (HALF, 0, 0.25),
-        (WHOLE, np.array([300]), np.int8([5])),
+        (spaces.Box(0.25, 0.5, (1,), np.float32), 7, 0.5),
+        (spaces.Box(0.25, 0.5, (1,), np.float32), -2.5, 0.25),
+        (spaces.Box(0, 5, (1,), np.int8), np.array([300]), np.int8([5])),
         (
             CAR,
             {"gas": [9.5, -9], "gear": (2, np.float32([7]))},
@@ -408,63 +378,38 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(make, space, ac
         flown(make, space, action, clip_actions=False)
 
 
-@CLIPPING_VIEWS
 @pytest.mark.parametrize(
     ("space", "wrong"),
     [
         *((BOX, wrong) for wrong in (np.array([np.nan, 0.0]), np.array([5.0]), np.array(["a", "b"]), None, [[1, 2]])),
-        (WHOLE, np.array([2.5])),
+        (spaces.Box(0, 5, (1,), np.int8), np.array([2.5])),
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
 )
-def test_what_is_no_action_is_refused_all_the_same(make, space, wrong) -> None:
+def test_what_is_no_action_is_refused_all_the_same(space, wrong) -> None:
     with pytest.raises(InvalidActionError):
-        flown(make, space, wrong)
+        flown(single_env, space, wrong)
 
 
-@given(st.lists(st.floats(width=32), min_size=2, max_size=2))
-def test_the_vector_view_clips_as_the_single_view_does(numbers) -> None:
-    action = np.array(numbers, np.float32)
-    taken = []
-    made = definition(
-        action_space=BOX, choices=None, action_space_mapping=lambda action: taken.append(action) or 0, agent="pilot"
-    )
-    env = vector_env(Game, {f"{PLACE}.move": made}, num_envs=2, clip_actions=True)
-    env.reset(seed=0)
-    if np.isnan(action).any():
-        with pytest.raises(InvalidActionError):
-            env.step(np.stack([np.zeros(2, np.float32), action]))
-        assert taken == []
-    else:
-        env.step(np.stack([np.zeros(2, np.float32), action]))
-        assert same(taken, [np.zeros(2, np.float32), flown(single_env, BOX, action)])
-    env.close()
+def test_the_vector_view_clips_as_the_single_view_does() -> None:
+    action = np.array([-7.5, 1e30], np.float32)
+    assert same(flown(two, BOX, np.stack([np.zeros(2, np.float32), action])), flown(single_env, BOX, action))
+    with pytest.raises(InvalidActionError):
+        flown(two, BOX, np.array([[0, 0], [np.nan, 0]], np.float32))
 
 
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-class Timed(Game, SimulationInterface):
-    def reset(self, seed=None):
-        super().reset(seed)
-        self.now = 0.0
-
-    def time(self):
-        return self.now
-
-
-class Seats(Timed):
-    """Red has no choice and is out before blue is asked; blue plays on for as long as it is let."""
-
-    offers = (1, 1)
-    days = 3
+class Seats(Game, SimulationInterface):
+    """Red has no choice and is out before blue is asked; blue plays on."""
 
     def run(self):
         red, blue = self.players
-        for _ in self.offers:
+        for _ in range(2):
             red.coins += red.move([1])
         self.end_agent("player_red")
-        for _ in range(self.days):
+        for _ in range(3):
             blue.coins += blue.move([1, 2])
 
 
@@ -472,49 +417,26 @@ class Endless(Game, SimulationInterface):
     """Red is out after its first move, and the others go on for ever."""
 
     def run(self):
-        self.players[0].move([1, 2])
+        self.players[0].coins += self.players[0].move([1, 2])
         self.end_agent("player_red")
         while True:
             self.players[1].move([1, 2])
 
 
-class Pauses(Timed):
-    """The same choices as the game's, at a time each."""
-
-    def run(self):
-        for offered in (2, 1, 1, 2, 1):
-            self.players[0].move([1, 2][:offered])
-            self.players[0].coins += 1
-            self.now += 10
-
-
-@pytest.mark.parametrize("days", [3, 0])
-def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_round(days) -> None:
-    class Days(Seats):
-        pass
-
-    Days.days = days
-    roster = {"possible_agents": list(NAMES), "skip_forced": True}
-    env = parallel_env(Days, MOVE, **roster)
+def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round() -> None:
+    env = parallel_env(Seats, MOVE, **ROSTER)
     env.reset(seed=1)
-    if days == 0:
-        assert env.step(zeros(env.agents))[1]["player_red"] == 2.0
-        return
     assert sorted(env.agents) == sorted(NAMES)
     _, rewards, terminations, _, _ = env.step(zeros())
     assert rewards == {"player_red": 2.0, "player_blue": 1.0}
     assert terminations == {"player_red": True, "player_blue": False}
     assert env.agents == ["player_blue"]
-    joint = joint_env(Days, MOVE, **roster)
+    joint = joint_env(Seats, MOVE, **ROSTER)
     joint.reset(seed=1)
     assert joint.step(zeros())[1] == 3.0
-
-
-def test_the_single_view_of_an_agent_that_ends_during_the_reset() -> None:
-    env = single_env(Seats, MOVE, agent="player_red", skip_forced=True)
-    for _ in range(2):
-        env.reset(seed=1)
-        assert env.step(0)[1:4] == (3.0, True, False)
+    single = single_env(Seats, MOVE, agent="player_red", skip_forced=True)
+    single.reset(seed=1)
+    assert single.step(0)[1:4] == (3.0, True, False)
     vector = vector_env(Seats, MOVE, agent="player_red", skip_forced=True, num_envs=2)
     vector.reset(seed=1)
     _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
@@ -522,19 +444,11 @@ def test_the_single_view_of_an_agent_that_ends_during_the_reset() -> None:
     vector.close()
 
 
-def test_elapsed_time_adds_up_as_rewards_do() -> None:
-    env = single_env(Pauses, MOVE, agent="player_red", skip_forced=True)
-    env.reset(seed=1)
-    told = [env.step(0) for _ in range(2)]
-    assert [step[1] for step in told] == [6.0, 9.0]
-    assert [step[-1]["elapsed"] for step in told] == [30.0, 20.0]
-
-
 @pytest.mark.parametrize("policies", [None, {"player_blue": lambda observation: 0}])
 def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies) -> None:
     env = single_env(Endless, MOVE, agent="player_red", policies=policies)
     for _ in range(2):
         env.reset(seed=1)
-        assert env.step(0)[2:4] == (True, False)
+        assert env.step(1)[1:4] == (2.0, True, False)
         with pytest.raises(EpisodeOverError):
             env.step(0)

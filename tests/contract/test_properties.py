@@ -1,28 +1,15 @@
 """Random simulations under random use, compared with what was computed without the library."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, aec_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env
 from simenv_marl.errors import EpisodeOverError, ResetNeededError
-from tests.worlds.models import follow_the_rule, notes
-from tests.worlds.worlds import (
-    Design,
-    FuseError,
-    Reference,
-    World,
-    advised,
-    agent_of,
-    answers,
-    designs,
-    legal,
-    points_of,
-    seeds,
-)
+from tests.worlds.models import notes
+from tests.worlds.worlds import Design, FuseError, Reference, World, advised, answers, designs, legal, points_of, seeds
 
 
 def made(design: Design, make: Any = aec_env, points: Any = None) -> Any:
@@ -97,48 +84,6 @@ def test_an_episode_is_what_was_computed_without_the_library(design, seed, given
             env.step(1)
     finally:
         env.close()
-
-
-@given(designs(), seeds)
-@settings(max_examples=150)
-def test_with_rule_throughout_it_is_the_plain_run(design, seed):
-    open_ended = replace(design, max_steps=None, policies=frozenset())
-    plain = World(open_ended, points_of(open_ended))
-    plain.reset(seed)
-    plain.run()
-    for make in (aec_env, parallel_env):
-        simulation = follow_the_rule(made(open_ended, make), seed)
-        assert simulation.trace == plain.trace
-        assert simulation.random.getstate() == plain.random.getstate()
-
-
-@given(designs(), seeds, answers)
-@settings(max_examples=150)
-def test_the_single_view_tells_the_same(design, seed, given_answers):
-    only = next(point for point in design.active)
-    if agent_of(design.kinds[only], only, 0) != agent_of(design.kinds[only], only, 1):
-        return
-    rules = frozenset(range(len(design.kinds))) - {only}
-    if not any(point == only for point, _ in design.program):
-        return
-    design = replace(design, rules=rules, policies=frozenset())
-    aec, single = made(design), made(design, single_env)
-    aec.reset(seed=seed)
-    observation, info = single.reset(seed=seed)
-    told = (0.0, False, False)
-    for given_answer in given_answers:
-        expected = aec.last()
-        assert observation.tolist() == expected[0].tolist()
-        assert told == expected[1:4]
-        if told[1] or told[2]:
-            break
-        action = legal(given_answer, info)
-        observation, *told, info = single.step(action)
-        told = tuple(told)
-        aec.step(action)
-    assert single.unwrapped.simulation.trace == aec.unwrapped.simulation.trace
-    aec.close()
-    single.close()
 
 
 @given(designs(), st.integers(1, 60), seeds, answers)

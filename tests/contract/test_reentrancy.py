@@ -1,13 +1,12 @@
 """An environment that is used from inside itself says so, in every view, whatever is asked or runs just then."""
 
-from contextlib import ExitStack
+from contextlib import closing
 
 import numpy as np
 import pytest
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env, vector_env
 from simenv_marl.errors import NotResetError, ReentrancyError
-from simenv_marl.plugins import handlers
 from tests.worlds.models import decision, script
 
 
@@ -25,7 +24,7 @@ VIEWS = {
 }
 PLACES = [
     *["action_space_mapping", "observation_space_mapping", "reward_mapping", "action_mask_mapping", "choices", "apply"],
-    *["agent", "rule", "policy", "before", "instead", "after", "plugin", "time", "expected_calls", "reset"],
+    *["agent", "rule", "policy", "plugin", "time", "expected_calls", "reset"],
 ]
 
 
@@ -37,7 +36,6 @@ class World:
         self.place, self.method = place, method
         self.armed, self.resetting, self.catch, self.raised = False, False, True, []
         self.made = []
-        self.undo = ExitStack()
 
         def ant_rule():
             return 0
@@ -68,13 +66,8 @@ class World:
         policies = {"bee_0": (lambda *_: self.at("policy", 1)) if place == "policy" else RULE}
         options = {"policies": policies, "possible_agents": ["ant_0"] if named else None}
         if place == "plugin":
-            options["plugins"] = [(self.handle, bee, "before")]
-        elif place in ("before", "instead", "after"):
-            self.undo.enter_context(handlers((self.handle, bee, place)))
-        with self.undo.pop_all() as undo:
-            self.env = make(simulation, [ant, bee], **options)
-            undo.callback(self.env.close)
-            self.undo = undo.pop_all()
+            options["plugins"] = [(lambda: self.at("plugin", None), bee, "before")]
+        self.env = make(simulation, [ant, bee], **options)
 
     def changes(self):
         values = {
@@ -86,9 +79,6 @@ class World:
             "apply": lambda action: self.at("apply", action),
         }
         return {name: value for name, value in values.items() if name == self.place}
-
-    def handle(self):
-        self.at(self.place, None)
 
     def at(self, place, value):
         """Come by a place, at which a value is asked for."""
@@ -136,7 +126,7 @@ def test_an_environment_that_is_used_from_inside_itself_says_so_and_goes_on(view
     if place == "reset":
         return
     world = World(view, place, method)
-    with world.undo:
+    with closing(world.env):
         for world.catch in (True, True, False, False):
             world.env.reset(seed=1)
             world.armed = True
@@ -157,7 +147,7 @@ def test_an_environment_that_is_used_from_inside_itself_says_so_and_goes_on(view
 @METHODS
 def test_an_environment_that_is_used_from_inside_its_own_reset_says_so_and_goes_on(view, place, method):
     world = World(view, place, method)
-    with world.undo:
+    with closing(world.env):
         world.armed = world.resetting = True
         world.env.reset(seed=1)
         world.resetting = False

@@ -4,7 +4,6 @@ import asyncio
 import ctypes
 import gc
 import sys
-import threading
 from functools import partial
 from pathlib import Path
 
@@ -12,8 +11,6 @@ import greenlet
 import pytest
 
 from simenv_marl import single_env
-from simenv_marl.core.run import Run
-from simenv_marl.errors import ReentrancyError
 from tests.conftest import DRIVERS
 from tests.processes import alone
 from tests.worlds.models import decision, script
@@ -24,25 +21,21 @@ DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 # -- the exit -------------------------------------------------------------------------------------
 
 
-def close_through_printing_c_code(driver, loop, path):
-    def ask():
+def close_through_printing_c_code(driver, path):
+    async def work():
         sys.modules["__main__"].decide = decide
         ctypes.pythonapi.PyRun_SimpleString(b"decide()")  # which calls PyErr_Print
 
-    async def work():
-        ask()
-
     decide = decision()
-    env = single_env(script(lambda simulation: asyncio.run(work()) if loop else ask()), decide, driver=driver)
+    env = single_env(script(lambda simulation: asyncio.run(work())), decide, driver=driver)
     env.reset()
     env.close()
     Path(path).touch()
 
 
 @DRIVERS
-@pytest.mark.parametrize("loop", [False, True], ids=["plain", "asyncio"])
-def test_the_exit_does_not_end_a_process_whose_c_code_prints_it(driver, loop, tmp_path):
-    alone(close_through_printing_c_code, driver, loop, str(tmp_path / "closed"))
+def test_the_exit_does_not_end_a_process_whose_c_code_prints_it(driver, tmp_path):
+    alone(close_through_printing_c_code, driver, str(tmp_path / "closed"))
     assert (tmp_path / "closed").exists()
 
 
@@ -84,21 +77,6 @@ def test_an_error_that_an_engine_raises_in_place_of_the_exit_is_not_the_models(d
     env.close()
 
 
-@DRIVERS
-def test_an_error_of_a_cleanup_is_the_models(driver):
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            raise EngineError("the disk is full")
-
-    decide = decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset()
-    with pytest.raises(EngineError, match="disk"):
-        env.close()
-
-
 # -- event loops that end -------------------------------------------------------------------------
 
 
@@ -138,17 +116,11 @@ async def office(simulation, decide, cleanup):
     await asyncio.wait(tasks)
 
 
-def run_in_a_runner(work):
-    with asyncio.Runner() as runner:
-        runner.run(work)
-
-
 @DRIVERS
-@pytest.mark.parametrize("run", [asyncio.run, run_in_a_runner])
 @pytest.mark.parametrize("end", ["close", "reset"])
-def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(driver, run, end):
+def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(driver, end):
     decide, cleanup = decision(), []
-    env = single_env(script(lambda simulation: run(office(simulation, decide, cleanup))), decide, driver=driver)
+    env = single_env(script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))), decide, driver=driver)
     env.reset()
     log = env.simulation.log
     getattr(env, end)()
@@ -164,29 +136,27 @@ def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(dr
 class Engine:
     """Makes its worker once, for all episodes."""
 
-    def __init__(self, decide, back):
-        self.worker, self.decide, self.back = greenlet.greenlet(self.work), decide, back
+    def __init__(self, decide):
+        self.worker, self.decide = greenlet.greenlet(self.work), decide
 
     def reset(self, seed=None):
-        self.log, self.main = [], None
+        self.log = []
 
     def work(self):
         while True:
             self.log.append(self.decide())
-            (self.main or greenlet.getcurrent().parent).switch()
+            greenlet.getcurrent().parent.switch()
 
     def run(self):
-        self.main = greenlet.getcurrent() if self.back == "by name" else None
         for _ in range(3):
             self.worker.switch()
 
 
 @DRIVERS
 @pytest.mark.parametrize("steps", [0, 1, 3])
-@pytest.mark.parametrize("back", ["by name", "to the parent"])
-def test_greenlets_that_a_model_has_kept_do_not_decide_after_a_close(driver, steps, back):
+def test_greenlets_that_a_model_has_kept_do_not_decide_after_a_close(driver, steps):
     decide = decision()
-    env = single_env(partial(Engine, decide, back), decide, driver=driver)
+    env = single_env(partial(Engine, decide), decide, driver=driver)
     env.reset()
     simulation = env.simulation
     for number in range(steps):
@@ -212,41 +182,3 @@ def test_a_simulation_without_greenlets_stays_the_same_after_a_close(driver):
 
 
 # -- threads that use one environment -------------------------------------------------------------
-
-
-@DRIVERS
-@pytest.mark.parametrize("use", ["close", "reset"])
-def test_a_thread_that_ends_an_episode_while_another_one_does_is_refused(driver, use, monkeypatch):
-    """The second thread is on its way while the first one, which waits in the model's cleanup, comes to the end."""
-    arrived, errors, explain = [threading.Event() for _ in range(3)], [], Run.refusal
-
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            arrived[0].set()
-            assert arrived[1].wait(60)
-
-    def late(run):
-        arrived[1].set()
-        assert arrived[2].wait(60)
-        return explain(run)
-
-    def use_it():
-        assert arrived[0].wait(60)
-        try:
-            getattr(env, use)()
-        except Exception as error:
-            errors.append(type(error))
-        arrived[1].set()
-
-    monkeypatch.setattr(Run, "refusal", late)
-    decide = decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset()
-    thread = threading.Thread(target=use_it)
-    thread.start()
-    env.close()
-    arrived[2].set()
-    thread.join()
-    assert errors == [ReentrancyError]

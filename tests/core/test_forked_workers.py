@@ -17,9 +17,6 @@ LIMIT = 60
 
 PREAMBLE = """
     import multiprocessing, os, signal, sys, threading, warnings
-    from concurrent.futures import ProcessPoolExecutor
-
-    import greenlet
 
     from simenv_marl import single_env
     from simenv_marl.errors import WrongThreadError
@@ -56,20 +53,9 @@ PREAMBLE = """
             assert self.process.exitcode == 0
             return told
 
-    class Executor:
-        def __init__(self):
-            self.pool = ProcessPoolExecutor(1, mp_context=context)
-        def begin(self):
-            self.pool.submit(int).result(20)
-        def ask(self):
-            told = {self.pool.submit(ask).result(20) for _ in range(3)}
-            self.pool.shutdown()
-            return told
-
     class Pool:
-        options = {}
         def __init__(self):
-            self.pool = context.Pool(1, **self.options)
+            self.pool = context.Pool(1, maxtasksperchild=1)  # all but the first are forked in a thread of the pool
         def begin(self):
             pass
         def ask(self):
@@ -78,36 +64,12 @@ PREAMBLE = """
             self.pool.join()
             return told
 
-    class Changing(Pool):
-        options = {"maxtasksperchild": 1}  # all but the first are forked in a thread of the pool
-
-    class Fork:
-        def __init__(self):
-            self.reader, self.writer = os.pipe()
-        def ask(self):
-            child = os.fork()
-            if child == 0:
-                status = 1
-                try:
-                    os.write(self.writer, repr({ask(), ask()}).encode())
-                    status = 0
-                finally:
-                    os._exit(status)
-            assert os.waitpid(child, 0)[1] == 0
-            return eval(os.read(self.reader, 10_000))
-
     def in_a_thread(function):
         told = []
         thread = threading.Thread(target=lambda: told.append(function()))
         thread.start()
         thread.join(20)
         return told[0]
-
-    def in_a_greenlet(function):
-        return greenlet.greenlet(function).switch()
-
-    def directly(function):
-        return function()
 
     def play(between, make=Script):
         def main(simulation):
@@ -132,7 +94,7 @@ def run(code, driver):
     assert (result.returncode, result.stdout, result.stderr) == (0, "end True\n", ""), result.stdout + result.stderr
 
 
-KINDS = pytest.mark.parametrize("kind", ["Process", "Pool", "Changing", "Executor"])
+KINDS = pytest.mark.parametrize("kind", ["Process", "Pool"])
 
 
 @DRIVERS
@@ -140,7 +102,7 @@ KINDS = pytest.mark.parametrize("kind", ["Process", "Pool", "Changing", "Executo
 def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(kind, driver):
     run(
         f"""
-        for way in (directly, in_a_thread, in_a_greenlet):
+        for way in (in_a_thread, lambda function: function()):
             for _ in range(2):
                 assert play(lambda simulation: way(lambda: {kind}().ask())) == {{REFUSED}}, way
         """,
@@ -164,12 +126,6 @@ def test_workers_that_were_forked_before_the_model_runs_have_the_rule(kind, driv
         """,
         driver,
     )
-
-
-@DRIVERS
-@pytest.mark.parametrize("way", ["directly", "in_a_thread", "in_a_greenlet"])
-def test_a_plain_fork_without_the_user_is_refused_as_well(way, driver):
-    run(f"assert play(lambda simulation: {way}(Fork().ask)) == {{REFUSED}}", driver)
 
 
 @DRIVERS

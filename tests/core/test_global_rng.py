@@ -1,8 +1,6 @@
 """``global_rng=True``: global generators of its own for each environment, and untouched ones for everybody else."""
 
 import random
-import subprocess
-import sys
 import threading
 
 import numpy as np
@@ -127,11 +125,9 @@ def test_interleaved_environments_are_as_reproducible_as_alone(driver):
 def test_without_it_generators_are_everybodys():
     env = aec_env(Casino, POINTS)
     env.reset(seed=7)
-    random.seed(5)
+    before = world()
     env.step(RULE)
-    random.seed(5)
-    env.step(RULE)
-    assert env.simulation.log[-1] != plain(7)[-1]
+    assert world() != before
     env = aec_env(Casino, POINTS, global_rng=True)
     play(env)
     assert env.simulation.log[:4] == plain(env.simulation.seed)[:4]  # of the seed that it drew
@@ -146,12 +142,6 @@ def test_errors_give_the_generators_back():
     with pytest.raises(ZeroDivisionError):
         aec_env(Casino, {BET: broken}, global_rng=True).reset(seed=1)
     assert world() == before
-    env = aec_env(Casino, POINTS, global_rng=True)
-    env.reset(seed=1)
-    with pytest.raises(ValueError, match="action"):
-        env.step(77)
-    del env
-    assert world() == before
 
 
 class Seeding(Casino):
@@ -161,26 +151,16 @@ class Seeding(Casino):
         self.log = [self.bet(0)]
 
 
-def test_simulate_leaves_generators_alone_also_those_that_a_model_seeds_and_of_an_environment_within():
+def test_simulate_leaves_generators_alone_also_those_that_a_model_seeds():
     def draw(observation):
         return int(observation[0])
 
-    def use_another(observation):
-        inner.step(RULE)
-        return draw(observation)
-
-    before, inner = world(), aec_env(Casino, POINTS, global_rng=True)
-    inner.reset(seed=2)
-    inner.step(RULE)
-    alone, logs, inners = inner.simulation.log[:7], [], []
-    for kind, seed, policy in ((Casino, 3, draw), (Casino, 3, use_another), (Seeding, 1, draw), (Seeding, 2, draw)):
-        inner.reset(seed=2)
-        logs.append(simulate(kind, {BET: policy}, points=POINTS, seed=seed, global_rng=True).log)
-        inners.append(inner.simulation.log[:7])
+    before, logs = world(), []
+    for kind, seed in ((Casino, 3), (Casino, 3), (Seeding, 1), (Seeding, 2)):
+        logs.append(simulate(kind, {BET: draw}, points=POINTS, seed=seed, global_rng=True).log)
         assert world() == before
     assert logs[0] == logs[1]
     assert logs[2] == logs[3]
-    assert inners[1] == alone
 
 
 @pytest.mark.usefixtures("_states")
@@ -238,43 +218,7 @@ def test_two_at_work_at_once_in_two_threads_are_refused():
     random.setstate(before[0])
 
 
-def test_states_are_copied_as_bytes_but_where_memory_has_another_layout():
+def test_states_are_copied_as_bytes_but_where_memory_has_another_layout(monkeypatch):
     assert context.IS_COPIED
-    code = """
-import _random, sys
-class Other(_random.Random):
-    pass
-import random
-random._inst = None
-import numpy as np
-before = np.random.get_state(legacy=False)["state"]["pos"]
-import ctypes
-ctypes.string_at = lambda *args: b""
-import simenv_marl.core.context as generators
-print(generators.IS_COPIED, np.random.get_state(legacy=False)["state"]["pos"] == before)
-"""
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    assert ran.stdout.split() == ["False", "True"], ran.stderr
-
-
-@pytest.mark.usefixtures("_states")
-def test_a_saved_state_draws_the_same_numbers_again():
-    def draws():
-        drawn = [draw() for draw in (random.random, np.random.random, *[normal, np.random.standard_normal] * 2)]
-        random.seed(2)
-        np.random.seed(2)
-        np.random.standard_normal()
-        return drawn
-
-    def normal():
-        return random.gauss(0, 1)
-
-    with context.preserve_generators():
-        random.seed(5)
-        np.random.seed(5)
-        normal()
-        np.random.standard_normal()
-        state = context.save_generators(copy=True)
-        first = draws()
-        context.load_generators(state)
-        assert draws() == first
+    monkeypatch.setattr(context, "string_at", lambda address, size: bytes(size))
+    assert not context._is_layout_known()

@@ -2,11 +2,10 @@
 
 import gc
 import weakref
-from types import SimpleNamespace
 
 from simenv_marl.core import packing
 from simenv_marl.core.packing import pack, unpack
-from simenv_marl.core.points import find_point, locate, own_points, portable
+from simenv_marl.core.points import find_point, locate, portable
 from simenv_marl.decision import point_of, registered
 from simenv_marl.hooks.hook import hook_of, unwrap
 from simenv_marl.plugins import handlers
@@ -62,16 +61,6 @@ def test_an_undecorated_function_is_one_point_however_it_is_named_set_or_handled
     assert locate(Base.plain) is point
 
 
-def test_a_function_of_a_class_inside_a_function_is_found_as_itself():
-    class Inside:
-        def decide(self):
-            return "rule"
-
-    point, _ = find_point(Inside.decide, define())
-    assert point.rule is vars(Inside)["decide"]
-    assert point.name == f"{HERE}.{Inside.decide.__qualname__}"
-
-
 def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_base_class():
     inherited, definition = find_point(f"{HERE}.Sub.decorated")
     assert inherited is not point_of(Base.decorated)[0]
@@ -83,28 +72,6 @@ def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_
     finally:
         inherited.uninstall(1)
     assert "decorated" not in vars(Sub)
-
-
-def test_a_simulations_own_definition_comes_before_the_inherited_one():
-    name, definition = f"{HERE}.Sub.decorated", define(agent="own_0")
-    own = own_points(SimpleNamespace(points={name: definition}))
-    assert find_point(name, own=own)[1] is definition
-    assert find_point(name)[1] is point_of(Base.decorated)[1]
-
-
-def test_two_definitions_of_one_function_are_one_point():
-    one, two = define(agent="one_0"), define(agent="two_0")
-
-    def function():
-        return 0
-
-    first = one(function)
-    second = two(first)
-    assert point_of(first)[0] is point_of(second)[0]
-    assert (find_point(first)[1], find_point(second)[1]) == (one, two)
-    assert find_point(first)[0].definition is two  # what the bare name means
-    other = define()(function)
-    assert point_of(other)[0] is not point_of(first)[0]
 
 
 def test_a_point_goes_with_its_model():

@@ -7,8 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import simpy
-from examples.wolf_sheep.env import Meadow
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -32,7 +30,6 @@ class Crowd:
             while True:
                 yield generator.random()
 
-        self.seed = seed
         chances = [random.Random(seed + number) for number in range(9)]
         self.chance, self.legacy = chances[0], np.random.RandomState(seed)
         self.number, self.name, self.weights = 3, "crowd", np.zeros(4)
@@ -101,39 +98,6 @@ def test_streams_are_not_those_that_a_model_makes_of_the_same_seed():
     assert drawn.isdisjoint([random.Random(7).random(), np.random.RandomState(7).random(), *plain])
 
 
-def test_the_models_of_mesa():
-    one, other = Meadow(), Meadow()
-    one.reset(seed=1)
-    other.reset(seed=2)
-    other.model.agents.shuffle_do("remove")
-    before = one.model.random.getstate()
-    assert reseed_generators(one, 3) == reseed_generators(other.model, np.int64(3)) == 2
-    assert one.model.agents.random is one.model.random
-    assert one.model.random.getstate() == other.model.random.getstate() != before
-    drawn = [agent.random.random() for agent in one.model.agents]
-    assert len(drawn) > 20
-    assert drawn == [other.model.random.random() for _ in drawn]
-    assert one.model.rng.random() == other.model.rng.random()
-
-
-def customer(environment, chance, log):
-    while True:
-        log.append(chance.random())
-        yield environment.timeout(1)
-
-
-def test_what_processes_of_simpy_hold():
-    logs = [], []
-    for seed, log in enumerate(logs):
-        environment = simpy.Environment()
-        environment.process(customer(environment, random.Random(seed), log))
-        environment.run(until=seed + 1)
-        assert reseed_generators(environment, 9) == 1
-        del log[:]
-        environment.run(until=seed + 4)
-    assert logs[0] == logs[1]
-
-
 def test_the_global_generators_are_left_alone():
     model, before = SimpleNamespace(draw=random.random, numpy=np.random.mtrand._rand, own=random.Random()), world()
     assert reseed_generators(model, 3) == 1
@@ -144,11 +108,10 @@ def test_the_global_generators_are_left_alone():
     "model",
     [
         object(),
-        [],
         SimpleNamespace(random=random, draw=np.random.random, function=world),
         SimpleNamespace(chance=random.SystemRandom(), kind=random.Random, make=np.random.default_rng),
     ],
-    ids=["object", "list", "modules", "kinds"],
+    ids=["object", "modules", "kinds"],
 )
 def test_where_there_are_none_it_says_what_to_do(model):
     with pytest.raises(SimulationError, match=r"no random generator[\s\S]*attribute[\s\S]*global_rng=True"):

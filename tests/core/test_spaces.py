@@ -25,9 +25,7 @@ WORDS = spaces.Text(5)
         (BOX, [1, 2], np.array([1, 2], np.float32)),
         (BOX, np.array([1.5, 9.0]), np.array([1.5, 9.0], np.float32)),
         (BOX, (True, False), np.array([1, 0], np.float32)),
-        (BYTES, [0, 255], np.array([0, 255], np.uint8)),
         (BYTES, [1.0, 2.9], np.array([1, 2], np.uint8)),
-        (DIAL, 6, np.int64(6)),
         (DIAL, 6.0, np.int64(6)),
         (DIAL, np.array(7), np.int64(7)),
         (DIALS, [1, 5], np.array([1, 5], np.int64)),
@@ -46,10 +44,7 @@ def test_observations_are_cast(space, value, expected):
 def test_observations_in_observations_are_cast():
     found = observation_cast(TREE)({"pair": [6.0, {"bits": [1, 0, 0]}], "box": [1, 2]})
     assert list(found) == ["box", "pair"]
-    assert found["box"].dtype == np.float32
-    assert type(found["pair"]) is tuple
-    assert type(found["pair"][0]) is np.int64
-    assert found["pair"][1]["bits"].dtype == np.int8
+    assert [type(found["pair"]), type(found["pair"][0])] == [tuple, np.int64]
     assert found in TREE
 
 
@@ -57,17 +52,13 @@ def test_observations_in_observations_are_cast():
     ("space", "value", "match"),
     [
         (BOX, [1, 2, 3], r"shape \(3,\)"),
-        (BOX, 1.0, r"shape \(\)"),
         (BOX, [[1], [2, 3]], "does not fit"),
         (BOX, ["a", "b"], "not numeric"),
-        (BOX, [1j, 2], "not numeric"),
-        (BYTES, [0, np.nan], "not finite"),
         (BYTES, [0, np.inf], "not finite"),
         (BYTES, [0, 256], "cannot hold"),
         (BYTES, [-1, 0], "cannot hold"),
         (DIAL, 6.5, "must be an integer"),
         (DIAL, "6x", "must be an integer"),
-        (DIAL, [6, 7], "must be an integer"),
         (DIAL, None, "must be an integer"),
         (DIAL, np.inf, "must be an integer"),
         (TREE, {"box": [1, 2]}, "keys"),
@@ -77,7 +68,6 @@ def test_observations_in_observations_are_cast():
         (TREE, {"box": [1, 2], "pair": {0: 6, 1: 7}}, "2 parts"),
         (TREE, {"box": [1, 2], "pair": [6, {"bits": [1, 0]}]}, "shape"),
         (WORDS, "too many words", "not in"),
-        (WORDS, 3, "not in"),
     ],
     ids=str,
 )
@@ -91,7 +81,6 @@ def test_what_is_no_observation_is_refused(space, value, match):
     [
         (BOX, np.array([1, 2], np.float32)),
         (BOX, np.ones((3, 2), np.float32)[1]),
-        (BYTES, np.array([1, 2], np.uint8)),
         (DIALS, np.array([1, 5], np.int64)),
         (BITS, np.array([1, 1, 1], np.int8)),
         (spaces.Dict({"box": BOX}), {"box": np.array([1, 2], np.float32)}),
@@ -133,18 +122,12 @@ def test_duplicates_share_nothing(value):
     assert not same(found, kept)
 
 
-@pytest.mark.parametrize("value", [3, 2.5, "word", np.float32(2), np.int8(3)])
-def test_what_never_changes_needs_no_duplicate(value):
-    assert duplicate(value) is value
-
-
 @pytest.mark.parametrize(
     ("one", "other", "expected"),
     [
         (np.array([1.0, np.nan]), np.array([1.0, np.nan]), True),
         (np.array([1.0, 2.0]), np.array([1.0, 3.0]), False),
         (np.array([1, 2]), np.array([1, 2, 3]), False),
-        (np.array(["a"]), np.array(["a"]), True),
         ({"a": np.array([1])}, {"a": np.array([1])}, True),
         ({"a": np.array([1])}, {"a": np.array([2])}, False),
         ({"a": 1}, {"b": 1}, False),
@@ -154,7 +137,6 @@ def test_what_never_changes_needs_no_duplicate(value):
         ((1, 2), (1, 3), False),
         ((1, 2), (1, 2, 3), False),
         ((1, 2), 3, False),
-        (3, 3, True),
         (3, 4, False),
         ("word", "word", True),
     ],
@@ -167,15 +149,12 @@ def test_same_compares_number_for_number(one, other, expected):
 @pytest.mark.parametrize(
     ("space", "expected"),
     [
-        (BOX, np.zeros(2, np.float32)),
         (spaces.Box(2.0, 3.0, (2,), np.float32), np.full(2, 2, np.float32)),
         (spaces.Box(-3.0, -2.0, (1,), np.float64), np.full(1, -2.0)),
-        (DIAL, np.int64(5)),
         (spaces.Discrete(3, start=-7), np.int64(-5)),
         (spaces.Discrete(9, start=-4), np.int64(0)),
         (DIALS, np.array([0, 4])),
         (spaces.MultiDiscrete([2, 2], start=[-5, -1]), np.array([-4, 0])),
-        (BITS, np.zeros(3, np.int8)),
         (TREE, {"box": np.zeros(2), "pair": (5, {"bits": np.zeros(3)})}),
     ],
     ids=str,
@@ -297,7 +276,6 @@ def test_parts_of_actions_are_checked_like_actions(pair):
         {"pair": {0: 6, 1: {"bits": np.zeros(3, np.int8)}}},
         {"pair": (6, {"bits": np.zeros(2, np.int8)})},
         {"pair": (6, {"bats": np.zeros(3, np.int8)})},
-        {"pair": (6, None)},
     ],
     ids=str,
 )
@@ -322,10 +300,8 @@ def test_other_spaces_are_asked_themselves_and_actions_are_copied():
     "given",
     [
         [1, 0, 1],
-        (True, False, True),
         np.array([1.0, 0.0, 1.0]),
         np.array([1, 0, 1], np.int8),
-        np.array([1, 0, 1], np.uint8),
         np.array([[1, 9], [0, 9], [1, 9]], np.int8)[:, 0],
         np.array([True, False, True]),
     ],
@@ -343,17 +319,14 @@ def test_masks_are_new_arrays(given):
     ("given", "match"),
     [
         ([1, 0], "shape"),
-        ([1, 0, 1, 1], "shape"),
         ([[1, 0, 1]], "shape"),
         (1, "shape"),
         ([1, 2, 0], "other than 0 and 1"),
         ([0.5, 1, 0], "other than 0 and 1"),
         ([0, 0, 0], "no legal action"),
-        ([1, np.nan, 0], "other than 0 and 1"),
         ([1, 256, 0], "other than 0 and 1"),
         (np.array([1, 2, 1], np.int8), "other than 0 and 1"),
         (np.array([0, -1, 0], np.int8), "other than 0 and 1"),
-        (np.array([1, 255, 1], np.uint8), "other than 0 and 1"),
         (np.array([False, False, False]), "no legal action"),
     ],
     ids=repr,

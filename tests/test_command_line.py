@@ -13,8 +13,6 @@ from simenv_marl.__main__ import main
 MODELS = '''
 """Two walks, one of which limps."""
 
-import sys
-
 from tests.worlds import copied
 
 
@@ -33,17 +31,7 @@ class Limping(Walk):
     points = {copied.Walk.choose: copied.define(observation_space_mapping=shaken)}
 
 
-class Boot:
-    """What walkers wear."""
-
-
 number = 3
-
-
-def __getattr__(name):
-    if name == "late":
-        1 / 0
-    raise AttributeError(f"module 'walking' has no attribute {name!r}", name=name, obj=sys.modules["walking"])
 '''
 
 
@@ -60,21 +48,11 @@ def beside_the_models(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-def run(*arguments):
+def test_a_sound_simulation_of_the_current_directory():
     root = Path(__file__).parent.parent
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root / "src"), str(root)])}
-    return subprocess.run(
-        [sys.executable, "-m", "simenv_marl", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=environment,
-        timeout=300,
-    )
-
-
-def test_a_sound_simulation_of_the_current_directory():
-    done = run("check", "walking:Walk", "--episodes", "2")
+    command = [sys.executable, "-m", "simenv_marl", "check", "walking:Walk", "--episodes", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Walk: nothing to complain of")
 
@@ -114,17 +92,13 @@ def test_points_by_name(capsys):
     ("target", "told"),
     [
         ("walking", "not of the form module:Simulation"),
-        (":Walk", "not of the form module:Simulation"),
         ("walkin:Walk", "did you mean walking?"),
         ("walking:Wlak", "did you mean Walk?"),
-        ("walking:Xyz", "walking has no 'Xyz'"),
         ("walking:Walk.nothing", "Walk has no 'nothing'"),
         ("simenv_marl.registraton:x", "did you mean simenv_marl.registration"),
         ("broken_walk:Walk", "needs 'no_such_package_at_all'"),
         ("failing_walk:Walk", "cannot be imported: ZeroDivisionError"),
-        ("json.decoder.walking:Walk", "there is no module 'json.decoder.walking'"),
         ("quitting_walk:Walk", "cannot be imported: SystemExit: usage"),
-        ("walking:late", "walking:late cannot be imported: ZeroDivisionError"),
         ("walking:number", "is not a simulation"),
     ],
 )

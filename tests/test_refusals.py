@@ -1,5 +1,7 @@
-"""Mistakes of users that are told when the environment is made, or with the remedy."""
+"""Mistakes of users that are told when the environment is made, or with the remedy; and what ``help`` tells them."""
 
+import pydoc
+from dataclasses import fields
 from queue import SimpleQueue
 from threading import Thread
 
@@ -7,20 +9,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import SimulationInterface, aec_env, envs, make_step, parallel_env, single_env
-from simenv_marl.errors import DefinitionError, NoDecisionError, UnknownPointError
-
-
-def definition(**changes):
-    parts = {
-        "agent": "ant",
-        "observation_space": spaces.Discrete(2),
-        "observation_space_mapping": lambda model: 0,
-        "action_space": spaces.Discrete(2),
-        "action_space_mapping": int,
-        "reward_mapping": lambda model: 0.0,
-    }
-    return make_step(**{**parts, **changes})
+import simenv_marl
+from simenv_marl import SimulationInterface, aec_env, parallel_env, single_env
+from simenv_marl.core.options import CheckOptions, EpisodeOptions, Options, ViewOptions
+from simenv_marl.errors import DefinitionError, NoDecisionError, UnknownPointError, did_you_mean
+from tests.worlds.copied import Walk
+from tests.worlds.models import define
 
 
 class Model(SimulationInterface):
@@ -35,18 +29,10 @@ class Model(SimulationInterface):
 
 
 class Derived(Model):
+    """Overrides what a point of the base class names."""
+
     def choose(self):
         return 1
-
-
-class Simulation(SimulationInterface):
-    """Runs a derived model, though the point names the base class."""
-
-    def reset(self):
-        self.model = Derived()
-
-    def run(self):
-        self.model.run()
 
 
 CHOOSE = f"{__name__}.Model.choose"
@@ -58,7 +44,7 @@ def test_a_simulation_parameter_that_is_not_keyword_only_is_refused(part):
         return 0
 
     with pytest.raises(DefinitionError, match=r"_simulation of .*mapping.* must be keyword-only: write it behind a \*"):
-        aec_env(Model, {CHOOSE: definition(**{part: mapping})})
+        aec_env(Model, {CHOOSE: define(**{part: mapping})})
 
 
 @pytest.mark.parametrize(
@@ -67,18 +53,18 @@ def test_a_simulation_parameter_that_is_not_keyword_only_is_refused(part):
 )
 def test_a_typo_in_the_name_of_a_point_gets_the_nearest_names(name, close):
     with pytest.raises(UnknownPointError, match=f"did you mean .*{close}"):
-        aec_env(Model, {name: definition()})
+        aec_env(Model, {name: define()})
 
 
 def test_an_episode_without_a_decision_names_the_functions_that_override_the_point():
-    env = single_env(Simulation, {CHOOSE: definition()})
+    env = single_env(Derived, {CHOOSE: define()})
     with pytest.raises(NoDecisionError, match=rf"{CHOOSE}; .* called instead.*{__name__}\.Derived\.choose"):
         env.reset()
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_possible_agents_without_a_roster_say_how_to_declare_them(make):
-    env = make(Model, {CHOOSE: definition(agent=lambda model: "ant")})
+    env = make(Model, {CHOOSE: define(agent=lambda model: "ant")})
     assert not hasattr(env, "possible_agents")
     with pytest.raises(AttributeError, match="declare them with the option possible_agents="):
         print(env.possible_agents)
@@ -90,9 +76,7 @@ def test_possible_agents_without_a_roster_say_how_to_declare_them(make):
 @pytest.mark.parametrize("shape", [(1,), (2,)])
 def test_integers_are_clipped_without_wrapping_around(action, clipped, shape):
     box = spaces.Box(-5, 2**63 - 1, shape, np.int64)
-    env = single_env(
-        Model, {CHOOSE: definition(action_space=box, action_space_mapping=lambda action: action)}, clip_actions=True
-    )
+    env = single_env(Model, {CHOOSE: define(action_space=box)}, clip_actions=True)
     env.reset()
     env.step(np.full(shape, action, np.uint64 if action > 7 else np.int64))
     assert env.unwrapped.simulation.decided.tolist() == [clipped] * shape[0]
@@ -108,7 +92,7 @@ def test_an_episode_whose_decisions_fall_in_a_late_thread_names_the_thread_and_t
             assert answers.get(timeout=10) == 0
 
     middleware.start()
-    env = single_env(Served, {f"{__name__}.Model.choose": definition()})
+    env = single_env(Served, {f"{__name__}.Model.choose": define()})
     try:
         with pytest.raises(NoDecisionError, match=rf"{CHOOSE}; .*threads that are not the simulation's: middleware"):
             env.reset()
@@ -117,16 +101,57 @@ def test_an_episode_whose_decisions_fall_in_a_late_thread_names_the_thread_and_t
         middleware.join()
 
 
-def test_tab_completion_shows_what_users_call():
-    own = ["driver", "episode", "plugins", "provenance", "simulation", "state_space"]
-    for view, of_its_own in (
-        ("SimulationAECEnv", []),
-        ("SimulationParallelEnv", []),
-        ("SimulationJointEnv", ["action_masks"]),
-    ):
-        kind = getattr(envs, view)
-        theirs = {name for base in kind.__mro__ if not base.__module__.startswith("simenv_marl") for name in dir(base)}
-        shown = {name for name in dir(kind) if not name.startswith("_")} - theirs
-        shown -= {"np_random", "np_random_seed", "possible_agents", "state"}
-        shown -= {f"{what}_space{plural}" for what in ("action", "observation") for plural in ("", "s")}
-        assert sorted(shown) == sorted(own + of_its_own)
+# -- hints and help -------------------------------------------------------------------------------
+
+MAKERS = ("aec_env", "parallel_env", "single_env", "joint_env", "vector_env", "generate_env")
+OPTIONS = {field.name for field in fields(Options)}
+
+
+def test_type_checkers_know_the_options_that_there_are():
+    assert set(ViewOptions.__annotations__) == OPTIONS
+    assert set(EpisodeOptions.__annotations__) == OPTIONS - {"policies"}
+    assert set(CheckOptions.__annotations__) == OPTIONS - {"max_steps"}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_help_explains_every_option(name):
+    text = pydoc.plain(pydoc.render_doc(getattr(simenv_marl, name)))
+    for option in OPTIONS:
+        assert f"- ``{option}``: " in text
+    assert "{options}" not in text
+    assert text.rstrip().count("Raises:") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "hint"),
+    [
+        ("max_step", ["max_steps", "agent"], "; did you mean max_steps?"),
+        ("sheep_1", ["sheep_0", "sheep_2", "wolf_0"], "; did you mean sheep_2 or sheep_0?"),
+        ("quite different", ["max_steps"], ""),
+        (3, ["3"], ""),
+    ],
+)
+def test_hints_name_what_is_close(name, known, hint):
+    assert did_you_mean(name, known) == hint
+
+
+def environment():
+    made = simenv_marl.aec_env(Walk, Walk.choose)
+    made.reset(seed=1)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("wrong", "hint"),
+    [
+        (lambda: simenv_marl.aec_env(Walk, Walk.choose, max_step=3), "max_steps"),
+        (lambda: simenv_marl.single_env(Walk, Walk.choose, agent="walker"), "walker_0"),
+        (lambda: simenv_marl.generate_env(Walk, Walk.choose, view="paralel"), "parallel"),
+        (lambda: environment().observe("walker_1"), "walker_0"),
+        (lambda: simenv_marl.branch(environment(), 1, method="frok"), "fork"),
+        (lambda: simenv_marl.experiments.design({"a": [1, 2]}, "full_factorail"), "full_factorial"),
+    ],
+)
+def test_messages_hint_at_the_name_that_was_meant(wrong, hint):
+    with pytest.raises(simenv_marl.SimEnvError, match=f"did you mean {hint}"):
+        wrong()

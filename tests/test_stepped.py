@@ -10,7 +10,6 @@ from gymnasium import spaces
 
 from simenv_marl import RULE, SteppedSimulation, aec_env, evaluate, simulate, single_env
 from simenv_marl.errors import OptionValueError, SimulationError, UnknownPointError
-from simenv_marl.experiments import design, run_experiment
 from tests.worlds.models import define
 
 
@@ -109,14 +108,6 @@ def test_a_model_whose_scenario_holds_the_seed_is_not_left_unseeded():
     assert simulate(fixed, seed=2).model.place == walked(4, 5)
 
 
-def test_it_is_a_row_of_an_experiment(tmp_path):
-    table = run_experiment(
-        partial(SteppedSimulation, Walk, 10), design({"drift": [0.0, 1.0]}), seeds=range(2), store=tmp_path,
-        metric={"place": lambda simulation: simulation.model.place},
-    )  # fmt: skip
-    assert table.place.tolist() == [walked(seed, 10, drift=drift) for drift in (0.0, 1.0) for seed in range(2)]
-
-
 def test_copies_and_pickles():
     simulation = SteppedSimulation(Walk, 5, drift=0.5)
     for twin in (copy.deepcopy(simulation), pickle.loads(pickle.dumps(simulation))):
@@ -136,13 +127,6 @@ def test_models_steps_and_parameters_that_cannot_be_are_refused():
 
 
 def test_points_are_those_that_are_named():
-    def decide():
-        """Decide something of another model."""
-
-    others = []
-    for package in ("one", "another"):
-        decide.__module__ = f"{package}.model"
-        others.append(define()(decide))
     with pytest.raises(UnknownPointError, match="points is empty"):
         aec_env(SteppedSimulation(Walk, 5))
     assert simulate(SteppedSimulation(Walk, 5), seed=2).model.place == walked(2, 5)

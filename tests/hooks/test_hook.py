@@ -1,56 +1,29 @@
-"""Wrappers, and who takes part in their calls."""
+"""Wrappers of a model's functions, and who takes part in their calls."""
 
 import pickle
+from types import SimpleNamespace
 
 import cloudpickle
 import pytest
 from greenlet import getcurrent, greenlet
 
 from simenv_marl.hooks.hook import Hook, hook_of, made_with, unwrap
-from simenv_marl.hooks.stacks import EVALUATING, OUTSIDE, STACKS, outside_simulation, stack_of
+from simenv_marl.hooks.stacks import STACKS, outside_simulation, stack_of
 
 
 def rule(first, second=2, *, third=3):
     return first, second, third
 
 
-class Stack:
-    """A simulation's stack."""
-
-    hidden = 0
-
-    def leave_hooks(self, here):
-        self.hidden += 1
-
-    def enter_hooks(self):
-        self.hidden -= 1
-
-
-@pytest.fixture
-def stack():
-    made, here = Stack(), getcurrent()
-    STACKS[here] = made
-    yield made
-    del STACKS[here]
-
-
-def in_a_greenlet(function):
-    return greenlet(function).switch()
-
-
-# -- wrappers --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("function", "args", "kwargs"),
     [
         (rule, (1,), {}),
-        (rule, (1, 5), {}),
-        (rule, (1,), {"third": 7}),
+        (rule, (1, 5), {"third": 7}),
         (rule, (), {"first": 1}),
         (lambda model, /: 0, (1,), {}),
         (lambda model=None: 0, (), {}),
-        (lambda *models: 0, (), {}),
+        (lambda getcurrent: 0, (), {"getcurrent": 1}),  # a name that wrappers use
         (lambda *models: 0, (1, 2), {}),
         (lambda *, model: 0, (), {"model": 1}),
         (lambda: 0, (), {}),
@@ -82,39 +55,20 @@ def test_a_wrapper_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
     hook.leave(getcurrent())
 
 
-# -- who takes part --------------------------------------------------------------------------------
+def test_outside_a_simulation_its_interceptors_are_masked(monkeypatch):
+    here, told = getcurrent(), []
+    stack = SimpleNamespace(leave_hooks=told.append, enter_hooks=lambda: told.append("entered"))
 
-
-def test_outside_a_simulation_its_interceptors_are_masked(stack):
-    here = getcurrent()
-    with outside_simulation():
-        assert stack.hidden == 1
-        assert stack_of(here) is None
-        assert in_a_greenlet(lambda: stack_of(getcurrent())) is None
-        with outside_simulation():
-            assert stack.hidden == 1
-        assert STACKS[here] is OUTSIDE
-    assert stack.hidden == 0
-    assert stack_of(here) is stack
-    assert EVALUATING == {}
-
-
-def test_in_a_greenlet_of_the_model_only_that_is_masked(stack):
-    def work():
-        with outside_simulation():
-            assert stack.hidden == 0
+    def in_a_greenlet_of_the_model():
+        with outside_simulation():  # only that is masked, which has no hooks of its own to leave
             assert stack_of(getcurrent()) is None
         return stack_of(getcurrent())
 
-    assert in_a_greenlet(work) is stack
-    assert list(STACKS.values()).count(OUTSIDE) == 0
-
-
-def test_what_runs_in_the_functions_place_does_so_everywhere_but_in_what_has_begun():
-    hook = Hook(rule, f"{__name__}.rule")
-    made = hook.make_wrapper()
-    hook.replace_rule(lambda first: "other")
-    assert made(1) == in_a_greenlet(lambda: made(1)) == "other"
-    hook.replace_rule()
-    assert made(1) == (1, 2, 3)
-    assert hook.interceptors == {}
+    monkeypatch.setitem(STACKS, here, stack)
+    assert greenlet(in_a_greenlet_of_the_model).switch() is stack
+    with outside_simulation():
+        assert stack_of(here) is greenlet(lambda: stack_of(getcurrent())).switch() is None
+        with outside_simulation():
+            assert told == [here]
+    assert stack_of(here) is stack
+    assert told == [here, "entered"]

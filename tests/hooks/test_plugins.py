@@ -5,7 +5,6 @@ import collections.abc
 import copy
 import gc
 import inspect
-import itertools
 import pickle
 import sys
 from contextlib import nullcontext
@@ -29,7 +28,6 @@ from simenv_marl import (
 from simenv_marl.core import agent as agent_module
 from simenv_marl.errors import HandlerError, OptionValueError, PatchError, UnknownTargetError
 from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.stacks import EVALUATING
 from simenv_marl.plugins import (
     ChangedArgs,
     ChangedResult,
@@ -45,20 +43,7 @@ from simenv_marl.plugins import (
 from tests.foreign import market
 from tests.foreign.market import Broker, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
-from tests.worlds.models import (
-    alive,
-    calling,
-    decision,
-    decisions,
-    define,
-    nobody_is_asked,
-    notes,
-    plainly,
-    play,
-    script,
-    stacks,
-    step,
-)
+from tests.worlds.models import calling, decision, decisions, define, notes, plainly, play, script, step
 from tests.worlds.undone import left_as_they_were
 
 HERE = __name__
@@ -168,6 +153,7 @@ def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and
 
     def see(*args, **kwargs):
         seen.append((args, kwargs))
+        return 0  # which changes nothing
 
     entries = [
         (lambda value, more=0: ChangedArgs(value * 2, more=5), function, "before"),
@@ -182,39 +168,22 @@ def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and
     assert seen == [((6,), {"more": 5}), ((7,), {"more": 5, "_result": 12}), "plain"]
     assert repr(ChangedArgs(1, b=2)) == "ChangedArgs(1, b=2)"
     assert repr(ChangedResult("x")) == "ChangedResult('x')"
-    for other in (None, 0, False, "text", (1, 2)):
-        entries = [(lambda *args, other=other, **kwargs: other, function, position) for position in ("before", "after")]
-        assert with_handlers(lambda: function(1, 2), *entries) == 3
 
 
 @EVERYWHERE
-@pytest.mark.parametrize(
-    ("args", "kwargs", "under_other_names"),
-    [
-        ((1,), {}, (1, 8, 9)),
-        ((1, 2), {}, (1, 2, 9)),
-        ((1,), {"more": 2}, (1, 2, 9)),
-        ((), {"value": 1}, (1, 8, 9)),
-        ((), {"more": 3, "value": 1}, (1, 3, 9)),
-        ((1,), {"most": 5}, (1, 2, 5)),
-    ],
-    ids=str,
-)
-def test_handlers_get_the_arguments_as_they_were_passed_whatever_they_call_them(
-    args, kwargs, under_other_names, with_handlers
-):
+def test_handlers_get_the_arguments_as_they_were_passed_whatever_they_call_them(with_handlers):
     @expose_to_plugins
     def function(value, more=2, most=3):
         return value, more, most
 
     seen = []
-    result = with_handlers(
-        lambda: function(*args, **kwargs),
+    entries = [
         (lambda *args, **kwargs: seen.append((args, kwargs)), function, "before"),
         (lambda a, b=8, c=9: seen.append((a, b, c)), function, "before"),
-    )
-    assert result == function.__wrapped__(*args, **kwargs)
-    assert seen == [(args, kwargs), under_other_names]
+    ]
+    assert with_handlers(lambda: function(more=4, value=1), *entries) == (1, 4, 3)
+    assert with_handlers(lambda: function(1, most=5), *entries) == (1, 2, 5)
+    assert seen == [((), {"more": 4, "value": 1}), (1, 4, 9), ((1,), {"most": 5}), (1, 2, 5)]
 
 
 @EVERYWHERE
@@ -222,9 +191,8 @@ def test_errors_of_the_call_are_the_functions_own(with_handlers):
     function, log = local(), []
     before = (lambda *args, **kwargs: log.append("before"), function, "before")
     after = (lambda *args, **kwargs: log.append("after"), function, "after")
-    for wrong in (lambda: function(), lambda: function(1, 2, 3), lambda: function(1, other=3)):
-        with pytest.raises(TypeError):
-            with_handlers(wrong, before, after)
+    with pytest.raises(TypeError):
+        with_handlers(lambda: function(1, other=3), before, after)
     assert log == []
     with pytest.raises(TypeError) as caught:
         with_handlers(lambda: function("text", 1), before, after)
@@ -244,26 +212,23 @@ def test_of_several_instead_the_latest_alone_runs_and_may_call_what_it_replaces(
     assert with_handlers(lambda: function(2), *around, first, latest) == 20
     assert with_handlers(lambda: function(2), *around, latest, first) == "first"
     assert log == []
-    one = (lambda self, *_, **__: Trader.bid.__wrapped__(self, "tea") + 0.5, BID, "instead")
-    assert with_handlers(lambda: Trader().bid("tea", 7), one) == 5.5
 
 
-@EVERYWHERE
-def test_handlers_may_come_and_go_while_the_function_runs_and_call_it_again(with_handlers):
+def test_a_call_runs_the_handlers_that_were_attached_when_it_began():
     function, log = local(), []
 
-    def before(value, more=0):
+    def change(value, more=0):
         log.append(value)
         if value == 1:
             remove_handler(function, "after")
             attach_handler(lambda *args: log.append("late"), function, "before")
             function(0)
 
-    attach_handler(lambda *args: log.append("after"), function, "after")
-    with_handlers(lambda: function(1), (before, function, "before"))
-    assert sorted(log[1:-1], key=str) == [0, "late"]
-    assert (log[0], log[-1]) == (1, "after")
-    remove_handler(function, "before")
+    with handlers((change, function, "before")):
+        attach_handler(lambda *args: log.append("after"), function, "after")
+        function(1)
+        assert log == [1, 0, "late", "after"]
+        remove_handler(function, "before")
 
 
 # -- what is exposed ------------------------------------------------------------------------------
@@ -282,19 +247,14 @@ def test_what_is_exposed_in_classes_is_so_in_either_order_and_for_that_class_alo
     class Sub(Model):
         fee = 6
 
-    class Sibling(Trader):
-        bid = expose_to_plugins(Trader.bid)
-
     for name in ("over", "under", "class_over", "class_under"):
         given, result = ((), 6) if name.startswith("class") else ((2.5,), 2)
         with handlers((lambda *args: log.append(1), getattr(Model, name), "before")):
             assert getattr(Sub(), name)(*given) == getattr(Sub, name)(*given) == result
-            assert len(log) == 2
         assert getattr(Sub, name)(*given) == result
-        assert len(log) == 2
-        log.clear()
+    assert log == [1] * 8
     with handlers((lambda *args, **kwargs: "sub", Model.bid, "instead")):
-        assert [kind().bid("tea") for kind in (Trader, Sibling, Sub)] == [5, 5, "sub"]
+        assert [kind().bid("tea") for kind in (Trader, Sub)] == [5, "sub"]
 
 
 def test_exposing_again_gives_the_same():
@@ -303,32 +263,6 @@ def test_exposing_again_gives_the_same():
     for thing in (local(), POOL, held):
         assert expose_to_plugins(thing) is thing
     assert isinstance(expose_to_plugins(expose_to_plugins(Trader.opening)), classmethod)
-
-
-@pytest.mark.parametrize("function", [Trader.bid, Trader.haggle, Trader.wire, market.price], ids=plainly)
-def test_an_exposed_function_keeps_its_looks(function):
-    exposed = expose_to_plugins(function)
-    assert exposed is not function
-    assert exposed.__wrapped__ is function
-    assert inspect.signature(exposed) == inspect.signature(function)
-    for name in ("__name__", "__qualname__", "__doc__", "__module__"):
-        assert getattr(exposed, name) == getattr(function, name)
-    for kind in (inspect.isgeneratorfunction, inspect.iscoroutinefunction, inspect.isfunction):
-        assert kind(exposed) == kind(function)
-
-
-@pytest.mark.parametrize("parameter", ["found", "rule", "args", "self", "SLOT"])
-def test_parameters_may_have_any_name(parameter):
-    scope, log = {"expose_to_plugins": expose_to_plugins}, []
-    exec(
-        f"class Model:\n    @staticmethod\n    @expose_to_plugins\n    def function({parameter}): return {parameter}",
-        scope,
-    )
-    function = scope["Model"].function
-    for attached in ([], [(lambda *args, **kwargs: log.append(1), function, "before")]):
-        with handlers(*attached):
-            assert function(3) == function(**{parameter: 4}) - 1 == 3
-    assert log == [1, 1]
 
 
 def test_what_has_no_dotted_name_can_be_exposed():
@@ -347,18 +281,17 @@ def test_a_modules_iterables_and_an_iterables_own_functions_are_targets(with_han
     pool, subjects, before = Pool(1, 2), [], dict(vars(Pool))
 
     def items():
-        return list(pool), list(Deck()), list(POOL)
+        return list(pool), list(POOL)
 
     found = with_handlers(
         items,
         (subjects.append, f"{HERE}.Pool.__iter__", "before_next"),
         (lambda thing, _result: ChangedResult(_result + 10), Pool.__iter__, "after_next"),
-        (lambda thing, _result: ChangedResult(_result + 20), f"{HERE}.Deck.__next__", "after"),
         (lambda thing, _result: ChangedResult(_result + 30), f"{HERE}.POOL", "after_next"),
     )
-    assert found == ([11, 12], [22, 21, 20], [31, 32])
+    assert found == ([11, 12], [31, 32])
     assert subjects == [pool] * 3
-    assert items() == ([1, 2], [2, 1, 0], [1, 2])
+    assert items() == ([1, 2], [1, 2])
     assert dict(vars(Pool)) == before
 
 
@@ -373,37 +306,22 @@ class Pool:
         yield from self.items
 
 
-class Deck:
-    def __init__(self):
-        self.left = 3
-
-    def __iter__(self):
-        return self
-
-    def __next__(self):
-        if not self.left:
-            raise StopIteration
-        self.left -= 1
-        return self.left
-
-
 def test_an_exposed_list_is_one_in_all_respects():
-    items = expose_to_plugins([3, 1, 2])
+    items = expose_to_plugins([3, 1])
     assert isinstance(items, list)
     assert not isinstance(items, collections.abc.Iterator)
-    items.append(4)
-    assert (len(items), items[0], items[1:3], 4 in items, items == [3, 1, 2, 4]) == (4, 3, [1, 2], True, True)
-    assert [*items] == sorted(items, key=[3, 1, 2, 4].index) == list(reversed(items))[::-1] == [3, 1, 2, 4]
+    items.append(2)
+    assert (len(items), items[0], 2 in items, items == [3, 1, 2]) == (3, 3, True, True)
     seen, numbers = [], iter([7, 8])
     with handlers(
         (lambda thing: seen.append(thing is items), items, "before_next"),
         (lambda thing, _result: ChangedResult(_result * 10), items, "after_next"),
     ):
-        assert [*items] == [30, 10, 20, 40]
-    assert seen == [True] * 5
+        assert [*items] == [30, 10, 20]
+    assert seen == [True] * 4
     with handlers((lambda thing: next(numbers), items, "instead_next")):
         assert list(items) == [7, 8]
-    assert [*items] == [3, 1, 2, 4]
+    assert [*items] == [3, 1, 2]
 
 
 def test_iterators_stay_iterators():
@@ -432,15 +350,6 @@ def test_copies_of_an_exposed_iterable_have_its_handlers():
     assert type(restored) is type(items)
 
 
-def test_models_of_a_patched_class_are_copied_and_pickled():
-    deck = Deck()
-    with handlers((lambda self: 9, f"{HERE}.Deck.__next__", "instead")):
-        for copied in (copy.deepcopy(deck), pickle.loads(pickle.dumps(deck))):
-            assert (copied.left, next(copied)) == (3, 9)
-        assert pickle.loads(pickle.dumps(Deck.__next__)) is Deck.__next__
-    assert next(copied) == 2
-
-
 # -- what is refused ------------------------------------------------------------------------------
 
 
@@ -452,15 +361,10 @@ def two(a, b):
     ("entry", "error"),
     [
         ((print, "nowhere", "before"), UnknownTargetError),
-        ((print, f"{MARKET}.Trader.quote", "before"), PatchError),
         ((print, f"{MARKET}.OPEN", "before_next"), PatchError),
         ((print, "math.sqrt", "before"), PatchError),
-        ((print, "datetime.datetime.now", "before"), PatchError),
-        ((print, len, "before"), PatchError),
         ((print, [1, 2], "before_next"), PatchError),
         ((print, Trader().bid, "before"), PatchError),
-        ((print, Trader, "before_next"), PatchError),
-        ((print, two, "during"), HandlerError),
         ((print, two, None), HandlerError),
         ((print, two, "before_next"), HandlerError),
         ((print, POOL, "before"), HandlerError),
@@ -471,12 +375,9 @@ def two(a, b):
         ((lambda a, b, _result: None, two, "before"), HandlerError),
         ((lambda a, b, _result: None, two, "instead"), HandlerError),
         ((lambda **kwargs: None, two, "before"), HandlerError),
-        ((lambda good: None, f"{MARKET}.price", "before"), HandlerError),
         ((lambda good, *, discount=0: None, f"{MARKET}.price", "before"), HandlerError),
         ((lambda self, good: None, BID, "before"), HandlerError),
-        ((lambda good, limit: None, BID, "after"), HandlerError),
         ((print, BID), HandlerError),
-        (BID, HandlerError),
     ],
     ids=plainly,
 )
@@ -486,19 +387,14 @@ def test_what_cannot_work_is_refused_when_it_is_attached(entry, error):
         raise AssertionError
     assert isinstance(caught.value, SimEnvError)
     assert hook_of(two) is None
-    for make in (single_env, generate_env):
-        with pytest.raises(error):
-            make(House, House.water, plugins=[good, entry])
-    if len(entry) == 3:
-        with pytest.raises(error):
-            attach_handler(*entry)
+    with pytest.raises(error):
+        generate_env(House, House.water, plugins=[good, entry])
 
 
 @pytest.mark.parametrize("plugins", ["text", 3, {BID: print}])
 def test_plugins_are_a_list(plugins):
-    for make in (single_env, generate_env):
-        with pytest.raises(OptionValueError):
-            make(House, House.water, plugins=plugins)
+    with pytest.raises(OptionValueError):
+        generate_env(House, House.water, plugins=plugins)
 
 
 async def flow():
@@ -514,14 +410,6 @@ def test_what_cannot_be_extended_cannot_be_exposed(thing, why):
         expose_to_plugins(thing)
 
 
-def test_whatever_can_be_called_with_the_arguments_is_accepted():
-    good = [lambda a, b: None, lambda x, y: None, lambda *args, **kwargs: None, lambda *args: None]
-    good += [lambda a, *rest: None, lambda a, b, c=0: None, lambda a, b, /: None, Trader().bid, print]
-    for handler in good:
-        with handlers((handler, two, "before")):
-            assert two(1, b=2) == two(a=1, b=2) == (1, 2)
-
-
 @pytest.mark.parametrize(
     ("target", "position", "handler"),
     [(two, "before", None), (two, "before", print), (two, "during", None), (BID, "after", None)],
@@ -533,44 +421,27 @@ def test_removing_what_is_not_attached_is_refused(target, position, handler):
     assert ("no handler is attached" in str(caught.value)) is (handler is None)
 
 
-def test_a_slip_of_the_pen_gets_a_hint():
-    with pytest.raises(UnknownTargetError, match=r"did you mean .*counting"):
-        attach_handler(print, f"{HERE}.countin", "before")
-
-
 # -- for a while ----------------------------------------------------------------------------------
 
 
-def test_handlers_are_there_for_as_long_as_the_block_runs():
-    one, broken = (lambda *args, **kwargs: 1, BID, "instead"), (failing, BID, "instead")
-    with handlers(one):
-        assert Trader().bid("tea") == 1
-        assert attached_handlers() == [one]
-    with pytest.raises(ZeroDivisionError), handlers(broken):
-        Trader().bid("tea")
-    assert Trader().bid("tea") == 5
-
-
-def test_blocks_may_overlap_and_remove_nothing_but_their_own():
+def test_blocks_and_removals_take_away_nothing_but_their_own():
     function, log = local(), []
 
     def see(value, more=0):
         log.append(value)
 
-    see_it = (see, function, "before")
-    for _ in range(2):
-        attach_handler(*see_it)
-    one, two = handlers(see_it), handlers(see_it)
-    one.__enter__()
-    two.__enter__()
-    function(1)
-    one.__exit__(None, None, None)
-    remove_handler(function, "before", see)
+    for _ in range(3):
+        attach_handler(see, function, "before")
+    with handlers((see, function, "before")):
+        function(1)
     function(2)
-    remove_handler(function, "before")  # all of them
-    two.__exit__(None, None, None)
+    remove_handler(function, "before", see)
     function(3)
-    assert log == [1] * 4 + [2] * 2
+    remove_handler(function, "before")  # all of them
+    with pytest.raises(ZeroDivisionError), handlers((failing, function, "instead")):
+        function(4)
+    function(5)
+    assert log == [1] * 4 + [2] * 3 + [3] * 2
 
 
 # -- errors ---------------------------------------------------------------------------------------
@@ -692,32 +563,6 @@ def test_what_is_sent_before_a_generator_was_asked_is_not_sent_to_it():
 
 
 @EVERYWHERE
-@pytest.mark.parametrize("position", ["before", "instead"])
-def test_handlers_of_a_generator_function_end_no_items(position, with_handlers):
-    def stopping(*args, **kwargs):
-        raise StopIteration("a slip")
-
-    with pytest.raises(RuntimeError, match="StopIteration") as caught:
-        with_handlers(lambda: list(counting(3)), (stopping, counting, position))
-    assert f"stopping, attached {position}" in notes(caught.value.__cause__)
-
-
-def test_errors_of_a_generator_that_is_closed_are_raised():
-    @expose_to_plugins
-    def items():
-        try:
-            yield 1
-        finally:
-            raise LookupError("while it was closed")
-
-    with handlers((nothing, items, "before_next")):
-        generator = items()
-        assert next(generator) == 1
-        with pytest.raises(LookupError, match="while it was closed"):
-            generator.close()
-
-
-@EVERYWHERE
 def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited(with_handlers):
     name, log = f"{MARKET}.Trader.wire", []
 
@@ -792,19 +637,6 @@ def test_calls_are_traced_in_the_order_in_which_they_begin():
     assert len(calls) == 6
 
 
-def test_calls_of_an_episode_are_traced():
-    env = single_env(House, House.water, plugins=[says("mine")])
-    with trace(WORD, House.water) as calls:
-        env.reset()
-        env.step(7)
-    waters = [call for call in calls if call.target.endswith("water")]
-    assert [call.result for call in waters] == ["7", None]
-    assert {call.result for call in calls if call not in waters} == {"'mine'"}
-    assert calls[-1].result == "'mine'"
-    env.close()
-    assert waters[-1].result.startswith("raised SimulationExit")
-
-
 # -- one environment alone ------------------------------------------------------------------------
 
 
@@ -867,7 +699,7 @@ def test_plugins_apply_wherever_the_environments_simulation_is_at_work():
     env.close()
     assert simulation.log == ["mine"] * 5
     assert simulation.word() == "plain"
-    assert simulate(House, points=House.water, plugins=[says("mine")]).log == ["mine"] * 7
+    assert simulate(House, points=House.water, plugins=iter([says("mine")])).log == ["mine"] * 7
 
 
 @pytest.mark.parametrize(
@@ -895,71 +727,18 @@ def test_handlers_of_the_process_run_before_the_environments():
         for name in ("process", "environment")
         for position in ("before", "after")
     ]
+    env = single_env(House, House.water, plugins=[*entries[2:], says("environment")])
+    with handlers(*entries[:2], says("process")):
+        env.reset()
+        assert log == []  # the latest "instead" alone runs
+        assert env.unwrapped.simulation.log[-1] == "environment"
+        assert House().word() == "process"
+    env.close()
     env = single_env(House, House.water, plugins=entries[2:])
-    own = single_env(House, House.water, plugins=[says("environment")])
     with handlers(*entries[:2]):
         env.reset()
     assert log[:4] == [(position, name) for position in ("before", "after") for name in ("process", "environment")]
-    with handlers(says("process")):
-        for each, word in ((env, "process"), (own, "environment")):
-            each.reset()
-            assert each.unwrapped.simulation.log[-1] == word
-        assert House().word() == "process"
     env.close()
-    own.close()
-
-
-def test_an_environment_stepped_from_inside_another_one_sees_its_own_plugins_alone():
-    plain, mine = (single_env(House, House.water, plugins=plugins) for plugins in ([], [says("inner")]))
-    for env in (plain, mine):
-        env.reset()
-
-    def main(simulation):
-        simulation.log.append(House().word())
-        other()
-        for env in (plain, mine):
-            env.step(1)
-        House.water(House())
-        simulation.log.append(House().word())
-        other()
-
-    other = decision(agent="other_0")
-    policies = {House.water: lambda *_: plain.step(1) and 1}
-    env = aec_env(script(main), [other, House.water], plugins=[says("mine")], policies=policies)
-    env.reset()
-    env.step(1)
-    assert env.unwrapped.simulation.log == ["mine", "mine"]
-    assert plain.unwrapped.simulation.log == ["plain"] * 6
-    assert mine.unwrapped.simulation.log == ["inner"] * 4
-    for each in (env, plain, mine):
-        each.close()
-
-
-def test_a_plugins_error_surfaces_from_step_the_next_reset_works_and_nothing_is_left_behind():
-    number = itertools.count()
-
-    def fail(self):
-        if next(number) == 4:
-            raise ZeroDivisionError
-
-    env = single_env(House, House.water, plugins=[(fail, WORD, "before")])
-    before = stacks()
-    env.reset()
-    with pytest.raises(ZeroDivisionError) as caught:
-        env.step(1)
-    assert "in the handler" in notes(caught.value)
-    assert "waterer_0" in notes(caught.value)
-    del caught
-    for _ in range(2):
-        env.reset()
-        env.step(1)
-        env.close()
-    env.reset()
-    del env
-    assert alive(House) == 0
-    assert stacks() <= before
-    assert nobody_is_asked()
-    assert hook_of(vars(House)["water"]).interceptors == EVALUATING == {}
 
 
 def test_environments_may_be_collected_at_any_moment():
@@ -1012,17 +791,6 @@ def test_nothing_is_patched_but_while_there_is_an_environment():
     del one
     gc.collect()
     assert vars(House)["word"] is before
-    House.word = expose_to_plugins(House.word)  # which the class of environments outlives
-    try:
-        env = made()
-        env.reset()
-        assert set(env.unwrapped.simulation.log) == {"mine"}
-    finally:
-        House.word = before
-    env.step(1)
-    assert env.unwrapped.simulation.log[-2:] == ["plain", "plain"]
-    env.close()
-    assert vars(House)["word"] is before
 
 
 def test_the_simulations_own_methods_can_be_extended():
@@ -1051,25 +819,12 @@ def ventilate(self):
     return "rule"
 
 
-def asked(self):
-    return f"asked {ventilate(self)}"
-
-
-def test_a_plugin_may_decide_or_call_what_decides():
-    for handler, prefix in ((ventilate, ""), (asked, "asked ")):
-        points, plugins = [House.water, ventilate], [(handler, WORD, "instead")]
-        env = aec_env(House, points, plugins=plugins)
-        turns = play(env, {"waterer_0": 1, "ventilator_0": 7})
-        assert decisions(turns) == ["ventilator_0", "waterer_0", "ventilator_0"] * 3
-        log = env.unwrapped.simulation.log
-        assert log[0] == f"{prefix}rule"  # during reset the rule decides
-        assert [str(word) for word in log[1:]] == [f"{prefix}7"] * 6
-        env.close()
-        together = joint_env(House, points, plugins=plugins)
-        together.reset()
-        *_, info = together.step({"waterer_0": 1, "ventilator_0": 7})
-        assert info["acted"] == {"waterer_0": True, "ventilator_0": True}
-        together.close()
+def test_a_plugin_may_decide():
+    env = aec_env(House, [House.water, ventilate], plugins=[(ventilate, WORD, "instead")])
+    turns = play(env, {"waterer_0": 1, "ventilator_0": 7})
+    assert decisions(turns) == ["ventilator_0", "waterer_0", "ventilator_0"] * 3
+    assert env.unwrapped.simulation.log == ["rule", *[7] * 6]  # during reset the rule decides
+    env.close()
 
 
 @pytest.mark.parametrize("how", ["handlers first", "points first", "environment", "exposed"])
@@ -1143,23 +898,6 @@ def test_whoever_comes_and_goes_nobody_is_in_anothers_way(seed):
         leave()
 
 
-def test_points_find_functions_that_handlers_stand_in_front_of():
-    class Shed(House):
-        pass
-
-    model = calling(lambda: Broker().bid("tea"))
-    with handlers(*[(nothing, target, "before") for target in (BID, f"{MARKET}.Broker.bid", Shed.water)]):
-        envs = [aec_env(model, {point: define()}) for point in (Trader.bid, Broker.bid)]
-        fetched = Trader.bid
-        env = aec_env(Shed, Shed.water)  # with the definition that it has inherited
-        assert decisions(play(env, 1)) == ["waterer_0"] * 3
-        env.close()
-    for env in (*envs, aec_env(model, {fetched: define()})):
-        play(env, 3)
-        assert env.unwrapped.simulation.log == [3]
-        env.close()
-
-
 def test_decision_functions_can_be_named_whether_they_are_exposed_before_or_after():
     def choose():
         return "rule"
@@ -1193,99 +931,30 @@ def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside()
         Trader.bid = original
 
 
-@pytest.mark.parametrize("end", ["close", "reset", "collect"])
-def test_an_episode_that_ends_inside_an_exposed_call_passes_its_handlers(end):
-    log = []
-
-    @expose_to_plugins
-    def day():
-        try:
-            return CHOOSE()
-        finally:
-            log.append("unwound")
-
-    plugins = [(lambda position=position: log.append(position), day, position) for position in ("before", "after")]
-    env = aec_env(calling(day), CHOOSE, plugins=plugins)
-    with handlers((lambda: log.append("everybody"), day, "after")):
-        env.reset()
-        assert log == ["before"]
-        if end == "reset":
-            env.reset()
-        if end != "collect":
-            env.close()
-        del env
-        gc.collect()
-    assert log == ["before", "unwound"] * (2 if end == "reset" else 1)
-
-
 def test_generators_and_iterables_suspended_over_decisions_have_their_environments_plugins():
+    items, envs = expose_to_plugins([1, 2, 3]), {}
+
     @expose_to_plugins
     def days(number):
         for day in range(number):
             yield (day, CHOOSE())
 
-    class Shelf:
-        """Its iterable is copied with it."""
+    def main(simulation):
+        for (day, action), item in zip(days(3), items, strict=False):
+            simulation.log.append((day, item, action))
 
-        def __init__(self):
-            self.items = expose_to_plugins([1, 2, 3])
-
-        def reset(self):
-            self.log = []
-
-        def run(self):
-            for (day, action), item in zip(days(3), self.items, strict=False):
-                self.log.append((day, item, action))
-
-    shelf, envs = Shelf(), {}
     for factor in (10, 100, 1):
         after = [
             (lambda _, _result, by=factor: ChangedResult((_result[0] * by, _result[1])), days, "after_next"),
-            (lambda _, _result, by=factor: ChangedResult(_result * by), shelf.items, "after_next"),
+            (lambda _, _result, by=factor: ChangedResult(_result * by), items, "after_next"),
         ]
-        envs[factor] = aec_env(shelf, CHOOSE, plugins=after if factor > 1 else ())
+        envs[factor] = aec_env(script(main), CHOOSE, plugins=after if factor > 1 else ())
         envs[factor].reset()
     for action in (7, 8, 9):
         for env in envs.values():
             env.step(action)
     for factor, env in envs.items():
         assert env.unwrapped.simulation.log == [(day * factor, (day + 1) * factor, day + 7) for day in range(3)]
-
-
-class Sheep:
-    def __init__(self, name):
-        self.name = name
-
-    def remove(self):
-        pass
-
-    @define(agent=lambda self: self.name, removed_by=f"{HERE}.Sheep.remove")
-    def graze(self):
-        return 0
-
-
-@pytest.mark.parametrize("how", ["process", "environment"])
-def test_a_removal_may_have_handlers(how):
-    def main(simulation):
-        one, two = Sheep("sheep_1"), Sheep("sheep_2")
-        one.graze()
-        one.remove()
-        two.graze()
-
-    removed = []
-    entries = [(lambda self: removed.append(self.name), f"{HERE}.Sheep.remove", "after")]
-    env = aec_env(script(main), Sheep.graze, plugins=entries if how == "environment" else ())
-    with handlers(*entries) if how == "process" else nullcontext():
-        turns = play(env, 1)
-    assert [(turn.agent, turn.terminated) for turn in turns] == [
-        ("sheep_1", False),
-        ("sheep_1", True),
-        ("sheep_2", False),
-        ("sheep_2", True),
-    ]
-    assert removed == ["sheep_1"]
-    env.close()
-    assert hook_of(Sheep.remove) is None
 
 
 def test_mappings_of_vector_environments_see_the_plugins_too(monkeypatch):

@@ -14,12 +14,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def blocks(name: str, section: str | None = None) -> list[CodeType]:
-    """Compile all python blocks of a file in ``docs``, or of a section of it, in their order.
-
-    Args:
-        name: The file's name.
-        section: The heading of the section.
-    """
+    """Compile all python blocks of a file in ``docs``, or of a section of it, in their order."""
     text = (DOCS / name).read_text(encoding="utf-8")
     if section is not None:
         level, _, rest = text.partition(f"# {section}\n")
@@ -32,15 +27,7 @@ def blocks(name: str, section: str | None = None) -> list[CodeType]:
 
 
 def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
-    """Run the python blocks of a section of ``docs/clients.md``.
-
-    Args:
-        section: The heading of the section.
-        monkeypatch: Pytest's, which takes back what the run has changed about imports.
-
-    Yields:
-        After each block, the names that the code has left behind.
-    """
+    """Run the python blocks of a section of ``docs/clients.md``; after each, yield the names that it has left."""
     monkeypatch.syspath_prepend(DOCS)
     names: dict[str, Any] = {"__name__": "__main__"}
     with models_of_pages_forgotten():

@@ -116,6 +116,11 @@ def test_a_latin_hypercube_has_one_row_in_each_slice():
         design(factors, "latin_hypercube", 10, seed=-1)
 
 
+def test_rounding_leaves_no_range():
+    narrow = design({"x": (0.1, np.nextafter(0.1, 1))}, "latin_hypercube", 64)["x"]
+    assert set(narrow) == {0.1, np.nextafter(0.1, 1)}
+
+
 def test_one_at_a_time_changes_one_factor():
     table = design({"a": (0, 10), "b": ["x", "y", "z"], "c": (0.0, 1.0)}, "one_at_a_time")
     changed = [(0, "x", 0.5), (10, "x", 0.5), (5, "y", 0.5), (5, "z", 0.5), (5, "x", 0.0), (5, "x", 1.0)]

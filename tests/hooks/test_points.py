@@ -3,13 +3,17 @@
 import gc
 import subprocess
 import sys
+import threading
 import types
+from concurrent.futures import ThreadPoolExecutor
 from textwrap import dedent
 
 import pytest
 
 from simenv_marl import RULE, SimEnvError, aec_env, generate_env
+from simenv_marl.core.points import find_point
 from simenv_marl.errors import AgentError, DefinitionError, PatchError, UnknownPointError
+from simenv_marl.hooks.hook import hook_of, hooks
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
@@ -323,3 +327,18 @@ def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_
         aec_env(calling(decide), {decide: define()})
     decorated = decision(decide)
     assert log_of(aec_env(calling(decorated), decorated)) == [9]
+
+
+def test_threads_that_register_and_name_points_at_once_find_the_same(monkeypatch):
+    def work(number):
+        start.wait()
+        return [define()(lambda: 0) for _ in range(100)], [find_point(name, define())[0] for name in names]
+
+    crowd, names = types.ModuleType("crowd"), [f"crowd.Plain{number}.choose" for number in range(20)]
+    monkeypatch.setitem(sys.modules, "crowd", crowd)
+    vars(crowd).update({f"Plain{number}": type("Plain", (), {"choose": lambda self: 0}) for number in range(20)})
+    start = threading.Barrier(8)
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(work, range(8)))
+    assert all(placed == found[0][1] for _, placed in found)
+    assert {hook_of(choose) for registered, _ in found for choose in registered} <= set(hooks())

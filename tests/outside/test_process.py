@@ -35,6 +35,7 @@ from simenv_marl.errors import (
     WireError,
 )
 from simenv_marl.experiments import design, run_experiment
+from simenv_marl.plugins import handlers
 from simenv_marl.remote import ProcessSimulation
 from tests.outside.reservoirs import (
     BOTH,
@@ -210,6 +211,12 @@ def test_points_may_have_any_name_also_that_of_a_function(make_env, name):
     assert json.dumps is before
     play(env, seed=2)
     assert env.unwrapped.simulation.result == [None] * 6
+
+
+def test_handlers_extend_decisions_by_their_name(make_env):
+    assert plays_by_its_rule(make_env(aec_env, reservoirs()))
+    with handlers((lambda call: 7.0, "broker.price", "instead")):
+        assert simulate(reservoirs(), seed=1).result["price"] == 7.0
 
 
 def test_apply_answers_with_what_it_returns(make_env):

@@ -100,11 +100,7 @@ class Child:
         return self.receive()
 
     def play(self, choose: Callable[[Any], Any] | None = None, seed: Any = 7, **options: Any) -> tuple[list[Any], Any]:
-        """Play an episode, in which each call is answered with what ``choose`` says of it, or left to the rule.
-
-        Returns:
-            The calls, and the frame that came last.
-        """
+        """Play an episode, each call answered by ``choose`` or left to the rule. Return them, and the last frame."""
         calls, frame = [], self.begin(seed, **options)
         while frame is not None and "decide" in frame:
             calls.append(frame)

@@ -308,7 +308,10 @@ def test_wrappers_of_single_views():
     assert told.returns == pytest.approx(10 * table[::-1])
     assert told.best == 0
     told = action_values(wrapped, futures=3, horizon=3, base=lambda observation: 2)
-    assert told.returns == pytest.approx(10 * expected(env, "left", horizon=3, bases={"left": lambda seen: 0})[::-1])
+    bases = {"left": lambda seen: 0}
+    assert told.returns == pytest.approx(10 * expected(env, "left", horizon=3, bases=bases)[::-1])
+    told = action_values(wrapped, iter([RULE]), futures=3, horizon=3, base=lambda observation: 2)
+    assert told.returns == pytest.approx(10 * expected(env, "left", (1,), horizon=3, bases=bases))
 
 
 @METHODS

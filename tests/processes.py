@@ -16,11 +16,7 @@ ROOT = Path(__file__).parents[1]
 def alone(function: Callable[..., None], *arguments: Any) -> None:
     """Call a function of a test file in a process of its own, where no other test has left anything open.
 
-    Environments have the driver of the test that calls.
-
-    Args:
-        function: The function. It is not called in this process.
-        arguments: Its arguments: strings and numbers.
+    Environments have the driver of the test that calls. The arguments are strings and numbers.
     """
     code = f"""
 from simenv_marl.core.options import Options

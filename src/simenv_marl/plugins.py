@@ -275,7 +275,7 @@ class Plugins:
         given = list(entries)
         with LOCK:
             self.handlers = [_make_handler(entry, named, self) for entry in given]
-        self.hooks = list(dict.fromkeys(handler.target for handler in self.handlers))
+        self.hooks = dict.fromkeys(handler.target for handler in self.handlers)
         self.entries: list[Entry] = [(own.function, own.target.name, own.position) for own in self.handlers]
         # With the given target where its name would not lead to it in another process.
         pairs = zip(self.entries, given, strict=True)

@@ -12,10 +12,6 @@ def price(good: str, *, rebate: int = 0) -> int:
     return 10 - rebate
 
 
-def other_price(good: str) -> int:
-    return 20
-
-
 @lru_cache
 def cached_price(good: str) -> int:
     return 30

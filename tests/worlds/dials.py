@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from simenv_marl import TRUNCATED, single_env, vector_env
+from simenv_marl import TRUNCATED, single_env
 from tests.worlds.models import define
 
 
@@ -122,8 +122,3 @@ def points(seen: str, agent: Any = "hand_0") -> dict[Any, Any]:
 def dial_env(seen: str = "numbers", **options: Any) -> Any:
     """The single view of a simulation of dials."""
     return single_env(DialSim, points(seen), **options)
-
-
-def dial_envs(seen: str = "numbers", **options: Any) -> Any:
-    """The vector view of two of them."""
-    return vector_env(DialSim, points(seen), num_envs=2, **options)

@@ -252,9 +252,7 @@ class Announcing(Colony):
 class Answered(Colony):
     """A colony without an environment, in which everybody answers as ``answer`` says.
 
-    Attributes:
-        decisions: Who has decided, in their order.
-        first, last: By agent, the fortune at its first decision and at its end.
+    It keeps who has decided, in their order, and by agent the fortune at its first decision and at its end.
     """
 
     def __init__(self, design: Design, seed: int | None = None, answers: Any = answer) -> None:
@@ -323,13 +321,9 @@ _made: dict[Any, Any] = {}
 
 
 def colony(make: Any, design: Design, simulation: type[Colony] = Colony, *, roster: bool = False) -> Any:
-    """An environment of a colony: one that may have been used before, for another design.
+    """An environment of a colony of a design. One that was made before may come again.
 
-    Args:
-        make: What makes it.
-        design: The design of its episodes from now on.
-        simulation: Of which colony.
-        roster: Whether all that may be born are declared.
+    ``roster``: whether all that may be born are declared.
     """
     key = make, bool(design.overseen), simulation, roster
     if key not in _made:
@@ -338,21 +332,6 @@ def colony(make: Any, design: Design, simulation: type[Colony] = Colony, *, rost
         _made[key] = make(lambda: simulation(design), points, possible_agents=names)
     _made[key].unwrapped.simulation.design = design
     return _made[key]
-
-
-VILLAGE = Design(initial=5, most=40, ticks=12, overseen="after")
-NAMES_OF_THE_VILLAGE = [f"creature_{number}" for number in range(VILLAGE.most)]
-
-
-class Village(Colony):
-    """A colony that always has something to observe, and takes options."""
-
-    def __init__(self) -> None:
-        super().__init__(VILLAGE)
-
-    def reset(self, seed: int | None = None, options: Any = None) -> None:
-        super().reset(seed)
-        self.fortune = 7
 
 
 def advised(observation: Any, seed: int) -> Any:

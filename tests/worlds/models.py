@@ -106,12 +106,8 @@ class Turn(NamedTuple):
 def play(env: Any, actions: Any = RULE, *, seed: int | None = None, reset: bool = True) -> list[Turn]:
     """Play an AEC environment to its end.
 
-    Args:
-        env: The environment.
-        actions: One action for all decisions, an iterator of them, a dict from agents to either, or a
-            callable of the agent and the environment.
-        seed: What it is reset with.
-        reset: Whether it is reset before.
+    ``actions`` is one action for all decisions, an iterator of them, a dict from agents to either, or a callable of
+    the agent and the environment.
     """
     if reset:
         env.reset(seed=seed)

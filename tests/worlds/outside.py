@@ -28,13 +28,7 @@ class Reservoirs:
         self.price, self.time, self.born, self.log = 1.0, 0.0, 0, []
 
     def run(self, decide: Callable[..., Any], remove: Callable[..., None], update: Callable[..., None]) -> None:
-        """The main loop.
-
-        Args:
-            decide: Called with point, entity, time, arguments and rule; returns the decision.
-            remove: Called with point and entity, when that is gone.
-            update: Called with point, entity and what its arguments would be by now.
-        """
+        """The main loop: decides by ``decide``, says what is gone by ``remove``, and what has changed by ``update``."""
         for hour in range(self.hours):
             if self.words:
                 print("hm" * self.words, file=sys.stderr)

@@ -29,8 +29,7 @@ class Design:
     """What a yard is like.
 
     Attributes:
-        machines, jobs: How many machines there are first, and how many jobs each has.
-        cranes: How many of them may load at once.
+        machines, jobs, cranes: How many machines there are first; jobs of each; machines that may load at once.
         plans: After how many units of time the yard itself decides, again and again.
         luck: Of how many cases one brings a birth or a death.
         until: When it ends; None: with the last machine.

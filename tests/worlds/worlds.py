@@ -28,11 +28,9 @@ class Design:
     Attributes:
         kinds: Of what kind each decision point is.
         program: The calls: of which point, for which of three entities.
-        policies: The points that a policy answers.
-        rules: The points that nobody but their rule answers.
+        policies, rules: The points that a policy answers, and those that only their rule answers.
         differences: The points that are paid by how much the level has changed.
-        truncates: Whether the end is a limit of time.
-        max_steps: The environment's limit.
+        truncates, max_steps: Whether the end is a limit of time; the environment's limit.
     """
 
     kinds: tuple[str, ...]
@@ -120,13 +118,10 @@ class FuseError(Exception):
 
 
 class World:
-    """A simulation of a design.
-
-    Attributes:
-        fuse: At how many more calls of its rules and mappings it fails; None: never.
-    """
+    """A simulation of a design."""
 
     fuse: int | None = None
+    """At how many more calls of its rules and mappings it fails; None: never."""
 
     def burn(self) -> None:
         """Count a call of a rule or of a mapping."""

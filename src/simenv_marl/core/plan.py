@@ -334,9 +334,8 @@ class Plan:
             portable(point.function, point.name): None if definition is point.definition else definition
             for point, definition in self._named.items()
         }
-        options = dict(vars(self.options))
+        options = {**vars(self.options), "plugins": [] if self.plugins is None else self.plugins.portable}
         for name in ("policies", "possible_agents"):
             if isinstance(options[name], Mapping):
                 options[name] = {portable(key): value for key, value in options[name].items()}
-        options["plugins"] = [] if self.plugins is None else self.plugins.portable
         return partial(Plan, unattended=self.unattended), (self.source, points, options), {"variant": self.variant}

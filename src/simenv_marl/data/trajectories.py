@@ -266,7 +266,7 @@ class _DecisionLog:
 class Recorder:
     """Records the decisions of episodes while they run: a ``Watcher`` for ``run``."""
 
-    def __init__(self, first_episode: int = 0) -> None:
+    def __init__(self, first_episode: int) -> None:
         self._first_episode = first_episode
         self._logs: dict[Group, _DecisionLog] = {}
 

@@ -21,7 +21,7 @@ class Joint:
 
     def __init__(self, roster: Mapping[str, Point], *, flatten: bool) -> None:
         """Combine the spaces, or raise ``ViewError`` if they cannot be flattened."""
-        self.roster, self._flatten = dict(roster), flatten
+        self.roster, self._flatten = roster, flatten
         observations = {name: deepcopy(point.definition.observation_space) for name, point in roster.items()}
         actions = {name: deepcopy(point.definition.action_space) for name, point in roster.items()}
         self.observation_space: spaces.Space[Any] = spaces.Dict(observations)

@@ -114,7 +114,7 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
     def _update(self) -> None:
         """Read the rewards, infos and ends of a reset or a step."""
         env, episode = self.env, self.unwrapped.episode
-        rewards, infos = dict(env.rewards), dict(env.infos)
+        rewards, infos = dict(env.rewards), env.infos
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
         self.rewards, self.terminations, self.truncations, self.infos = _pad(self.unwrapped, rewards, infos)

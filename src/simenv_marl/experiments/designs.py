@@ -228,9 +228,8 @@ def _generators(basic: int, number: int) -> str:
     ``basic`` of the ``number`` factors have all their combinations. Columns are bits: the product of two columns is
     their exclusive or.
     """
-    columns: list[int] = []
     for resolution in range(min(basic + 1, 8), 2, -1):
-        columns = []
+        columns: list[int] = []
         sums: list[set[int]] = [{0}, *(set() for _ in range(resolution - 2))]  # the sums of 0, 1, 2, ... columns
         # First the basic factors; then greedily in this order: a lexicographic code, which is large.
         for word in [*(1 << place for place in range(basic)), *range(3, 2**basic)]:

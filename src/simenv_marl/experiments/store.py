@@ -132,7 +132,7 @@ class Store:
         row = to_json({name: entry["factors"][name] for name in self._factors})
         run = texts.get(row, row), str(entry["contender"]), int(entry["seed"])  # so that a text is in memory once
         provenance, parts = entry["provenance"], {}
-        versions = set(_versions_in(provenance).items())
+        versions = _versions_in(provenance).items()
         result: Result = str(entry["error"])
         if entry["status"] == "ok":
             returns = {name: float(value) for name, value in entry["returns"].items()}
@@ -141,7 +141,7 @@ class Store:
             result = Outcome(returns, lengths, metrics)
             if row in texts and self.sample in ("", row) and run[1] not in self._parts:
                 parts = {run[1]: _parts_of(provenance)}
-        self._versions |= versions
+        self._versions.update(versions)
         if isinstance(self.runs.get(run, ""), str):
             self.runs[run] = result
         if not isinstance(result, str):

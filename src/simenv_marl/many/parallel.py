@@ -107,7 +107,7 @@ _received: Final[set[str]] = set()
 def _pack_with_names(thing: Any) -> bytes:
     """Pickle an object for workers, with the functions of this process's script that it refers to by dotted name."""
     parcel, main = pack((thing, {})), sys.modules["__main__"]
-    named = {name.decode(): getattr(main, name.decode(), None) for name in set(_IN_SCRIPT.findall(parcel))}
+    named = {name.decode(): getattr(main, name.decode(), None) for name in _IN_SCRIPT.findall(parcel)}
     named = {name: found for name, found in named.items() if isinstance(found, (type, FunctionType))}
     return pack((thing, named)) if named else parcel
 

@@ -94,13 +94,13 @@ def check_wire(
     if decisions < 1 or not 0 < timeout < inf:
         raise OptionValueError(f"decisions and timeout must be positive, not {decisions} and {timeout}")
     start = encode({"start": {"seed": seed, "options": dict(options or {})}})
-    return _Check(list(command), start, decisions, timeout).run()
+    return _Check(command, start, decisions, timeout).run()
 
 
 class _Check:
     """A check of one simulator."""
 
-    def __init__(self, command: list[str], start: bytes, most: int, timeout: float) -> None:
+    def __init__(self, command: Sequence[str], start: bytes, most: int, timeout: float) -> None:
         self._command, self._start, self._most, self._timeout = command, start, most, timeout
         self._report = WireReport()
         self._first: list[dict[str, Any]] = []  # the frames of an episode by the rule, in a new process

@@ -148,12 +148,8 @@ class Child:
     def begin(self, start: bytes) -> dict[str, Any]:
         """Begin an episode with a line; return the first frame, as ``next_frame``."""
         stopped = self.state == "stopped"
-        self.state, self.number, self.time, self._frames = (
-            "running",
-            0,
-            None,
-            0,
-        )  # first, since the process may have exited
+        # First, because the process may have exited.
+        self.state, self.number, self.time, self._frames = "running", 0, None, 0
         if self._rest or self._reading in dict(self._output.poll(0)):
             frame = self.receive()
             self.refuse(frame, f"has sent {short_repr(frame)} before the start of an episode")

@@ -181,7 +181,7 @@ def test_a_branch_that_dies_says_so_and_leaves_the_environment_whole(function, m
     assert children() == before
 
 
-def test_an_error_that_cannot_be_pickled_is_told_of():
+def test_an_error_that_cannot_be_pickled_is_named():
     def fail(twin, number):
         error = Unpicklable(1, 2)
         error.held = (step for step in ())
@@ -240,7 +240,7 @@ def test_too_many_decisions_to_be_kept(make, monkeypatch):
 
 
 @METHODS
-def test_what_cannot_be_continued(method):
+def test_environments_without_a_pending_decision_cannot_be_branched(method):
     env, called = single_env(lambda: Walk(1), Walk.choose), []
 
     def calls(twin, number):
@@ -319,7 +319,7 @@ def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
         os.sched_setaffinity(0, cores)
 
 
-def test_what_was_decided_is_replayed_as_it_was_given():
+def test_actions_are_replayed_as_they_were_given():
     """Actions of the user and of a policy, who change them later; and nobody is asked again for what he has said."""
     amount = {
         "action_space": spaces.Box(-9, 9, (1,), np.float32),
@@ -389,7 +389,7 @@ def a_thread(model):
     ("held", "name"),
     [(a_socket, "a socket"), (a_child, "a child process"), (a_thread, "a thread")],
 )
-def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(held, name):
+def test_resources_that_forks_cannot_share_are_replayed_or_named(held, name):
     env = begun(single_env(type("Model", (Holding,), {"open": held}), filing.choose), 4)
     env.step(1)
     with pytest.raises(BranchError, match=f"{name}.*replay"):
@@ -399,7 +399,7 @@ def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(held, name):
     env.close()
 
 
-def test_what_the_user_has_opened_is_no_obstacle():
+def test_resources_of_the_user_do_not_keep_a_branch_from_forking():
     env, (one, other) = going_on(), socket.socketpair()
     with one, other, subprocess.Popen(["cat"], stdin=subprocess.PIPE):
         assert branch(env, lambda twin, number: os.getpid(), method="fork") != [os.getpid()]
@@ -453,7 +453,7 @@ def test_selectors_of_branches_take_no_events_from_the_environment():
 
 
 @pytest.mark.parametrize("flush", [False, True])
-def test_what_a_branch_prints_is_printed_once(flush):
+def test_output_of_a_branch_is_printed_once(flush):
     code = f"""if True:
         from simenv_marl import branch, single_env
         from tests.worlds.models import calling, decision
@@ -608,7 +608,7 @@ def test_decisions_of_reseed_are_the_rules(method):
 
 
 @METHODS
-def test_who_cannot_draw_anew_is_told_what_to_do(monkeypatch, method):
+def test_seeds_without_a_reseed_raise_an_error_with_the_remedy(monkeypatch, method):
     env = reseedable(simulation=Walk)
     monkeypatch.setattr(os, "fork", None)
     with pytest.raises(BranchError, match=r"Walk[\s\S]*reseed\(seed\)[\s\S]*global_rng=True"):

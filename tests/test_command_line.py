@@ -103,7 +103,7 @@ def test_points_by_name(capsys):
     ],
 )
 @pytest.mark.parametrize("command", ["check", "inspect"])
-def test_what_cannot_be_looked_at(command, target, told, capsys):
+def test_objects_that_are_no_simulation_are_refused(command, target, told, capsys):
     assert main([command, target]) == 2
     out, err = capsys.readouterr()
     assert out == ""

@@ -221,7 +221,7 @@ def told_by(env, *actions):
     ],
     ids=["dict", "start", "none", "mask", "mask from 5", "choices"],
 )
-def test_what_actions_decide_and_which_are_illegal(changes, refused, actions, told):
+def test_actions_decide_by_their_mapping_and_illegal_ones_are_refused(changes, refused, actions, told):
     decide = decision(**changes)
     env = single_env(calling(*[decide] * len(actions)), decide)
     env.reset()

@@ -158,7 +158,7 @@ def test_flatten_is_an_option_of_the_joint_view_alone(register, flatten):
     pettingzoo.make("parallel", ids[-1]).reset()
 
 
-def test_names_of_points_become_camel_case_and_are_told_apart(register):
+def test_names_of_points_become_camel_case_and_stay_distinct(register):
     """The id of the joint view is taken, names may differ in how they are written alone, and classes share names."""
     named = ["Robot.joint", "Robot.choose_2nd_route", "Robot.open_grip", "Robot.openGrip", "Legs.move", "Arms.move"]
     inside = [f"{function}.<locals>.{name}" for function in "fg" for name in ("Boat.choose", "choose", "<lambda>")]
@@ -189,7 +189,7 @@ def test_names_of_points_become_camel_case_and_are_told_apart(register):
         ({"simulation": Variant("hot summer", Voyage), "name": None}, OptionValueError),
     ],
 )
-def test_what_cannot_be_registered_leaves_the_registries_as_they_were(register, changes, error):
+def test_a_refused_registration_leaves_the_registries_unchanged(register, changes, error):
     registries = gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry
     before = [dict(registry) for registry in registries]
     with pytest.raises(error):

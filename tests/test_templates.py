@@ -35,7 +35,7 @@ def run(folder, *arguments):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_written_passes_its_own_tests(kind, tmp_path):
+def test_a_written_template_passes_its_own_tests(kind, tmp_path):
     done = run(tmp_path, "-m", "simenv_marl", "new", kind, "water_tank")
     assert (done.returncode, done.stderr) == (0, "")
     written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
@@ -71,7 +71,7 @@ def test_training_is_worth_something(kind, tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_templates_import_nothing_but_packages_that_the_user_is_told_of(kind):
+def test_templates_import_only_packages_that_the_command_names(kind):
     told = {"simenv_marl", "numpy", "gymnasium", *(package.replace("-", "_") for package in KINDS[kind].split())}
     tree = ast.parse((SOURCE / f"simenv_marl/testing/templates/{kind}.py").read_text())
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

@@ -218,7 +218,7 @@ def test_mixtures_demonstrate_and_say_who_decided():
     assert recorded.storage.metadata["algorithm_name"] == "<Mixture: 0.5 rule, 0.5 ones>"
 
 
-def test_what_the_rule_has_taken_must_be_known():
+def test_unknown_rule_actions_are_refused():
     points = beings(rule_action_mapping=lambda decided, being: None)
     with pytest.raises(DefinitionError, match="not known"):
         record_dataset(NAME, script(herd), {Being.act: lambda seen: RULE}, points=points, seeds=[1])

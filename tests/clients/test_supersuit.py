@@ -157,7 +157,7 @@ def test_one_policy_of_stable_baselines3_for_all_agents():
     assert after > parallel_return(tested, lambda agent, seen, info: 1) + 5
 
 
-def test_what_options_say_in_place_of_wrappers():
+def test_options_replace_wrappers():
     common, before, after = page.blocks("coming-from-supersuit.md")
     told = []
     for code in (before, after):

@@ -73,7 +73,7 @@ def of(what):
     return [seed for kind, seed in LOG if kind == what]
 
 
-def test_it_comes_before_the_next_reset_and_when_the_environment_is_closed():
+def test_close_is_called_before_the_next_reset_and_when_the_environment_is_closed():
     env = single_env(Shop, BOOKS)
     env.reset(seed=1)
     env.step(3)
@@ -172,7 +172,7 @@ def test_its_error_does_not_take_the_place_of_an_earlier_one():
         env.close()
 
 
-def test_its_error_is_a_warning_where_nobody_can_catch_it():
+def test_an_error_of_close_is_a_warning_in_a_finalizer():
     envs = [single_env(Broken, BOOKS)]
     envs[0].reset(seed=1)
     with pytest.warns(ResourceWarning, match="books cannot be closed"):

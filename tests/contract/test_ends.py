@@ -230,7 +230,7 @@ def left(kind):
 @pytest.mark.usefixtures("_collected")
 @VIEWS
 @pytest.mark.parametrize("how", ["returns", "raises", "mapping"])
-def test_what_an_episode_returns_or_raises_or_was_called_with_is_not_kept(view, how):
+def test_results_errors_and_arguments_of_an_episode_are_not_kept_alive(view, how):
     def fail(*arguments):
         if armed:
             raise RaisedError

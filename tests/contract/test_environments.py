@@ -49,7 +49,7 @@ def test_generate_env_returns_a_class_of_a_view(points, options, base):
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
-def test_what_environments_say_about_themselves(make):
+def test_environments_have_names_metadata_and_spaces_of_their_own(make):
     seeing, acting = spaces.Box(0, 1, (3,), np.float32), spaces.Discrete(4)
     pump = decision(observation_space=seeing, action_space=acting, agent="pump_0")
     env, other = (make(calling(pump), pump) for _ in range(2))
@@ -180,7 +180,7 @@ def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
 @pytest.mark.parametrize(
     ("policy", "answer"), [(lambda observation: 4, 4), (RULE, "rule"), (lambda observation: RULE, "rule")]
 )
-def test_what_policies_answer_is_no_agent(key, policy, answer):
+def test_points_that_policies_answer_are_no_agents(key, policy, answer):
     env = aec_env(BOTH, [PUMP, FAN], policies={key: policy})
     assert env.possible_agents == ["pump_0"]
     env.reset()

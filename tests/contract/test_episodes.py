@@ -247,7 +247,7 @@ def test_before_its_first_decision_an_agents_observation_is_zero_clipped_into_it
 # -- 5.4: rewards ---------------------------------------------------------------------------------
 
 
-def test_in_aec_each_action_is_rewarded_once_and_the_book_adds_up_to_what_last_tells():
+def test_in_aec_each_action_is_rewarded_once_and_rewards_add_up_to_those_of_last():
     balance, asked = {}, {"a_0": 0, "b_0": 0}
 
     def point(name):
@@ -338,7 +338,7 @@ def test_rewards_are_python_floats_at_every_decision_and_at_the_end(view):
         (10**400, "too large"),
     ],
 )
-def test_what_is_no_finite_number_is_an_error_at_every_decision_and_at_the_end(view, place, wrong, why):
+def test_rewards_that_are_not_finite_are_errors_at_every_decision_and_at_the_end(view, place, wrong, why):
     env = paying([1.0] * place + [wrong] + [1.0] * (3 - place), view)
     env.reset()
     for _ in range(place):

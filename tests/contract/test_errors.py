@@ -234,7 +234,7 @@ def test_one_note_names_agent_decision_and_seed_of_the_episode():
     assert re.search(r"decision 5\b", told)
 
 
-def test_drawn_seeds_are_told_too():
+def test_errors_name_drawn_seeds_too():
     decide = decision(lambda: 1 / 0)
     env = single_env(calling(decide), decide)
     env.reset()

@@ -317,7 +317,7 @@ def interrupt_at(number, function, *args):
 
 
 @VIEWS
-def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view):
+def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
     # In a process of its own: where greenlets were interrupted amid a switch, the collector may crash later.
     alone(interrupt_anywhere, view.__name__)
 

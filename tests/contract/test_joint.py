@@ -327,7 +327,7 @@ def test_gymnasiums_check_passes(make):
 
 
 @pytest.mark.parametrize("flatten", [False, True])
-def test_what_is_returned_is_the_users_own(flatten):
+def test_returned_observations_and_infos_belong_to_the_user(flatten):
     kept = np.array([1.0, 2.0])
     ant, bee = points(observation_space_mapping=lambda: kept)
     env = joint_env(calling(ant, bee, bee, bee), [ant, bee], flatten=flatten)

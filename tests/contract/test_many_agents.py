@@ -414,7 +414,7 @@ def test_removals_that_cannot_be_are_refused(removed_by, error, match):
     assert Being(0).act() == "rule"
 
 
-def test_everybody_else_removes_as_ever():
+def test_removing_functions_work_as_before_outside_of_environments():
     leave, act = vars(Being)["leave"], vars(Being)["act"]
     env = aec_env(life("0 acts, 1 acts"), beings())
     env.reset()
@@ -464,7 +464,7 @@ def test_an_error_at_an_end_says_whose_it_was(program, error, whose):
 
 @pytest.mark.parametrize("simulation", [Hunt, AnnouncedHunt])
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
-def test_choices_keep_nobody_alive(make, simulation):
+def test_choices_keep_no_entity_alive(make, simulation):
     """What somebody may choose from is not held until it does."""
     plain = simulation()
     plain.reset()

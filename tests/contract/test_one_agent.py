@@ -167,7 +167,7 @@ def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
     assert env.simulation.log == [(5, 1), (5, 1)]
 
 
-def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
+def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> None:
     named = {
         f"{PLACE}.move": definition(),
         f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
@@ -240,7 +240,7 @@ def test_forced_moves_are_not_asked_for_and_their_rewards_and_times_add_up() -> 
     assert [env.step(0)[-1]["elapsed"] for _ in range(2)] == [40.0, 60.0]
 
 
-def test_nobody_is_asked_for_a_forced_move_not_even_a_policy() -> None:
+def test_forced_moves_ask_neither_the_user_nor_a_policy() -> None:
     asked = []
 
     def policy(observation, info):
@@ -297,7 +297,7 @@ def test_there_are_forced_moves_without_choices(changes, asked, moves) -> None:
     assert moves_of(env, "player_red") == moves
 
 
-def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
+def test_an_episode_of_forced_moves_alone_ends_at_the_first_step() -> None:
     env = single_env(Forced, MOVE, agent="player_red", skip_forced=True)
     for _ in range(2):
         observation, _ = env.reset(seed=0)
@@ -386,7 +386,7 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(make, space, ac
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
 )
-def test_what_is_no_action_is_refused_all_the_same(space, wrong) -> None:
+def test_invalid_actions_are_refused_before_a_forced_move_too(space, wrong) -> None:
     with pytest.raises(InvalidActionError):
         flown(single_env, space, wrong)
 

@@ -88,7 +88,7 @@ def test_an_episode_is_what_was_computed_without_the_library(design, seed, given
 
 @given(designs(), st.integers(1, 60), seeds, answers)
 @settings(max_examples=150)
-def test_an_error_anywhere_surfaces_and_the_next_episode_is_as_ever(design, fuse, seed, given_answers):
+def test_an_error_anywhere_surfaces_and_the_next_episode_is_complete(design, fuse, seed, given_answers):
     env = made(design)
     fresh = list(turns_of(env, seed, given_answers))
     world = env.unwrapped.simulation

@@ -53,7 +53,7 @@ def acted(results):
 # -- the rule of rounds ---------------------------------------------------------------------------
 
 
-def test_nobody_sees_the_others_moves_of_the_round():
+def test_observations_do_not_show_the_moves_of_the_same_round():
     class Announced(Script):
         def expected_calls(self, point):
             return [()]

@@ -80,7 +80,7 @@ def test_errors_tell_the_seed(source, policies, error, match):
     ],
     ids=["option", "policy of nobody", "no policy", "no simulation", "seed"],
 )
-def test_arguments_that_cannot_be(arguments, error, match):
+def test_invalid_arguments_are_refused(arguments, error, match):
     with pytest.raises(error, match=match):
         simulate(**{"simulation": calling(ANT), "points": ANT} | arguments)
 
@@ -124,7 +124,7 @@ def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent,
 
 
 @pytest.mark.parametrize("action", [1, RULE])
-def test_policies_keep_nobody_alive(action):
+def test_policies_keep_no_entity_alive(action):
     def main(simulation):
         for number in range(3):
             being = Being(number)

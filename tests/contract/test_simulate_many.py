@@ -126,7 +126,7 @@ def test_policies_see_stacks_of_all_kinds_of_spaces(space, value):
     assert [simulation.log for simulation in found] == [[1]] * 4
 
 
-def test_what_policies_are_given_is_theirs_with_infos_if_they_take_them():
+def test_policies_own_their_observations_and_get_infos_if_they_take_them():
     mask = [0, 1] + [0] * 8
     ant = decision(agent="ant_0", action_mask_mapping=lambda: mask, **PAIRS)
 
@@ -322,7 +322,7 @@ def test_an_error_in_a_reset_or_a_factory_says_of_which_seed():
         assert "seed 17" in notes(caught.value)
 
 
-def test_what_the_others_raise_when_they_are_unwound_is_noted():
+def test_errors_of_other_simulations_while_unwinding_are_noted():
     class Stubborn(Delicate):
         def run(self):
             try:
@@ -349,7 +349,7 @@ def test_what_the_others_raise_when_they_are_unwound_is_noted():
     ],
     ids=plainly,
 )
-def test_arguments_that_cannot_be(wrong):
+def test_invalid_arguments_are_refused(wrong):
     (name,) = wrong
     words = {"policies": "polic", "seeds": "seed", "speed": "there is no option"}.get(name, f"{name} must be")
     with pytest.raises((OptionValueError, UnknownPointError, UnknownOptionError), match=words):
@@ -388,7 +388,7 @@ def test_simulations_within_policies_and_rules():
 
 
 @pytest.mark.parametrize(("missing", "wanted"), [("tqdm.auto", {"progress": True}), ("joblib", {"workers": 2})])
-def test_what_is_missing_is_named(monkeypatch, missing, wanted):
+def test_missing_packages_are_named_with_their_extra(monkeypatch, missing, wanted):
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[many\]"):
         simulate_many(Going, seeds=[1, 2], **wanted)

@@ -116,7 +116,7 @@ class Lockable(Simulation):
 @pytest.mark.parametrize(
     "source", [3, "Simulation", None, NoReset(), NoReset, NoRun, NoRun(), lambda: None, Lockable()], ids=plainly
 )
-def test_what_is_no_simulation_is_refused(source):
+def test_objects_that_are_no_simulation_are_refused(source):
     with pytest.raises(SimulationError, match="simulation") as caught:
         single_env(source, Model.decide)
     assert isinstance(caught.value, TypeError)

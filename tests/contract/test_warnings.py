@@ -92,7 +92,7 @@ def test_all_runners_notice(heard_alone, run) -> None:
     assert len(heard_alone(DRAWS)) == 1
 
 
-def test_what_its_user_or_generators_of_its_own_draw_is_not_laid_at_its_door(heard) -> None:
+def test_draws_of_the_user_or_of_own_generators_cause_no_warning(heard) -> None:
     def draw():
         return random.random() + np.random.random()
 
@@ -111,7 +111,7 @@ def test_what_its_user_or_generators_of_its_own_draw_is_not_laid_at_its_door(hea
     assert heard(DRAWS) == []
 
 
-def test_what_other_threads_draw_is_not_laid_at_its_door(heard) -> None:
+def test_draws_of_other_threads_cause_no_warning(heard) -> None:
     over, draws_going_on = threading.Event(), threading.Event()
 
     def draw():
@@ -174,7 +174,7 @@ def through(env):
     ],
     ids=["policies", "a roster"],
 )
-def test_an_agent_that_never_comes_is_told_of_at_the_end_of_the_episode_and_once(heard, options, absent) -> None:
+def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode(heard, options, absent) -> None:
     through(aec_env(Hill, HILL, **options))
     (message,) = heard(ABSENT)
     missing, _, those_who_came = message.partition(";")
@@ -191,7 +191,7 @@ def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
     assert len(heard(ABSENT)) == 2
 
 
-def test_those_that_come_and_episodes_that_are_broken_off_are_not_told_of(heard) -> None:
+def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> None:
     class Dotted(Hill):
         names = ("nest.1", "ant_0")
 
@@ -204,7 +204,7 @@ def test_those_that_come_and_episodes_that_are_broken_off_are_not_told_of(heard)
 
 
 @pytest.mark.parametrize("slip", [f"{__name__}.Ant.setp", f"{__name__}.Nat.step"])
-def test_what_leads_into_a_module_and_not_to_a_function_is_refused(slip) -> None:
+def test_policies_for_names_without_a_function_are_refused(slip) -> None:
     with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
         aec_env(Hill, HILL, policies={slip: lambda observation: 0})
 
@@ -212,7 +212,7 @@ def test_what_leads_into_a_module_and_not_to_a_function_is_refused(slip) -> None
 # -- rounds that stand still ----------------------------------------------------------------------
 
 
-def test_rounds_without_an_action_for_the_pending_agent_are_told_of(heard) -> None:
+def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard) -> None:
     env = parallel_env(Hill, HILL, possible_agents=["ant_0", "ant_1"])
     env.reset(seed=1)
     for number in range(150):

@@ -153,7 +153,7 @@ def test_decisions_in_threads_of_the_model_are_refused_and_the_step_says_so(driv
 
 
 @DRIVERS
-def test_a_refusal_is_raised_once_or_told_of_by_another_error(driver):
+def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
     def passed_on():
         return by_pool(decide)
 
@@ -332,7 +332,7 @@ def test_a_process_that_is_forked_in_mid_episode_has_to_reset_with_threads():
 
 
 @needs_fork
-def test_what_a_forked_model_in_a_thread_does_not_catch_is_printed():
+def test_uncaught_errors_of_a_forked_model_in_a_thread_are_printed():
     said = run("""
         def main(simulation):
             decide()

@@ -229,7 +229,7 @@ async def waited(clerk):
 @pytest.mark.parametrize("way", [grouped, gathered, waited])
 @pytest.mark.parametrize("steps", [0, 1])
 @pytest.mark.parametrize("how", ["close", "reset", "collected"])
-def test_nothing_is_told_of_tasks_that_are_unwound(driver, way, steps, how, loud):
+def test_tasks_that_are_unwound_are_not_reported(driver, way, steps, how, loud):
     decide = decision()
     env = single_env(script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide, driver=driver)
     env.reset()
@@ -243,7 +243,7 @@ def test_nothing_is_told_of_tasks_that_are_unwound(driver, way, steps, how, loud
 
 
 @DRIVERS
-def test_errors_of_tasks_are_told_all_the_same_while_others_are_unwound(driver, loud):
+def test_errors_of_tasks_are_reported_while_others_are_unwound(driver, loud):
     async def fail():
         raise ValueError
 

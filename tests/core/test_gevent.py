@@ -97,7 +97,7 @@ def test_a_decision_of_the_users_while_the_model_waits_in_a_hub_runs_the_rule(wh
     ],
     ids=["spawned", "in turn", "raw"],
 )
-def test_what_a_model_spawns_on_the_hub_is_refused(how, first):
+def test_greenlets_that_a_model_spawns_on_the_users_hub_are_refused(how, first):
     run(
         f"""
         if {first!r} == "user":
@@ -121,7 +121,7 @@ def test_what_a_model_spawns_on_the_hub_is_refused(how, first):
     )
 
 
-def test_what_a_model_spawns_on_a_hub_of_its_own_decides():
+def test_greenlets_that_a_model_spawns_on_a_hub_of_its_own_decide():
     run(
         """
         def main(simulation):

@@ -61,7 +61,7 @@ def test_an_undecorated_function_is_one_point_however_it_is_named_set_or_handled
     assert locate(Base.plain) is point
 
 
-def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_base_class():
+def test_an_inherited_function_is_a_point_of_its_own_with_the_definition_of_the_base_class():
     inherited, definition = find_point(f"{HERE}.Sub.decorated")
     assert inherited is not point_of(Base.decorated)[0]
     assert definition is point_of(Base.decorated)[1]

@@ -178,7 +178,7 @@ class Recalcitrant(Unspeakable):
 
 
 @pytest.mark.parametrize("error", [Many("some", "thing", "more"), Recalcitrant()], ids=["unpicklable", "recalcitrant"])
-def test_what_cannot_cross_is_told_of_with_its_notes_and_causes(error):
+def test_errors_that_cannot_be_pickled_cross_as_text_with_notes_and_causes(error):
     noted(caused(error, raised(open, "/nowhere")), "a note").held = (part for part in ())
     again = unpack_error(pack_error(error))
     assert type(again) is WorkerError

@@ -78,7 +78,7 @@ def test_the_same_seed_gives_the_same_states_whatever_was_drawn_before(seed, bef
 
 
 @pytest.mark.parametrize("kind", [np.random.PCG64, np.random.MT19937, np.random.Philox])
-def test_what_is_spawned_is_another_one_too(kind):
+def test_spawned_generators_are_reseeded_too(kind):
     """Where NumPy can put that back into a generator at all."""
     generator = np.random.Generator(kind(1))
     spawned = generator.spawn(1)[0].random()

@@ -71,7 +71,7 @@ def test_observations_in_observations_are_cast():
     ],
     ids=str,
 )
-def test_what_is_no_observation_is_refused(space, value, match):
+def test_invalid_observations_are_refused(space, value, match):
     with pytest.raises(ObservationError, match=match):
         observation_cast(space)(value)
 
@@ -210,7 +210,7 @@ SMALL = spaces.Box(0, 10, (2,), np.uint8)
     ],
     ids=lambda given: type(given).__name__,
 )
-def test_what_is_no_action_is_illegal(space, actions):
+def test_actions_outside_the_space_are_illegal(space, actions):
     check = action_check(space)
     assert [action for action in actions if check(action) is not ILLEGAL] == []
 
@@ -331,7 +331,7 @@ def test_masks_are_new_arrays(given):
     ],
     ids=repr,
 )
-def test_what_is_no_mask_is_refused(given, match):
+def test_invalid_masks_are_refused(given, match):
     with pytest.raises(MaskError, match=match):
         mask_cast(DIAL)(given)
     with pytest.raises(MaskError, match=match):
@@ -350,7 +350,7 @@ def test_masks_of_several_numbers_are_tuples(given):
 PAIRS = [(one, other) for one in (0, 1) for other in (4, 5, 6)]
 
 
-def test_a_mask_tells_what_is_allowed_and_an_open_one_allows_everything():
+def test_a_mask_allows_its_actions_and_an_open_one_allows_all():
     mask = np.array([0, 1, 0], np.int8)
     assert [mask_allows(DIAL, mask, action) for action in (5, 6, 7)] == [False, True, False]
     masks = (np.array([1, 0], np.int8), np.array([0, 0, 1], np.int8))

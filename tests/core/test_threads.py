@@ -12,7 +12,7 @@ import pytest
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core import threads
 from simenv_marl.errors import ReentrancyError
-from tests.worlds.models import calling, decision, notes, play, script, step
+from tests.worlds.models import Script, calling, decision, notes, play, script, step
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
 
@@ -127,6 +127,25 @@ def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what):
     step(env, 3, "choose_0")
     assert env.simulation.log == [1, 3]
     assert env.simulation.episodes == 1
+
+
+@VIEWS
+def test_no_other_thread_moves_an_environment_before_the_results_of_a_move_are_read(view):
+    class Drawn(Script):
+        render_modes = ("human",)
+
+        def render(self, mode):
+            with pytest.raises(ReentrancyError, match="another thread"):
+                in_a_thread(step, env, 2, "choose_0")
+            self.pictures = getattr(self, "pictures", 0) + 1
+
+    decide = decision()
+    main = calling(*[decide] * 3)().main
+    env = view(lambda: Drawn(main), decide, driver="thread", render_mode="human")
+    env.reset()
+    step(env, 1, "choose_0")
+    assert (env.simulation.log, env.simulation.pictures) == ([1], 2)
+    env.close()
 
 
 # -- what is left behind --------------------------------------------------------------------------

@@ -52,7 +52,7 @@ LARGE = Variant("large", Farm, parameters={"fields": 3, "price": 2}, points=POIN
 DEAR = replace(LARGE, name="dear", plugins=[(dearer, HARVEST, "after")], policies={HARVEST: RULE})
 
 
-def test_a_variant_serves_wherever_a_simulation_is_asked_for():
+def test_a_variant_is_accepted_like_a_simulation():
     assert simulate(LARGE).log == [("wheat", 2)] * 3
     assert simulate(DEAR).log == [("wheat", 20)] * 3
     assert simulate(DEAR, {"sower_0": five}).log == [(5, 20)] * 3
@@ -69,7 +69,7 @@ def test_a_variant_serves_wherever_a_simulation_is_asked_for():
     assert Farm().sow(0) == "wheat"  # and the model is what it was
 
 
-def test_what_is_given_beside_it_comes_on_top():
+def test_arguments_override_those_of_the_variant():
     assert simulate(DEAR, {HARVEST: five}).log == [("wheat", 50)] * 3
     assert simulate(DEAR, plugins=[(dearer, HARVEST, "after")]).log == [("wheat", 200)] * 3
     limited = replace(DEAR, options={"max_steps": 1})
@@ -123,7 +123,7 @@ def test_variants_are_frozen_and_can_be_pickled():
         ({"plugins": [(dearer, HARVEST, "between")]}, HandlerError, "between"),
     ],
 )
-def test_variants_that_cannot_be(changes, error, message):
+def test_invalid_variants_are_refused(changes, error, message):
     with pytest.raises(error, match=message):
         aec_env(replace(LARGE, **changes))
 
@@ -160,7 +160,7 @@ def test_versions_are_those_of_the_packages_that_the_model_comes_from():
     assert said["variant"] is None
 
 
-def test_what_json_does_not_know_is_named():
+def test_values_that_are_no_json_are_named():
     ant = decision(agent="ant_0")
     parameters = {
         "a": np.arange(2), "b": {1.5}, "c": Farm, "d": {1: {Farm: 2, (3, None): 4}},

@@ -257,7 +257,7 @@ def test_extras_that_do_not_fit(second, match):
         collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2))
 
 
-def test_episodes_in_which_nobody_decides():
+def test_episodes_without_decisions_are_collected():
     ant, bee = decision(agent="ant_0", action_space=spaces.Box(0, 1, (2,))), decision(agent="bee_0")
     source = script(lambda simulation: bee() if simulation.seed % 2 else None)
     found = collect_episodes(source, {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))
@@ -269,7 +269,7 @@ def test_episodes_in_which_nobody_decides():
     assert len(collect_episodes(source, {ant: ones}, seeds=[])[ant]) == 0
 
 
-def test_what_is_collected_of_each_simulation():
+def test_collect_is_called_with_each_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def found(**options):
@@ -293,7 +293,7 @@ def test_one_name_at_points_whose_spaces_differ():
         collect_episodes(source, {"being_0": ones}, points=points, seeds=range(2))
 
 
-def test_whom_no_policy_of_the_call_decides_for_is_no_agent():
+def test_points_without_a_policy_of_the_call_are_no_agents():
     asked = []
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0)
     variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: lambda observation: 5})
@@ -307,7 +307,7 @@ def test_whom_no_policy_of_the_call_decides_for_is_no_agent():
 
 
 @pytest.mark.parametrize("policies", [[1], {"nobody": ones}])
-def test_policies_that_cannot_be(policies):
+def test_invalid_policies_are_refused(policies):
     ant = decision(agent="ant_0")
     assert collect_episodes(calling(ant), {}, points=ant, seeds=[1]) == {}
     with pytest.raises((OptionValueError, UnknownPointError), match=r"policies|nobody"):

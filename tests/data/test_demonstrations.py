@@ -102,7 +102,7 @@ def test_mixtures_work_with_composite_spaces():
     ],
     ids=plainly,
 )
-def test_mixtures_that_cannot_be(parts):
+def test_invalid_mixtures_are_refused(parts):
     with pytest.raises(OptionValueError, match=r"mixture|weight"):
         Mixture(parts)
 
@@ -139,7 +139,7 @@ def test_each_policy_needs_a_data_set_of_its_own(dataset_id, match):
         record_dataset(dataset_id, calling(ant, bee), {"ant_0": ones, "bee_0": ones}, points=[ant, bee], seeds=[1])
 
 
-def test_what_the_rule_decides_must_be_known_before_anything_runs(monkeypatch):
+def test_unknown_rule_actions_are_refused_before_anything_runs(monkeypatch):
     monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
 
     class Ran(Exception):
@@ -193,7 +193,7 @@ def test_policies_are_asked_while_the_rule_decides(size):
         assert np.array_equal(getattr(found.trajectories, name), getattr(alone, name)), name
 
 
-def test_who_would_leave_it_to_the_rule_agrees_with_it():
+def test_a_policy_that_leaves_the_decision_to_the_rule_agrees_with_it():
     policy = Mixture({RULE: 1, (lambda seen: [7] * len(seen)): 1})
     found = compare_with_rule(script(crowd), {Being.act: policy}, points=TOLD, seeds=range(4))[Being.act]
     assert set(np.unique(found.policy_actions)) == {0, 1, 2, 7}
@@ -225,7 +225,7 @@ def test_actions_of_all_kinds_are_compared():
     assert found.policy_actions[1].tolist() == ["hello", "hello", "hell", "hello", "hello"]
 
 
-def test_comparisons_of_several_policies_and_of_nobody():
+def test_comparisons_of_several_policies_and_without_decisions():
     ant, bee = (decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0"))
     cat, logs = decision(agent="cat_0"), []
     source = script(lambda simulation: logs.append([ant(), cat(), ant()]))
@@ -252,7 +252,7 @@ def test_decisions_that_correspond_to_no_action():
     [{"policies": ones}, {"policies": {"ant_0": RULE}}, {"tolerance": -1}, {"others": 3}, {"tolerance": "1"}],
     ids=plainly,
 )
-def test_comparisons_that_cannot_be(wrong):
+def test_invalid_comparisons_are_refused(wrong):
     ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 1)
     given = {"policies": {ant: ones}, "seeds": [1], **wrong}
     with pytest.raises(OptionValueError, match=next(iter(wrong))):

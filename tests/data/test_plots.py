@@ -109,7 +109,7 @@ def test_the_clock_is_what_runs_from_left_to_right():
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_what_the_rule_has_decided_is_told_apart(known):
+def test_decisions_of_the_rule_look_different(known):
     names = {**dict(enumerate("abcdefghi")), 9: "rule"} if known else int
     ant = decision(agent="ant_0", action_space_mapping=names)
     found = asked(ant, ant, ant, answers=[[1], RULE, [3]])
@@ -148,7 +148,7 @@ def test_actions_of_several_parts_have_a_chart_for_each_part():
     assert {"how[0]", "how[1]"} <= set(texts(by_name["how"]))
 
 
-def test_where_nobody_lives_is_shaded():
+def test_times_without_a_living_agent_are_shaded():
     first, _, second, _, third, _ = plot_timeline(herd(3, 2, dying=[1])).axes
     # being_1, which has made the second of five decisions, goes after the third.
     assert [patch.get_x() for patch in second.patches] == [0, 3]
@@ -203,7 +203,7 @@ def test_rows_of_actions_with_components_are_coloured_by_one():
         plot_timeline(found, component="where")
 
 
-def test_what_only_the_rule_knows_is_grey():
+def test_unknown_actions_of_the_rule_are_grey():
     answers = iter([RULE])
     found = herd(8, 1, policy=lambda seen: next(answers, [2] * len(seen)), seeds=(5, 6))
     assert found[Being.act].by_rule.any()
@@ -248,7 +248,7 @@ def test_episodes_are_counted_from_either_end():
             plot_timeline(found, episode)
 
 
-def test_episodes_in_which_nobody_decides():
+def test_episodes_without_decisions_are_plotted():
     ant = decision(agent="ant_0", reward_mapping=lambda: 3.0)
     main = lambda simulation: ant() if simulation.seed else None  # noqa: E731
     found = collect_episodes(script(main), {ant: ones}, seeds=[0, 1, 2])
@@ -263,7 +263,7 @@ def test_episodes_in_which_nobody_decides():
 
 @pytest.mark.parametrize("wrong", [None, {}, {"ant": 1}])
 @pytest.mark.parametrize("draw", [plot_timeline, plot_returns])
-def test_what_cannot_be_drawn(draw, wrong):
+def test_invalid_arguments_are_refused(draw, wrong):
     with pytest.raises(OptionValueError, match="draw"):
         draw(wrong)
 

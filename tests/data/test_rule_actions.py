@@ -47,7 +47,7 @@ def begun(source: Any, function: Any, **options: Any) -> Any:
     ids=["callable", "dict", "none"],
 )
 @DRIVERS
-def test_the_next_info_tells_the_rules_action_and_only_that_of_the_latest_decision(mapping, told, driver):
+def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping, told, driver):
     function = decision(counting(), rule_action_mapping=mapping)
     env = begun(four(function), function, driver=driver)
     expected = [{} if action is None else {"rule_action": action} for action in told]
@@ -93,7 +93,7 @@ def test_decisions_within_rules_do_not_take_each_others_place():
     assert "of 'wrong_0'" in notes(caught.value)
 
 
-def test_entities_are_told_each_their_own():
+def test_each_entity_gets_its_own_rule_action():
     points, names = beings(rule_action_mapping=lambda decided, being: being.number), ["being_0", "being_1", "being_2"]
     env = parallel_env(life("0 acts, 1 acts, 2 acts, 0 acts"), points, possible_agents=names)
     env.reset(seed=0)
@@ -101,7 +101,7 @@ def test_entities_are_told_each_their_own():
     assert [infos[agent].get("rule_action") for agent in names] == [0, None, 2]
 
 
-def test_arrays_are_cast_and_nobody_elses():
+def test_arrays_of_rule_actions_are_cast_and_copied():
     decided = np.array([0.25, 0.5])
     space = spaces.Box(0, 1, (2,), np.float32)
     function = decision(lambda: decided, action_space=space, rule_action_mapping=lambda value: value)

@@ -44,7 +44,7 @@ def test_the_wheel_contains_the_package_and_nothing_else(tracked, wheel):
     assert wheel[f"{described}licenses/LICENSE"] == (ROOT / "LICENSE").read_bytes()
 
 
-def test_what_is_tested_is_what_was_installed(wheel):
+def test_the_tests_use_the_installed_package(wheel):
     package = Path(simenv_marl.__file__).parent
     assert package.parent.name == "site-packages"
     for name, content in wheel.items():

@@ -177,7 +177,7 @@ def test_masks_are_open_and_clocks_go_on():
     assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_an_error_surfaces_and_the_next_episode_is_as_ever():
+def test_an_error_surfaces_and_the_next_episode_is_complete():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
     env = pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES))
     env.reset(seed=0)

@@ -173,7 +173,7 @@ def counts(envs: Any) -> list[int]:
 
 
 @PROCESSES
-def test_one_illegal_action_moves_nobody(processes):
+def test_one_illegal_action_moves_no_sub_environment(processes):
     envs = begun(vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK))
     for actions, number in (
         ([1, 1, 9], 2),
@@ -197,7 +197,7 @@ def test_one_illegal_action_moves_nobody(processes):
     assert counts(envs) == [1, 1, 1]
 
 
-def test_one_illegal_action_in_a_joint_view_moves_nobody():
+def test_one_illegal_action_in_a_joint_view_moves_no_sub_environment():
     envs = begun(vector_env(Voyage, num_envs=2))
     legal = {"helm_0": np.ones((2, 1)), "sail_0": np.ones((2, 1))}
     for illegal in (
@@ -239,7 +239,7 @@ def test_boxes_take_actions_in_other_dtypes():
 @PROCESSES
 @pytest.mark.parametrize("copy", [True, False])
 @pytest.mark.parametrize("kind", ["plain", "nested"])
-def test_observations_are_copies_unless_told_otherwise(kind, copy, processes):
+def test_observations_are_copies_unless_copy_is_false(kind, copy, processes):
     model, decision = VARIETY[kind]
     envs = vector_env(model, {POINT: decision}, num_envs=2, copy=copy, workers=processes, context=FORK)
     told = [envs.reset(seed=0)]
@@ -256,7 +256,7 @@ def test_observations_are_copies_unless_told_otherwise(kind, copy, processes):
 
 @pytest.mark.parametrize("where", ["run", "observation_space_mapping", "reward_mapping", "action_space_mapping"])
 @pytest.mark.parametrize("culprit", [0, 2])
-def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset(where, culprit):
+def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, culprit):
     def fail(thing: Any) -> Any:
         if thing == 3 or (isinstance(thing, Counter) and thing.seed == culprit and thing.count):
             raise FuseError
@@ -335,7 +335,7 @@ def test_another_thread_may_use_it_with_the_thread_driver_alone(driver, error):
 
 
 @PROCESSES
-def test_sub_environments_can_be_asked_and_told(processes):
+def test_call_get_attr_and_set_attr_reach_the_sub_environments(processes):
     points = {POINT: VARIETY["goal"][1]}
     envs = begun(vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK), 3)
     envs.step([1, 2, 3])
@@ -364,7 +364,7 @@ def test_sub_environments_can_be_asked_and_told(processes):
     assert envs.unwrapped is envs
 
 
-def test_it_cannot_be_copied_or_pickled():
+def test_vector_environments_cannot_be_copied_or_pickled():
     envs = vector_env(Counter, Counter.decide, num_envs=2)
     for use in (copy.copy, copy.deepcopy, pickle.dumps):
         with pytest.raises(CopyError, match="cannot be copied or pickled"):

@@ -114,7 +114,7 @@ def goes_on(envs: Any, seed: int = 0) -> None:
         *[(kind, mode, FORK) for kind in VARIETY for mode in MODES],
     ],
 )
-def test_workers_tell_what_one_process_tells(kind, mode, context):
+def test_workers_return_the_same_as_one_process(kind, mode, context):
     model, decision = VARIETY[kind]
     with_workers = workers(model, decision, num_envs=5, autoreset_mode=mode, context=context)
     without = vector_env(model, {POINT: decision}, num_envs=5, autoreset_mode=mode)
@@ -166,7 +166,7 @@ def test_models_and_mappings_that_no_module_holds_are_sent_along():
     assert rewards.tolist() == [5.0, 7.0, 9.0]
 
 
-def test_what_cannot_be_sent_is_refused():
+def test_objects_that_cannot_be_pickled_are_refused():
     lock = threading.Lock()
     with pytest.raises(OptionValueError, match="cannot be sent to another process"):
         vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
@@ -384,7 +384,7 @@ def start_in_vain(error: str) -> None:
     assert descriptors() == before
 
 
-def test_a_script_without_its_guard_is_told_what_it_lacks(tmp_path):
+def test_a_script_without_a_main_guard_raises_an_error_that_names_it(tmp_path):
     text = SCRIPT.format(context="spawn", end="").replace('if __name__ == "__main__":', "if True:")
     last = run_script(tmp_path / "script.py", text).stderr.strip().splitlines()[-1]
     assert last.startswith("simenv_marl.errors.WorkerError: ")

@@ -70,7 +70,7 @@ def test_a_day_in_the_papers_order():
     assert greenhouse.day == 1
 
 
-def test_the_model_tells_its_days_as_in_the_paper():
+def test_the_model_prints_its_days_as_in_the_paper():
     command = [sys.executable, "-W", "error", "examples/greenhouse_coop/model.py", "--seed", "1"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
     lines = done.stdout.splitlines()
@@ -91,7 +91,7 @@ def test_ruled_throughout_a_pickled_environment_is_the_plain_model(make):
     environment.close()
 
 
-def test_it_ends_when_all_are_dead_and_is_truncated_after_a_hundred_days(pair):
+def test_an_episode_terminates_when_all_plants_are_dead_and_is_truncated_after_a_hundred_days(pair):
     dead = play(pair, seed=1)
     assert [turn[3:5] for turn in dead[-2:]] == [(True, False)] * 2
     assert pair.simulation.greenhouse.alive == 0

@@ -171,12 +171,12 @@ THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (
         ("more than 10,000,000", ({f"x{i}": list(range(100)) for i in range(4)},)),
     ],
 )
-def test_what_cannot_be_is_refused(match, arguments):
+def test_invalid_designs_are_refused(match, arguments):
     with pytest.raises(OptionValueError, match=match):
         design(*arguments)
 
 
-def test_pydoe_is_found_under_either_name_or_its_extra_is_told(monkeypatch):
+def test_pydoe_is_found_under_either_name_or_its_extra_is_named(monkeypatch):
     expected = design({"x": (0.0, 1.0)}, "halton", 4)
     monkeypatch.setitem(sys.modules, "pyDOE", pydoe)  # its name in releases for older NumPy
     monkeypatch.setitem(sys.modules, "pydoe", None)

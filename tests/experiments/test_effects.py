@@ -82,7 +82,7 @@ def test_sobol_indices_are_those_of_the_model(tmp_path):
         assert found[column].tolist() == pytest.approx([0.2, 0.8], abs=0.03)
 
 
-def test_what_cannot_be_is_refused(tmp_path):
+def test_invalid_arguments_are_refused(tmp_path):
     factors = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
     frame = results(design(factors, "sobol", 6), tmp_path)
     odd = {"text": lambda s: "x", "some": lambda s: s.y if s.a > 0.5 else None}

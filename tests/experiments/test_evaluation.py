@@ -241,7 +241,7 @@ def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_
         Evaluation(returns, None, 0.95).seeds_needed(1)
 
 
-def test_it_stops_as_soon_as_intervals_are_narrow_enough():
+def test_evaluation_stops_as_soon_as_intervals_are_narrow_enough():
     def seeds_run(contenders, number, **given):
         return len(evaluate(Shop, contenders, seeds=range(number), points=POINTS, **given).values())
 
@@ -279,14 +279,14 @@ def test_the_team_is_what_its_user_makes_of_the_returns():
     ],
     ids=["team", "policy"],
 )
-def test_what_fails_does_so_at_once_and_says_of_which_seed(match, contender, keeper, given, arguments):
+def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, given, arguments):
     with pytest.raises(KeyError, match=match) as caught:
         evaluate(Shop, {"rule": {}, "bad": {"keeper": keeper}}, seeds=SEEDS, points=POINTS, **given, **arguments)
     assert "seed 0" in notes(caught.value)
     assert f"of the contender '{contender}'" in notes(caught.value)
 
 
-def test_what_is_no_number_has_no_mean():
+def test_metrics_that_are_no_numbers_have_no_mean():
     metrics = {"day": lambda shop: "monday", "huge": lambda shop: 10**400, "some": lambda shop: shop.seed or None}
     found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=metrics, baseline="rule")
     assert set(found.values("day")["rule"]) == {"monday"}
@@ -349,7 +349,7 @@ def test_pictures_show_each_seed_and_can_be_read():
         ("of 'keeper' in 'mixed', <Mixture.*batched=True", {"contenders": MIXED}),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_before_anything_runs(match, arguments):
+def test_invalid_arguments_are_refused_before_anything_runs(match, arguments):
     made = []
     given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
     with pytest.raises((OptionValueError, UnknownPointError), match=match):
@@ -377,7 +377,7 @@ def test_metrics_are_numbers_strings_or_none():
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda s: [1]})
 
 
-def test_what_no_worker_can_be_given_is_found_out_before_anything_runs(tmp_path):
+def test_objects_that_no_worker_can_unpickle_are_refused_before_anything_runs(tmp_path):
     class Writing(Shop):
         def reset(self, seed):
             (tmp_path / str(seed)).touch()
@@ -394,7 +394,7 @@ def test_progress_is_shown(capsys):
     assert "24/24" in capsys.readouterr().err
 
 
-def test_a_missing_package_is_told_with_its_extra(monkeypatch):
+def test_a_missing_package_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[experiments\]"):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS)

@@ -149,7 +149,7 @@ def test_each_run_is_a_line_with_its_provenance(tmp_path):
     assert "numpy" in provenance["dependencies"]
 
 
-def test_what_is_known_is_not_run_again(tmp_path):
+def test_stored_runs_are_not_run_again(tmp_path):
     calls = []
 
     def make(days):
@@ -222,7 +222,7 @@ def test_a_run_whose_line_is_torn_is_run_again(cut, tmp_path):
 
 
 @pytest.mark.parametrize("text", [b"[" * 100_000, b"\xff\xfe[", b"{"])
-def test_a_damaged_head_of_a_store_is_told(text, tmp_path):
+def test_a_damaged_head_of_a_store_is_an_error(text, tmp_path):
     (tmp_path / "experiment.json").write_bytes(text)
     with pytest.raises(StoreError, match=r"experiment\.json cannot be read"):
         run(tmp_path)
@@ -283,7 +283,7 @@ def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
         ("'a', .* batched=True", {"contenders": {"a": {"keeper": Mixture({much_of_many: 1})}}}),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, tmp_path):
+def test_invalid_arguments_are_refused_before_anything_is_stored(match, arguments, tmp_path):
     with pytest.raises((OptionValueError, UnknownPointError, TypeError), match=match):
         run(tmp_path / "store", **arguments)
     assert not (tmp_path / "store").exists()
@@ -339,7 +339,7 @@ def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch)
         (r"points .*helper.* then", {"points": {Shop.order: POINTS[Shop.order]}}),
     ],
 )
-def test_what_was_made_otherwise_is_warned_of(told, arguments, tmp_path):
+def test_stored_runs_of_other_definitions_are_warned_of(told, arguments, tmp_path):
     contenders = {"contenders": {"much": {"keeper": much}}}
     first = run(tmp_path, **contenders)
     more = pd.concat([DESIGN[:1].assign(days=7), DESIGN])  # of whose first row nothing is stored
@@ -360,7 +360,7 @@ def test_a_row_that_is_known_to_fail_does_not_keep_others_from_being_run(tmp_pat
     assert frame.groupby("days")["status"].first().to_dict() == {2: "error", 3: "ok"}
 
 
-def test_what_was_made_alike_is_not_warned_of(tmp_path):
+def test_stored_runs_of_equal_definitions_cause_no_warning(tmp_path):
     class Policy:
         def __call__(self, observation):
             return 1
@@ -379,7 +379,7 @@ def test_another_version_of_a_package_is_warned_of(tmp_path):
         assert run(tmp_path).equals(first)
 
 
-def test_a_full_disk_is_told_and_what_is_stored_stays(tmp_path, monkeypatch):
+def test_a_full_disk_is_an_error_and_stored_runs_stay(tmp_path, monkeypatch):
     real, written = os.write, []
 
     def write(file, data):
@@ -399,7 +399,7 @@ def test_a_full_disk_is_told_and_what_is_stored_stays(tmp_path, monkeypatch):
         assert run(tmp_path / str(batched), contenders=None).equals(run(tmp_path / "whole", contenders=None))
 
 
-def test_a_store_that_cannot_be_written_is_told(tmp_path):
+def test_a_store_that_cannot_be_written_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     for store in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(StoreError, match="cannot be made or read as the folder of an experiment"):
@@ -587,7 +587,7 @@ def test_workers_that_cannot_be_are_refused_before_anything_runs(lacks, tmp_path
 HUGE = 10**5000
 
 
-def test_integers_that_no_line_can_hold_are_told(tmp_path):
+def test_integers_of_too_many_digits_are_errors_of_their_run(tmp_path):
     given = {"seeds": [1], "points": POINTS, "metric": lambda shop: HUGE}
     with pytest.raises(OptionValueError, match="'metric' must be a number of no more than 4,200 digits"):
         evaluate(Shop, {"rule": {}}, **given)
@@ -695,7 +695,7 @@ NAMED = """
 
 
 @pytest.mark.parametrize("workers", ["0", "2"])
-def test_what_a_script_names_is_found_in_its_workers_and_models_need_not_decide(workers, tmp_path):
+def test_workers_find_classes_of_a_script_and_models_need_not_decide(workers, tmp_path):
     path = tmp_path / "script.py"
     path.write_text(textwrap.dedent(NAMED), encoding="utf-8")
     command = [sys.executable, path, tmp_path, workers]

@@ -124,7 +124,7 @@ def test_a_function_is_found_by_what_its_module_calls_it(make_module):
 
 
 @pytest.mark.parametrize(("error", "raised"), [(TypeError, PatchError), (ZeroDivisionError, ZeroDivisionError)])
-def test_what_fails_half_way_is_put_back(error, raised, make_module):
+def test_a_patch_that_fails_half_way_is_undone(error, raised, make_module):
     class Refusing(types.ModuleType):
         def __setattr__(self, name, value):
             if name == "alias" and hook_of(value) is not None:
@@ -262,7 +262,7 @@ def test_threads_come_and_go_at_once(path, monkeypatch, make_module):
 
 @pytest.mark.parametrize("name", ["Base.method", "Base.static", "Base.of_class", "Sub.method", "function"])
 @pytest.mark.parametrize("end", ["close", "drop"])
-def test_what_something_else_has_set_is_left_alone_and_the_point_usable_afterwards(name, end):
+def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(name, end):
     owner, attribute = resolve(f"{HERE}.{name}", UnknownTargetError)
     before = vars(owner).get(attribute)
 

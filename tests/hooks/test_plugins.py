@@ -234,7 +234,7 @@ def test_a_call_runs_the_handlers_that_were_attached_when_it_began():
 # -- what is exposed ------------------------------------------------------------------------------
 
 
-def test_what_is_exposed_in_classes_is_so_in_either_order_and_for_that_class_alone():
+def test_exposed_methods_are_exposed_in_either_order_and_for_that_class_alone():
     held, log = vars(Trader), []
 
     class Model(Trader):
@@ -265,7 +265,7 @@ def test_exposing_again_gives_the_same():
     assert isinstance(expose_to_plugins(expose_to_plugins(Trader.opening)), classmethod)
 
 
-def test_what_has_no_dotted_name_can_be_exposed():
+def test_functions_without_a_dotted_name_can_be_exposed():
     first, function, length = local(), local(), expose_to_plugins(len)
     with handlers(
         (lambda value, more=0: 9, f"{HERE}.local.<locals>.function", "instead"),
@@ -381,7 +381,7 @@ def two(a, b):
     ],
     ids=plainly,
 )
-def test_what_cannot_work_is_refused_when_it_is_attached(entry, error):
+def test_handlers_that_cannot_work_are_refused_when_they_are_attached(entry, error):
     good = (nothing, f"{HERE}.two", "before")
     with pytest.raises(error) as caught, handlers(good, entry):
         raise AssertionError
@@ -405,7 +405,7 @@ async def flow():
     ("thing", "why"),
     [(Pool, "expose one of its"), (int, "expose one of its"), (flow, "async generator"), (3, "neither")],
 )
-def test_what_cannot_be_extended_cannot_be_exposed(thing, why):
+def test_exposing_anything_but_functions_and_iterables_is_refused(thing, why):
     with pytest.raises(PatchError, match=why):
         expose_to_plugins(thing)
 
@@ -492,7 +492,7 @@ def test_handlers_of_a_generator_function_see_its_arguments_its_items_and_what_i
 
 @EVERYWHERE
 @pytest.mark.parametrize("positions", [(), ("before",), ("after_next",)])
-def test_what_is_sent_and_thrown_reaches_the_generator(positions, with_handlers):
+def test_sent_values_and_thrown_errors_reach_the_generator(positions, with_handlers):
     def call():
         generator = counting(4)
         seen = [next(generator), generator.send(5), generator.throw(KeyError()), generator.send(7)]
@@ -554,7 +554,7 @@ def test_a_generator_and_its_items_may_be_replaced(instead, position, items, val
     with_handlers(call, (instead, counting, position))
 
 
-def test_what_is_sent_before_a_generator_was_asked_is_not_sent_to_it():
+def test_a_value_sent_before_the_first_item_is_not_passed_on():
     with handlers((lambda number, step=1: "instead", counting, "instead_next")):
         generator = counting(3)
         assert next(generator) == "instead"
@@ -595,7 +595,7 @@ def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited(with_hand
 # -- seeing what happens --------------------------------------------------------------------------
 
 
-def test_what_is_exposed_and_attached_is_listed():
+def test_exposed_functions_and_attached_handlers_are_listed():
     gc.collect()  # other tests have exposed functions, too
     function, items, choose = local(), expose_to_plugins({1}), decision()
     name = f"{HERE}.local.<locals>.function"
@@ -687,7 +687,7 @@ def says(word):
     return (lambda self: word, WORD, "instead")
 
 
-def test_plugins_apply_wherever_the_environments_simulation_is_at_work():
+def test_plugins_apply_in_the_simulation_and_in_mappings_of_their_environment():
     env = single_env(House, House.water, plugins=[says("mine")], render_mode="ansi")
     simulation = env.unwrapped.simulation
     assert env.reset()[0].tolist() == [4, 0]
@@ -859,7 +859,7 @@ def test_handlers_lie_outside_the_decision(how, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_whoever_comes_and_goes_nobody_is_in_anothers_way(seed):
+def test_environments_that_open_and_close_in_any_order_do_not_disturb_each_other(seed):
     random, live, log = Random(seed), [], []
     calls = {name: (call, result) for name, call, result in FORMS.values()}
 

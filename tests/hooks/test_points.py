@@ -193,7 +193,7 @@ def test_a_plain_function_becomes_a_decision_point(name, call, rule, how):
 BASE, SUB = {BID: define()}, {f"{MARKET}.Broker.bid": define()}
 
 
-def test_what_is_inherited_is_decided_for_the_class_that_is_named_and_gets_the_class_that_was_called():
+def test_an_inherited_point_is_decided_for_the_named_class_and_gets_the_called_class():
     seen = []
     env = aec_env(
         calling(lambda: Broker.opening(), lambda: Junior.opening(), lambda: Dealer.opening()),

@@ -175,7 +175,7 @@ def test_errors_surface_as_themselves(raised, policy, error, match, told):
         assert "in main" in str(caught.value.__cause__)  # where it was raised there
 
 
-def test_what_nobody_wants_any_more_is_cancelled(monkeypatch):
+def test_an_interrupt_cancels_the_remaining_work(monkeypatch):
     """An interrupt while results arrive: the rest is given up, and nothing is in the way of the next call."""
 
     def interrupted(parcel):
@@ -266,7 +266,7 @@ def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkey
 
 
 @pytest.mark.parametrize("seeds", [range(4), range(8)])
-def test_what_is_collected_of_lots_in_which_nobody_decides(seeds):
+def test_simulations_without_decisions_are_collected_in_order(seeds):
     ant = decision(agent="ant_0")
     given = {"seeds": seeds, "batch_size": 2, "workers": 2, "collect": lambda simulation: simulation.seed * 10}
     found = collect_episodes(script(lambda simulation: ant() if simulation.seed == 5 else None), {ant: ones}, **given)

@@ -203,7 +203,7 @@ REPORTS = {
 }
 
 
-def test_updates_and_removals_are_told(child, client):
+def test_clients_send_updates_and_removals(child, client):
     told = [child.begin(play="reports"), *(child.receive() for _ in range(4))]
     assert told == [*REPORTS[client.name], ended()]
 
@@ -262,7 +262,7 @@ def test_a_stop_unwinds_the_model_which_is_silent_until_the_next_start(child, cl
     assert child.ended() == (0, client.said, client.unwound * 3)
 
 
-def test_a_model_that_does_not_hear_is_told_again(child):
+def test_a_model_that_ignores_a_stop_is_stopped_again(child):
     child.begin(play="deaf", times=3)
     child.send(stop=True)
     assert plays_well(child)
@@ -322,7 +322,7 @@ FAILURES = {
 }
 
 
-def test_an_error_is_told_and_the_next_episode_works(child, client):
+def test_an_error_is_sent_and_the_next_episode_works(child, client):
     for play, (kind, text, trace) in FAILURES[client.name].items():
         error = child.begin(play=play)["error"]
         assert re.fullmatch(kind, error["type"])
@@ -382,7 +382,7 @@ ANSWERS = {
     indirect=["client"],
     ids=lambda value: repr(value[:40]),
 )
-def test_what_is_no_answer_ends_the_child_with_an_error(child, client, line):
+def test_an_invalid_answer_ends_the_child_with_an_error(child, client, line):
     child.begin(play="count")
     child.send(line + b"\n")
     error = child.receive()["error"]
@@ -415,7 +415,7 @@ def test_an_answer_between_episodes_is_an_error_and_the_end(child, client):
 @pytest.mark.parametrize(
     "frame", [{"stop": True}, {"start": {"seed": "x"}}, {"start": {"seed": -1}}, {"start": {"seed": 0.5}}, {"start": 1}]
 )
-def test_what_begins_no_episode_ends_the_child_with_an_error(child, frame):
+def test_an_invalid_start_ends_the_child_with_an_error(child, frame):
     child.send(**frame)
     assert child.receive()["error"]["type"] == "simenv::WireError"
     assert has_given_up(child)
@@ -438,7 +438,7 @@ def test_a_model_may_exit(child):
 
 
 @CPP
-def test_what_the_model_starts_has_nothing_of_the_wire(child):
+def test_processes_of_the_model_inherit_nothing_of_the_wire(child):
     reading, writing = child.descriptors
     command = f'test -z "$SIMENV_MARL_FDS" && ! test -e /dev/fd/{reading} && ! test -e /dev/fd/{writing}'
     assert child.begin(play="shell", command=command) == ended(0)

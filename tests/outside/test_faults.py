@@ -134,7 +134,7 @@ def test_at_once(make_env, what):
         ("", "cannot be started"),
     ],
 )
-def test_a_command_that_leads_nowhere_is_told_with_the_reason(command, text):
+def test_a_command_that_does_not_exist_is_an_error_with_the_reason(command, text):
     with pytest.raises(ProcessDiedError, match=text):
         aec_env(ProcessSimulation(command, BOTH)).reset()
 
@@ -155,7 +155,7 @@ def test_one_process_that_is_killed_leaves_the_others_alone(make_env, when):
     assert [number == child(env) for number, env in zip(numbers, envs, strict=True)] == [True, False, True]
 
 
-def test_a_process_that_does_not_read_is_told_of(make_env):
+def test_a_process_that_does_not_read_is_an_error(make_env):
     env = before_its_fault("silence", make_env)
     simulation = env.unwrapped.simulation
     simulation._child.timeout = 0.3
@@ -166,7 +166,7 @@ def test_a_process_that_does_not_read_is_told_of(make_env):
         env.step(RULE)
 
 
-def test_what_is_long_crosses_in_both_directions(make_env):
+def test_long_lines_cross_in_both_directions(make_env):
     env = make_env(aec_env, reservoirs())
     assert plays_by_its_rule(env, long=["ö" * 1000] * 2000, hours=3)
     with pytest.raises(WireError, match=r"the limit is 16,777,216"):

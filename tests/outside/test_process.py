@@ -109,7 +109,7 @@ def test_rule_is_the_plain_run_and_one_process_plays_all_episodes(make_env):
 
 
 @pytest.mark.parametrize("truncated", [True, False])
-def test_options_arrive_and_ends_are_told(make_env, truncated):
+def test_options_arrive_and_ends_are_reported(make_env, truncated):
     env = make_env(aec_env, reservoirs())
     env.reset(seed=1, options={"hours": 4, "truncated": truncated})
     *_, last = [turn for turn in play(env, reset=False) if turn.agent == "price_0"]
@@ -126,7 +126,7 @@ def test_a_process_that_exits_after_its_episodes_is_started_anew(make_env):
     assert len(numbers) == 3
 
 
-def test_it_runs_without_an_environment():
+def test_a_process_simulation_runs_without_an_environment():
     simulation = reservoirs()
     simulation.reset(4)
     assert simulation.run() is None
@@ -356,7 +356,7 @@ def test_options_that_are_no_json_are_refused_before_anything_is_sent(make_env, 
     assert plays_by_its_rule(env)
 
 
-def test_a_decision_that_is_no_json_is_told_with_its_point(make_env):
+def test_a_decision_that_is_no_json_is_an_error_with_its_point(make_env):
     env = make_env(aec_env, reservoirs({"broker.price": replace(PRICE, action_space_mapping=lambda action: {1, 2})}))
     env.reset(seed=1)
     with pytest.raises(WireError, match="not JSON") as caught:

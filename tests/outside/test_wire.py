@@ -25,7 +25,7 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
-def test_what_is_sent_arrives(value):
+def test_decoded_frames_equal_encoded_ones(value):
     line = encode({"value": value})
     assert line.endswith(b"\n")
     assert line.count(b"\n") == 1
@@ -60,7 +60,7 @@ def test_numbers_that_are_not_finite():
         ("ä\n\ud800", '"\\u00e4\\n\\ud800"'),
     ],
 )
-def test_what_numpy_and_python_have_is_sent_as_json(value, sent):
+def test_numbers_of_numpy_and_python_are_sent_as_json(value, sent):
     assert encode({"value": value}) == f'{{"value":{sent}}}\n'.encode()
 
 
@@ -68,7 +68,7 @@ def test_what_numpy_and_python_have_is_sent_as_json(value, sent):
     ("value", "where"),
     [({1}, "not JSON"), ([1, [object()]], r"\[1\]\[0\]"), ({"a": {2: 3}}, "'a'"), (b"a", "b'a'"), (1j, "1j")],
 )
-def test_what_is_no_json_is_refused_with_its_place(value, where):
+def test_values_that_are_no_json_are_refused_with_their_place(value, where):
     with pytest.raises(WireError, match=where):
         encode({"value": value})
 
@@ -79,7 +79,7 @@ LONG = b'{"a": ' + b"1" * 10_000 + b"}"
 @pytest.mark.parametrize(
     "line", [b"", b"NaN", b"[1]", b"3", b"{", b'{"a": Infinity}', b'{"a": "\xff"}', b"[" * 10**5, LONG]
 )
-def test_what_is_no_frame_is_refused(line):
+def test_invalid_frames_are_refused(line):
     with pytest.raises(WireError):
         decode(line)
 
@@ -137,7 +137,7 @@ def test_an_episode_that_does_not_end_is_broken_off():
         ),
     ],
 )
-def test_what_is_wrong_is_found(tmp_path, change, tried):
+def test_wire_check_finds_faults(tmp_path, change, tried):
     report = check_wire(changed(tmp_path, change), timeout=10.0)
     assert not report.ok
     assert found(report)[tried] == "wrong", str(report)

@@ -345,7 +345,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("given", "error", "match"), WRONG)
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
-def test_what_cannot_be(view, given, error, match):
+def test_invalid_arguments_are_refused(view, given, error, match):
     env = made(view)
     with pytest.raises(error, match=match):
         action_values(env, **{"futures": 1} | given)
@@ -462,7 +462,7 @@ class Births(SimulationInterface):
 
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env])
-def test_what_an_action_is_worth_reaches_to_the_next_decision(view):
+def test_the_value_of_an_action_reaches_to_the_next_decision(view):
     env = begun(view(Births, [Births.act]))
     turn = {"horizon": 1, "terminal_value": lambda env: 100 * env.unwrapped.simulation.turn}
     for given, means in (

@@ -116,7 +116,7 @@ def test_masked_candidates_are_left_out():
 @METHODS
 @pytest.mark.parametrize("key", ["left", LEFT])
 @pytest.mark.parametrize("driver", DRIVERS)
-def test_simulate(driver, key, method):
+def test_planners_decide_in_simulate_as_by_hand(driver, key, method):
     noted = Noted(planner(method=None if driver == "thread" and method == "fork" else method))
     found = simulate(Duel, {key: noted}, points=tame(), seed=5, driver=driver)
     assert (noted.answers, found.value) == by_hand()
@@ -349,7 +349,7 @@ def test_candidates_meet_the_same_futures():
     ("option", "values"),
     [("depth", [0, 1.5]), ("exploration", [-1, float("inf")]), ("budget", [0, 1.5]), ("horizon", [0])],
 )
-def test_what_cannot_be(option, values):
+def test_invalid_options_are_refused(option, values):
     for value in values:
         with pytest.raises(OptionValueError, match=option):
             TreeSearchPolicy(**{option: value})

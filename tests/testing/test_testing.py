@@ -108,7 +108,7 @@ def test_a_sound_walk_is_clean():
     assert any("aec, parallel, single, joint" in line for line in report.checked)
 
 
-def test_points_of_all_kinds_are_clean_and_those_of_the_same_name_are_told_apart():
+def test_points_of_all_kinds_are_clean_and_those_of_the_same_name_have_different_labels():
     design = worlds.Design(worlds.KINDS, tuple((number % 9, number % 3) for number in range(27)))
     functions = worlds.points_of(design)
     report = clean(check_simulation(lambda: worlds.World(design, functions), functions, episodes=4))
@@ -363,7 +363,7 @@ class Endless(Walk):
 
 
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), FOUND)
-def test_what_is_wrong_or_odd_about_models_is_found(model, changes, options, severity, words, told):
+def test_faults_and_oddities_of_models_are_found(model, changes, options, severity, words, told):
     report = checked(model, changes, **options)
     seen = finding(report, words)
     assert seen.severity == severity
@@ -475,7 +475,7 @@ def test_options_reach_the_environments():
     assert [part.agents for part in report.statistics] == ["walker_0"]
 
 
-def test_what_cannot_be_used_is_an_error_of_the_caller():
+def test_invalid_arguments_are_errors_of_the_caller():
     with pytest.raises(SimulationError, match="is not a simulation"):
         check_simulation(3, points(Walk))
     with pytest.raises(UnknownPointError, match="cannot be found"):
@@ -498,7 +498,7 @@ def test_the_library_does_not_import_its_checks():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_inspection_tells_points_calls_and_the_end():
+def test_inspection_shows_points_calls_and_the_end():
     seen = inspect_simulation(GreenhouseSim)
     assert seen.calls == "(update_air_exchange choose_water_amount){9}"
     assert [point["agent"] for point in seen.points] == ["waterer_0", "ventilator_0"]
@@ -534,7 +534,7 @@ def test_inspection_of_what_fails():
         ([str(number) for number in range(50)] * 100, " ".join(map(str, range(30))) + " ... and 5000 calls in all"),
     ],
 )
-def test_the_order_of_calls_is_told_shortly(calls, told):
+def test_the_order_of_calls_is_shown_in_short(calls, told):
     assert order_of(calls) == told
 
 
@@ -579,7 +579,7 @@ def test_differences_are_seen(one, other):
         lambda: np.array([None, 1], object),
     ],
 )
-def test_what_is_the_same_is_the_same(make):
+def test_equal_models_have_no_differences(make):
     assert differences(holding(it=make()), holding(it=make())) == []
 
 
@@ -596,7 +596,7 @@ def test_a_long_history_does_not_hide_the_rest():
     assert [path for path, _, _ in differences(one, other)] == ["simulation.thing (state of the generator)"]
 
 
-def test_a_simulation_that_truncates_by_itself_is_told_from_one_that_is_cut():
+def test_simulations_that_truncate_and_simulations_that_are_cut_are_counted_apart():
     report = clean(checked(variant("Limited", run=lambda walk: Walk.run(walk) or TRUNCATED)))
     assert report.episodes == {"terminated": 0, "truncated": 4, "cut": 0}
 

@@ -90,7 +90,7 @@ def test_branches_are_what_the_environment_would_have_done(make, points, method)
 
 
 @METHODS
-def test_branches_of_branches(method):
+def test_branches_can_be_branched(method):
     def plan(twin, number):
         twin.step(number)
         return branch(twin, lambda deeper, second: (deeper.step(second)[0].tolist(), number, second), 2, method=method)

@@ -57,7 +57,7 @@ def test_a_sound_simulation_of_the_current_directory():
     assert done.stdout.startswith("Walk: nothing to complain of")
 
 
-def test_a_simulation_with_an_error(capsys):
+def test_a_simulation_with_an_error_ends_the_command_with_status_1(capsys):
     assert main(["check", "walking:Limping", "--episodes", "2", "--seed", "4", "--max-steps", "5"]) == 1
     text = capsys.readouterr().out
     assert "behaves differently when it is observed" in text
@@ -77,7 +77,7 @@ def test_reports_and_inspections_as_text_and_json(capsys):
     assert all(part in text for part in ("walker_0", "choose{10}", "aec, parallel, single, joint"))
 
 
-def test_points_by_name(capsys):
+def test_points_can_be_given_by_name(capsys):
     greenhouse = "examples.greenhouse_coop.model.Greenhouse."
     assert main(["check", "walking:Walk", "--points", "walking.Walk.chose"]) == 2
     assert "chose" in capsys.readouterr().err
@@ -118,7 +118,7 @@ def test_objects_that_are_no_simulation_are_refused(command, target, told, capsy
         *("new", "new plain", "new netlogo tank"),
     ],
 )
-def test_wrong_arguments(arguments, capsys):
+def test_wrong_arguments_end_the_command_with_status_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         main(arguments.split())
     assert caught.value.code == 2

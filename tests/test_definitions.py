@@ -347,7 +347,7 @@ def test_one_function_may_have_many_definitions():
         assert told == [["early"], ["late"], ["last"]]
 
 
-def test_masks_of_multi_discrete_spaces():
+def test_masks_of_multi_discrete_spaces_have_a_part_for_each():
     decide = decision(action_space=spaces.MultiDiscrete([2, 3]), action_mask_mapping=lambda: ([1, 0], [0, 1, 1]))
     env = single_env(calling(decide), decide)
     _, info = env.reset()

@@ -33,7 +33,7 @@ def run():
         names.clear()  # a suspended simulation holds its globals, and these hold its environment
 
 
-def test_the_front_page(run):
+def test_the_code_of_the_front_page_has_the_rewards_that_it_shows(run):
     (code,) = page.blocks("index.md")
     env = run(code)["env"]
     assert env.reset(seed=1)[0] == [5.0]

@@ -199,11 +199,11 @@ def test_a_refused_registration_leaves_the_registries_unchanged(register, change
 
 @pytest.mark.parametrize("identity", many_registered.IDS[:-1])
 @pytest.mark.parametrize("mode", [None, "ansi", "rgb_array"])
-def test_gymnasiums_check(identity, mode):
+def test_registered_environments_pass_gymnasiums_check(identity, mode):
     check_env(made(identity, render_mode=mode))
 
 
-def test_pettingzoos_tests():
+def test_registered_environments_pass_pettingzoos_tests():
     api_test(pettingzoo.make("aec", COOP), num_cycles=20)
     parallel_api_test(pettingzoo.make("parallel", COOP), num_cycles=20)
 

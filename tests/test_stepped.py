@@ -108,7 +108,7 @@ def test_a_model_whose_scenario_holds_the_seed_is_not_left_unseeded():
     assert simulate(fixed, seed=2).model.place == walked(4, 5)
 
 
-def test_copies_and_pickles():
+def test_copies_and_pickles_run_the_same():
     simulation = SteppedSimulation(Walk, 5, drift=0.5)
     for twin in (copy.deepcopy(simulation), pickle.loads(pickle.dumps(simulation))):
         assert simulate(twin, seed=2).model.place == walked(2, 5, drift=0.5)

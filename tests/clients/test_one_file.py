@@ -9,7 +9,7 @@ from . import page
 from .returns import single_return
 
 
-def test_the_page(monkeypatch):
+def test_the_code_of_the_page_runs(monkeypatch):
     steps = page.steps("Scripts in one file", monkeypatch)
     names = next(steps)
     env = single_env(names["FourWeeks"], {"bakery.Bakery.choose_batch": names["batch"]})

@@ -39,7 +39,7 @@ def rescaled(env):
     ],
     ids=["single", "goal", "joint", "greenhouse", "joint greenhouse", "registered"],
 )
-def test_check_env(make):
+def test_sb3_accepts_the_views(make):
     env = make()
     check_env(env, warn=env.action_space == gymnasium.spaces.Box(-1, 1, env.action_space.shape))
     env.close()
@@ -56,7 +56,7 @@ def test_many_shops_in_processes_of_their_own():
     assert learnt[0] == learnt[1]
 
 
-def test_a_goal_with_hindsight():
+def test_hindsight_replay_learns_a_goal():
     model = SAC(
         "MultiInputPolicy",
         single_env(CraneSim),
@@ -82,7 +82,7 @@ def test_masked_decisions_of_a_joint_view():
     assert get_action_masks(env).tolist() == [True] * 4
 
 
-def test_the_page(monkeypatch):
+def test_the_code_of_the_page_runs(monkeypatch):
     steps = page.steps("Stable-Baselines3 and sb3-contrib", monkeypatch)
     names = next(steps)
     env = single_env(names["FourWeeks"], names["points"])

@@ -26,7 +26,7 @@ def test_agents_that_are_born_and_die_are_all_there_all_the_time():
     env.close()
 
 
-def test_the_page(monkeypatch):
+def test_the_code_of_the_page_runs(monkeypatch):
     steps = page.steps("skrl", monkeypatch)
     names = next(steps)
     env, learner = names["env"], names["learners"]

@@ -10,7 +10,7 @@ from . import commands, page
 pytestmark = pytest.mark.filterwarnings("default")  # learners warn of much that is theirs
 
 
-def test_imitation_of_the_rule(capsys):
+def test_the_study_of_imitation_runs(capsys):
     pytest.importorskip("minari"), pytest.importorskip("torchrl")
     from studies.imitation import rule
 
@@ -21,7 +21,7 @@ def test_imitation_of_the_rule(capsys):
 
 
 @pytest.mark.parametrize("plainly", [[], ["--plainly"]])
-def test_imitation_of_plans(plainly):
+def test_the_study_of_planned_imitation_runs(plainly):
     pytest.importorskip("minari"), pytest.importorskip("torchrl")
     options = "--budget", 2800, "--learners", 1, "--steps", 5, "--seeds", 1, "--workers", 2
     assert "learner 1: " in commands.python("-m", "studies.imitation.plans", *options, *plainly)

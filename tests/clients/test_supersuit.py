@@ -177,7 +177,7 @@ def test_options_replace_wrappers():
     assert min(rewards["boat_0"] for _, rewards in ours[1:]) == -0.5
 
 
-def test_the_page(monkeypatch):
+def test_the_code_of_the_page_runs(monkeypatch):
     (names,) = page.steps("SuperSuit", monkeypatch)
     assert names["observations"].shape == (4, 6)
     assert names["rewards"].shape == (4,)

@@ -13,6 +13,6 @@ def test_training_is_worth_something(tmp_path):
     assert 1 < difference_low <= difference <= difference_high
 
 
-def test_a_moment_of_training(tmp_path):
+def test_templates_train(tmp_path):
     write_template("plain", "tank", tmp_path)
     assert "trained " in python(tmp_path / "tank.py", "--quick")

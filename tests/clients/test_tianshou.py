@@ -27,7 +27,7 @@ def greedy(algorithm):
     return act
 
 
-def test_masks_in_observations(monkeypatch):
+def test_masks_in_observations_reach_the_policy(monkeypatch):
     """It draws no masked action, not even to explore: that would be an error."""
     np.random.seed(0)
     steps = page.steps("Tianshou", monkeypatch)
@@ -65,7 +65,7 @@ def test_agents_that_are_born_and_die():
     assert min(days[False]) < 15
 
 
-def test_the_page(monkeypatch):
+def test_the_code_of_the_page_runs(monkeypatch):
     np.random.seed(0)
     steps = page.steps("Tianshou", monkeypatch)
     names = next(steps)

@@ -18,13 +18,13 @@ VIEWS = {"parallel": parallel_env, "aec": aec_env}
 EVERY_VIEW = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
 
 
-def test_the_pages_checks():
+def test_the_checks_of_the_page_pass():
     exec(blocks("_clients_torchrl.md")[0], {})
 
 
 @pytest.mark.parametrize("make", [greenhouse.parallel_env, greenhouse.raw_env, greenhouse.env])
 @pytest.mark.parametrize("grouped", [None, {"agents": ["waterer_0", "ventilator_0"]}])
-def test_the_greenhouse(make, grouped):
+def test_the_greenhouse_passes_the_checks(make, grouped):
     env = PettingZooWrapper(make(), use_mask=True, group_map=grouped)
     check_env_specs(env)
     env.set_seed(1)
@@ -33,7 +33,7 @@ def test_the_greenhouse(make, grouped):
     assert not days["next", "done"][:-1].any()
 
 
-def test_one_agent():
+def test_single_views_pass_the_checks():
     check_env_specs(GymWrapper(greenhouse.watering_env()))
 
 
@@ -41,7 +41,7 @@ def test_one_agent():
 @pytest.mark.parametrize("done_on_any", [True, False])
 @pytest.mark.parametrize("grouped", [None, {"bees": BEES}], ids=["apart", "together"])
 @pytest.mark.parametrize("definition", [DEFINITION, MASKED], ids=["free", "masked"])
-def test_births_and_deaths(view, definition, grouped, done_on_any):
+def test_agents_that_are_born_and_die_pass_the_checks(view, definition, grouped, done_on_any):
     env = PettingZooWrapper(
         pad_agents(view(HiveSim, points(definition), possible_agents=BEES)),
         use_mask=True,
@@ -62,7 +62,7 @@ def test_births_and_deaths(view, definition, grouped, done_on_any):
 
 
 @EVERY_VIEW
-def test_its_state(view):
+def test_the_state_is_part_of_the_tensors(view):
     options = {"possible_agents": BEES, "state_space": spaces.Box(0, 1, (4,), np.float32)}
     env = PettingZooWrapper(pad_agents(view(HiveSim, points(), **options)), use_mask=True, return_state=True)
     check_env_specs(env)

@@ -152,7 +152,7 @@ def test_pettingzoos_tests_pass_with_masks_in_observations():
 # -- its wrappers ---------------------------------------------------------------------------------
 
 
-def test_illegal_actions_terminate():
+def test_illegal_actions_terminate_under_pettingzoos_wrapper():
     env = wrappers.TerminateIllegalWrapper(aec_env(walk("bee", "cat"), [CAT]), illegal_reward=-1)
     env.reset(seed=1)
     unwrapped = env.unwrapped

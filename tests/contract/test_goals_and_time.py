@@ -286,7 +286,7 @@ def test_the_time_of_views_of_one_agent_is_that_of_its_steps(make):
         assert told(RULE) == (4.0, 1.0)
 
 
-def test_the_time_of_rounds():
+def test_rounds_have_the_time_of_the_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
     *_, infos = env.reset()

@@ -321,7 +321,7 @@ RENAMED = f"{GOING}, 2 number 7, 2 acts, 2 whole 0, 2 leaves, 0 acts"
         ),
     ],
 )
-def test_removals(program, changes, options, expected):
+def test_agents_are_removed_when_their_entities_leave(program, changes, options, expected):
     env = aec_env(life(program), beings(**changes), **options)
     assert story(play(env, 1)) == expected
 

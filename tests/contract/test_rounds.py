@@ -76,7 +76,7 @@ def test_observations_do_not_show_the_moves_of_the_same_round():
     assert env.agents == []
 
 
-def test_a_decision_within_a_decision():
+def test_a_round_answers_a_decision_within_a_decision():
     inner = decision(agent="inner_0")
     outer = decision(lambda: inner() + 1, agent="outer_0")
     env = parallel_env(calling(outer), [outer, inner])

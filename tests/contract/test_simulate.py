@@ -63,7 +63,7 @@ ANT, BROKEN = decision(agent="ant_0"), decision(agent="broken_0", observation_sp
     ],
     ids=["action", "policy", "model", "observation"],
 )
-def test_errors_tell_the_seed(source, policies, error, match):
+def test_errors_name_the_seed(source, policies, error, match):
     with pytest.raises(error, match=match) as caught:
         simulate(source, policies, seed=13)
     assert "seed 13" in notes(caught.value)

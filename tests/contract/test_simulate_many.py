@@ -238,7 +238,7 @@ def test_actions_come_as_anything_that_has_rows(space, answer, expected):
     [[1], [1, 1, 1], [], np.int64(1), 1, None, "ab", {}, {"a": [1], "b": [1, 2]}, np.ones((3, 2))],
     ids=repr,
 )
-def test_a_wrong_number_of_actions(answer):
+def test_a_wrong_number_of_actions_is_refused(answer):
     ant = decision(agent="ant_0")
     with pytest.raises(InvalidActionError, match=r"2 decisions|not in its action space") as caught:
         simulate_many(calling(ant), {ant: lambda observations: answer}, seeds=[3, 4])
@@ -373,7 +373,7 @@ def test_plugins_are_for_these_simulations_alone():
     assert len(called) == 6
 
 
-def test_simulations_within_policies_and_rules():
+def test_policies_and_rules_may_simulate():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def look_ahead(observations):

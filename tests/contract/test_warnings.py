@@ -87,7 +87,7 @@ def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_r
     lambda kind: simulate_many(kind, {decide: lambda observations: np.ones(len(observations), np.int64)}, seeds=[1, 2]),
     lambda kind: vector_env(kind, decide, num_envs=3).reset(seed=1),
 ])  # fmt: skip
-def test_all_runners_notice(heard_alone, run) -> None:
+def test_all_runners_warn(heard_alone, run) -> None:
     run(gambler(random.random))
     assert len(heard_alone(DRAWS)) == 1
 

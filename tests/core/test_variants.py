@@ -79,7 +79,7 @@ def test_arguments_override_those_of_the_variant():
     assert len(play(aec_env(limited, max_steps=2), 1)) == 3
 
 
-def test_registered_by_their_name():
+def test_variants_are_registered_by_their_name():
     with registries_put_back():
         ids = register_simulation(DEAR) + register_simulation(replace(LARGE, options={"max_steps": 1}), name="other")
         assert ids[:3] == ["dear/Sow-v0", "dear/Joint-v0", "dear/coop_v0"]

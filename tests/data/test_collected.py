@@ -115,7 +115,7 @@ def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
             check(found[point], episodes, lambda agent, number=number: agent.split("_")[1] == str(number))
 
 
-def test_agents_under_their_own_keys():
+def test_agents_are_collected_under_their_own_keys():
     def main(simulation):
         for number in (0, 1, 2, 1, 0):
             simulation.log.append(Being(number).act())
@@ -138,7 +138,7 @@ class Timed(Script):
         return len(self.log) * 2
 
 
-def test_shapes_and_dtypes():
+def test_arrays_have_the_documented_shapes_and_dtypes():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Box(0, 9, (2, 3), np.float32),
@@ -191,7 +191,7 @@ def test_spaces_are_those_of_the_decision_point():
     assert unborn["being_3"].action_space is None
 
 
-def test_composite_spaces():
+def test_observations_of_composite_spaces_are_stacked():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Dict(a=spaces.Discrete(5), b=spaces.Tuple([spaces.Box(0, 9, (2,)), spaces.Text(5)])),
@@ -208,7 +208,7 @@ def test_composite_spaces():
     assert found.by_rule.tolist() == [False, True, True, True]
 
 
-def test_masks_of_several_parts():
+def test_masks_of_several_parts_are_stacked():
     ant = decision(
         agent="ant_0",
         action_space=spaces.MultiDiscrete([2, 3]),
@@ -250,7 +250,7 @@ def test_extras_stand_row_by_row_whatever_the_policy_does_to_them_later():
     ("second", "match"),
     [({"values": [1.0]}, "2 decisions"), ({"values": 1.0}, "2 decisions"), (None, "values")],
 )
-def test_extras_that_do_not_fit(second, match):
+def test_extras_that_do_not_fit_are_refused(second, match):
     ant = decision(agent="ant_0")
     answers = iter([([1, 1], {"values": [0.5, 1.5]}), [1, 1] if second is None else ([1, 1], second)])
     with pytest.raises(OptionValueError, match=match):
@@ -285,7 +285,7 @@ def test_collect_is_called_with_each_simulation():
             found(**wrong)
 
 
-def test_one_name_at_points_whose_spaces_differ():
+def test_one_name_at_points_whose_spaces_differ_is_refused():
     space = {"observation_space": spaces.Discrete(3), "observation_space_mapping": lambda other: 1}
     points = beings() | others(agent=lambda other: f"being_{other.number}", **space)
     source = script(lambda simulation: (Being if simulation.seed else Other)(0).act() and None)

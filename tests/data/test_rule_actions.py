@@ -131,7 +131,7 @@ def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
 
 
 @DRIVERS
-def test_generators_and_coroutines(driver):
+def test_generators_and_coroutines_have_rule_actions(driver):
     def choose_slowly():
         yield "wait"
         return 3

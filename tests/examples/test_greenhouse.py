@@ -102,7 +102,7 @@ def test_an_episode_terminates_when_all_plants_are_dead_and_is_truncated_after_a
 
 
 @pytest.mark.parametrize("make", [raw_env, env])
-def test_pettingzoo_accepts_it(make):
+def test_the_greenhouse_passes_pettingzoos_tests(make):
     environment = make()
     api_test(environment, num_cycles=300)
     environment.close()
@@ -112,7 +112,7 @@ def test_pettingzoo_accepts_it(make):
 @pytest.mark.parametrize(
     ("name", "options"), [("Watering", {}), ("Ventilation", {}), ("Joint", {}), ("Joint", {"flatten": True})]
 )
-def test_gymnasium_accepts_it(name, options):
+def test_the_greenhouse_passes_gymnasiums_check(name, options):
     environment = gymnasium.make(f"greenhouse_coop/{name}-v0", **options)
     check_env(environment.unwrapped)
     environment.close()

@@ -92,7 +92,7 @@ def test_the_table_is_the_same_however_it_is_run(arguments, tmp_path, capsys):
         Variant("v", Shop),
     ],
 )
-def test_whatever_makes_simulations(make, tmp_path):
+def test_classes_factories_and_variants_make_simulations(make, tmp_path):
     assert run(tmp_path / "a", make=make).equals(run(tmp_path / "b"))
 
 

@@ -257,7 +257,7 @@ def test_exposed_methods_are_exposed_in_either_order_and_for_that_class_alone():
         assert [kind().bid("tea") for kind in (Trader, Sub)] == [5, "sub"]
 
 
-def test_exposing_again_gives_the_same():
+def test_exposing_a_function_again_returns_the_same():
     held = expose_to_plugins(vars(Trader)["rounded"])
     assert isinstance(held, staticmethod)
     for thing in (local(), POOL, held):
@@ -828,7 +828,7 @@ def test_a_plugin_may_decide():
 
 
 @pytest.mark.parametrize("how", ["handlers first", "points first", "environment", "exposed"])
-def test_handlers_lie_outside_the_decision(how, monkeypatch):
+def test_handlers_run_around_the_decision(how, monkeypatch):
     seen, decided = [], []
 
     def before(self, good, limit=5):

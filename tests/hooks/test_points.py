@@ -82,7 +82,7 @@ HOME = f"{__name__}.Home"
     ],
     ids=plainly,
 )
-def test_points_in_all_forms(points, agents):
+def test_points_may_be_named_in_all_forms(points, agents):
     env = aec_env(home(), points)
     order = ["heat_0", "cool_0", "cooler_0", "air_0", "fan_0", "light_0"]  # in which the simulation calls them
     assert env.possible_agents == agents

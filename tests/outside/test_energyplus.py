@@ -144,7 +144,7 @@ def test_branches_go_on_exactly(method):
     env.close()
 
 
-def test_policies_back_in_the_model():
+def test_policies_decide_in_plain_runs():
     simulation = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, RULE), seed=3)
     assert simulation.results == plain(3)[0]
     other = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, by_presence), seed=3)

@@ -98,7 +98,7 @@ def before_its_fault(what, make_env=lambda kind, *arguments: kind(*arguments)):
 
 
 @pytest.mark.parametrize("what", IN_MID_EPISODE)
-def test_in_mid_episode(make_env, what):
+def test_faults_in_mid_episode_are_errors(make_env, what):
     kind, text = IN_MID_EPISODE[what]
     env = before_its_fault(what, make_env)
     number = child(env)
@@ -116,7 +116,7 @@ def test_in_mid_episode(make_env, what):
 
 
 @pytest.mark.parametrize("what", AT_ONCE_TOLD)
-def test_at_once(make_env, what):
+def test_faults_before_the_first_episode_are_errors(make_env, what):
     kind, text = AT_ONCE_TOLD[what]
     env = make_env(aec_env, broken("at once", what, timeout=patience(what)), "reservoir.inflow")
     for _ in range(2):

@@ -117,7 +117,7 @@ def test_lives_begin_and_end_in_mid_episode(model, env):
 
 
 @of_the_network
-def test_the_code_of_its_page(model, capsys):
+def test_the_code_of_the_page_runs(model, capsys):
     (code,) = blocks("ns3.md")
     exec(code, {"__name__": "page"})
     assert capsys.readouterr().out == f"{plain_network(7, seconds=10)}\n"

@@ -175,7 +175,7 @@ def _price(simulation):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_simulate_many_and_evaluate(workers):
+def test_simulate_many_and_evaluate_run_processes(workers):
     policies = {"broker.price": lambda observations: np.ones(len(observations), int)}
     found = simulate_many(reservoirs(), policies, seeds=range(4), collect=_price, workers=workers)
     assert found == [1.0] * 4

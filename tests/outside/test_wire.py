@@ -148,7 +148,7 @@ def test_a_reseed_that_changes_nothing_is_noted(tmp_path):
     assert found(report)["reseed"] == "note"
 
 
-def test_the_command_line(capsys):
+def test_the_command_wire_check_reports_and_exits(capsys):
     assert main(["wire-check", "--seed", "3", "--", *command()]) == 0
     assert "nothing is wrong" in capsys.readouterr().out
     assert main(["wire-check", "--json", "--options", '{"hours": 3}', *command()]) == 0

@@ -88,7 +88,7 @@ BASES = {"left": greedy, "right": down}
 @METHODS
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("view", VIEWS)
-def test_every_view_and_driver(view, driver, method):
+def test_values_are_the_same_in_every_view_and_driver(view, driver, method):
     if driver == "thread" and method == "fork":
         method = None  # which is then a replay
     env = made(view, driver=driver)
@@ -104,7 +104,7 @@ def test_every_view_and_driver(view, driver, method):
 
 
 @pytest.mark.parametrize("view", ["aec", "parallel"])
-def test_a_decision_in_mid_episode(view):
+def test_values_in_mid_episode_are_those_of_the_pending_decision(view):
     env = made(view)
     for agent in ("left", "right", "left"):
         env.step(1 if view == "aec" else {agent: 1})
@@ -297,7 +297,7 @@ class Doubled(BaseParallelWrapper):
         return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
 
 
-def test_wrappers_of_single_views():
+def test_wrappers_of_single_views_take_part():
     env = made("single")
     table = expected(env, "left", horizon=3)
     limited = begun(TimeLimit(OrderEnforcing(PassiveEnvChecker(env)), 3))  # as gymnasium.make does
@@ -315,7 +315,7 @@ def test_wrappers_of_single_views():
 
 
 @METHODS
-def test_wrappers_of_pettingzoo(method):
+def test_wrappers_of_pettingzoo_take_part(method):
     env = begun(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec"))))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(expected(env, "left"))
@@ -383,7 +383,7 @@ def test_candidates_must_be_listed_unless_they_are_discrete():
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, lambda env: TransformReward(env, float)])
-def test_masked_candidates(wrapper):
+def test_masked_candidates_are_left_out(wrapper):
     given = points(action_mask_mapping=lambda duel: [1, 1, duel.turn % 2])
     env = begun(wrapper(single_env(Duel, {LEFT: given[LEFT]})))
     assert action_values(env, futures=2).actions == (0, 1)
@@ -415,7 +415,7 @@ def test_a_time_limit_ends_branches_that_hang():
         action_values(made("single"), futures=1, base=lambda observation: time.sleep(60), time_limit=0.2)
 
 
-def test_progress_on_request(capsys):
+def test_progress_is_shown_on_request(capsys):
     assert action_values(made("single"), futures=3, progress=True).counts.tolist() == [3, 3, 3]
     assert "9/9" in capsys.readouterr().err
 
@@ -477,7 +477,7 @@ def test_the_value_of_an_action_reaches_to_the_next_decision(view):
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
-def test_the_first_of_padded_rounds(wrapper):
+def test_the_first_of_padded_rounds_can_be_planned(wrapper):
     class Unannounced(Duel):
         def expected_calls(self, point):
             return []

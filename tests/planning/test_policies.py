@@ -125,7 +125,7 @@ def test_planners_decide_in_simulate_as_by_hand(driver, key, method):
 
 @METHODS
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
-def test_policies_of_environments(make, method):
+def test_planners_decide_in_environments_as_by_hand(make, method):
     noted = Noted(planner(method=method))
     env = begun(make(Duel, tame(), policies={"left": noted}))
     while not step(env, 1, "right"):
@@ -159,7 +159,7 @@ def test_batch_policies_of_others_go_on_in_branches(method):
     assert told[0] == told[1] == simulate(Duel, {"left": planner(), "right": alone}, points=tame(), seed=5).value
 
 
-def test_compare_with_rule():
+def test_planners_can_be_compared_with_the_rule():
     given = {"points": tame(rule_action_mapping=lambda decision: decision), "seeds": [5, 6]}
     told = compare_with_rule(Duel, {"left": planner()}, **given)["left"]
     env, wanted = single_env(Duel, given["points"], agent="left"), []
@@ -180,7 +180,7 @@ def test_data_sets_are_recorded_of_planners(monkeypatch):
     assert saved.call_args.args[1].actions.tolist() == by_hand()[0]
 
 
-def test_a_vector_environment():
+def test_planners_decide_in_vector_environments():
     envs = begun(vector_env(Duel, tame(), num_envs=2, policies={"right": planner()}))
     for _ in range(3):
         envs.step(np.array([1, 1]))
@@ -194,7 +194,7 @@ def test_a_mixture_cannot_ask_it():
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_the_environment_of_a_policy(many):
+def test_a_policy_gets_the_environment_with_its_decision_pending(many):
     seen = []
 
     def left(observation, info, *, _environment):
@@ -380,7 +380,7 @@ def share(policy, seeds):
     return 1 - sum(lost) / len(seeds) / BEST
 
 
-def test_planned_over_a_poor_rule():
+def test_plans_are_better_than_a_poor_rule():
     """Beside the optimum of a model that can be solved."""
     planner = RolloutPolicy(futures=16, horizon=3)
     assert share(lambda env: 1, range(40)) < 0.75

@@ -517,7 +517,7 @@ class Broken(Walk):
         return 1 // (3 - self.number)
 
 
-def test_inspection_of_what_fails():
+def test_inspection_shows_where_a_model_fails():
     seen = inspect_simulation(Broken, points(Broken))
     assert seen.calls == "choose{4}"
     assert "ZeroDivisionError" in seen.ended

@@ -26,7 +26,7 @@ test-all: test test-wheel test-oldest test-templates test-pythons test-clients t
 # The quickest of them, for each commit: some 40 seconds on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
 	$(addprefix tests/contract/test_,$(addsuffix .py,conformance environments episodes errors identity joint many_agents \
-	messages one_agent rewards rounds simulate)) \
+	messages one_agent rounds simulate)) \
 	tests/core/test_points.py tests/core/test_spaces.py tests/envs/test_vector.py
 check: lint
 	$(BIN)/python -m pytest --quiet -n 2 $(CHECK_TESTS)

@@ -65,6 +65,7 @@ def test_turns_are_those_of_the_living_and_all_else_stands_by(world):
         decided.append(agent)
         for other, value in env.rewards.items():
             seen[other] += value
+    assert env.possible_agents == everybody
     plain = Answered(design, seed)
     assert decided == plain.decisions
     assert env.simulation.trace == plain.trace

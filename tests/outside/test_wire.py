@@ -3,6 +3,7 @@
 import json
 import sys
 from math import inf, isnan, nan
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -106,7 +107,7 @@ def test_a_simulator_may_exit_after_a_stop(tmp_path):
 
 
 def test_an_episode_that_does_not_end_is_broken_off():
-    report = check_wire(command(), options={"hours": 10_000}, decisions=20)
+    report = check_wire(command(), options=MappingProxyType({"hours": 10_000}), decisions=20)
     assert report.ok
     assert found(report)["an episode by its own rule"] == "note"
 

@@ -127,7 +127,7 @@ class Runner:
             raise OptionValueError(
                 "there is no option policies here; pass the policies of each contender in contenders="
             )
-        self.contenders: dict[str, Mapping[Any, Any]] = dict(contenders)
+        self.contenders: Mapping[str, Mapping[Any, Any]] = contenders
         self.metrics: dict[str, Callable[[Any], Any]] = {"metric": metric}
         if metric is None or isinstance(metric, Mapping):
             self.metrics = dict(metric or {})
@@ -306,12 +306,11 @@ def make_table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> DataFrame
     return table
 
 
-def dtype_of(values: Iterable[Any], *, missing: bool) -> Any:
+def dtype_of(values: Collection[Any], *, missing: bool) -> Any:
     """Return the dtype of a column that keeps the types of its values.
 
     With ``missing``, None is a missing number, and numbers of both types become floats where that is exact.
     """
-    values = list(values)
     kinds = set(map(type, values))
     if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
         return np.int64

@@ -95,7 +95,7 @@ def run_experiment(
         contenders or {}, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
         factors=list(table.columns),
     )  # fmt: skip
-    if runner.contenders.pop(BY_RULE, {}):
+    if runner.contenders.get(BY_RULE):
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another name"
         )

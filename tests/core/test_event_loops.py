@@ -327,3 +327,5 @@ def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations() -> None
     assert "of an earlier episode" in str(raised)
     env.close()
     env.simulation.loop.close()
+    del env, raised
+    gc.collect()  # what this loop has kept, before another test does

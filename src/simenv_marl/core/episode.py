@@ -317,19 +317,20 @@ class Episode(Run):
     def _without_decision(self) -> NoDecisionError:
         """Make the error for an episode that ended without a decision for the environment's user."""
         expected = ", ".join(point.point.name for point in self.plan.active)
-        overriding = [name for point in self.plan.active for name in overrides(point.point)]
-        hint = "does the simulation call the decision functions as attributes of their class or module?"
-        if overriding:
-            hint = f"these override it and are called instead: {listed(overriding)}; name them as decision points"
+        overriding = listed([name for point in self.plan.active for name in overrides(point.point)])
+        hints: list[str] = []
         threads = {name for point in self.plan.active for name in point.point.threads} - {current_thread().name}
+        if overriding:
+            hints.append(f"these override it and are called instead: {overriding}; name them as decision points")
         if threads:
-            hint = (
+            hints.append(
                 f"the rule has decided in threads that are not the simulation's: {listed(sorted(threads))}; call it"
                 " where run() runs, and pass the decision on"
             )
         if self.others:
             expected = f"{self.plan.one_agent!r} at {expected}" if self.plan.one_agent else expected
-            hint = f"these have decided: {listed(self.others)}"
+            hints = [f"these have decided: {listed(self.others)}"]
+        hint = "; ".join(hints) or "does the simulation call its decision functions as attributes of class or module?"
         return NoDecisionError(f"{type(self.simulation).__name__}.run() ended without a decision of {expected}; {hint}")
 
 

@@ -18,7 +18,7 @@ def test_agents_that_are_born_and_die_are_all_there_all_the_time():
     days = 0
     while env.agents:
         assert observations.keys() == set(FORAGERS)
-        assert env.state().shape == (1, 2 * len(FORAGERS))
+        assert {state.shape for state in env.state().values()} == {(1, 2 * len(FORAGERS))}
         observations, rewards, *_ = env.step({agent: torch.tensor([[1]]) for agent in FORAGERS})
         assert rewards.keys() == set(FORAGERS)
         days += 1

@@ -12,6 +12,7 @@ from simenv_marl.errors import (
     DefinitionError,
     EpisodeOverError,
     InvalidActionError,
+    NoDecisionError,
     OptionValueError,
     UnknownOptionError,
     UnknownPointError,
@@ -188,6 +189,8 @@ def test_points_that_policies_answer_are_no_agents(key, policy, answer):
     assert set(env.rewards) == set(env.infos) == {"pump_0"}
     assert decisions(play(env, 5)) == ["pump_0", "pump_0"]
     assert env.simulation.log == [5, answer, 5]
+    with pytest.raises(NoDecisionError, match="without a decision"):
+        aec_env(calling(FAN), [PUMP, FAN], policies={key: policy}).reset()
 
 
 def first_legal(observation, info=None):

@@ -26,13 +26,9 @@ ROSTER = {f"{HERE}.Machine.{name}": [f"{name}_{number}" for number in range(MOST
 
 @dataclass(frozen=True)
 class Design:
-    """What a yard is like.
+    """What a yard is like: machines at first, jobs of each, machines that may load at once (``cranes``).
 
-    Attributes:
-        machines, jobs, cranes: How many machines there are first; jobs of each; machines that may load at once.
-        plans: After how many units of time the yard itself decides, again and again.
-        luck: Of how many cases one brings a birth or a death.
-        until: When it ends; None: with the last machine.
+    It decides itself every ``plans`` units of time. One of ``luck`` cases brings a birth or a death.
     """
 
     machines: int

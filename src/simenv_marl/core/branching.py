@@ -195,7 +195,7 @@ def _call_in_forks(function: Callable[[int], Any], n: int, time_limit: float) ->
     try:
         while started < n or children:
             while started < n and len(children) < cores:
-                process, pipe = _fork(function, started, list(children))
+                process, pipe = _fork(function, started, children)
                 children[pipe] = started, process, time.monotonic() + time_limit
                 waiting.register(pipe, select.POLLIN)
                 started += 1
@@ -216,7 +216,7 @@ def _call_in_forks(function: Callable[[int], Any], n: int, time_limit: float) ->
     return results
 
 
-def _fork(function: Callable[[int], Any], number: int, others: list[int]) -> tuple[int, int]:
+def _fork(function: Callable[[int], Any], number: int, others: Iterable[int]) -> tuple[int, int]:
     """Fork a process that calls the function and sends the outcome. Return the process, and the pipe to read from."""
     _flush()  # else both processes would write what is buffered
     parent = os.getpid()
@@ -327,7 +327,7 @@ def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
 def _open_resources(opened: Iterable[Any] | None) -> dict[Any, str]:
     """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
     found: dict[Any, str] = {}
-    for thing in list(opened or ()):
+    for thing in opened or ():
         if isinstance(thing, socket.socket):
             if thing.fileno() >= 0:
                 found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"

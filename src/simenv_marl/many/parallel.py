@@ -76,7 +76,7 @@ def spread(
     joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
     size = max(1, ceil(len(items) / (share * processes)), min(least, ceil(len(items) / processes)))
-    parts = [list(items[start : start + size]) for start in range(0, len(items), size)]
+    parts = [items[start : start + size] for start in range(0, len(items), size)]
     parcel = _pack_with_names((work, arguments))
     try:
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")

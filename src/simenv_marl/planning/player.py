@@ -6,7 +6,7 @@ The environment may have wrappers. The agent's actions go through them, and its 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import isfinite
 from numbers import Real
@@ -54,8 +54,8 @@ class Player:
                 raise OptionValueError(
                     f"actions=None needs a Discrete action space; list candidates of {short_repr(space)}"
                 )
-            actions, legal = range(int(space.start), int(space.start + space.n)), True
-        listed = list(actions) if isinstance(actions, Iterable) and not isinstance(actions, (str, Mapping)) else []
+            actions, legal = list(range(int(space.start), int(space.start + space.n))), True
+        listed = actions if isinstance(actions, list) else []
         if not listed:
             raise OptionValueError(f"actions must be a list of candidates, not {short_repr(actions)}")
         for action in listed:

@@ -93,7 +93,7 @@ def check_wire(
         raise OptionValueError(f"seed must be an integer from 0 to 2**31 - 1, not {short_repr(seed)}")
     if decisions < 1 or not 0 < timeout < inf:
         raise OptionValueError(f"decisions and timeout must be positive, not {decisions} and {timeout}")
-    start = encode({"start": {"seed": seed, "options": dict(options or {})}})
+    start = encode({"start": {"seed": seed, "options": options or {}}})
     return _Check(command, start, decisions, timeout).run()
 
 

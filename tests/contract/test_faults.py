@@ -368,24 +368,27 @@ def interrupt_anywhere(name):
     assert number > 100
 
 
+USES = {
+    "aec_env": lambda: cut_short(farm_env(aec_env, "before"), aec_env),
+    "vector_env": lambda: vector_env(Small, {f"{PLACE}.plan": POINTS[f"{PLACE}.plan"]}, num_envs=2).close(),
+    "simulate": lambda: simulate(Small, points=POINTS),
+    "simulate_many": lambda: simulate_many(Small, {"planner": lambda o: [0] * len(o)}, points=POINTS, seeds=[1, 2]),
+}
+
+
 @pytest.mark.greenlet("the release is the same with every driver")
-@pytest.mark.parametrize(
-    "use",
-    [
-        lambda: cut_short(farm_env(aec_env, "before"), aec_env),
-        lambda: vector_env(Small, {f"{PLACE}.plan": POINTS[f"{PLACE}.plan"]}, num_envs=2).close(),
-        lambda: simulate(Small, points=POINTS),
-        lambda: simulate_many(Small, {"planner": lambda o: [0] * len(o)}, points=POINTS, seeds=[1, 2]),
-    ],
-)
-@pytest.mark.usefixtures("_collected")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # in a finalizer
+@pytest.mark.parametrize("use", USES)
 def test_an_interrupt_anywhere_in_what_opens_and_closes_leaves_nothing_patched(use):
-    use()
+    alone(interrupt_what_opens_and_closes, use)  # as above
+
+
+def interrupt_what_opens_and_closes(use):
+    gc.disable()
+    USES[use]()
     where, number = "", 0
     while where is not None:
         number += 7
-        where, raised = interrupt_at(number, use)
+        where, raised = interrupt_at(number, USES[use])
         assert raised is None or type(raised) is KeyboardInterrupt, where
         del raised
         gc.collect()

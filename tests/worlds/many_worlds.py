@@ -321,10 +321,7 @@ _made: dict[Any, Any] = {}
 
 
 def colony(make: Any, design: Design, simulation: type[Colony] = Colony, *, roster: bool = False) -> Any:
-    """An environment of a colony of a design. One that was made before may come again.
-
-    ``roster``: whether all that may be born are declared.
-    """
+    """An environment of a colony, also one made before. ``roster``: whether all possible agents are declared."""
     key = make, bool(design.overseen), simulation, roster
     if key not in _made:
         names = {f"{HERE}.Creature.act": ROSTER} if roster else None

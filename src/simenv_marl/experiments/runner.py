@@ -60,10 +60,10 @@ class Returns(tuple[float, ...]):
 
     _by_agent: dict[str, float]
 
-    def __new__(cls, returns: dict[str, float]) -> Returns:
+    def __new__(cls, returns: Mapping[str, float]) -> Returns:
         """Make the returns from a dict."""
         instance = super().__new__(cls, returns.values())
-        instance._by_agent = returns
+        instance._by_agent = dict(returns)  # the user of the tuple may change it
         return instance
 
     def __getitem__(self, key: Any) -> Any:

@@ -25,7 +25,7 @@ DRIVERS = ("greenlet", "thread")
 
 def pytest_addoption(parser) -> None:
     parser.addoption("--driver", choices=(*DRIVERS, "both"), default="both", help="drivers to test the contract with")
-    parser.addoption("--order", metavar="SEED", help="shuffle the files by this seed, or by a new one: random")
+    parser.addoption("--order", metavar="SEED", help="shuffle files and tests by this seed, or by a new one: random")
 
 
 def pytest_configure(config) -> None:
@@ -36,13 +36,13 @@ def pytest_configure(config) -> None:
 
 
 def pytest_report_header(config) -> str | None:
-    return f"files in the order of --order {config.option.order}" if config.option.order else None
+    return f"files and tests in the order of --order {config.option.order}" if config.option.order else None
 
 
 def pytest_collection_modifyitems(config, items) -> None:
     if config.option.order:
+        random.Random(config.option.order).shuffle(items)
         files = list(dict.fromkeys(item.path for item in items))
-        random.Random(config.option.order).shuffle(files)
         items.sort(key=lambda item: files.index(item.path))
 
 

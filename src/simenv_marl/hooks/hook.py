@@ -38,8 +38,6 @@ _ABSENT: Final = object()
 BOUND: Final[dict[str, Any]] = {}
 """The keyword arguments of a call that passes each parameter by position, and so needs no binding."""
 
-_FILE: Final = "<wrapper of "
-
 _MADE_WITH: Final = "__simenv_marl__"
 """The attribute of a wrapper with its hook and the object that it was made with."""
 
@@ -133,8 +131,8 @@ def unbind(value: Any) -> Any:
 def hook_of(value: Any) -> Hook | None:
     """Return the hook of a wrapper, also as an attribute of a class; None for anything else."""
     function = unbind(value)
-    # A wrapper is known by its code, not by an attribute: other decorators copy a function's attributes.
-    if isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE):
+    # A wrapper is known by its globals, not by an attribute: other decorators copy a function's attributes.
+    if isinstance(function, FunctionType) and isinstance(function.__globals__.get("INTERCEPTORS"), Interceptors):
         hook: Hook = vars(function)[_MADE_WITH][0]
         return hook
     return None
@@ -249,7 +247,7 @@ class Hook:
             "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors, "fits": self.bind,
             "getcurrent": getcurrent, "intercept": self._intercept, "rule": self.function, "BOUND": BOUND,
         }  # fmt: skip
-        exec(compile(_source(self, scope), f"{_FILE}{self.name}>", "exec"), scope)
+        exec(compile(_source(self, scope), f"<wrapper of {self.name}>", "exec"), scope)
         made: FunctionType = scope["wrapper"]
         made.__code__ = made.__code__.replace(co_name=getattr(self.function, "__name__", "call"))  # for tracebacks
         update_wrapper(made, self.function)

@@ -414,6 +414,7 @@ def test_removals_that_cannot_be_are_refused(removed_by, error, match):
     assert Being(0).act() == "rule"
 
 
+@pytest.mark.usefixtures("_collected")  # an environment of another test would still patch the class
 def test_removing_functions_work_as_before_outside_of_environments():
     leave, act = vars(Being)["leave"], vars(Being)["act"]
     env = aec_env(life("0 acts, 1 acts"), beings())

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from time import sleep
 from typing import Any, NamedTuple
+from weakref import WeakSet
 
 import greenlet
 import numpy as np
@@ -182,22 +183,20 @@ def alive(kind: type) -> int:
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
-def stacks(expected: int | None = None, looks: int = 1000) -> int:
-    """How many greenlets there are since the file of tests began, but for those that are a thread's own.
+def stacks(before: WeakSet[Any] | None = None) -> WeakSet[Any]:
+    """The greenlets since the file of tests began, but for those that are a thread's own, which have no parent.
 
-    A thread's own has no parent, and is freed a moment after the thread has ended. Of environments that hold others one
-    goes at a time: what is expected is waited for, and else until nothing more goes.
+    Those that were there ``before`` are left out. Of environments that hold others one goes at a time.
     """
-    number = -1
-    for _ in range(looks):  # on a machine that is busy a moment may be long
-        before = number
+    for _ in range(1000):  # on a machine that is busy a moment may be long
         gc.collect()
-        number = sum(type(thing) is greenlet.greenlet and thing.parent is not None for thing in gc.get_objects())
-        if number == (before if expected is None else expected):
+        found = WeakSet(
+            thing for thing in gc.get_objects() if type(thing) is greenlet.greenlet and thing.parent is not None
+        )
+        if before is None or found <= before:
             break
-        if expected is not None:
-            sleep(0.01)
-    return number
+        sleep(0.01)
+    return found if before is None else found - before
 
 
 _unattended = decision()

@@ -93,7 +93,7 @@ class outside_simulation:  # noqa: N801 - it is used like a function
             EVALUATING.pop(here, None)
 
     def __exit__(self, *error: object) -> None:
-        here = self._here
+        here, self._here = self._here, None  # tracebacks keep this object, and a root must not outlive its thread
         if here is None:
             return
         if self._before is not None:

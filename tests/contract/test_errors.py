@@ -263,8 +263,8 @@ def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_n
         in_a_thread(
             lambda: (roots.append(ref(getcurrent())), step(env, 5, "a_0") if what == "step" else getattr(env, what)())
         )
-    gc.collect()
-    assert (isinstance(caught.value, RuntimeError), roots[0]()) == (True, None)  # else greenlet crashes the collector
+    assert isinstance(caught.value, RuntimeError)
+    assert (root := roots[0]()) is None or not gc.get_referrers(root)  # else the collector crashes in greenlet
     assert not unwound
     step(env, 2, "a_0")
     assert env.unwrapped.simulation.log == [1, 2]

@@ -34,7 +34,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .core.branching import branch
+    from .core.clone import branch, clone
     from .core.rng import reseed_generators
     from .decision import Definition, difference, make_step
     from .envs import aec_env, generate_env, joint_env, parallel_env, single_env, vector_env
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "aec_env", "branch",
+    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "aec_env", "branch", "clone",
     "difference", "evaluate", "generate_env", "joint_env", "make_step", "parallel_env", "register_simulation",
     "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
 ]  # fmt: skip
@@ -56,7 +56,7 @@ ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote
 """The modules in which all other public names are."""
 
 _MODULES = {
-    "core.branching": ("branch",),
+    "core.clone": ("branch", "clone"),
     "core.rng": ("reseed_generators",),
     "decision": ("Definition", "difference", "make_step"),
     "envs": ("aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "vector_env"),

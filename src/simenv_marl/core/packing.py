@@ -29,7 +29,7 @@ from ..hooks.hook import Hook, hook_of, made_with, unwrap
 def pack(thing: Any) -> bytes:
     """Pickle an object for any other process."""
     buffer = io.BytesIO()
-    _Pickler(buffer, 5).dump(thing)
+    Pickler(buffer, 5).dump(thing)
     return buffer.getvalue()
 
 
@@ -61,7 +61,7 @@ def unpack_outcome(parcel: bytes) -> tuple[Any, BaseException | None]:
     return (unpack(result), None) if error is None else (None, unpack_error(error))
 
 
-class _Pickler(cloudpickle.Pickler):
+class Pickler(cloudpickle.Pickler):
     """A pickler for objects that the default pickling would change: errors, and functions that a patch has wrapped."""
 
     def reducer_override(self, obj: Any) -> Any:

@@ -136,7 +136,7 @@ class Run:
         Raises:
             ReentrancyError, WrongThreadError: The simulation is moving, or suspended in another thread.
         """
-        if self.running and self.driver.lost:
+        if self.driver.lost or self.driver.given_up is not None:
             self.running, self.over = False, True
         if self.pending is None and not self.over:
             raise self.refusal()
@@ -150,6 +150,8 @@ class Run:
     def _unwind(self) -> list[BaseException]:
         """Unwind the simulation if it is suspended; then the episode is over. Return the errors that it raised."""
         problems: list[BaseException] = []
+        if self.driver.given_up is not None:  # it was inherited by a fork
+            self.running = False
         self.pending, self.over = None, not self.running  # until then it moves
         if self.over:
             return problems
@@ -174,8 +176,8 @@ def refusal(state: str) -> Exception:
     return {
         "new": NotResetError("there is no episode yet; call reset() first"),
         "copied": NotResetError(
-            "this is a copy of an environment, and has no episode yet; call reset() first, or use branch() to continue"
-            " the episode of the original"
+            "this is a copy of an environment, and has no episode yet; call reset() first, or use clone() to go on from"
+            " where the original stands"
         ),
         "moving": ReentrancyError(
             "the environment was used from inside its own reset, simulation or mappings, or while another thread was"

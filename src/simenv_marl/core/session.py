@@ -6,9 +6,11 @@ together with its session.
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Callable
 from contextvars import Context, copy_context
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -134,17 +136,20 @@ class Session:
             if self._installed is None or not self._installed.complete:
                 self._installed = Installation(self.plan.patches)
             self.options = options
-            if seed is None:
-                seed = int(self.np_random.integers(2**31))
-            else:
-                self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
-            self.seed = seed
+            self.seed = seed = self.seed_for(seed)
             if self._driver.given_up is not None or self._driver.outlived:
                 self._make_simulation()  # code that still uses the old one must not meet another episode
                 self._driver.given_up = None
             return self._begin(seed, in_rounds, script)
         finally:
             self.state = "new" if self.episode is None else "over"
+
+    def seed_for(self, seed: int | None) -> int:
+        """Return the seed of an episode, and seed the generator with it; draw one from the generator for None."""
+        if seed is None:
+            return int(self.np_random.integers(2**31))
+        self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
+        return seed
 
     def _begin(self, seed: int, in_rounds: bool, script: Any) -> Episode:
         """Reset the simulation, and run it to its first decision."""
@@ -175,27 +180,58 @@ class Session:
             raise
         return episode
 
-    def replay(self, other: Session) -> None:
-        """Bring the simulation to the current decision of another session with the same plan, or raise an error."""
-        episode = other.episode
+    def recording(self) -> tuple[int, Any, bool, list[Any], Any]:
+        """Return what a replay needs: seed, options, whether it is in rounds, the answers, and the pending decision."""
+        episode = self.episode
         if episode is None or (episode.pending or episode.consulted) is None:
-            raise other.refusal()
+            raise self.refusal()
         if len(episode.tape) == episode.tape_size or episode.plan.solo:
             raise BranchError(
                 f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of the environment that"
                 ' a policy is given, so its actions were not kept; use method="fork"'
             )
-        again = self.start(other.seed, other.options, in_rounds=episode.in_rounds, script=episode.tape)
+        return episode.seed, self.options, episode.in_rounds, episode.tape, _decision(episode)
+
+    def replay(self, other: Session) -> None:
+        """Bring the simulation to the current decision of another session with the same plan, or raise an error."""
+        seed, options, in_rounds, tape, decision = other.recording()
+        again = self.start(seed, options, in_rounds=in_rounds, script=tape)
         while again.script:
-            again.step(again.script.popleft())
+            answer = again.script.popleft()
+            if isinstance(answer, _Reseeded):
+                self.reseed(answer.seed)
+            else:
+                again.step(answer)
         again.script, again.just_ended = None, []  # the other view has reported the ends
-        if not same(_decision(again), _decision(episode)):
+        if not same(_decision(again), decision):
             again.close()
             raise BranchError(
                 f"{type(self.simulation).__name__} does not repeat its decisions with the same seed and the same"
                 ' actions: some of its random numbers do not follow from the seed. Use method="fork", or'
                 " global_rng=True if it draws from random or numpy.random"
             )
+        self.restore(copy.deepcopy(other.snapshot()) | {"state": self.state})
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Take over the attributes that ``snapshot`` has returned."""
+        for name, value in snapshot.items():
+            setattr(self, name, value)
+
+    def inherit(self) -> None:
+        """In a forked process: leave the episode's stack and simulation as they are when it ends, not unwound."""
+        self._driver.given_up, self._close = "belongs to the environment that was cloned", None
+
+    def ask(self, name: str, *args: Any) -> Any:
+        """Call a method of the simulation on the user's side; raise ``NotImplementedError`` if it has none."""
+        method = getattr(self.simulation, name, None)
+        if not callable(method):
+            raise NotImplementedError(f"{type(self.simulation).__name__} has no method {name}()")
+        with self.context():
+            return method(*args)
+
+    def call(self, env: Any, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+        """Call a function with an environment of this session where the simulation is."""
+        return function(env, *args)
 
     def snapshot(self) -> dict[str, Any]:
         """The attributes that a copy takes over: its state, the latest seed, and the generator."""
@@ -277,6 +313,15 @@ class Session:
                 except BaseException as error:
                     annotate(error, f"simenv_marl: while the simulation was reseeded; seed {seed}")
                     raise
+        if self.episode is not None and len(self.episode.tape) < self.episode.tape_size:
+            self.episode.tape.append(_Reseeded(seed))
+
+
+@dataclass(frozen=True)
+class _Reseeded:
+    """On the tape of an episode: here the simulation was reseeded."""
+
+    seed: int
 
 
 def _decision(episode: Episode) -> Any:

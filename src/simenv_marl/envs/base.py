@@ -27,7 +27,9 @@ from ..core.spaces import observation_cast
 from ..errors import UnknownAgentError, UnknownOptionError, ViewError, did_you_mean, short_repr, warn_user
 from ..plugins import Entry
 
-_OWN = frozenset(("_definition", "_finalizer", "_own", "_roster", "_session", "joint", "metadata"))
+_OWN = frozenset(
+    ("_definition", "_finalizer", "_outermost", "_own", "_plan", "_roster", "_session", "joint", "metadata")
+)
 """The attributes that no copy takes over."""
 
 
@@ -43,16 +45,17 @@ class View:
     render_mode: str | None
     _option: ClassVar[str | None] = None  # the option that only this view takes
     _in_rounds: ClassVar[bool] = False  # whether all agents are updated when a step returns
+    _solo: ClassVar[bool] = False  # whether its branches wait for one agent only
     _finalizer: Any = None
+    _outermost: Callable[[], Any] = staticmethod(lambda: None)  # the wrapper with which it was cloned
     _set_up: Callable[[], None]  # completes what is made
     _begin: Callable[[Episode], Any]  # makes the records of a new episode, and returns the results of its reset
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the view of a plan, of a session that its owner closes, or else of a new session."""
-        adapted = self._adapt(plan)
         super().__init__()
         self._plan = plan
-        self._session = Session(adapted) if session is None else session
+        self._session = Session(self._adapt(plan)) if session is None else session
         if session is None:
             self._finalizer = weakref.finalize(self, self._session.abandon)
         self.metadata = self._metadata_of(plan)
@@ -145,11 +148,7 @@ class View:
                 parts.append(spaces.flatten(agent.point.definition.observation_space, seen))
             value: Any = np.concatenate(parts)
         else:
-            tell = getattr(self.simulation, "state", None)
-            if not callable(tell):
-                raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
-            with self._session.context():
-                value = tell()
+            value = self._session.ask("state")
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -182,8 +181,7 @@ class View:
         if self._picture_mode != self.render_mode:
             frames, self._frames = self._frames, []
             return frames
-        with self._session.context():
-            return self.simulation.render(self._picture_mode)
+        return self._session.ask("render", self._picture_mode)
 
     def _show(self, *, begins: bool = False) -> None:
         """Render after a step, or after the reset with which an episode ``begins``."""
@@ -192,8 +190,7 @@ class View:
         if self._picture_mode == self.render_mode:
             self.render()
             return
-        with self._session.context():
-            self._frames.append(self.simulation.render(self._picture_mode))
+        self._frames.append(self._session.ask("render", self._picture_mode))
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.
@@ -265,7 +262,7 @@ class View:
     def __deepcopy__(self, memory: dict[int, Any]) -> Any:
         """Make an environment like this one, with a simulation of its own. It needs a reset."""
         made = memory[id(self)] = type(self).__new__(type(self))
-        made.__setstate__(copy.deepcopy(self._state(), memory))
+        made.__setstate__(copy.deepcopy(self._recipe(), memory))
         return made
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -278,25 +275,22 @@ class View:
             pickle.dumps(view)
         except Exception:  # a class that generate_env made and that its name does not lead to
             view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-        return _unpickled, (pack((view, self._state())),)
+        return _unpickled, (pack((view, self._recipe())),)
 
     def _state(self) -> dict[str, Any]:
-        """Return what a copy takes over."""
-        own = {name: value for name, value in vars(self).items() if name not in _OWN}
-        return own | {"session": self._session.snapshot()}
+        """Return what is in the same state in a copy."""
+        return {name: value for name, value in vars(self).items() if name not in _OWN}
 
-    def __setstate__(self, state: dict[str, Any], original: Session | None = None) -> None:
-        """Make this environment from the state of another, and replay its episode if its session is given."""
-        View.__init__(self, state.pop("_plan"))
-        if original is not None:
-            self._session.replay(original)
-        for name, value in state.pop("session").items():
-            setattr(self._session, name, value)
-        vars(self).update(state)
-        if original is None:
-            self._clear()
-        else:
-            self._set_up()
+    def _recipe(self) -> dict[str, Any]:
+        """Return what a copy is made of."""
+        return self._state() | {"_plan": self._plan, "session": self._session.snapshot()}
+
+    def __setstate__(self, recipe: dict[str, Any]) -> None:
+        """Make this environment like the one with a recipe."""
+        View.__init__(self, recipe.pop("_plan"))
+        self._session.restore(recipe.pop("session"))
+        vars(self).update(recipe)
+        self._clear()
 
     # -- branches and planners --------------------------------------------------------------------
 
@@ -305,11 +299,34 @@ class View:
         if self.episode.pending is None:
             raise self._session.refusal()
 
-    def _replayed(self) -> Any:
-        """Make an environment in exactly the same state in mid-episode, or raise as ``Session.replay``."""
+    def _cloned(self, session: Session) -> Any:
+        """Make an environment in the same state in mid-episode, with a session that stands at the same decision."""
         made = type(self).__new__(type(self))
-        made.__setstate__(copy.deepcopy(self._state()), self._session)
+        View.__init__(made, self._plan, session)
+        vars(made).update(copy.deepcopy(self._state()))
+        made._finalizer = weakref.finalize(made, session.abandon)
+        made._set_up()
         return made
+
+    def _set_outermost(self, env: Any) -> None:
+        """Note the environment with all wrappers, as which this one was cloned."""
+        self._outermost = weakref.ref(env)
+
+    def call(self, function: Callable[..., Any], *args: Any) -> Any:
+        """Call a function with this environment; that of a clone, in the clone's process, with the clone's wrappers.
+
+        Args:
+            function: Called with the environment and the arguments. It may do anything with it.
+            *args: Further arguments.
+
+        Returns:
+            The result of the function; of a forked clone, a copy.
+
+        Raises:
+            BranchError: The clone's process has ended, or takes too long.
+            BaseException: Any exception of the function.
+        """
+        return self._session.call(self._outermost() or self, function, args)
 
     def _begin_branch(self) -> None:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""

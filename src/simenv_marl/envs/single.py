@@ -118,13 +118,16 @@ class PlannerEnv(SimulationEnv):
     can be stepped; policies or rules answer for all other agents.
     """
 
+    _solo = True
+    _branched = False  # whether it is a branch, or a clone
+
     def _set_up(self) -> None:
         episode: Any = self._session.episode
         if episode is not None:  # otherwise the session is going to replay one
             self._own = episode.consulted or episode.pending
             self._agent, self._definition = self._own.name, self._own.point.definition
             self._roster = {self._agent: self._own.point}
-        self._shows = self._branched = False
+        self._shows = False
 
     @classmethod
     def _adapt(cls, plan: Plan) -> Plan:
@@ -161,6 +164,6 @@ class PlannerEnv(SimulationEnv):
         super().close()
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        raise CopyError("the environment that a policy is given cannot be copied; use branch to continue it")
+        raise CopyError("the environment that a policy is given cannot be copied; use branch or clone to continue it")
 
     __deepcopy__ = __reduce_ex__  # type: ignore[assignment]

@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
-from ..core.branching import pending_view
+from ..core.clone import pending_view
 from ..core.planner import PlannerPolicy, base_of, two_arguments
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv

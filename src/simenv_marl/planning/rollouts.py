@@ -11,7 +11,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.branching import branch
+from ..core.clone import branch
 from ..core.planner import PLANNING
 from ..core.rng import is_seed
 from ..core.session import checked_seed

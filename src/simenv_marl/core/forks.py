@@ -1,0 +1,437 @@
+"""Forked processes: each continues as this process would, answers over a socket, and ends with the first process.
+
+``fork`` copies the memory, but parent and child share the offsets and contents of open files, the events of epoll
+objects, and the sockets of event loops. ``separator`` gives the child its own.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import random
+import select
+import shutil
+import signal
+import socket
+import stat
+import struct
+import sys
+import tempfile
+import time
+import warnings
+import weakref
+from collections.abc import Callable, Container, Iterable
+from contextlib import nullcontext, suppress
+from subprocess import Popen
+from threading import Thread
+from typing import Any, Final
+
+from ..errors import BranchError
+
+CAN_FORK: Final = sys.platform == "linux"
+"""Whether processes can be forked: elsewhere, nothing ends a busy one with its user's process."""
+
+if CAN_FORK:
+    import fcntl
+
+_LENGTH: Final = struct.Struct("!Q")
+"""The number of bytes of a message, which precedes it."""
+
+
+# -- the first process ----------------------------------------------------------------------------
+
+
+class _Life:
+    """A pipe whose write end only this process holds. Its end ends the processes that were forked for this one.
+
+    A signal of the kernel ends them, because a process that is busy would not notice the end of a pipe. The kernel's
+    other signal, at the end of a parent, is of no use: it comes at the end of the thread that has forked.
+    """
+
+    def __init__(self) -> None:
+        self.reading, self.writing = os.pipe()
+
+    def __del__(self) -> None:
+        for descriptor in (self.reading, self.writing):
+            with suppress(OSError):
+                os.close(descriptor)
+
+
+class _Process:
+    """What this process has of its own: its life, while it has forked others; and as a fork, what it has from above.
+
+    Attributes:
+        life: A weak reference to the life that all forks of this process hold.
+        lives: The read ends of the lives of the processes above this one.
+        connection: The socket to the process that uses this one.
+    """
+
+    def __init__(self, lives: tuple[int, ...] = ()) -> None:
+        self.life: Callable[[], _Life | None] = lambda: None
+        self.lives = lives
+        self.connection: socket.socket | None = None
+
+
+_this = _Process()
+
+
+def _own_life() -> _Life:
+    """Return the life on which all forks of this process depend."""
+    life = _this.life()
+    if life is None:
+        try:
+            life = _Life()
+        except OSError as error:
+            raise BranchError(f"no process can be forked: {error}; close some clones") from error
+        _this.life = weakref.ref(life)
+    return life
+
+
+def _begin_process() -> None:
+    """In a forked process, also one that the user has forked: let go of what belongs to the parent."""
+    global _this
+    life = _this.life()
+    if life is not None:  # else the parent's end would go unnoticed as long as this process lives
+        os.close(life.writing)
+        life.writing = -1
+    if _this.connection is not None:
+        _this.connection.close()
+    _this = _Process()
+
+
+if CAN_FORK:
+    os.register_at_fork(after_in_child=_begin_process)
+
+
+def _end_with(descriptor: int) -> None:
+    """Let the kernel kill this process when the write end of a pipe is closed."""
+    own = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY | os.O_NONBLOCK)  # the owner belongs to the opening
+    os.dup2(own, descriptor, inheritable=False)
+    os.close(own)
+    fcntl.fcntl(descriptor, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) | os.O_ASYNC)
+    end = select.poll()
+    end.register(descriptor, select.POLLHUP)
+    if end.poll(0):  # it was closed before
+        os._exit(1)
+
+
+# -- forks ----------------------------------------------------------------------------------------
+
+
+class Fork:
+    """A forked process, and the connection to it.
+
+    Attributes:
+        process: The process's number.
+        connection: The socket that leads to it.
+    """
+
+    def __init__(self, process: int, connection: socket.socket, life: Any = None) -> None:
+        """Take over a process. It is a child of this process if this process's life is given."""
+        self.process, self.connection, self._life = process, connection, life
+        self._owner = os.getpid()
+        self._alive = True
+
+    @classmethod
+    def begin(cls, main: Callable[[socket.socket], None], separate: Callable[[], None]) -> Fork:
+        """Fork a process that separates itself from this one, and runs ``main`` with its end of the connection.
+
+        Raises:
+            BranchError: There are no more descriptors or processes. Nothing is left behind.
+        """
+        life = _own_life()
+        here, there = pair()
+        with there:
+            try:
+                process = start(there, (*_this.lives, life.reading), separate)
+            except BaseException:
+                here.close()
+                raise
+            if process == 0:
+                try:
+                    here.close()
+                    main(there)
+                finally:
+                    os._exit(0)  # without any of the parent's exit handlers
+        return cls(process, here, life)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the process was not ended, and belongs to this one, which may have been forked itself."""
+        return self._alive and self._owner == os.getpid()
+
+    def send(self, message: bytes) -> None:
+        """Send a message."""
+        send(self.connection, message)
+
+    def receive(self, deadline: float = float("inf")) -> bytes:
+        """Receive a message until a time of ``time.monotonic``; an empty one if the process has ended.
+
+        Raises:
+            TimeoutError: It did not come in time.
+        """
+        return receive(self.connection, deadline)
+
+    def end(self) -> str:
+        """End the process, and wait for its end; return how it has ended. In a copy of this one, only let go of it."""
+        how, alive, self._alive = "its process has ended", self._alive, False
+        if not alive:
+            return how
+        if self._owner == os.getpid():
+            if self._life is not None or not self._has_ended():
+                with suppress(ProcessLookupError):
+                    os.kill(self.process, signal.SIGKILL)
+            if self._life is not None:
+                with suppress(ChildProcessError):  # the user has waited for it
+                    code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
+                    how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
+        self._life = None
+        self.connection.close()
+        return how
+
+    def _has_ended(self) -> bool:
+        """Whether the process has closed its end of the connection: then its number may be another process's."""
+        self.connection.setblocking(False)
+        try:
+            return self.connection.recv(1, socket.MSG_PEEK) == b""
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+
+def pair() -> tuple[socket.socket, socket.socket]:
+    """Make two connected sockets, or raise a ``BranchError``."""
+    try:
+        return socket.socketpair()
+    except OSError as error:
+        raise BranchError(f"no process can be connected: {error}; close some clones") from error
+
+
+def start(connection: socket.socket, lives: tuple[int, ...], separate: Callable[[], None]) -> int:
+    """Fork a process that ends with the given lives; return its number, and 0 in that process.
+
+    Raises:
+        BranchError: There are no more processes.
+    """
+    flush()  # else both processes would write what is buffered
+    try:
+        # Python 3.12 warns because the child never releases locks that other threads hold.
+        with warnings.catch_warnings(action="ignore") if sys.version_info >= (3, 12) else nullcontext():
+            process = os.fork()
+    except OSError as error:
+        raise BranchError(f"no process can be forked: {error}; close some clones") from error
+    if process == 0:
+        try:
+            _this.lives, _this.connection = lives, connection
+            for life in lives:
+                _end_with(life)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the user's process
+            signal.set_wakeup_fd(-1)
+            separate()
+            gc.freeze()  # the collector would write to what is shared with the parent, and so copy it
+        except BaseException:
+            os._exit(1)
+    return process
+
+
+def lives_above() -> tuple[int, ...]:
+    """The lives of the processes above this one, for forks that belong to them."""
+    return _this.lives
+
+
+def send(connection: socket.socket, message: bytes) -> None:
+    """Send a message."""
+    connection.sendall(_LENGTH.pack(len(message)) + message)
+
+
+def receive(connection: socket.socket, deadline: float = float("inf")) -> bytes:
+    """Receive a message until a time of ``time.monotonic``; an empty one if the other end was closed.
+
+    Raises:
+        TimeoutError: It did not come in time.
+    """
+    parts: list[bytes] = []
+    size = missing = -1
+    while missing:
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        connection.settimeout(min(left, 3600.0))  # in parts, because the time limit may be infinite
+        try:
+            part = connection.recv(1 << 16 if missing < 0 else min(missing, 1 << 20))
+        except TimeoutError:
+            continue
+        except ConnectionError:
+            return b""
+        if not part:
+            return b""
+        if size < 0:
+            size = _LENGTH.unpack_from(part)[0]
+            part, missing = part[_LENGTH.size :], size
+        parts.append(part)
+        missing -= len(part)
+    return b"".join(parts)
+
+
+def flush() -> None:
+    """Write out what the standard streams have buffered."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(Exception):
+            stream.flush()
+
+
+# -- what makes a forked process continue as its parent would -------------------------------------
+
+_DESCRIPTORS: Final = "/proc/self/fd"
+
+_FLAGS: Final = os.O_WRONLY | os.O_RDWR | os.O_APPEND
+"""The flags with which a file is opened again. The others say how it was made, or matter for other kinds of files."""
+
+Files = dict[tuple[int, int], list[tuple[int, int, list[int]]]]
+"""Open regular files by what identifies them. For each time that one was opened: the flags, the offset, and the
+descriptors that share the offset."""
+
+
+def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
+    """Return a function that separates forked children, in which the event loops continue, from this process.
+
+    ``fork`` copies the memory, but parent and child share the offsets and contents of open files, the events of epoll
+    objects, and the sockets of event loops. And Python reseeds its global generator in the child.
+    """
+    python, (files, polls) = random.getstate(), _open_files()
+
+    def separate() -> None:
+        random.setstate(python)  # Python reseeds it after a fork
+        for inode, openings in files.items():
+            # A file may have been closed since: by the garbage collector, or in a thread that does not exist here.
+            if all(_inode(number) == inode for _, _, numbers in openings for number in numbers):
+                _reopen(openings)
+        for loop in loops:
+            _separate_loop(loop)
+        for number in polls:
+            _separate_poll(number)
+        torch = sys.modules.get("torch")
+        if torch is not None:
+            torch.set_num_threads(1)  # its threads do not exist here, and torch would wait for them
+
+    return separate
+
+
+def open_resources(opened: Iterable[Any] | None) -> dict[Any, str]:
+    """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
+    found: dict[Any, str] = {}
+    for thing in opened or ():
+        if isinstance(thing, socket.socket):
+            if thing.fileno() >= 0:
+                found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
+        elif isinstance(thing, Thread):
+            if thing.is_alive():
+                found[thing] = "a thread"
+        elif (thing.returncode if isinstance(thing, Popen) else thing.exitcode) is None:
+            found[thing] = f"a child process ({thing.pid})"
+    return found
+
+
+def loops_on(descriptors: Container[int]) -> list[Any]:
+    """Return the open asyncio event loops whose wake-up sockets are among the given descriptors."""
+    events = sys.modules.get("asyncio.selector_events")
+    if events is None:
+        return []
+    loops = [thing for thing in gc.get_objects() if isinstance(thing, events.BaseSelectorEventLoop)]
+    return [loop for loop in loops if not loop.is_closed() and loop._ssock.fileno() in descriptors]
+
+
+def _separate_loop(loop: Any) -> None:
+    """Give an event loop a selector, and sockets behind the same descriptors, that belong to this process only."""
+    for old, new in zip((loop._ssock, loop._csock), socket.socketpair(), strict=True):
+        with new:
+            new.setblocking(False)
+            os.dup2(new.fileno(), old.fileno(), inheritable=False)
+    shared = loop._selector
+    loop._selector = type(shared)()
+    for key in shared.get_map().values():
+        loop._selector.register(key.fileobj, key.events, key.data)
+    shared.close()
+
+
+def _separate_poll(number: int) -> None:
+    """Put an epoll object of this process, which waits for the same events, behind a descriptor."""
+    with suppress(OSError), select.epoll() as own, open(f"/proc/self/fdinfo/{number}", encoding="ascii") as entries:
+        watched = [entry.split() for entry in entries if entry.startswith("tfd:")]
+        # Only those of Python have the descriptors as data. C libraries find out themselves that they were forked.
+        if all(int(entry[1]) == int(entry[5], 16) for entry in watched):
+            for entry in watched:
+                own.register(int(entry[1]), int(entry[3], 16))
+            os.dup2(own.fileno(), number, inheritable=os.get_inheritable(number))
+
+
+def _open_files() -> tuple[Files, list[int]]:
+    """Return the open regular files of this process, except for standard streams, and its epoll objects."""
+    files: Files = {}
+    polls: list[int] = []
+    standard = [_inode(number) for number in range(3)]  # which branches share with their parent
+    for number in sorted(map(int, os.listdir(_DESCRIPTORS))):
+        inode = _inode(number)
+        if inode is None or inode in standard:
+            continue
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            with suppress(OSError):
+                if os.readlink(f"{_DESCRIPTORS}/{number}") == "anon_inode:[eventpoll]":
+                    polls.append(number)
+            continue
+        with suppress(OSError):  # a descriptor that only stands for a path
+            flags, offset = fcntl.fcntl(number, fcntl.F_GETFL) & _FLAGS, os.lseek(number, 0, os.SEEK_CUR)
+            openings = files.setdefault(inode, [])
+            for *opening, numbers in openings:
+                if opening == [flags, offset] and _share_offset(numbers[0], number):
+                    numbers.append(number)
+                    break
+            else:
+                openings.append((flags, offset, [number]))
+    return files, polls
+
+
+def _inode(number: int) -> tuple[int, int] | None:
+    """Return what identifies the file behind a descriptor; None if the descriptor is closed."""
+    try:
+        status = os.fstat(number)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _share_offset(one: int, other: int) -> bool:
+    """Return whether two descriptors with the same offset share it, because one is a duplicate of the other."""
+    offset = os.lseek(one, 1, os.SEEK_CUR)
+    try:
+        return os.lseek(other, 0, os.SEEK_CUR) == offset
+    finally:
+        os.lseek(one, -1, os.SEEK_CUR)
+
+
+def _reopen(openings: list[tuple[int, int, list[int]]]) -> None:
+    """Open a file again: the same one if it is only read, else a copy that is deleted when it is closed."""
+    path = _path(openings[0][2][0])
+    modes = {flags & os.O_ACCMODE for flags, _, _ in openings}
+    copied: Any
+    with nullcontext() if modes == {os.O_RDONLY} else tempfile.TemporaryFile() as copied:
+        if modes == {os.O_WRONLY}:  # the contents are never read
+            copied.truncate(os.stat(path).st_size)
+        elif copied is not None:
+            shutil.copyfile(path, _path(copied.fileno()))
+        for flags, offset, numbers in openings:
+            again = os.open(path if copied is None else _path(copied.fileno()), flags)
+            os.lseek(again, offset, os.SEEK_SET)
+            for number in numbers:
+                os.dup2(again, number, inheritable=os.get_inheritable(number))
+            os.close(again)
+
+
+def _path(number: int) -> str:
+    """Return a path by which an open file can be opened again, even if it was deleted."""
+    if hasattr(fcntl, "F_GETPATH"):  # on macOS, where opening /dev/fd would share the offset
+        return os.fsdecode(fcntl.fcntl(number, fcntl.F_GETPATH, bytes(1024)).partition(b"\0")[0])
+    return f"{_DESCRIPTORS}/{number}"

@@ -13,6 +13,7 @@ To begin with:
 - ``aec_env``, ``parallel_env``, ``single_env``, ``joint_env`` and ``vector_env`` make environments;
 - ``RULE`` as an action lets the model's own function decide;
 - ``simulate`` and ``evaluate`` run the simulation with policies, and compare these with the rule;
+- ``clone`` copies an environment in mid-episode;
 - ``python -m simenv_marl check MODULE:SIMULATION`` checks a simulation.
 
 All other names are in rooms, which are imported when they are first used:
@@ -47,8 +48,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "aec_env", "branch", "clone",
-    "difference", "evaluate", "generate_env", "joint_env", "make_step", "parallel_env", "register_simulation",
+    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "aec_env", "branch",
+    "clone", "difference", "evaluate", "generate_env", "joint_env", "make_step", "parallel_env", "register_simulation",
     "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
 ]  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 Each module imports only from those below it::
 
-    branching                   exact continuations of an episode
+    clone                       copies of an environment in mid-episode, and exact continuations
     provenance                  the record of what an environment was made of
     session                     the simulation of one environment, over all its episodes
     episode, plan               one episode, and the life cycle of a decision; the checked description of an environment
@@ -15,4 +15,5 @@ Each module imports only from those below it::
     actions, planner            checks of actions; policies that get the environment
     spaces, stacking            casts and checks of single values; stacks of many
     rng, options, packing       seeds of generators; options; pickles for other processes
+    forks                       forked processes, which end with the first one
 """

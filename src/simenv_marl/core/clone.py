@@ -345,7 +345,7 @@ def _unpicklable(error: Exception) -> BranchError:
 
 # -- the clone as this process has it --------------------------------------------------------------
 
-_FIELDS: Final = ("observation", "reward", "info", "mask", "acted", "decided", "ended", "present")
+_FIELDS: Final = ("observation", "reward", "info", "mask", "acted", "decided", "ended", "present", "consultations")
 """What views read of an agent."""
 
 State = tuple[Any, ...]
@@ -362,7 +362,7 @@ class Mirror(Episode):
         nothing: Any = None
         self.remote, self.plan, self.seed = remote, remote.plan, remote.seed or 0
         self.simulation = self.driver = self.latest = self.consulted = self.script = nothing
-        self.clock = None if state[5] is None else lambda: remote.time
+        self.clock = None if state[5] is None else partial(getattr, remote, "time")
         self.agents, self.others, self.ended, self.entities = {}, {}, {}, {}
         self.running, self.skips = True, False
         *_, self.unreported_end, self.last_time = state
@@ -381,7 +381,7 @@ class Mirror(Episode):
                 setattr(agent, field, value)
         self.others.update(dict.fromkeys(others))
         for name in ended:
-            self.ended[name] = self.agents.pop(name, None) or self.ended[name]
+            self.ended[name] = self.agents.pop(name) if name in self.agents else self.ended[name]
         self.just_ended = [self.ended[name] for name in ended]
         self.pending = None if pending is None else self.agents[pending]
 
@@ -434,7 +434,7 @@ class ForkedSession(Session):
         self.episode = (MirrorOfRounds if in_rounds else Mirror)(self, state)
 
     @property
-    def simulation(self) -> Any:  # type: ignore[override]
+    def simulation(self) -> Any:
         """Refuse it: it is in another process."""
         raise BranchError(
             "the simulation of a clone is in the clone's process; reach it with"
@@ -481,10 +481,10 @@ class ForkedSession(Session):
         whole = _MOVES.get(name)
         if state is not None:
             in_rounds, state = pickle.loads(state)
-            if whole or self.episode is None:
-                self._mirror(in_rounds, state)
+            if isinstance(self.episode, Mirror) and not whole:
+                self.episode.load(state)
             else:
-                self.episode.load(state)  # type: ignore[attr-defined]
+                self._mirror(in_rounds, state)
         elif whole is not None:
             self.episode = None
         if error is None:
@@ -756,7 +756,7 @@ def _state_of(episode: Episode, *, whole: bool) -> State:
 
 def _fields(agent: Agent) -> tuple[Any, ...]:
     seen = agent.observation, agent.reward, dict(agent.info), agent.mask
-    return *seen, agent.acted, agent.decided, agent.ended, agent.present
+    return *seen, agent.acted, agent.decided, agent.ended, agent.present, agent.consultations
 
 
 def _pack_state(episode: Episode, *, whole: bool) -> tuple[bytes, list[str]]:

@@ -65,6 +65,7 @@ class Pickler(cloudpickle.Pickler):
     """A pickler for objects that the default pickling would change: errors, and functions that a patch has wrapped."""
 
     def reducer_override(self, obj: Any) -> Any:
+        """How to pickle a function, an error or a class."""
         reduced = None
         if isinstance(obj, FunctionType):
             reduced = _reduce_function(obj)

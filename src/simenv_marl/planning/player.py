@@ -6,11 +6,13 @@ The environment may have wrappers. The agent's actions go through them, and its 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import isfinite
 from numbers import Real
-from typing import Any
+from typing import Any, Final
+from zlib import crc32
 
 import numpy as np
 from gymnasium import spaces
@@ -18,10 +20,19 @@ from gymnasium import spaces
 from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
 from ..core.clone import pending_view
-from ..core.planner import PlannerPolicy, base_of, two_arguments
+from ..core.planner import PLANNING, PlannerPolicy, base_of, two_arguments
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
-from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, did_you_mean, short_repr
+from ..errors import (
+    EpisodeOverError,
+    InvalidActionError,
+    OptionValueError,
+    UnknownAgentError,
+    annotate,
+    did_you_mean,
+    short_repr,
+    warn_user,
+)
 from ..simulation import RULE
 
 
@@ -165,7 +176,7 @@ class Player:
 
     def _sample(self, name: str) -> Any:
         """Return a legal action of an agent, which wrappers see in place of ``RULE``."""
-        space, agent = self._space_of(name), self.episode.agents.get(name)
+        space, agent = copy.deepcopy(self._space_of(name)), self.episode.agents.get(name)  # whose generator stays
         masked = agent is not None and agent.mask is not None and space == agent.point.definition.action_space
         return space.sample(agent.mask) if masked else space.sample()
 
@@ -265,6 +276,30 @@ def player_of(env: Any, base: Any) -> Player:
     return next((player for kind, player in players.items() if isinstance(view, kind)), Player)(env, base)
 
 
+def is_planning() -> bool:
+    """Return whether this code runs in a branch in which a planner tries a candidate."""
+    return PLANNING.get()
+
+
+def try_out(env: Any, number: int, tries: Sequence[tuple[list[Any], int]], policy: Any) -> tuple[list[float], int]:
+    """In a branch, take the actions of one of the tries; return what ``rollout`` returns, and a digest of what was seen.
+
+    A try is a list of actions, and the number of the future. ``policy`` is a ``RolloutPolicy``.
+    """
+    actions, future = tries[number]
+    planning = PLANNING.set(True)
+    try:
+        player = player_of(env, policy.base)
+        rewards = rollout(player, actions, policy)
+        return rewards, crc32(repr((player.record.observation, player.record.info)).encode(errors="replace"))
+    except BaseException as error:
+        tried = ", ".join(map(short_repr, actions))
+        annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
+        raise
+    finally:
+        PLANNING.reset(planning)
+
+
 def rollout(player: Player, actions: Sequence[Any], options: Any) -> list[float]:
     """Take actions in a branch, one after the other, and continue with the base.
 
@@ -294,6 +329,16 @@ def rollout(player: Player, actions: Sequence[Any], options: Any) -> list[float]
             raise OptionValueError(f"terminal_value must return a finite number, not {short_repr(value)}")
         rewards[-1] += float(value) * weight
     return rewards
+
+
+_WARNED: Final[set[tuple[str, str]]] = set()
+
+
+def warn_once(name: str, message: str) -> None:
+    """Warn of a simulation, once for each message."""
+    if (name, message) not in _WARNED:
+        _WARNED.add((name, message))
+        warn_user(message)
 
 
 def is_number(value: Any) -> bool:

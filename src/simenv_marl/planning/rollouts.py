@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import ceil, inf, log, log2, sqrt
 from typing import Any, Final
 from zlib import crc32
@@ -12,15 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.clone import branch
-from ..core.planner import PLANNING
 from ..core.rng import is_seed
 from ..core.session import checked_seed
-from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
+from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE
-from .player import is_number, player_of, rollout
+from .player import is_number, is_planning, player_of, try_out, warn_once
 
 _KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
+
+_SEVERAL: Final = 4
+"""The number of futures of a plan that are compared to find out whether they are all the same."""
 
 _AT_ONCE: Final = 8
 """The number of branches that run before a tree is updated. It does not depend on the number of cores."""
@@ -113,7 +116,7 @@ def action_values(
         actions, base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
         discount=discount, discount_by=discount_by, seed=seed, method=method, time_limit=time_limit,
     )  # fmt: skip
-    if PLANNING.get():
+    if is_planning():
         return base_value(env, base)
     rollouts = Rollouts(env, policy)
     candidates = range(len(rollouts.actions))
@@ -147,19 +150,20 @@ class Rollouts:
             raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
         self.actions = player.candidates(policy.actions, legal=legal)
         self.returns: list[list[float]] = [[] for _ in self.actions]
+        self._outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
         number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
+        self._name = player.view._plan.name
         try:
             player.view._session.check_reseed()
             self.reseeds = True
         except BranchError:
             self.reseeds = False
             warn_user(
-                f"{type(player.view.simulation).__name__} cannot draw new random numbers in a branch: the planner"
-                " tries all candidates on the one future that will happen, and so foresees chance. Give it a method"
-                " reseed(seed), empty if nothing is random, or set global_rng=True if it draws from random or"
-                " numpy.random"
+                f"{self._name} cannot draw new random numbers in a branch: the planner tries all candidates on the one"
+                " future that will happen, and so foresees chance. Give it a method reseed(seed), empty if nothing is"
+                " random, or set global_rng=True if it draws from random or numpy.random"
             )
 
     def seeds(self, number: int) -> list[int]:
@@ -182,29 +186,31 @@ class Rollouts:
         if self.reseeds:
             numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
             seeds = [numbers[future] for _, future in rollouts]
-
-        def run_one(env: Any, number: int) -> list[float]:
-            plan, future = rollouts[number]
-            actions = [self.actions[place] for place in plan]
-            planning = PLANNING.set(True)
-            try:
-                return rollout(player_of(env, policy.base), actions, policy)
-            except BaseException as error:
-                tried = ", ".join(map(short_repr, actions))
-                annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
-                raise
-            finally:
-                PLANNING.reset(planning)
-
-        results: list[list[float]] = branch(
-            self._env, run_one, len(rollouts), method=policy.method, seeds=seeds, time_limit=policy.time_limit
-        )
-        for (plan, _), rewards in zip(rollouts, results, strict=True):
+        tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
+        results = branch(
+            self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
+            time_limit=policy.time_limit,
+        )  # fmt: skip
+        for (plan, _), (rewards, seen) in zip(rollouts, results, strict=True):
             self.returns[plan[0]].append(sum(rewards))
-        return results
+            self._outcomes.setdefault(plan, []).append((rewards, seen))
+        return [rewards for rewards, _ in results]
+
+    def check_futures(self) -> None:
+        """Warn if chance was drawn anew and all futures are the same nevertheless."""
+        several = [outcomes for outcomes in self._outcomes.values() if len(outcomes) >= _SEVERAL]
+        if self.reseeds and several and all(outcomes.count(outcomes[0]) == len(outcomes) for outcomes in several):
+            warn_once(
+                self._name,
+                f"all futures of {self._name} are the same, although it was reseeded for each: it is deterministic from"
+                " here, or its reseed does not reach the generators that it draws from, and the planner foresees"
+                " chance. reseed must seed each of them; global_rng=True reaches those of random and numpy.random"
+                " alone",
+            )
 
     def values(self, finalists: Sequence[int]) -> ActionValues:
         """Estimate the values; the best candidate is one of the finalists, which are given by their places."""
+        self.check_futures()
         counts = np.array([len(values) for values in self.returns], np.int64)
         returns = np.full((len(counts), counts.max()), np.nan)
         means, errors = np.full((2, len(counts)), np.nan)
@@ -294,7 +300,7 @@ class RolloutPolicy:
             OptionValueError: The budget is too small to try each candidate.
             BaseException: As ``action_values``.
         """
-        if PLANNING.get():
+        if is_planning():
             return base_value(env, self.base)
         rollouts = Rollouts(env, self, legal=True)
         number = len(rollouts.actions)

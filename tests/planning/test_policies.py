@@ -311,6 +311,7 @@ def choice(planner, model=Lock, given=None):
 
 
 @METHODS
+@pytest.mark.filterwarnings("ignore:all futures of Lock are the same")
 def test_two_decisions_that_are_worth_something_together(method):
     tree = TreeSearchPolicy(futures=10, exploration=1.4, method=method)
     rollouts = RolloutPolicy(futures=10, method=method)
@@ -321,6 +322,7 @@ def test_two_decisions_that_are_worth_something_together(method):
     assert not simulate(Lock, {"thief": rollouts}, points=locked(), seed=1).open
 
 
+@pytest.mark.filterwarnings("ignore:all futures of Lock are the same")
 def test_actions_that_are_masked_by_then_are_left_to_the_base():
     given = locked(action_mask_mapping=lambda lock: [1, 1, 1, not lock.tried])
     told = choice(TreeSearchPolicy(futures=10), given=given)

@@ -3,6 +3,7 @@
 Each module imports only from those below it::
 
     clone                       copies of an environment in mid-episode, and exact continuations
+    mirror, host                a clone, as its view sees it, and in its process
     provenance                  the record of what an environment was made of
     session                     the simulation of one environment, over all its episodes
     episode, plan               one episode, and the life cycle of a decision; the checked description of an environment

@@ -126,11 +126,12 @@ class Fork:
     Attributes:
         process: The process's number.
         connection: The socket that leads to it.
+        life: What keeps it from ending.
     """
 
-    def __init__(self, process: int, connection: socket.socket, life: Any = None) -> None:
-        """Take over a process. It is a child of this process if this process's life is given."""
-        self.process, self.connection, self._life = process, connection, life
+    def __init__(self, process: int, connection: socket.socket, life: Any, *, is_child: bool) -> None:
+        """Take over a process that ends with a life: a child of this process, or a child's."""
+        self.process, self.connection, self.life, self._is_child = process, connection, life, is_child
         self._owner = os.getpid()
         self._alive = True
 
@@ -155,7 +156,7 @@ class Fork:
                     main(there)
                 finally:
                     os._exit(0)  # without any of the parent's exit handlers
-        return cls(process, here, life)
+        return cls(process, here, life, is_child=True)
 
     @property
     def usable(self) -> bool:
@@ -174,20 +175,25 @@ class Fork:
         """
         return receive(self.connection, deadline)
 
+    def receive_descriptors(self, limit: float) -> list[int]:
+        """Receive the descriptors that the process sends with a single byte."""
+        self.connection.settimeout(limit)
+        return socket.recv_fds(self.connection, 1, 1)[1]
+
     def end(self) -> str:
         """End the process, and wait for its end; return how it has ended. In a copy of this one, only let go of it."""
         how, alive, self._alive = "its process has ended", self._alive, False
         if not alive:
             return how
         if self._owner == os.getpid():
-            if self._life is not None or not self._has_ended():
+            if self._is_child or not self._has_ended():
                 with suppress(ProcessLookupError):
                     os.kill(self.process, signal.SIGKILL)
-            if self._life is not None:
+            if self._is_child:
                 with suppress(ChildProcessError):  # the user has waited for it
                     code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
                     how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
-        self._life = None
+        self.life = None
         self.connection.close()
         return how
 

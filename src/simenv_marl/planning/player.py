@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import isfinite
 from numbers import Real
+from time import perf_counter
 from typing import Any, Final
 from zlib import crc32
 
@@ -43,6 +45,7 @@ class Player:
         env, view: The environment, with or without wrappers, and the unwrapped one.
         may_be: Returns whether an agent of a name exists, or may appear.
         over: Whether the agent's episode has ended.
+        seen: Observation and info, as the latest step has returned them, by agent.
     """
 
     def __init__(self, env: Any, base: Any) -> None:
@@ -53,7 +56,7 @@ class Player:
         self.may_be: Callable[[Any], bool] = self.episode.may_have
         self.over = False
         self._policies: dict[str, Any] = {}  # the bases that were asked, by agent
-        self._seen: dict[str, Any] = {}  # observation and info, as the latest step has returned them, by agent
+        self.seen: dict[str, Any] = {}
 
     # -- checks, before anything moves ------------------------------------------------------------
 
@@ -111,9 +114,9 @@ class Player:
 
     # -- in a branch ------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Prepare a branch."""
-        self.view._shows = False
+    def start(self, seen: dict[str, Any]) -> None:
+        """Prepare a branch, in which a step may already have returned something."""
+        self.view._shows, self.seen = False, dict(seen)
         if isinstance(self.view, SimulationEnv) and isinstance(self.base, Mapping):
             self.episode.delegate(self.base)  # the simulation answers for all other agents
 
@@ -124,7 +127,7 @@ class Player:
     def step(self, action: Any) -> float:
         """Take an action, continue to the agent's next decision or its end, and return the reward."""
         observation, reward, terminated, truncated, info = self._step_env(action, self.agent)
-        self._seen, self.over = {self.agent: (observation, info)}, terminated or truncated
+        self.seen, self.over = {self.agent: (observation, info)}, terminated or truncated
         return float(reward)
 
     def decide(self) -> Any:
@@ -144,8 +147,8 @@ class Player:
 
     def _observe(self, name: str) -> Any:
         """Return the latest observation and info of an agent."""
-        if name in self._seen:
-            return self._seen[name]
+        if name in self.seen:
+            return self.seen[name]
         agent = self.record if name == self.agent else self.episode.agents[name]
         observation = agent.point.blank() if agent.observation is None else duplicate(agent.observation)
         return observation, dict(agent.info)
@@ -213,7 +216,7 @@ class JointPlayer(Player):
         return {name: self._decide_for(name) if name in agents else RULE for name in self.view.joint.roster}
 
     def _observe(self, name: str) -> Any:
-        if name == self.agent and not self._seen:
+        if name == self.agent and not self.seen:
             return self.view.joint.observe(self.episode), {}
         return super()._observe(name)
 
@@ -263,7 +266,7 @@ class ParallelPlayer(Player):
         """Play a round in which the other agents follow their bases."""
         others = {name: self._decide_for(name) for name in self.episode.agents if name != self.agent}
         observations, rewards, terminations, truncations, infos = self._step_env(actions | others, self.agent)
-        self._seen = {name: (observations[name], infos.get(name, {})) for name in observations}
+        self.seen = {name: (observations[name], infos.get(name, {})) for name in observations}
         over = terminations.get(self.agent, True) or truncations.get(self.agent, True)
         self.over = bool(over or self.record.ended)  # pad_agents keeps ended agents
         return float(rewards.get(self.agent, 0.0))
@@ -281,17 +284,53 @@ def is_planning() -> bool:
     return PLANNING.get()
 
 
-def try_out(env: Any, number: int, tries: Sequence[tuple[list[Any], int]], policy: Any) -> tuple[list[float], int]:
-    """In a branch, take the actions of one of the tries; return what ``rollout`` returns, and a digest of what was seen.
+@dataclass
+class Progress:
+    """How far a rollout has come.
 
-    A try is a list of actions, and the number of the future. ``policy`` is a ``RolloutPolicy``.
+    Attributes:
+        rewards: The discounted reward of each decision of the agent.
+        start: The time at its begin; None if time does not matter.
+        seen: What the latest step has returned, by agent.
+        over: Whether the agent's episode has ended.
+        seconds: The real time that it took.
     """
+
+    rewards: list[float] = field(default_factory=list)
+    start: float | None = None
+    seen: dict[str, Any] = field(default_factory=dict)
+    over: bool = False
+    seconds: float = 0.0
+
+
+Outcome = tuple[list[float], int, float]
+"""The rewards of a rollout, a digest of what the agent saw at its end, and the real seconds for each decision."""
+
+
+def try_out(env: Any, number: int, tries: Sequence[tuple[list[Any], int]], policy: Any) -> Outcome:
+    """In a branch, make one of the rollouts, each given by its actions and the number of the future."""
     actions, future = tries[number]
-    planning = PLANNING.set(True)
+    return rollout_from(env, actions, policy, Progress(), future=future)[1]
+
+
+def rollout_from(
+    env: Any, actions: Sequence[Any], policy: Any, progress: Progress, *, stop: int | None = None, future: int = 0
+) -> tuple[Progress, Outcome]:
+    """In a branch, continue a rollout up to its end, or before decision number ``stop``; return it and its outcome.
+
+    Take actions, one after the other, and continue with the base. If an action is illegal when its decision arises, the
+    base decides. The terminal value is added to the last reward. ``policy`` is a ``RolloutPolicy``.
+    """
+    planning, began = PLANNING.set(True), perf_counter()
     try:
         player = player_of(env, policy.base)
-        rewards = rollout(player, actions, policy)
-        return rewards, crc32(repr((player.record.observation, player.record.info)).encode(errors="replace"))
+        player.start(progress.seen)
+        made = replace(progress, rewards=progress.rewards.copy())
+        _continue(made, player, actions, policy, stop)
+        made.seen, made.over = player.seen, player.over
+        made.seconds += perf_counter() - began
+        digest = crc32(repr((player.record.observation, player.record.info)).encode(errors="replace"))
+        return made, (made.rewards, digest, made.seconds / max(1, len(made.rewards)))
     except BaseException as error:
         tried = ", ".join(map(short_repr, actions))
         annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
@@ -300,35 +339,30 @@ def try_out(env: Any, number: int, tries: Sequence[tuple[list[Any], int]], polic
         PLANNING.reset(planning)
 
 
-def rollout(player: Player, actions: Sequence[Any], options: Any) -> list[float]:
-    """Take actions in a branch, one after the other, and continue with the base.
-
-    If an action is illegal when its decision arises, the base decides. Return the discounted reward of each decision of
-    the agent; the terminal value is added to the last one. ``options`` is a ``RolloutPolicy``.
-    """
-    player.start()
-    rewards: list[float] = []
-    action, start = actions[0], player.now() if options.timed else 0.0
-    while True:
-        number, elapsed = len(rewards), player.now() - start if options.timed else 0.0
+def _continue(made: Progress, player: Player, actions: Sequence[Any], options: Any, stop: int | None) -> None:
+    """Take steps, and add their rewards."""
+    rewards = made.rewards
+    if options.timed and made.start is None:
+        made.start = player.now()
+    while not player.over and len(rewards) != stop:
+        number, elapsed = len(rewards), player.now() - made.start if made.start is not None else 0.0
         weight = options.discount ** (elapsed if options.discount_by == "time" else number)
-        if number:
-            reached = elapsed if options.horizon_by == "time" else number
-            if options.horizon is not None and reached >= options.horizon:
-                break
-            planned = number < len(actions) and player.allows(actions[number])
-            action = actions[number] if planned else player.decide()
-        rewards.append(weight * player.step(action))
-        if player.over:
-            return rewards
-    if options.terminal_value is not None:
-        value: Any = options.terminal_value(player.env)
-        if isinstance(value, np.ndarray) and value.size == 1:
-            value = value.item()
-        if not is_number(value):
-            raise OptionValueError(f"terminal_value must return a finite number, not {short_repr(value)}")
-        rewards[-1] += float(value) * weight
-    return rewards
+        reached = elapsed if options.horizon_by == "time" else number
+        if number and options.horizon is not None and reached >= options.horizon:
+            if options.terminal_value is not None and stop is None:
+                rewards[-1] += weight * _terminal_value(options.terminal_value, player.env)
+            return
+        planned = number == 0 or (number < len(actions) and player.allows(actions[number]))
+        rewards.append(weight * player.step(actions[number] if planned else player.decide()))
+
+
+def _terminal_value(function: Callable[[Any], Any], env: Any) -> float:
+    value: Any = function(env)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if not is_number(value):
+        raise OptionValueError(f"terminal_value must return a finite number, not {short_repr(value)}")
+    return float(value)
 
 
 _WARNED: Final[set[tuple[str, str]]] = set()

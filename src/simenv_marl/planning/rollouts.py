@@ -6,19 +6,21 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import ceil, inf, log, log2, sqrt
+from time import perf_counter
 from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.clone import branch
+from ..core.clone import branch, clone
 from ..core.rng import is_seed
 from ..core.session import checked_seed
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE
 from .player import is_number, is_planning, player_of, try_out, warn_once
+from .states import Plan, States
 
 _KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
 
@@ -27,9 +29,6 @@ _SEVERAL: Final = 4
 
 _AT_ONCE: Final = 8
 """The number of branches that run before a tree is updated. It does not depend on the number of cores."""
-
-Plan = tuple[int, ...]
-"""The places of the candidates to take at the agent's next decisions, beginning with the pending one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +150,8 @@ class Rollouts:
         self.actions = player.candidates(policy.actions, legal=legal)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         self._outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
+        self._states: States | None = None
+        self._seconds = 0.0  # for a step
         number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
@@ -186,15 +187,38 @@ class Rollouts:
         if self.reseeds:
             numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
             seeds = [numbers[future] for _, future in rollouts]
-        tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
-        results = branch(
-            self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
-            time_limit=policy.time_limit,
-        )  # fmt: skip
-        for (plan, _), (rewards, seen) in zip(rollouts, results, strict=True):
+        if self._states is not None:
+            outcomes = self._states.run([plan for plan, _ in rollouts])
+        else:
+            tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
+            outcomes = branch(
+                self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
+                time_limit=policy.time_limit,
+            )  # fmt: skip
+        for (plan, _), (rewards, seen, seconds) in zip(rollouts, outcomes, strict=True):
             self.returns[plan[0]].append(sum(rewards))
             self._outcomes.setdefault(plan, []).append((rewards, seen))
-        return [rewards for rewards, _ in results]
+            self._seconds = max(self._seconds, seconds)
+        return [rewards for rewards, _, _ in outcomes]
+
+    def keep_states(self) -> None:
+        """From now on, keep the states of plans, if there is one exact future and a step takes longer than a fork."""
+        if self.reseeds or self._policy.method == "replay":
+            return
+        began = perf_counter()
+        try:
+            root = clone(self._env, method="fork", time_limit=self._policy.time_limit)
+        except (BranchError, OptionValueError):  # only a replay is possible
+            return
+        if self._seconds > perf_counter() - began:
+            self._states = States(root, self._policy, self.actions)
+        else:
+            root.close()
+
+    def close(self) -> None:
+        """End the states that were kept."""
+        if self._states is not None:
+            self._states.close()
 
     def check_futures(self) -> None:
         """Warn if chance was drawn anew and all futures are the same nevertheless."""
@@ -359,14 +383,18 @@ class TreeSearchPolicy(RolloutPolicy):
 
     def _search(self, rollouts: Rollouts, budget: int) -> list[int]:
         tree = _Tree(len(rollouts.actions), self.depth, self.exploration)
-        while budget:
-            batch: list[tuple[Plan, int]] = []
-            for _ in range(min(_AT_ONCE, budget)):
-                plan = tree.descend()
-                batch.append((plan, tree.visits[plan[:1]] - 1 if rollouts.reseeds else 0))
-            for (plan, _), rewards in zip(batch, rollouts.run(batch), strict=True):
-                tree.learn(plan, rewards)
-            budget -= len(batch)
+        try:
+            for begin in range(0, budget, _AT_ONCE):
+                batch: list[tuple[Plan, int]] = []
+                for _ in range(min(_AT_ONCE, budget - begin)):
+                    plan = tree.descend()
+                    batch.append((plan, tree.visits[plan[:1]] - 1 if rollouts.reseeds else 0))
+                for (plan, _), rewards in zip(batch, rollouts.run(batch), strict=True):
+                    tree.learn(plan, rewards)
+                if begin == 0 and self.depth > 1:
+                    rollouts.keep_states()
+        finally:
+            rollouts.close()
         return [tree.best()]
 
 

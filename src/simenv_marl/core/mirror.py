@@ -1,0 +1,271 @@
+"""A clone in a forked process, as its view sees it: a session that asks the process, and a mirror of the episode."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from ..errors import BranchError, annotate, describe_error, short_repr, warn_user
+from .agent import Agent
+from .context import ExclusiveLock
+from .episode import Episode, Rounds
+from .forks import Fork
+from .host import FIELDS, MOVES, State, layers_of, pack_env, pack_state, unpack_env
+from .packing import pack, pack_plainly, unpack, unpack_error
+from .session import Session
+
+
+class Mirror(Episode):
+    """The episode of a clone, as its view sees it: the agents, and what is pending, as of the latest reply."""
+
+    __slots__ = ("remote",)
+
+    def __init__(self, remote: ForkedSession, state: State) -> None:
+        """Mirror a state that lists all agents."""
+        nothing: Any = None
+        self.remote, self.plan, self.seed = remote, remote.plan, remote.seed or 0
+        self.simulation = self.driver = self.latest = self.consulted = self.script = nothing
+        self.clock = None if state[5] is None else partial(getattr, remote, "time")
+        self.agents, self.others, self.ended, self.entities = {}, {}, {}, {}
+        self.running, self.skips = True, False
+        *_, self.unreported_end, self.last_time = state
+        self.load(state)
+
+    def load(self, state: State) -> None:
+        """Take over a state. What the view itself notes in an episode stays."""
+        pending, self.over, self.terminated, self.truncated, self.turns, time, others, agents, ended, *_ = state
+        self.remote.time = time
+        for name, point, values in agents:
+            agent = self.agents.get(name) or self.ended.get(name)
+            if agent is None:
+                agent = Agent(name, self.plan.points[point], self.plan, self.clock)
+                (self.ended if values[6] else self.agents)[name] = agent
+            for field, value in zip(FIELDS, values, strict=True):
+                setattr(agent, field, value)
+        self.others.update(dict.fromkeys(others))
+        for name in ended:
+            self.ended[name] = self.agents.pop(name) if name in self.agents else self.ended[name]
+        self.just_ended = [self.ended[name] for name in ended]
+        self.pending = None if pending is None else self.agents[pending]
+
+    def single_out(self, agent: Agent) -> None:
+        """Do nothing: the clone's process has done it."""
+
+    def step(self, action: Any, entered: bool = False) -> None:
+        """Take a step in the clone's process."""
+        if self.pending is None:
+            self.report_end()
+            return
+        self.unreported_end = False
+        self.remote.request("step", action)
+
+
+class MirrorOfRounds(Mirror, Rounds):
+    """The same for an episode that is played in rounds."""
+
+    __slots__ = ()
+
+
+class ForkedSession(Session):
+    """The session of a clone in a forked process.
+
+    Attributes:
+        time: The simulation's time as of the latest reply; None if it has none.
+    """
+
+    __slots__ = ("_fork", "_gone", "_limit", "_made_from", "_renewed", "_stepped", "_warned", "time")
+
+    def __init__(self, original: Session, fork: Fork, time_limit: float, made_from: Any = None) -> None:
+        """Take over a process in which the episode of a session goes on; ``made_from``: its parent, a clone itself."""
+        self.plan, self.bound_plan = original.plan, None
+        self.state, self.options, self.seed = original.state, original.options, original.seed
+        self.np_random_seed, self._np_random = original.np_random_seed, copy.deepcopy(original._np_random)
+        self.exclusive = self.lock = ExclusiveLock()
+        self._fork, self._limit, self._made_from = fork, time_limit, made_from
+        self._gone: str | None = None  # why the process is gone
+        self._renewed = self._stepped = self._warned = False
+        self.episode = self.time = None
+
+    def begin(self, view: Any) -> None:
+        """Mirror the episode of the view that was cloned."""
+        if view._solo:  # from now on, it waits for one agent only
+            self.request("begin")
+        else:
+            self._mirror(*pickle.loads(pack_state(view.episode, whole=True)[0]))
+
+    def _mirror(self, in_rounds: bool, state: State) -> None:
+        self.episode = (MirrorOfRounds if in_rounds else Mirror)(self, state)
+
+    @property
+    def simulation(self) -> Any:
+        """Refuse it: it is in another process."""
+        raise BranchError(
+            "the simulation of a clone is in the clone's process; reach it with"
+            " env.unwrapped.call(lambda env: env.unwrapped.simulation...), which returns a copy of the result"
+        )
+
+    # -- requests -----------------------------------------------------------------------------------
+
+    def request(self, name: str, *args: Any, limit: float | None = None) -> Any:
+        """Call a method of the clone's ``Host`` or session; mirror the episode afterwards; return the result.
+
+        Raises:
+            BranchError: The process has ended, or takes too long and is ended.
+            BaseException: Any exception there, with its traceback as a note.
+        """
+        with self.exclusive:
+            if self._gone is not None or not self._fork.usable:
+                raise BranchError(f"the clone is gone: {self._gone or 'it belongs to another process'}")
+            self._stepped |= name in ("step", "start", "call")
+            reply, descriptors = self._exchange(
+                name, pack_plainly((name, args)), self._limit if limit is None else limit
+            )
+            if not reply:
+                raise BranchError(f"the clone is gone: {self._gone}")
+            value = self._unpack(name, reply)
+            if not descriptors:
+                return value
+            return Fork(value, socket.socket(fileno=descriptors[0]), self._fork.life, is_child=False)
+
+    def _exchange(self, name: str, message: bytes, limit: float) -> tuple[bytes, list[int]]:
+        """Send a message; return the reply, empty if the process is gone, and the descriptors before it."""
+        fork, descriptors, reply = self._fork, list[int](), b""
+        try:
+            with suppress(ConnectionError):
+                fork.send(message)
+                if name == "fork":
+                    descriptors = fork.receive_descriptors(limit)
+                reply = fork.receive(time.monotonic() + limit)
+            if not reply:
+                self._end("its process has died, ")
+        except TimeoutError:
+            self._end(f"it was ended, because it took longer than {limit} s; ")
+        except BaseException:  # an interrupt: the reply would be taken for the next one
+            self._end("it was ended by an interrupt; ")
+            raise
+        return reply, descriptors
+
+    def _unpack(self, name: str, reply: bytes) -> Any:
+        """Mirror the state in a reply; return its value, or raise its error."""
+        value, error, state, left_out = pickle.loads(reply)
+        if left_out and not self._warned:
+            self._warned = True
+            warn_user(f"infos of clones lack what cannot be pickled: {', '.join(left_out)}")
+        whole = MOVES.get(name)
+        if state is not None:
+            in_rounds, state = pickle.loads(state)
+            if isinstance(self.episode, Mirror) and not whole:
+                self.episode.load(state)
+            else:
+                self._mirror(in_rounds, state)
+        elif whole is not None:
+            self.episode = None
+        if error is None:
+            return None if value is None else unpack(value)
+        raised = unpack_error(error)
+        cause, raised.__cause__ = raised.__cause__, None
+        annotate(raised, f"simenv_marl: in a clone, where it was raised by{cause}")
+        raise raised
+
+    def ask(self, name: str, *args: Any) -> Any:
+        """Call a method of the simulation."""
+        return self.request("ask", name, *args)
+
+    def check_reseed(self) -> None:
+        """Check that the simulation's future random numbers can be drawn anew."""
+        self.request("check_reseed")
+
+    def reseed(self, seed: int) -> None:
+        """Draw the simulation's future random numbers anew, and those of the clone's process."""
+        self.request("reseed", seed)
+
+    def recording(self) -> Any:
+        """Return what a replay of the episode needs."""
+        return self.request("recording")
+
+    def step_out(self) -> None:
+        """Do nothing: the clone's process has done it."""
+
+    def call(self, env: Any, function: Callable[..., Any], args: tuple[Any, ...], limit: float | None = None) -> Any:
+        """Call a function in the clone's process, with the environment there in the state that it has here."""
+        view, episode, parcel = env.unwrapped, self.episode, None
+        noted = None if episode is None else (episode.unreported_end, episode.last_time)
+        try:
+            parcel = pack_env(env, [view], self)
+        except Exception as error:
+            if self._stepped or env is not view._outermost():
+                raise BranchError(
+                    f"the wrappers of the clone cannot be sent to its process ({describe_error(error)}); call functions"
+                    " before its first step"
+                ) from error
+        self._renewed = True  # the function may reset the environment
+        result, parcel = self.request("call", pack((function, args)), parcel, noted, limit=limit)
+        if parcel is not None:
+            layers = layers_of(env)
+            for layer, state in zip(layers, unpack_env(parcel, layers, self), strict=False):
+                vars(layer).clear()
+                vars(layer).update(state)
+        view._set_up()  # there may be another episode
+        return result
+
+    # -- episodes -----------------------------------------------------------------------------------
+
+    def start(
+        self, seed: int | None, options: dict[str, Any] | None, *, in_rounds: bool = False, script: Any = None
+    ) -> Episode:
+        """Reset the simulation in the clone's process."""
+        self.options, self.seed = options, self.seed_for(seed)
+        self.episode, self.state = None, "over"
+        self._renewed = True
+        self.request("start", self.seed, options, in_rounds)
+        episode: Any = self.episode
+        return episode  # type: ignore[no-any-return]
+
+    def end(self) -> None:
+        """Forget the episode. It ends when another begins, or with the process."""
+        self.episode = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether the process has ended."""
+        return self._gone is not None
+
+    def close(self) -> None:
+        """End the process. Unwind and close the simulation there if it was reset there."""
+        try:
+            if self._renewed and self._gone is None and self._fork.usable:
+                self.request("close")
+        finally:
+            self.episode, self.state = None, "closed"
+            self._end("it is closed; ")
+
+    def abandon(self) -> None:
+        """Close it, from a finalizer."""
+        try:
+            self.close()
+        except Exception as error:
+            warn_user(f"a clone that was abandoned raised {short_repr(error)}", ResourceWarning)
+
+    def _end(self, why: str) -> None:
+        """End the process, for a reason."""
+        self.episode = None
+        if self._gone is None:
+            self._gone = why + self._fork.end()
+            if self._made_from is not None:
+                with suppress(Exception):  # the parent may be gone, or busy; then it waits later
+                    self._made_from.request("reap", self._fork.process)
+
+    def fork(self, method: str | None, time_limit: float) -> ForkedSession | None:
+        """Fork the clone's process; return the session of the new one, or None if the episode must be replayed."""
+        fork = self.request("fork", method)
+        if fork is None:
+            return None
+        made = ForkedSession(self, fork, time_limit, self)
+        made._stepped = self._stepped
+        return made

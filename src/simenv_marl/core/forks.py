@@ -82,7 +82,7 @@ def _own_life() -> _Life:
         try:
             life = _Life()
         except OSError as error:
-            raise BranchError(f"no process can be forked: {error}; close some clones") from error
+            raise exhausted(error) from error
         _this.life = weakref.ref(life)
     return life
 
@@ -115,6 +115,11 @@ def _end_with(descriptor: int) -> None:
     end.register(descriptor, select.POLLHUP)
     if end.poll(0):  # it was closed before
         os._exit(1)
+
+
+def exhausted(error: OSError) -> BranchError:
+    """Make the error that says that there are no more descriptors or processes."""
+    return BranchError(f"no process can be forked: {error}; close some clones")
 
 
 # -- forks ----------------------------------------------------------------------------------------
@@ -213,7 +218,7 @@ def pair() -> tuple[socket.socket, socket.socket]:
     try:
         return socket.socketpair()
     except OSError as error:
-        raise BranchError(f"no process can be connected: {error}; close some clones") from error
+        raise exhausted(error) from error
 
 
 def start(connection: socket.socket, lives: tuple[int, ...], separate: Callable[[], None]) -> int:
@@ -228,7 +233,7 @@ def start(connection: socket.socket, lives: tuple[int, ...], separate: Callable[
         with warnings.catch_warnings(action="ignore") if sys.version_info >= (3, 12) else nullcontext():
             process = os.fork()
     except OSError as error:
-        raise BranchError(f"no process can be forked: {error}; close some clones") from error
+        raise exhausted(error) from error
     if process == 0:
         try:
             _this.lives, _this.connection = lives, connection
@@ -307,7 +312,10 @@ def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
     ``fork`` copies the memory, but parent and child share the offsets and contents of open files, the events of epoll
     objects, and the sockets of event loops. And Python reseeds its global generator in the child.
     """
-    python, (files, polls) = random.getstate(), _open_files()
+    try:
+        python, (files, polls) = random.getstate(), _open_files()
+    except OSError as error:
+        raise exhausted(error) from error
 
     def separate() -> None:
         random.setstate(python)  # Python reseeds it after a fork

@@ -59,7 +59,7 @@ class Host:
         left_out: list[str] = []
         try:
             value = getattr(self if hasattr(self, name) else self._session, name)(*args)
-            value = None if value is None or name == "start" else pack_plainly(value)
+            value = None if value is None else pack_plainly(value)
         except BaseException as problem:
             value, error = None, pack_error(problem)
         episode = self._session.episode
@@ -102,6 +102,10 @@ class Host:
         if self._session.episode is None:
             raise self._session.refusal()
         self._session.episode.step(action)
+
+    def start(self, seed: int, options: Any, in_rounds: bool) -> None:
+        """Begin another episode."""
+        self._session.start(seed, options, in_rounds=in_rounds)
 
     def reseed(self, seed: int) -> None:
         """Draw what lies ahead anew."""

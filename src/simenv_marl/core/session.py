@@ -180,8 +180,8 @@ class Session:
             raise
         return episode
 
-    def recording(self) -> tuple[int, Any, bool, list[Any], Any]:
-        """Return what a replay needs: seed, options, whether it is in rounds, the answers, and the pending decision."""
+    def recording(self) -> tuple[Any, ...]:
+        """Return what a replay of the episode needs: seed, options, kind, answers, decision, and last time."""
         episode = self.episode
         if episode is None or (episode.pending or episode.consulted) is None:
             raise self.refusal()
@@ -190,11 +190,11 @@ class Session:
                 f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of the environment that"
                 ' a policy is given, so its actions were not kept; use method="fork"'
             )
-        return episode.seed, self.options, episode.in_rounds, episode.tape, _decision(episode)
+        return episode.seed, self.options, episode.in_rounds, episode.tape, _decision(episode), episode.last_time
 
     def replay(self, other: Session) -> None:
         """Bring the simulation to the current decision of another session with the same plan, or raise an error."""
-        seed, options, in_rounds, tape, decision = other.recording()
+        seed, options, in_rounds, tape, decision, last_time = other.recording()
         again = self.start(seed, options, in_rounds=in_rounds, script=tape)
         while again.script:
             answer = again.script.popleft()
@@ -203,6 +203,7 @@ class Session:
             else:
                 again.step(answer)
         again.script, again.just_ended = None, []  # the other view has reported the ends
+        again.last_time = last_time
         if not same(_decision(again), decision):
             again.close()
             raise BranchError(

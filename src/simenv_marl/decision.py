@@ -44,6 +44,9 @@ class Definition:
     action_space_mapping: Callable[[Any], Any] | None
     apply: Mapped | None
     choices: Mapped | None
+    split: Mapped | None
+    gather: Mapped | None
+    part: Mapped | None
     rule_action_mapping: Mapped | Mapping[Any, Any] | None
     agent: str | Mapped | None
     action_mask_mapping: Mapped | None
@@ -102,6 +105,9 @@ def make_step(
     reward_mapping: Mapped,
     apply: Mapped | None = None,
     choices: Mapped | None = None,
+    split: Mapped | None = None,
+    gather: Mapped | None = None,
+    part: Mapped | None = None,
     rule_action_mapping: Mapped | Mapping[Any, Any] | None = None,
     agent: str | Mapped | None = None,
     action_mask_mapping: Mapped | None = None,
@@ -126,10 +132,19 @@ def make_step(
         reward_mapping: A callable like ``observation_space_mapping``, called at each decision of the agent and at its
             end. It returns the reward of the agent's previous action.
         apply: An alternative to ``action_space_mapping``: a callable of the action and the call's arguments, which runs
-            in the simulation instead of the rule. The decision function returns its result.
+            in the simulation instead of the rule. The decision function returns its result. With a keyword-only
+            parameter ``_rule`` it gets the rule, to run it with other arguments or under other parameters of the model.
+            Calls of the same decision point by the same agent inside ``apply`` run the rule.
         choices: A callable of the call's arguments that returns the sequence of legal answers. The action is an index
             into it, ``action_space`` a ``Discrete`` (from 0) of the largest length. The action mask follows from it.
             The decision function returns the chosen answer; with ``apply``, that gets the answer instead of the action.
+        split: For a call that decides for many entities at once: a callable of the call's arguments that returns the
+            items, each of which is a decision. All other callables get the item before the call's arguments (``apply``
+            after the action). The function must return what it decides, and not act in place.
+        gather: With ``split``: a callable of the items, their decisions and the call's arguments. It returns the value
+            of the call. Default: a list of the decisions.
+        part: With ``split``: a callable of the rule's result, an item and the call's arguments. It returns the part of
+            the result that is for the item, where the rule decides for this item only. Default: by position.
         rule_action_mapping: The action that corresponds to a decision of the rule, for learning from the rule: a
             callable of the decision (and the call's arguments, if it takes more than one), which returns an action or
             None; or a dict from decision to action. After a decision of the rule, the agent's next info has it as
@@ -190,6 +205,8 @@ def _problems(definition: Definition) -> Iterator[str]:
             yield f"choices needs a Discrete action_space that starts at 0, not {space}"
         if has_mask:
             yield "choices makes the mask itself; leave action_mask_mapping out"
+    if definition.split is None and (definition.gather is not None or definition.part is not None):
+        yield "gather and part need split"
     missing = [name for name in _GOAL if getattr(definition, name) is None]
     if 0 < len(missing) < len(_GOAL):
         yield f"a goal needs all of its parts; missing: {', '.join(missing)}"

@@ -40,6 +40,7 @@ class Agent:
         reward: The reward of the agent's previous action, as of its latest decision or its end.
         asked: Whether the user was asked for an action in this episode. Used where forced moves are skipped.
         carried: The sum of the rewards of forced moves. It is added to the agent's next reward.
+        applying: How many of its actions are being applied, on the simulation's side. Meanwhile its calls run the rule.
         consultations: How many decisions were put to a policy that gets the environment.
         observation: The latest observation, cast to its space. None before the first one.
         handed_out: The observation that a view has returned and must not return a second time.
@@ -53,10 +54,10 @@ class Agent:
     """
 
     __slots__ = (
-        "acted", "answered_at", "asked", "carried", "choices", "clock", "consultations", "decided", "delegated",
-        "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "kwargs", "mask", "memory",
-        "name", "notes", "now", "observation", "offered", "plugins", "point", "policy", "present", "report", "rest",
-        "reward", "rule_action", "update",
+        "acted", "answered_at", "applying", "asked", "carried", "choices", "clock", "consultations", "decided",
+        "delegated", "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "kwargs",
+        "mask", "memory", "name", "notes", "now", "observation", "offered", "plugins", "point", "policy", "present",
+        "report", "rest", "reward", "rule_action", "update",
     )  # fmt: skip
 
     def __init__(self, name: str, point: Point, plan: Plan, clock: Any) -> None:
@@ -67,7 +68,7 @@ class Agent:
         self.update: Callable[..., None] = point.updates[0]
         self.decided = self.acted = self.ended = self.present = self.asked = self.informs_rule_action = False
         self.reward = self.carried = 0.0
-        self.consultations = 0
+        self.consultations = self.applying = 0
         nothing: Any = None
         self.observation = self.handed_out = self.mask = self.choices = self.offered = self.rule_action = nothing
         self.entity = self.group = self.notes = nothing
@@ -82,6 +83,8 @@ class Agent:
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Handle a decision: update the agent and return ``WAIT``, or the reply if a policy or the episode has one."""
+        if self.applying:
+            return RULE
         if self.delegated:
             return self.ask_policy(episode, args, kwargs)
         point = self.point

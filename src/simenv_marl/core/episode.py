@@ -138,6 +138,7 @@ class Episode(Run):
         """
         try:
             self.pending = None  # so that an action from inside a mapping is refused
+            reply: Any
             recorded = action
             if agent.choices is not None:
                 choices, agent.choices = agent.choices, None
@@ -151,6 +152,8 @@ class Episode(Run):
                     recorded = duplicate(action)  # before a mapping can change it
                 convert = agent.point.convert  # a local variable: calling the attribute directly is slower
                 reply = convert(action)
+            if agent.point.applies and reply is not RULE:
+                reply = agent, reply
         except BaseException:
             if turn:
                 self.pending = agent
@@ -240,8 +243,8 @@ class Episode(Run):
         """The live agents that ``expected_calls`` announces, with the bound arguments of the first call of each."""
         announced: dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]] = {}
         for point in self.plan.active:
-            for call in expected_calls(point.point.name):
-                args, kwargs = point.point.bind(call, BOUND) or (tuple(call), BOUND)
+            calls = (point.point.bind(call, BOUND) or (tuple(call), BOUND) for call in expected_calls(point.point.name))
+            for args, kwargs in point.decisions_of(calls):
                 name = point.agent or point.name_agent(*args, **kwargs)
                 agent = None if name is None else self.agent_for(point, name)
                 if agent is not None and not agent.delegated:
@@ -263,12 +266,11 @@ class Episode(Run):
         """In a branch, wait for one agent's decision alone. For all others answer their policies, else the rule."""
         if list(self.agents.values()) != [agent]:
             self.most_steps = inf  # ``max_steps`` counts the steps of other agents
-        self.others.pop(agent.name, None)
-        self.agents.pop(agent.name, None)
         self.plan = self.plan.for_one(agent.name)
         for name, other in self.agents.items():
             other.policy, other.delegated = self.plan.policy_of(name, other.point), True
         self.others |= self.agents
+        self.others.pop(agent.name)
         self.agents, self.just_ended = {agent.name: agent}, []
         agent.policy, agent.delegated, agent.asked = None, False, True
         self.__class__ = Episode  # it is played in turns from now on

@@ -46,6 +46,7 @@ from .points import (
     resolve_policies,
     resolve_roster,
 )
+from .split import Split
 from .threads import ThreadDriver
 
 DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {"greenlet": GreenletDriver, "thread": ThreadDriver}
@@ -226,7 +227,9 @@ class Plan:
 
     def _find_events(self) -> None:
         """Find the events that the simulation sends: decisions, and calls that end agents."""
-        self.events: dict[Hook, Any] = {point.point: point for point in self.points}
+        self.events: dict[Hook, Any] = {
+            point.point: point if point.definition.split is None else Split(point) for point in self.points
+        }
         for point in self.points:
             for name, agent in (*point.point.removed_by.items(), *point.definition.removed_by.items()):
                 remover = locate(name, self._own)

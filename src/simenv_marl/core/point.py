@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from types import coroutine
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from . import actions, spaces
 from .actions import ILLEGAL, MASK
 
 if TYPE_CHECKING:
+    from .agent import Agent
     from .episode import Episode
 
 
@@ -44,6 +46,7 @@ class Point:
             environment's user does.
         cast: Casts an observation to the observation space.
         check: Checks an action against the action space. Returns it in the form that ``convert`` takes, or ``ILLEGAL``.
+        applies: Whether an ``apply`` gets the action, on the simulation's side.
         convert: Turns a checked action into the reply to the simulation.
         legal: Returns the mask of a call, and its choices if it has any. None if all actions are always legal.
         deliver: Turns the reply, on the simulation's side, into the value that the decision function returns. None if
@@ -54,8 +57,8 @@ class Point:
     """
 
     __slots__ = (
-        "agent", "cast", "check", "convert", "definition", "deliver", "informs_rule_action", "legal", "masked_parts",
-        "name_agent", "one_entity", "point", "policy", "report", "updates",
+        "agent", "applies", "cast", "check", "convert", "definition", "deliver", "informs_rule_action", "legal",
+        "masked_parts", "name_agent", "one_entity", "point", "policy", "report", "updates",
     )  # fmt: skip
 
     def __init__(
@@ -68,7 +71,7 @@ class Point:
         self.cast = spaces.observation_cast(definition.observation_space)
         self.check = actions.action_check(definition.action_space, clips=clips)
         self.convert: Any = definition.action_space_mapping or _same
-        self.deliver = _delivery(definition, point.kind)
+        self.deliver, self.applies = _delivery(definition, point), definition.apply is not None
         self.legal = _legal(definition, point.name)
         self.masked_parts = [] if self.legal is None else _masked_parts(definition.observation_space)
         self.informs_rule_action = definition.rule_action_mapping is not None
@@ -89,6 +92,15 @@ class Point:
         if agent is None or agent.point is not self:
             agent = episode.agent_for(self, name)
         return agent.handle(episode, args, kwargs)
+
+    def decisions_of(self, calls: Iterable[tuple[Any, Any]]) -> Iterator[tuple[tuple[Any, ...], dict[str, Any]]]:
+        """Yield the arguments of the decisions of some calls: of each call, or of each of its items."""
+        split = self.definition.split
+        for args, kwargs in calls:
+            if split is None:
+                yield args, kwargs
+            else:
+                yield from (((item, *args), kwargs) for item in split(*args, **kwargs))
 
     def warn_of_several(self, agent: str) -> None:
         """Warn once that several objects decide under the name of one agent."""
@@ -178,25 +190,57 @@ def _legal(definition: Definition, name: str) -> Callable[[Any, Any], tuple[Any,
 # -- in the simulation ----------------------------------------------------------------------------
 
 
-def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
-    """Make the function that turns a reply into the value of a call; for a generator function that is a generator."""
-    apply = definition.apply if definition.choices is None else partial(_deliver_choice, definition.apply)
-    if kind == "function":
-        return apply
-    wrap = _returning if kind == "generator" else _awaiting
+def _delivery(definition: Definition, hook: DecisionPoint) -> Callable[..., Any] | None:
+    """Make the function that turns a reply into the value of a call; for a generator function that is a generator.
+
+    A reply to an ``apply`` comes with its agent, whose calls run the rule meanwhile. A choice comes in a list of its
+    own, so that the user's side keeps no reference to it.
+    """
+    apply: Any = definition.apply
+    chosen, kind = definition.choices is not None, hook.kind
+    if asks_for(apply, "_rule"):
+        apply = partial(apply, _rule=lambda *args, **kwargs: hook.rule(*args, **kwargs))
+    if apply is None and not chosen and kind == "function":
+        return None
+    wrap = {"function": _same, "generator": _returning, "coroutine": _awaiting}[kind]
 
     def deliver(reply: Any, *args: Any, **kwargs: Any) -> Any:
         if apply is None:
-            return wrap(reply)
-        value = apply(reply, *args, **kwargs)
-        return value if inspect.isgenerator(value) or inspect.isawaitable(value) else wrap(value)
+            return wrap(reply.pop() if chosen else reply)
+        agent, action = reply
+        agent.applying += 1
+        try:
+            value = apply(action.pop() if chosen else action, *args, **kwargs)
+        finally:
+            agent.applying -= 1
+        if kind != "function" and inspect.isgenerator(value):
+            return _applying(agent, value)
+        if kind != "function" and inspect.isawaitable(value):
+            awaited: Any = coroutine(_applying)
+            return awaited(agent, value.__await__())
+        return wrap(value)
 
     return deliver
 
 
-def _deliver_choice(apply: Callable[..., Any] | None, box: list[Any], *args: Any, **kwargs: Any) -> Any:
-    """Take the choice out of its list. It crosses in a list so that the user's side keeps no reference to it."""
-    return box.pop() if apply is None else apply(box.pop(), *args, **kwargs)
+def _applying(agent: Agent, inner: Any) -> Any:
+    """Run a generator of ``apply``; the agent's own calls run the rule while it runs, but not while it waits."""
+    resume, sent = inner.send, None
+    while True:
+        agent.applying += 1
+        try:
+            waits = resume(sent)
+        except StopIteration as end:
+            return end.value
+        finally:
+            agent.applying -= 1
+        try:
+            resume, sent = inner.send, (yield waits)
+        except GeneratorExit:
+            inner.close()
+            raise
+        except BaseException as error:
+            resume, sent = inner.throw, error
 
 
 def _returning(value: Any) -> Any:
@@ -255,6 +299,16 @@ class RuleDecided:
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Note the action that corresponds to the decision. ``args``: the decision, its call's args and kwargs."""
         decision, call_args, call_kwargs = args
+        part = self.point.definition.part
+        if self.point.definition.split is None:
+            self._note(episode, decision, call_args, call_kwargs)
+            return
+        items, episode.items = episode.items, None
+        for place, item in enumerate(items or ()):
+            piece = decision[place] if part is None else part(decision, item, *call_args, **call_kwargs)
+            self._note(episode, piece, (item, *call_args), call_kwargs)
+
+    def _note(self, episode: Episode, decision: Any, call_args: tuple[Any, ...], call_kwargs: dict[str, Any]) -> None:
         point = self.point
         name = point.agent or point.name_agent(*call_args, **call_kwargs)
         agent = (episode.agents.get(name) or episode.others.get(name)) if type(name) is str else None

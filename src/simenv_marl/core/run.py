@@ -54,6 +54,7 @@ class Run:
         decide: What is done with a decision of the user's instead of updating the agent and waiting.
         tape: The answers of the user and of policies, in order. If it is full, later ones are not kept.
         script: During a replay, the answers on the other episode's tape that are still to be given. Else None.
+        items: The items of a call that was split, until the rule has decided or another call is split.
         last_time: The time at the latest step of a joint view.
         actions: In rounds, the unused actions of the current round, by agent.
         stalled: The number of rounds without an action for the pending agent since the simulation last moved.
@@ -61,8 +62,8 @@ class Run:
 
     __slots__ = (
         "_lock", "_rng", "actions", "agents", "clock", "consulted", "decide", "driver", "ended", "entities",
-        "failed_in_model", "just_ended", "last_time", "latest", "most_steps", "others", "over", "pending", "plan",
-        "running", "script", "seed", "simulation", "skips", "stalled", "tape", "tape_size", "terminated", "truncated",
+        "failed_in_model", "items", "just_ended", "last_time", "latest", "most_steps", "others", "over", "pending",
+        "plan", "running", "script", "seed", "simulation", "skips", "stalled", "tape", "tape_size", "terminated", "truncated",
         "turns", "unreported_end",
     )  # fmt: skip
 
@@ -99,6 +100,7 @@ class Run:
         self.tape_size = LONGEST_TAPE + 1 if replayable else 0
         self.script: deque[Any] | None = None
         self.last_time: float | None = None
+        self.items: list[Any] | None = None
 
     def context(self) -> environment_context:
         """The context in which the environment's code must run."""

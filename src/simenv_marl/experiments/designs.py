@@ -62,12 +62,12 @@ class Factor:
         values = [float(min(max(value, self.low), self.high)) for value in values]
         return [round(value) for value in values] if self.is_whole else values
 
-    def steps(self, number: int | None) -> list[Any]:
+    def steps(self, number: int | None) -> Sequence[Any]:
         """Return ``number`` values (default 2) of a range from bound to bound, or all levels of a list."""
         if number == 1:
             raise OptionValueError("this method takes n values of each range; n must be at least 2")
         if self.levels is not None:
-            return list(self.levels)
+            return self.levels
         return list(dict.fromkeys(self.scale(np.linspace(0.0, 1.0, _rows(number or 2)))))
 
     def ends(self) -> tuple[Any, ...]:

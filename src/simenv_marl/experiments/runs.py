@@ -109,7 +109,7 @@ def run_experiment(
         folder = Path(store).absolute()  # other processes may have another working directory
     except TypeError as error:
         raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
-    storage = Store(folder, list(table.columns), list(runner.metrics))
+    storage = Store(folder, list(table.columns), runner.metrics)
     storage.read(keys)
     storage.check_rows(keys)
     session = f"{time_ns():016x}{uuid4().hex[:8]}"  # of all processes that do runs now; later ones sort after it
@@ -303,7 +303,7 @@ def _run_seeds(make: Any, runner: Runner, write: Any, key: str, contender: str, 
             raise
         except BaseException as error:
             if runner.batch_size > 1 and len(remaining) > 1:  # running them one by one shows which of them failed
-                for seed in list(remaining):
+                for seed in remaining:
                     _run_seeds(make, runner, write, key, contender, [seed], bar)
                 return
             trace = "".join(traceback.format_exception(error))[-4000:]

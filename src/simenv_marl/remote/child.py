@@ -84,7 +84,6 @@ class Child:
         self._rest = b""  # received bytes of the next lines
         self._tail = bytearray()  # the last part of its standard error
         self._owner, self._closed = os.getpid(), False
-        self._without_input = 0.0  # when its input was closed
         self._frames = self._bytes = 0  # since the latest call
         self._since = 0.0  # when the first of these frames came
         try:
@@ -354,7 +353,7 @@ class Child:
         """Close its input; its output can still be received."""
         if self._writing >= 0:
             os.close(self._writing)
-            self._writing, self._without_input = -1, monotonic()
+            self._writing, self._without_input = -1, monotonic()  # when it was closed
 
     def close(self, patience: float = GRACE) -> None:
         """Close its pipes; ``patience`` seconds after the end of its input at the latest, kill it and its group.

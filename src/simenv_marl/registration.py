@@ -53,7 +53,7 @@ def register_simulation(
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
     plan = Plan(simulation, points, options)
     recipe = f"{name}-v{version}"
-    _RECIPES[recipe] = simulation, points, dict(options)
+    _RECIPES[recipe] = simulation, points, options
     named = [point for point in plan.active if point.agent or plan.one_agent]
     views: dict[str, dict[str, Any]] = {}
     for title, point in zip(_titles([point.point.name for point in named]), named, strict=True):

@@ -168,10 +168,11 @@ def test_blanks_are_zero_clipped_into_their_space(space, expected):
 
 
 def test_the_blank_of_a_space_without_a_zero_is_always_the_same():
+    found = blank(WORDS)
     WORDS.seed(3)
     state = WORDS.np_random.bit_generator.state
-    assert blank(WORDS) == blank(WORDS)
-    assert blank(WORDS) in WORDS
+    assert blank(WORDS) == found
+    assert found in WORDS
     assert WORDS.np_random.bit_generator.state == state
 
 
@@ -202,6 +203,7 @@ SMALL = spaces.Box(0, 10, (2,), np.uint8)
         (BOX, [[0.0], [0.0, 0.0, 0.0], 0.0, "ab", None, [[0.0, 0.0]], [None, 0.0], [[1], [2, 3]]]),
         (ONE, [1.5, -0.5, np.float32(2), 2, np.array(-1.0), np.nan]),
         (SMALL, [[256, 0], np.array([-255, 0]), [1.0, 2.0]]),
+        (spaces.Box(0, 9, (1,), np.int8), [5.0]),
         (spaces.Box(np.array([0, 10]), np.array([1, 11]), dtype=np.float64), [np.array([10.0, 1.0])]),
         (DIALS, [np.array([2, 6])]),
         (WORDS, ["too many words"]),

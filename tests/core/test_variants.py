@@ -5,6 +5,7 @@ import pickle
 from dataclasses import FrozenInstanceError, replace
 from importlib.metadata import version
 
+import cloudpickle
 import gymnasium
 import numpy as np
 import pettingzoo
@@ -99,10 +100,14 @@ def test_variants_are_frozen_and_can_be_pickled():
     with pytest.raises(TypeError):
         LARGE.parameters["fields"] = 5
     given = {"fields": 1}
-    variant = Variant("small", Farm, parameters=given, plugins=[(dearer, HARVEST, "after")], points=[SOW])
+    points = {Farm.sow: POINTS[SOW]}
+    variant = Variant("small", Farm, parameters=given, plugins=[(dearer, HARVEST, "after")], points=points)
     given["fields"] = 7
-    again = pickle.loads(pickle.dumps(variant))
-    assert (again.name, again.simulation, dict(again.parameters), again.plugins, again.points) == (
+    env = aec_env(variant)
+    env.reset()  # now hooks stand in the places of the functions
+    again = pickle.loads(cloudpickle.dumps(variant))
+    env.close()
+    assert (again.name, again.simulation, dict(again.parameters), again.plugins, list(again.points)) == (
         ("small", Farm, {"fields": 1}, ((dearer, HARVEST, "after"),), [SOW])
     )
     for each in (variant, again):

@@ -45,7 +45,9 @@ def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
     cells = found.cells("b", "c")
     assert (cells.loc[1.0, "y"] - cells.loc[1.0, "x"]) == pytest.approx(4)
     assert found.cells("c", "b").equals(cells.T)
-    assert sum(axes.get_visible() for axes in found.plot().axes) == 4
+    panels = found.plot().axes
+    assert sum(axes.get_visible() for axes in panels) == 4
+    assert len({axes.get_ylim() for axes in panels[:3]}) == 1  # main effects can be compared
     with pytest.raises(OptionValueError, match="not two factors"):
         found.cells("a", "z")
 

@@ -250,6 +250,7 @@ def test_progress_is_shown_where_it_is_asked_for(capsys):
         traces(seeds=range(5), workers=workers, progress=True)
         assert "5/5" in capsys.readouterr().err
     traces(seeds=range(5))
+    collect_episodes(lambda: Colony(DESIGN), {Creature.act: ones}, points=POINTS, seeds=range(5))
     assert capsys.readouterr().err == ""
 
 

@@ -330,6 +330,8 @@ def test_calls_can_be_copied():
     totals = set()
 
     def look(call):
+        with pytest.raises(KeyError):
+            call["rain"]
         for copied in (copy.copy(call), copy.deepcopy(call), pickle.loads(pickle.dumps(call))):
             assert (copied.total, copied.time) == (call.total, call.time)
             assert (copied.point, copied.entity) == ("broker.price", None)

@@ -121,7 +121,6 @@ class SimulationJointEnv(OneAgentView):
         session = self._session
         if not self._plan.complete:
             if not hasattr(session.simulation, "expected_calls"):
-                session.close()
                 points = ", ".join(point.point.name for point in self._plan.active if point.agent is None)
                 raise ViewError(
                     "all agents must be known when the environment is made, and a callable names those of"

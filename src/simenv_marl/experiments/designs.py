@@ -303,7 +303,7 @@ def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Colum
         for value in factor.steps(n):
             if not _is_same(value, middle[place]):
                 rows.append([*middle[:place], value, *middle[place + 1 :]])
-    return [list(column) for column in zip(*rows, strict=True)]
+    return list(zip(*rows, strict=True))
 
 
 def _rows(number: int | None) -> int:

@@ -142,7 +142,7 @@ def _state_of(episode: Episode, *, whole: bool) -> State:
     agents, plan, pending = [*episode.just_ended], episode.plan, episode.pending
     if whole:
         agents = [*episode.ended.values(), *episode.agents.values()]
-    elif episode.over or episode.in_rounds:
+    elif episode.over or episode.in_rounds or episode.skips:  # forced moves update others, too
         agents += episode.agents.values()
     elif pending is not None:
         agents.append(pending)

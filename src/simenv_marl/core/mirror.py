@@ -11,7 +11,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from ..errors import BranchError, annotate, describe_error, short_repr, warn_user
+from ..errors import BranchError, ClosedError, annotate, describe_error, short_repr, warn_user
 from .agent import Agent
 from .context import ExclusiveLock
 from .episode import Episode, Rounds
@@ -121,17 +121,25 @@ class ForkedSession(Session):
         """
         with self.exclusive:
             if self._gone is not None or not self._fork.usable:
-                raise BranchError(f"the clone is gone: {self._gone or 'it belongs to another process'}")
+                raise self.refusal()
             self._stepped |= name in ("step", "start", "call")
             reply, descriptors = self._exchange(
                 name, pack_plainly((name, args)), self._limit if limit is None else limit
             )
             if not reply:
-                raise BranchError(f"the clone is gone: {self._gone}")
+                raise self.refusal()
             value = self._unpack(name, reply)
             if not descriptors:
                 return value
             return Fork(value, socket.socket(fileno=descriptors[0]), self._fork.life, is_child=False)
+
+    def refusal(self) -> Exception:
+        """Make the error that says why no action can be taken now."""
+        if self.state == "closed":
+            return ClosedError("the clone is closed, and its process has ended; clone the environment again")
+        if self._gone is not None or not self._fork.usable:
+            return BranchError(f"the clone is gone: {self._gone or 'it belongs to another process'}")
+        return super().refusal()
 
     def _exchange(self, name: str, message: bytes, limit: float) -> tuple[bytes, list[int]]:
         """Send a message; return the reply, empty if the process is gone, and the descriptors before it."""

@@ -80,23 +80,27 @@ def clone(env: Any, *, seed: int | None = None, method: str | None = None, time_
         if not is_seed(seed):
             raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
         view._session.check_reseed()
-    session: Session | None = _forked(env, view, method, time_limit)
+    original, eager = view._session, view._solo or isinstance(view._session, ForkedSession)
+    begin = _fork_of(env, view, method)
+    session: Any = Session(original.plan) if begin is None else ForkedSession(original, time_limit)
     try:
-        if isinstance(session, ForkedSession):
-            session.begin(view)
-        else:
+        if begin is None:
             with preserve_generators():  # the model may draw from the process's generators, then and now
-                session = Session(view._session.plan)
-                session.replay(view._session)
+                session.replay(original)
+        elif eager:
+            session.attach(begin())
+        if begin is not None:
+            session.begin(view)
         twin = view._cloned(session)
         twin._begin_branch()
-        if seed is not None:
-            session.reseed(int(seed))
         made = copy.deepcopy(env, {id(view): twin})  # copies each wrapper with its state
         twin._set_outermost(made)
+        if begin is not None and not eager:  # last: what this process changes after the fork is not shared
+            session.attach(begin())
+        if seed is not None:
+            session.reseed(int(seed))
     except BaseException as error:
-        if session is not None:
-            close_after(error, session.close, "the clone")
+        close_after(error, session.close, "the clone")
         raise
     return made
 
@@ -211,15 +215,13 @@ def _checked_view(env: Any, user: str, method: str | None, time_limit: float) ->
     return view
 
 
-def _forked(env: Any, view: Any, method: str | None, time_limit: float) -> ForkedSession | None:
-    """Fork a process for a clone, and return its session; None if the episode must be replayed."""
-    original = view._session
-    if isinstance(original, ForkedSession):
-        return None if method == "replay" else original.fork(method, time_limit)
+def _fork_of(env: Any, view: Any, method: str | None) -> Callable[[], Fork] | None:
+    """Return a function that forks a process for a clone; None if the episode must be replayed."""
+    if isinstance(view._session, ForkedSession):
+        fork = None if method == "replay" else view._session.request("fork", method)
+        return None if fork is None else lambda: fork
     separate = separator_of(view, method)
-    if separate is None:
-        return None
-    return ForkedSession(original, Fork.begin(Host(env, view).serve, separate), time_limit)
+    return None if separate is None else partial(Fork.begin, Host(env, view).serve, separate)
 
 
 # -- branches: clones for one call ----------------------------------------------------------------
@@ -259,6 +261,7 @@ def _call_in_forks(
         while started < n or running:
             while started < n and len(running) < cores:
                 fork = Fork.begin(main, separate)
+                fork.limit(time_limit)  # for the parts of a message; the time until it comes is limited below
                 descriptor = fork.connection.fileno()
                 running[descriptor] = started, fork, time.monotonic() + time_limit
                 waiting.register(descriptor, select.POLLIN)

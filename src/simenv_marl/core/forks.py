@@ -17,7 +17,6 @@ import stat
 import struct
 import sys
 import tempfile
-import time
 import warnings
 import weakref
 from collections.abc import Callable, Container, Iterable
@@ -36,6 +35,12 @@ if CAN_FORK:
 
 _LENGTH: Final = struct.Struct("!Q")
 """The number of bytes of a message, which precedes it."""
+
+_TIME: Final = struct.Struct("ll")
+"""A time limit of a socket: seconds and microseconds."""
+
+_LONGEST: Final = 1e9
+"""The number of seconds from which on there is no limit."""
 
 
 # -- the first process ----------------------------------------------------------------------------
@@ -172,18 +177,26 @@ class Fork:
         """Send a message."""
         send(self.connection, message)
 
-    def receive(self, deadline: float = float("inf")) -> bytes:
-        """Receive a message until a time of ``time.monotonic``; an empty one if the process has ended.
+    def limit(self, seconds: float) -> None:
+        """Limit the time for which a message is awaited."""
+        whole, part = divmod(max(seconds, 1e-6), 1) if seconds < _LONGEST else (0, 0)  # zeros: there is no limit
+        limit = _TIME.pack(int(whole), int(part * 1e6))
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+
+    def receive(self) -> bytes:
+        """Receive a message; an empty one if the process has ended.
 
         Raises:
-            TimeoutError: It did not come in time.
+            TimeoutError: It did not come within the limit.
         """
-        return receive(self.connection, deadline)
+        return receive(self.connection)
 
-    def receive_descriptors(self, limit: float) -> list[int]:
+    def receive_descriptors(self) -> list[int]:
         """Receive the descriptors that the process sends with a single byte."""
-        self.connection.settimeout(limit)
-        return socket.recv_fds(self.connection, 1, 1)[1]
+        try:
+            return socket.recv_fds(self.connection, 1, 1)[1]
+        except BlockingIOError as error:
+            raise TimeoutError from error
 
     def end(self) -> str:
         """End the process, and wait for its end; return how it has ended. In a copy of this one, only let go of it."""
@@ -204,9 +217,8 @@ class Fork:
 
     def _has_ended(self) -> bool:
         """Whether the process has closed its end of the connection: then its number may be another process's."""
-        self.connection.setblocking(False)
         try:
-            return self.connection.recv(1, socket.MSG_PEEK) == b""
+            return self.connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
         except BlockingIOError:
             return False
         except OSError:
@@ -236,13 +248,13 @@ def start(connection: socket.socket, lives: tuple[int, ...], separate: Callable[
         raise exhausted(error) from error
     if process == 0:
         try:
+            gc.freeze()  # the collector would write to what is shared with the parent, and so copy it
             _this.lives, _this.connection = lives, connection
             for life in lives:
                 _end_with(life)
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the user's process
             signal.set_wakeup_fd(-1)
             separate()
-            gc.freeze()  # the collector would write to what is shared with the parent, and so copy it
         except BaseException:
             os._exit(1)
     return process
@@ -258,33 +270,28 @@ def send(connection: socket.socket, message: bytes) -> None:
     connection.sendall(_LENGTH.pack(len(message)) + message)
 
 
-def receive(connection: socket.socket, deadline: float = float("inf")) -> bytes:
-    """Receive a message until a time of ``time.monotonic``; an empty one if the other end was closed.
+def receive(connection: socket.socket) -> bytes:
+    """Receive a message; an empty one if the other end was closed.
 
     Raises:
-        TimeoutError: It did not come in time.
+        TimeoutError: It did not come within the time limit of the connection.
     """
-    parts: list[bytes] = []
-    size = missing = -1
-    while missing:
-        left = deadline - time.monotonic()
-        if left <= 0:
-            raise TimeoutError
-        connection.settimeout(min(left, 3600.0))  # in parts, because the time limit may be infinite
-        try:
-            part = connection.recv(1 << 16 if missing < 0 else min(missing, 1 << 20))
-        except TimeoutError:
-            continue
-        except ConnectionError:
-            return b""
+    try:
+        part = connection.recv(1 << 16)
         if not part:
             return b""
-        if size < 0:
-            size = _LENGTH.unpack_from(part)[0]
-            part, missing = part[_LENGTH.size :], size
-        parts.append(part)
-        missing -= len(part)
-    return b"".join(parts)
+        size = _LENGTH.size + _LENGTH.unpack_from(part)[0]
+        if len(part) == size:
+            return part[_LENGTH.size :]
+        parts = bytearray(part)
+        while part and len(parts) < size:
+            part = connection.recv(1 << 20)
+            parts += part
+        return bytes(parts[_LENGTH.size :]) if part else b""
+    except BlockingIOError as error:
+        raise TimeoutError from error
+    except ConnectionError:
+        return b""
 
 
 def flush() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import socket
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -81,16 +80,24 @@ class ForkedSession(Session):
 
     __slots__ = ("_fork", "_gone", "_limit", "_made_from", "_renewed", "_stepped", "_warned", "time")
 
-    def __init__(self, original: Session, fork: Fork, time_limit: float, made_from: Any = None) -> None:
-        """Take over a process in which the episode of a session goes on; ``made_from``: its parent, a clone itself."""
+    def __init__(self, original: Session, time_limit: float) -> None:
+        """Prepare a session that goes on where another one stands, in a process that ``attach`` brings."""
         self.plan, self.bound_plan = original.plan, None
         self.state, self.options, self.seed = original.state, original.options, original.seed
         self.np_random_seed, self._np_random = original.np_random_seed, copy.deepcopy(original._np_random)
         self.exclusive = self.lock = ExclusiveLock()
-        self._fork, self._limit, self._made_from = fork, time_limit, made_from
-        self._gone: str | None = None  # why the process is gone
-        self._renewed = self._stepped = self._warned = False
+        self._limit = time_limit
+        self._made_from = original if isinstance(original, ForkedSession) else None  # whose process forks this one's
+        self._fork: Any = None
+        self._gone: str | None = "its process was not forked"  # why there is none
+        self._renewed = self._warned = False
+        self._stepped: bool = self._made_from is not None and self._made_from._stepped
         self.episode = self.time = None
+
+    def attach(self, fork: Fork) -> None:
+        """Take over a process."""
+        self._fork, self._gone = fork, None
+        fork.limit(self._limit)
 
     def begin(self, view: Any) -> None:
         """Mirror the episode of the view that was cloned."""
@@ -123,9 +130,7 @@ class ForkedSession(Session):
             if self._gone is not None or not self._fork.usable:
                 raise self.refusal()
             self._stepped |= name in ("step", "start", "call")
-            reply, descriptors = self._exchange(
-                name, pack_plainly((name, args)), self._limit if limit is None else limit
-            )
+            reply, descriptors = self._exchange(name, pack_plainly((name, args)), limit)
             if not reply:
                 raise self.refusal()
             value = self._unpack(name, reply)
@@ -141,22 +146,27 @@ class ForkedSession(Session):
             return BranchError(f"the clone is gone: {self._gone or 'it belongs to another process'}")
         return super().refusal()
 
-    def _exchange(self, name: str, message: bytes, limit: float) -> tuple[bytes, list[int]]:
+    def _exchange(self, name: str, message: bytes, limit: float | None) -> tuple[bytes, list[int]]:
         """Send a message; return the reply, empty if the process is gone, and the descriptors before it."""
         fork, descriptors, reply = self._fork, list[int](), b""
         try:
-            with suppress(ConnectionError):
-                fork.send(message)
-                if name == "fork":
-                    descriptors = fork.receive_descriptors(limit)
-                reply = fork.receive(time.monotonic() + limit)
-            if not reply:
-                self._end("its process has died, ")
+            if limit is not None:
+                fork.limit(limit)
+            fork.send(message)
+            if name == "fork":
+                descriptors = fork.receive_descriptors()
+            reply = fork.receive()
+            if limit is not None:
+                fork.limit(self._limit)
         except TimeoutError:
-            self._end(f"it was ended, because it took longer than {limit} s; ")
+            self._end(f"it was ended, because it took longer than {self._limit if limit is None else limit} s; ")
+        except ConnectionError:
+            pass
         except BaseException:  # an interrupt: the reply would be taken for the next one
             self._end("it was ended by an interrupt; ")
             raise
+        if not reply:
+            self._end("its process has died, ")
         return reply, descriptors
 
     def _unpack(self, name: str, reply: bytes) -> Any:
@@ -268,12 +278,3 @@ class ForkedSession(Session):
             if self._made_from is not None:
                 with suppress(Exception):  # the parent may be gone, or busy; then it waits later
                     self._made_from.request("reap", self._fork.process)
-
-    def fork(self, method: str | None, time_limit: float) -> ForkedSession | None:
-        """Fork the clone's process; return the session of the new one, or None if the episode must be replayed."""
-        fork = self.request("fork", method)
-        if fork is None:
-            return None
-        made = ForkedSession(self, fork, time_limit, self)
-        made._stepped = self._stepped
-        return made

@@ -34,6 +34,7 @@ copybutton_prompt_is_regexp = True
 html_theme = "furo"
 html_title = f"simenv_marl {release}"
 html_static_path = ["_static"]
+html_extra_path = ["_moved"]  # pages at old addresses, which lead to the new ones
 html_css_files = ["pages.css"]
 html_copy_source = False
 html_show_copyright = False

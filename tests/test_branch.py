@@ -22,7 +22,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from simenv_marl import aec_env, branch, difference, joint_env, parallel_env, single_env
 from simenv_marl.core import run
-from simenv_marl.core.forks import loops_on
+from simenv_marl.core.separation import loops_on
 from simenv_marl.errors import (
     BranchError,
     ClosedError,

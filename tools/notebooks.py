@@ -17,7 +17,7 @@ from typing import Any, Final
 import nbformat
 from nbclient import NotebookClient
 
-PAGES = ("tutorial", "many-agents", "planning")
+PAGES = ("tutorial", "many-agents", "branches")
 """The pages that have a notebook."""
 
 FENCE = re.compile(r"^```(\S+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

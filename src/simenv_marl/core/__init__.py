@@ -9,6 +9,7 @@ Each module imports only from those below it::
     episode, plan               one episode, and the life cycle of a decision; the checked description of an environment
     run                         the state of an episode, its errors, and how it is unwound
     agent                       one agent of an episode
+    split                       calls that hold many decisions
     point                       decision points and other events
     greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
     driver                      the switch between a simulation's stack and its user's; what a simulation has opened
@@ -16,5 +17,5 @@ Each module imports only from those below it::
     actions, planner            checks of actions; policies that get the environment
     spaces, stacking            casts and checks of single values; stacks of many
     rng, options, packing       seeds of generators; options; pickles for other processes
-    forks                       forked processes, which end with the first one
+    forks, separation           forked processes, which end with the first one; what separates them from it
 """

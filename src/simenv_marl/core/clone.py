@@ -55,8 +55,8 @@ def clone(env: Any, *, seed: int | None = None, method: str | None = None, time_
     returns a copy of the result. The function may do anything with the environment. ``unwrapped.simulation`` exists
     only there.
 
-    A clone ends when it is closed or collected, and with the user's process. Then, and at a reset, the episode in which
-    it was cloned is neither unwound nor closed.
+    A clone ends when it is closed or collected, and with the user's process. Then, and at a reset, a forked clone does
+    not unwind or close the episode in which it was cloned; a replayed one has an episode for itself, and does.
 
     Args:
         env: An environment of a single simulation, in any view, with or without wrappers; also another clone.

@@ -14,9 +14,10 @@ from typing import Any, Final
 from ..errors import BranchError
 from .agent import Agent
 from .episode import Episode
-from .forks import CAN_FORK, flush, lives_above, loops_on, open_resources, pair, receive, send, separator, start
+from .forks import CAN_FORK, flush, lives_above, pair, receive, send, start
 from .packing import Pickler, pack_error, pack_plainly, unpack
 from .rng import PROCESS, seed_globals
+from .separation import loops_on, open_resources, separator
 from .session import Session
 
 DEEPEST: Final = 4

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import os
 import pickle
 import socket
 from collections.abc import Callable
 from contextlib import suppress
+from errno import EMFILE
 from functools import partial
 from typing import Any
 
@@ -14,7 +16,7 @@ from ..errors import BranchError, ClosedError, annotate, describe_error, short_r
 from .agent import Agent
 from .context import ExclusiveLock
 from .episode import Episode, Rounds
-from .forks import Fork
+from .forks import Fork, exhausted
 from .host import FIELDS, MOVES, State, layers_of, pack_env, pack_state, unpack_env
 from .packing import pack, pack_plainly, unpack, unpack_error
 from .session import Session
@@ -135,6 +137,9 @@ class ForkedSession(Session):
                 raise self.refusal()
             value = self._unpack(name, reply)
             if not descriptors:
+                if name == "fork" and value is not None:  # it ends, because its connection was lost
+                    self.request("reap", value)
+                    raise exhausted(OSError(EMFILE, os.strerror(EMFILE)))
                 return value
             return Fork(value, socket.socket(fileno=descriptors[0]), self._fork.life, is_child=False)
 

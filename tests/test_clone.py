@@ -1,0 +1,408 @@
+"""Clones: what they do, what they leave alone, and how they end."""
+
+import errno
+import gc
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import TimeLimit
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from pettingzoo.test import api_test, parallel_api_test
+
+from simenv_marl import aec_env, branch, clone, parallel_env, single_env
+from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError, ReentrancyError, WrongThreadError
+from tests.contract.test_conformance import SHAPES, made
+from tests.core.test_global_rng import world
+from tests.processes import ROOT, alone, descriptors, runs
+from tests.test_branch import METHODS, Holding, a_child, a_socket, a_thread, children
+from tests.worlds import filing, random_worlds
+from tests.worlds.counters import FORKS
+from tests.worlds.models import notes
+from tests.worlds.trips import VIEWS, Free, Lucky, Trip, future, move, outcome, trip
+
+CHECKS = [("aec", api_test), ("parallel", parallel_api_test), ("single", check_env), ("joint", check_env)]
+LUCKY = {"simulation": Lucky, "global_rng": True}
+OPTIONS = {
+    "plain": {}, "short": {"skip_forced": True, "max_steps": 4, "render_mode": "ansi"},
+    "lucky": LUCKY | {
+        "policies": {"guide_0": lambda observation, info: int(info["action_mask"].sum()) - 1},
+        "plugins": [(lambda trip: setattr(trip, "place", trip.place + 1), Lucky.luck, "before")],
+        "render_mode": "ansi_list", "state_space": "observations",
+    },
+}  # fmt: skip
+
+
+def number_of(twin):
+    return twin.unwrapped.call(lambda env: os.getpid())
+
+
+def ended(*numbers):
+    """Whether processes end within a second, which is longer on a machine that is busy."""
+    for _ in range(100):
+        if any(map(runs, numbers)):
+            time.sleep(0.01)
+    return not any(map(runs, numbers))
+
+
+@METHODS
+@pytest.mark.parametrize("options", OPTIONS)
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_clone_does_what_the_environment_does_and_neither_sees_the_other(view, options, method):
+    for taken in (0, 3):
+        env = trip(view, taken=taken, **OPTIONS[options])
+        twin, other = clone(env, method=method), clone(env, method=method)
+        deeper = clone(twin, method=method)
+        other.reset(seed=9)
+        move(other)
+        found = future(twin)
+        assert future(other) != found == future(env)
+        assert (future(deeper), type(deeper), type(deeper.unwrapped)) == (found, type(env), type(env.unwrapped))
+
+
+@given(random_worlds.designs, random_worlds.seeds, st.integers(0, 12), st.sampled_from([aec_env, parallel_env]))
+@settings(max_examples=60)
+def test_clones_of_random_worlds_are_exact_where_agents_join_and_leave(design, seed, taken, make):
+    env = make(lambda: random_worlds.Yard(design), random_worlds.POINTS)
+    env.reset(seed=seed)
+    assume(not any(move(env)[1] for _ in range(taken)) and env.unwrapped.episode.pending is not None)
+    twins = [clone(env, method=method) for method in ("fork", "replay")]
+    found = [future(each, lambda env: random_worlds.outcome(env.unwrapped.simulation)) for each in (*twins, env)]
+    assert found[0] == found[1] == found[2]
+
+
+@METHODS
+@pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes")
+@pytest.mark.parametrize(("view", "check"), CHECKS)
+def test_pettingzoos_and_gymnasiums_tests_pass(view, check, method):
+    env = made(SHAPES["one agent" if view == "single" else "twice in a row"], view, "ansi")
+    env.reset(seed=1)
+    check(clone(env, method=method))
+
+
+@METHODS
+def test_a_checkpoint_rewinds_when_what_it_was_cloned_from_is_gone(method):
+    env = trip("single, limited", taken=2)
+    checkpoint = clone(clone(env, method=method), method=method)
+    env.close()
+    found = [future(clone(checkpoint, method=method)) for _ in range(3)]
+    assert found == [future(trip("single, limited", taken=2))] * 3 == [future(checkpoint)] * 3
+
+
+def test_clones_have_many_generations_and_end_when_they_are_collected():
+    twin, numbers = clone(trip(), method="fork"), []
+    for _ in range(150):
+        numbers.append(number_of(twin))
+        twin = clone(twin, method="fork")
+    assert ended(*numbers)
+    numbers = [number_of(twin)]
+    assert future(twin) == future(trip())
+    del twin
+    assert ended(*numbers)
+
+
+@METHODS
+def test_wrappers_keep_count(method):
+    env = trip("single, limited", Free)
+    twin = clone(env, method=method)
+    twin.step(1)
+    told = twin.unwrapped.call(lambda env: (env._elapsed_steps, env.step(1)[3], env._elapsed_steps))
+    assert (told, twin._elapsed_steps, env._elapsed_steps) == ((2, False, 3), 3, 1)
+    assert clone(twin, method=method).step(1)[3] is twin.step(1)[3] is True
+    twin.unwrapped.call(lambda env: env.reset(seed=5))
+    assert twin._elapsed_steps == 0
+    assert future(twin) == future(trip("single, limited", Free, taken=0, seed=5))
+    outer = TimeLimit(clone(trip(), method=method), 2)
+    outer.reset(seed=4)
+    outer.step(1)
+    last = clone(outer, method=method)
+    assert last.step(1)[3] is outer.step(1)[3] is True
+    assert last.unwrapped.call(lambda env: env._elapsed_steps) == 2
+
+
+def test_functions_are_called_where_the_clone_is():
+    twin, factor = clone(trip(), method="fork"), 2
+    assert number_of(twin) != os.getpid() == number_of(clone(twin, method="replay"))
+    assert twin.call(lambda env, by: (factor * by, env.step(1)[4]["time"]), 4) == (8, 3.0)
+    twin.call(lambda env: env.simulation.steps).clear()
+    assert twin.call(lambda env: len(env.simulation.steps)) == 4
+    with pytest.raises(BranchError, match=r"\.call\("):
+        _ = twin.simulation
+    with pytest.raises(TypeError, match="pickle"):
+        twin.call(lambda env: env.simulation.held)
+
+
+@METHODS
+@pytest.mark.parametrize("view", VIEWS)
+def test_errors_surface_as_themselves(view, method):
+    failing = type("Failing", (Free,), {"luck": lambda trip: 1 / (1 - trip.day)})
+    twin = clone(trip(view, failing, taken=0), method=method)
+    before = twin.unwrapped.call(outcome)
+    with pytest.raises(InvalidActionError):
+        twin.unwrapped.call(lambda env: env.unwrapped.step({"walker_0": 99, "guide_0": 99}))
+    assert twin.unwrapped.call(outcome) == before
+    with pytest.raises(ZeroDivisionError) as caught:
+        [move(twin) for _ in range(10)]
+    assert "seed 3" in notes(caught.value)
+    assert method == "replay" or "in <lambda>\n" in notes(caught.value)
+    twin.reset(seed=3)
+    assert twin.unwrapped.call(outcome) == before
+
+
+def test_infos_lose_what_cannot_be_pickled():
+    def add(env, key):
+        env.episode.agent("walker_0").info.update({key: (step for step in ()), "kept": 1})
+
+    twin = clone(trip(), method="fork")
+    with pytest.warns(UserWarning, match=r"cannot be pickled: 'held'$"):
+        twin.call(add, "held")
+    twin.call(add, "other")  # it warns once
+    assert twin.episode.agent("walker_0").info.keys() == {"action_mask", "time", "elapsed", "kept"}
+
+
+@METHODS
+@pytest.mark.parametrize("view", ["aec, padded", "parallel", "single, limited", "joint"])
+@pytest.mark.parametrize("options", [{}, LUCKY])
+def test_the_same_seed_is_the_same_future(view, options, method):
+    env, before = trip(view, **options), world()
+    twins = [clone(env, seed=seed, method=method) for seed in (5, 6, 5, 5)]
+    again = clone(twins.pop(), method="replay")
+    found = [future(twin) for twin in twins]
+    assert found[1] != found[0] == found[2] == future(again)
+    assert branch(env, lambda twin, number: future(twin), 2, seeds=[5, 6]) == found[:2]
+    assert world() == before
+    assert future(env) == future(trip(view, **options)) != found[0]
+
+
+def fail(*_):
+    raise OSError(errno.EAGAIN, "no more")
+
+
+@METHODS
+def test_a_clone_that_cannot_be_made_leaves_nothing(method, monkeypatch):
+    faulty, fixed = (trip(simulation=type("Model", (Trip,), {"reseed": reseed})) for reseed in (fail, None))
+    twin = clone(fixed, method="fork")
+    gc.collect()
+    before = children(), descriptors().keys()
+    monkeypatch.setattr(os, "fork", os.fork if method == "replay" else fail)
+    if method == "fork":
+        twin.call(lambda env: setattr(os, "fork", fail))
+    refused = [(faulty, seed, OptionValueError, "seed must") for seed in (-1, True, 2.0, "3")]
+    refused += [(fixed, 1, BranchError, "reseed"), (twin, 1, BranchError, "reseed"), (faulty, 1, OSError, "no more")]
+    if method == "fork":
+        refused += [(each, None, BranchError, "no process .* no more; close some clones") for each in (fixed, twin)]
+    for source, seed, error, message in refused:
+        with pytest.raises((error, BranchError), match=message):
+            clone(source, seed=seed, method=method)
+    gc.collect()
+    assert (children(), descriptors().keys(), twin.call(lambda env: children())) == (*before, set())
+
+
+TWO = ["reset 8", "unwound 8", "closed 8", "reset 9", "unwound 9", "closed 9"]
+USES = [
+    (lambda twin: twin.step(1), []),
+    (lambda twin: twin.reset(seed=9), TWO[3:]),
+    (lambda twin: twin.call(lambda env: env.reset(seed=9)), TWO[3:]),
+    (lambda twin: [twin.reset(seed=8), twin.reset(seed=9)], TWO),
+]
+
+
+@pytest.mark.parametrize("end", [lambda twins: twins[0].close(), list.clear])
+@pytest.mark.parametrize(("use", "told"), USES)
+def test_only_episodes_that_begin_in_a_clone_are_unwound_and_closed(use, told, end, tmp_path):
+    env = trip(simulation=lambda: Trip(tmp_path / "diary"))
+    twins = [clone(env, method="fork")]
+    use(twins[0])
+    clone(twins[0], method="fork").close()
+    end(twins)
+    assert (tmp_path / "diary").read_text().splitlines() == ["reset 3", *told]
+    env.close()
+
+
+USER = """
+import os, sys, threading, time
+from tqdm import tqdm
+from simenv_marl import clone
+from tests.worlds.trips import trip
+def number(env):
+    return os.getpid()
+def keep(env):
+    kept.append(clone(env))
+    return kept[0].call(number)
+def spin(env, place):
+    os.mkdir(place)
+    while True: pass
+def show():
+    for count in tqdm(range(10**9), mininterval=0):
+        print(count, flush=True)
+        if cloned.is_set(): return
+kept, cloned = [], threading.Event()
+shows = threading.Thread(target=show)
+shows.start()
+twins = [clone(trip(), method="fork") for _ in range(20)]
+twins += [clone(twins[0]), clone(twins[0])]
+twins.append(clone(twins[-1]))
+numbers = [*[twin.call(number) for twin in twins], twins[1].call(keep)]
+cloned.set()
+shows.join()
+for twin in twins[2], twins[-1]:
+    place = os.path.join(sys.argv[1], str(twin.call(number)))
+    threading.Thread(target=twin.call, args=(spin, place), daemon=True).start()
+    while not os.path.exists(place): time.sleep(0.01)
+if os.fork() == 0:  # it does not keep clones alive
+    time.sleep(30)
+    os._exit(0)
+print("all", *numbers, flush=True)
+"""
+INTERRUPTED = """
+try: twins[0].call(lambda env: print("ready", flush=True) or time.sleep(600))
+except KeyboardInterrupt: print(twins[1].call(lambda env: "well"))
+twins[0].step(1)
+"""
+ENDS = [("os.kill(os.getpid(), 9)", ""), ("1 / 0", "ZeroDivisionError"), ("os._exit(0)", ""), ("", "")]
+ENDS += [(INTERRUPTED, "BranchError: the clone is gone: it was ended by an interrupt")]
+
+
+@pytest.mark.parametrize(("end", "error"), ENDS)
+def test_no_clone_outlives_its_users_process_and_interrupts_reach_that_alone(end, error, tmp_path):
+    command, told = [sys.executable, "-c", USER + end, str(tmp_path)], tmp_path / "told"
+    options = {"cwd": ROOT, "stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+    with told.open("w") as file, subprocess.Popen(command, stderr=file, **options) as process:
+        try:
+            numbers = next(line for line in process.stdout if line.startswith("all")).split()[1:]
+            if end is INTERRUPTED:
+                assert process.stdout.readline() == "ready\n"
+                os.killpg(process.pid, signal.SIGINT)
+                assert process.stdout.readline() == "well\n"
+            process.wait(60)
+            assert ended(*map(int, numbers))
+            assert (len({*numbers}), error in told.read_text()) == (24, True)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+def test_a_clone_that_dies_says_so_and_others_go_on():
+    env = trip()
+    killed, exits, late, other = (clone(env, method="fork", time_limit=limit) for limit in (60, 60, 0.3, float("inf")))
+    os.kill(number_of(killed), signal.SIGKILL)
+    for use in (number_of, lambda twin: twin.step(1), clone, lambda twin: twin.reset(), number_of):
+        with pytest.raises(BranchError, match="has died, killed by signal 9"):
+            use(killed)
+    with pytest.raises(BranchError, match="has died, with exit code 3"):
+        exits.call(lambda env: os._exit(3))
+    number = number_of(late)
+    with pytest.raises(BranchError, match=r"longer than 0\.3 s"):
+        late.call(lambda env: time.sleep(600))
+    assert ended(number)
+    assert future(other) == future(env)
+
+
+def test_threads_use_a_clone_one_at_a_time(tmp_path):
+    def wait(env):
+        (tmp_path / "begun").touch()
+        while not (tmp_path / "over").exists():
+            time.sleep(0.01)
+
+    env = trip()
+    twin = clone(env, method="fork")
+    with ThreadPoolExecutor(1) as pool:
+        with pytest.raises(WrongThreadError, match="thread"):
+            pool.submit(clone, env).result()
+        assert future(pool.submit(clone, twin, method="fork").result()) == future(env)
+        waits = pool.submit(twin.call, wait)
+        while not (tmp_path / "begun").exists():
+            time.sleep(0.01)
+        for use in (lambda: twin.step(1), twin.reset, lambda: clone(twin)):
+            with pytest.raises(ReentrancyError):
+                use()
+        (tmp_path / "over").touch()
+        waits.result()
+    twin.step(1)
+
+
+def test_a_default_timeout_of_sockets_is_none_of_clones():
+    socket.setdefaulttimeout(0.05)
+    try:
+        twin = clone(trip(), method="fork")
+        deeper = clone(twin, method="fork")
+    finally:
+        socket.setdefaulttimeout(None)
+    assert deeper.call(lambda env: time.sleep(0.3) or 5) == twin.call(lambda env: time.sleep(0.3) or 5) == 5
+
+
+@FORKS
+def test_a_clone_is_refused_in_a_fork_of_its_users_process_and_unharmed():
+    twin, child = clone(trip(), method="fork"), os.fork()
+    if child == 0:
+        with suppress(BaseException):
+            try:
+                twin.step(1)
+            except BranchError as error:
+                twin.close()
+                os._exit("another process" in str(error))
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    assert future(twin) == future(trip())
+
+
+def crowd():
+    env, before = trip(), descriptors()
+    twins = [clone(env, method="fork") for _ in range(100)]
+    assert sum(each.startswith("socket") for each in descriptors().values()) == len(children()) == 100
+    while twins:
+        twins.pop().close()
+    assert (children(), descriptors()) == (set(), before)
+
+
+def starve(spare):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+    env, number = trip(), os.getpid()
+    for source in (env, clone(env, method="fork")):
+        before, taken, twins = children(), [], []
+        with suppress(OSError):
+            while True:
+                taken.append(os.dup(0))
+        while len(taken) > 50 - spare:
+            os.close(taken.pop())
+        with suppress(BranchError):
+            twins.append(clone(source, method="fork"))
+        while taken:
+            os.close(taken.pop())
+        assert number not in map(number_of, twins)
+        twins.clear()
+        assert (children(), source.call(lambda env: children())) == (before, before if source is env else set())
+
+
+@pytest.mark.parametrize(("function", "args"), [(crowd, ()), *((starve, (spare,)) for spare in range(9))])
+def test_clones_take_one_descriptor_each_and_leave_none(function, args):
+    alone(function, *args)
+
+
+@pytest.mark.parametrize("held", [a_socket, a_child, a_thread])
+def test_what_cannot_be_forked_is_replayed_or_named(held):
+    env = single_env(type("Model", (Holding,), {"open": held}), filing.choose)
+    env.reset(seed=4)
+    env.step(1)
+    with pytest.raises(BranchError, match="replay"):
+        clone(env, method="fork")
+    twin = clone(env)
+    assert number_of(deeper := clone(twin)) == os.getpid()
+    assert filing.left(deeper) == filing.left(twin) == filing.left(env)  # a thread that is not played to its end stays
+
+
+def test_a_model_that_does_not_repeat_itself_can_only_be_forked():
+    env = trip(simulation=type("Dice", (Trip,), {"reset": lambda trip, seed=None: Trip.reset(trip)}))
+    with pytest.raises(BranchError, match="the same seed"):
+        clone(env, method="replay")
+    twin = clone(env, method="fork")
+    assert [move(twin) for _ in range(4)] == [move(env) for _ in range(4)]

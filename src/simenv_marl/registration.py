@@ -15,7 +15,7 @@ from .core.points import Points
 from .envs import vector_env, view_class
 from .errors import OptionValueError, UnknownPointError, short_repr
 
-_RECIPES: dict[str, tuple[Any, Any, dict[str, Any]]] = {}
+_RECIPES: dict[str, tuple[Any, Any, Any]] = {}
 """The simulation, the points and the options that ``register_simulation`` was given, by name and version."""
 
 

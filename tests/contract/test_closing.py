@@ -9,7 +9,8 @@ from gymnasium.vector import AutoresetMode
 
 from simenv_marl import aec_env, branch, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
 from simenv_marl.data import collect_episodes
-from tests.worlds.models import define
+from simenv_marl.experiments import evaluate
+from tests.worlds.models import define, notes
 
 BOOK = f"{__name__}.Shop.book"
 LOG = []
@@ -160,14 +161,16 @@ def test_its_error_is_raised_by_the_next_reset_or_by_close():
 
 
 def test_its_error_does_not_take_the_place_of_an_earlier_one():
-    with pytest.raises(LookupError, match="first") as caught:
-        simulate(Broken, {BOOK: fail}, points=BOOKS, seed=1)
-    assert "books cannot be closed" in "".join(caught.value.__notes__)
+    for run, policies in ((simulate, {BOOK: fail}), (evaluate, {"bad": {BOOK: fail}})):
+        seed = {"seed": 1} if run is simulate else {"seeds": [1]}
+        with pytest.raises(LookupError, match="first") as caught:
+            run(Broken, policies, points=BOOKS, **seed)
+        assert "books cannot be closed" in notes(caught.value)
     env = single_env(Broken, BOOKS)
     env.reset(seed=1)
     with pytest.raises(LookupError, match="first") as caught:
         branch(env, fail, 1, method="replay")
-    assert "books cannot be closed" in "".join(caught.value.__notes__)
+    assert "books cannot be closed" in notes(caught.value)
     with pytest.raises(ConnectionError):
         env.close()
 

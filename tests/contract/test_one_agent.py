@@ -30,7 +30,7 @@ from simenv_marl.errors import (
     ViewError,
 )
 from tests.worlds.counters import same
-from tests.worlds.models import play
+from tests.worlds.models import calling, decision, play
 
 NAMES = ("player_red", "player_blue")
 RED = {"agent": "player_red"}
@@ -191,6 +191,9 @@ def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_d
         single_env(Nothing, MOVE, agent="player_red", skip_forced=True).reset()
 
 
+ANT, BEE = decision(agent="ant_0"), decision(agent="bee_0")
+
+
 def simulated(simulation, points, **options):
     return simulate(simulation, points=points, **options)
 
@@ -200,6 +203,14 @@ def simulated(simulation, points, **options):
     [
         (single_env, Game, MOVE, {}, ViewError, "agent="),
         (single_env, Casino, NAMED, {"agent": "mvoer"}, AgentError, "mover, better"),
+        (
+            single_env,
+            calling(ANT, BEE),
+            ANT,
+            {"agent": "bee_0", "policies": {BEE: RULE}},
+            AgentError,
+            "its agents are ant_0",
+        ),
         *((single_env, Game, MOVE, {"agent": agent}, OptionValueError, "agent") for agent in ("", 3, ("player_red",))),
         *((make, Game, MOVE, RED, UnknownOptionError, "single view") for make in (aec_env, parallel_env, joint_env)),
         (simulated, Game, MOVE, RED, UnknownOptionError, "single_env"),

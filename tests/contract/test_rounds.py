@@ -9,7 +9,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, parallel_env
+from simenv_marl import RULE, branch, parallel_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     ClosedError,
@@ -84,6 +84,15 @@ def test_a_round_answers_a_decision_within_a_decision():
     results = env.step({"outer_0": RULE, "inner_0": 5})
     assert env.simulation.log == [6]
     assert acted(results) == {"outer_0", "inner_0"}
+
+
+def test_actions_of_a_round_are_replayed_as_they_were_given():
+    box = {"action_space": spaces.Box(0, 9, (1,)), "action_space_mapping": lambda action: action.__iadd__(1).item()}
+    ant = decision(agent="ant_0", **box)
+    env = parallel_env(calling(ant, ant), ant)
+    env.reset(seed=0)
+    env.step({"ant_0": np.zeros(1, np.float32)})  # which the mapping changes
+    assert branch(env, lambda twin, _: twin.simulation.log, 1, method="replay") == [[1.0]]
 
 
 # -- actions that are refused ---------------------------------------------------------------------

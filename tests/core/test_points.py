@@ -1,10 +1,11 @@
 """Decision points on top of hooks, and how they are found."""
 
 import gc
+import sys
 import weakref
 
 from simenv_marl.core import packing
-from simenv_marl.core.packing import pack, unpack
+from simenv_marl.core.packing import pack, pack_plainly, unpack
 from simenv_marl.core.points import find_point, locate, portable
 from simenv_marl.decision import point_of, registered
 from simenv_marl.hooks.hook import hook_of, unwrap
@@ -107,3 +108,12 @@ def test_functions_go_to_other_processes_by_name(monkeypatch):
     parcels = list(map(pack, functions))
     monkeypatch.setattr(packing, "_known", {})  # as where nothing has come from yet
     assert list(map(unpack, parcels)) == functions
+
+
+def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypatch):
+    main = sys.modules["__main__"]
+    monkeypatch.delattr(main, "__file__", raising=False)
+    with monkeypatch.context() as notebook:
+        notebook.setattr(main, "Cell", type("Cell", (), {"__module__": "__main__", "value": 3}), raising=False)
+        parcel = pack_plainly(main.Cell)
+    assert unpack(parcel).value == 3

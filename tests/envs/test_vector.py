@@ -227,11 +227,14 @@ def test_the_action_of_one_that_is_reset_is_not_looked_at():
 
 
 def test_boxes_take_actions_in_other_dtypes():
-    envs = begun(vector_env(Counter, {POINT: VARIETY["box"][1]}, num_envs=2))
-    for batch in (np.ones((2, 2)), np.ones((2, 2), int), [[1.0, 1.0], [1, 1]]):
+    dtypes, box = [], VARIETY["box"][1].action_space
+    mapping = {"action_space_mapping": lambda action: dtypes.append(action.dtype) or 3}
+    envs = begun(vector_env(Counter, {POINT: definition(action_space=box, **mapping)}, num_envs=2))
+    for batch in (np.ones((2, 2)), np.ones((2, 2), int), np.ones((2, 2), np.float16), [[1.0, 1.0], [1, 1]]):
         envs.reset(seed=0)
         envs.step(batch)
-        assert counts(envs) == [3, 3]
+    assert dtypes == [np.float32] * 8
+    assert envs.single_action_space is not box
     with pytest.raises(InvalidActionError, match="sub-environment 1"):
         envs.step(np.array([[0, 0], [0, 3.5]], np.float32))
 

@@ -11,7 +11,7 @@ from scipy import stats
 from statsmodels.stats.power import TTestPower
 from tools.coverage_of_intervals import measure
 
-from simenv_marl import RULE, aec_env, evaluate, make_step, simulate
+from simenv_marl import RULE, aec_env, branch, evaluate, make_step, simulate
 from simenv_marl.data import Mixture
 from simenv_marl.data.plots import interval, is_proportion
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
@@ -19,7 +19,7 @@ from simenv_marl.experiments import Evaluation, Variant
 from simenv_marl.planning import RolloutPolicy
 from tests.conftest import DRIVERS
 from tests.worlds.many_worlds import Colony, Design, colony_points
-from tests.worlds.models import notes
+from tests.worlds.models import calling, decision, notes
 from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some
 
 SEEDS = range(12)
@@ -120,6 +120,17 @@ def test_planners_decide_as_they_do_in_simulate(arguments):
     found = evaluate(Shop, contenders, seeds=range(2), points=NEAR, metric=level, **arguments).values("metric")
     for name, policies in contenders.items():
         assert found[name].tolist() == [simulate(Shop, policies, points=NEAR, seed=seed).level for seed in range(2)]
+
+
+def test_futures_of_an_agent_that_is_alone_end_with_max_steps():
+    choose, truncated = decision(agent="a_0"), []
+
+    def planner(observation, *, _environment):
+        truncated.append(branch(_environment, lambda env, _: [env.step(RULE)[3] for _ in range(3 - len(truncated))], 1))
+        return 1
+
+    evaluate(calling(*[choose] * 5), {"one": {choose: planner}}, seeds=[0], max_steps=3)
+    assert truncated == [[[False, False, True]], [[False, True]], [[True]]]
 
 
 MIXED = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {"keeper": much_of_many}}

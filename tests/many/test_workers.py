@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 
 import joblib
@@ -129,6 +130,12 @@ def test_undecorated_models_variants_and_closures_reach_the_workers():
     alone, shared = (simulate_many(variant, {Creature.act: of_many}, **given, workers=workers) for workers in (0, 2))
     assert shared == alone
     assert vars(Creature)["act"] is before
+
+
+def test_what_a_script_names_without_defining_it_is_not_sent(monkeypatch):
+    monkeypatch.setattr(sys.modules["__main__"], "lock", threading.Lock(), raising=False)
+    found = simulate_many(script(lambda simulation: simulation.log.append("__main__.lock")), seeds=[1, 2], workers=2)
+    assert [simulation.log for simulation in found] == [["__main__.lock"]] * 2
 
 
 def local_error():

@@ -202,6 +202,8 @@ def test_a_fork_can_begin_anew_and_cannot_go_on_with_the_process_nor_end_it(make
             env.step(RULE)
         assert plays_by_its_rule(env, 2)
         env.close()
+        with pytest.raises(ChildProcessError):
+            os.waitpid(-1, os.WNOHANG)  # nothing is left that would guard processes
 
     in_a_fork(closes)
     in_a_fork(begins_anew)

@@ -56,7 +56,7 @@ class Effects:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        factors = list(self.levels)
+        factors = self.levels
         pairs = [pair for pair, strength in self.interactions["strength"].items() if strength > 0][:4]
         columns = min(max(len(factors), len(pairs)), 5)  # more would be too small to read
         above = ceil(len(factors) / columns)

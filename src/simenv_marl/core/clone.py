@@ -15,6 +15,7 @@ import os
 import select
 import socket
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf
@@ -94,7 +95,7 @@ def clone(env: Any, *, seed: int | None = None, method: str | None = None, time_
         twin = view._cloned(session)
         twin._begin_branch()
         made = copy.deepcopy(env, {id(view): twin})  # copies each wrapper with its state
-        twin._set_outermost(made)
+        twin._outermost = weakref.ref(made)
         if begin is not None and not eager:  # last: what this process changes after the fork is not shared
             session.attach(begin())
         if seed is not None:

@@ -254,7 +254,7 @@ class View:
             for space in self._spaces[agent]:
                 space.seed(int(sequence.generate_state(1)[0]))
 
-    # -- copies -----------------------------------------------------------------------------------
+    # -- copies, branches and planners ------------------------------------------------------------
 
     def __copy__(self) -> Any:
         return copy.deepcopy(self)
@@ -292,8 +292,6 @@ class View:
         vars(self).update(recipe)
         self._clear()
 
-    # -- branches and planners --------------------------------------------------------------------
-
     def _check_pending(self) -> None:
         """Check that a decision is pending, or raise ``ResetNeededError`` or ``ReentrancyError``."""
         if self.episode.pending is None:
@@ -308,23 +306,11 @@ class View:
         made._set_up()
         return made
 
-    def _set_outermost(self, env: Any) -> None:
-        """Note the environment with all wrappers, as which this one was cloned."""
-        self._outermost = weakref.ref(env)
-
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Call a function with this environment; that of a clone, in the clone's process, with the clone's wrappers.
-
-        Args:
-            function: Called with the environment and the arguments. It may do anything with it.
-            *args: Further arguments.
-
-        Returns:
-            The result of the function; of a forked clone, a copy.
+        """Return ``function(environment, *args)``; for a clone from its process, with the wrappers that were cloned.
 
         Raises:
-            BranchError: The clone's process has ended, or takes too long.
-            BaseException: Any exception of the function.
+            BaseException: Any exception of the function; a ``BranchError`` if the clone's process has ended.
         """
         return self._session.call(self._outermost() or self, function, args)
 

@@ -192,8 +192,8 @@ class ForkedSession(Session):
         if error is None:
             return None if value is None else unpack(value)
         raised = unpack_error(error)
-        cause, raised.__cause__ = raised.__cause__, None
-        annotate(raised, f"simenv_marl: in a clone, where it was raised by{cause}")
+        annotate(raised, f"simenv_marl: in a clone, where it was raised by{raised.__cause__}")
+        BaseException.__setattr__(raised, "__cause__", None)  # its class may be frozen
         raise raised
 
     def ask(self, name: str, *args: Any) -> Any:

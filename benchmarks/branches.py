@@ -1,6 +1,6 @@
-"""The cost of a branch beside the minimum for the same task, and the speed-up by two cores.
+"""The cost of branches and clones beside the minimum for the same task, and the speed-up by two cores.
 
-Times are wall-clock times, as branches are processes. On one core, they run one after another.
+Times are wall-clock times, as these are processes. On one core, branches run one after another.
 """
 
 from __future__ import annotations
@@ -8,13 +8,19 @@ from __future__ import annotations
 import os
 import pickle
 import random
+import socket
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+from examples.greenhouse_coop.env import env as make_greenhouse
+
 from benchmarks.measure import Contender, Group, Row, timer, two_cores
-from benchmarks.noop import Alone, Busy, Model
-from simenv_marl import branch, reseed_generators, single_env
+from benchmarks.noop import Alone, Busy, Model, steps
+from simenv_marl import branch, clone, reseed_generators, single_env
 
 BRANCHES, STEPS = 20, 10
 MANY = 64
@@ -55,11 +61,20 @@ def groups(number: int) -> Iterator[Group]:
             Row(f"{what}, replayed / {hand}", replay, least, unit="ms"),
         ]
     )
+    ours = milliseconds(lambda: [clone(env, method="fork").close() for _ in range(count)], count)
+    least = milliseconds(lambda: [os.waitpid(child(int), 0) for _ in range(count)], count)
+    yield Group([Row("a clone, made and closed / os.fork by hand", ours, least, 2.0, 1.5, unit="ms")])
+    number, clock = min(number, 1_000), time.perf_counter
+    through, direct = (steps(each, 0, number, clock) for each in (clone(env, method="fork"), env))
+    row = Row("a step of a clone / a round trip to a process by hand", through, timer(echo(), number, clock))
+    yield Group([row, Row("a step of a clone, less a step", lambda: through() - direct(), None, 110, 80)])
+    memory = partial(memory_of_clones, min(300, number // 2))
+    yield Group([Row("memory of each of 300 clones of the greenhouse", memory, None, 3, 2, unit="MiB")], most=1)
     env.close()
     env = single_env(Slow, Model.left)
     env.reset(seed=0)
     with two_cores():
-        two = milliseconds(lambda: branch(env, one_step, many, method="fork"), many)
+        two = milliseconds(lambda: branch(env, lambda env, _: env.step(0)[1], many, method="fork"), many)
 
         def one() -> float:
             both = os.sched_getaffinity(0)
@@ -69,9 +84,8 @@ def groups(number: int) -> Iterator[Group]:
             finally:
                 os.sched_setaffinity(0, both)
 
-        yield Group(
-            [Row("branches of 10 ms: two cores beside one", two, one, 1.7, 1.9, faster=True, unit="ms")], most=9
-        )
+        row = Row("branches of 10 ms: two cores beside one", two, one, 1.7, 1.9, faster=True, unit="ms")
+        yield Group([row], most=9)
     env.close()
 
 
@@ -83,11 +97,6 @@ def some_steps(env: Any, number: int) -> float:
     return total
 
 
-def one_step(env: Any, number: int) -> float:
-    """Take one step."""
-    return float(env.step(0)[1])
-
-
 def milliseconds(run: Callable[[], Any], number: int) -> Contender:
     """Make a contender of a number of branches: the milliseconds of each."""
     microseconds = timer(lambda number: run(), number, time.perf_counter)
@@ -97,14 +106,56 @@ def milliseconds(run: Callable[[], Any], number: int) -> Contender:
 def by_hand(env: Any, number: int) -> Any:
     """Do the same in a process that is forked by hand and answers through a pipe."""
     reading, writing = os.pipe()
-    process = os.fork()
-    if process == 0:
-        os.write(writing, pickle.dumps(some_steps(env, number)))
-        os._exit(0)
+    process = child(lambda: os.write(writing, pickle.dumps(some_steps(env, number))))
     os.close(writing)
-    answer = b""
-    while chunk := os.read(reading, 1 << 16):
-        answer += chunk
+    answer = os.read(reading, 1 << 16)
     os.close(reading)
     os.waitpid(process, 0)
     return pickle.loads(answer)
+
+
+def child(main: Callable[[], Any]) -> int:
+    """Fork a process that only calls a function; return its number."""
+    process = os.fork()
+    if process == 0:
+        main()
+        os._exit(0)
+    return process
+
+
+def echo() -> Callable[[int], None]:
+    """Fork a process that sends back what it receives; return a function that sends it a number of messages."""
+    here, there = socket.socketpair()
+
+    def answer() -> None:
+        here.close()
+        while message := there.recv(1 << 16):
+            there.sendall(message)
+
+    def ask(number: int) -> None:
+        for _ in range(number):
+            here.sendall(bytes(100))
+            here.recv(1 << 16)
+
+    child(answer)
+    there.close()
+    return ask
+
+
+def memory_of_clones(number: int = 300) -> float:
+    """Measure by how much each clone of a greenhouse makes the memory of all processes grow, in MiB."""
+    env, own = make_greenhouse(), str(os.getpid())
+    env.reset(seed=0)
+
+    def memory() -> int:
+        """What n processes share counts as an n-th in each."""
+        kib = 0
+        for path in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # it has just ended
+                if own in (path.name, (path / "stat").read_text().rpartition(")")[2].split()[1]):
+                    kib += int((path / "smaps_rollup").read_text().partition("\nPss:")[2].split()[0])
+        return kib
+
+    before, clones = memory(), [clone(env, method="fork") for _ in range(number)]
+    time.sleep(1.0)  # until all have started
+    return (memory() - before) / len(clones) / 1024

@@ -43,9 +43,8 @@ def groups(number: int) -> Iterator[Group]:
     with two_cores():
         few = min(FEW, number // 10)
         two, one = (experiment(SlowTurn, few, time.perf_counter, workers) for workers in (2, 0))
-        yield Group(
-            [Row("runs of 10 ms: two workers beside one process", two, one, 1.8, 1.95, faster=True, unit="ms")], most=1
-        )
+        row = Row("runs of 10 ms: two workers beside one process", two, one, 1.8, 1.95, faster=True, unit="ms")
+        yield Group([row], most=1)
 
 
 def experiment(make: type, rows: int, clock: Callable[[], float], workers: int = 0) -> Contender:

@@ -51,22 +51,17 @@ def other_point(number: int) -> Any:
 
 
 POINTS = [Model.left, Model.right]
+OURS = partial(aec_env, Turns, POINTS)
 EXTRAS: dict[str, Callable[[], tuple[Any, Any]]] = {
-    "without": lambda: (aec_env(Turns, POINTS), None),
+    "without": lambda: (OURS(), None),
     "a clock": lambda: (aec_env(ClockTurns, POINTS), None),
-    "an idle plugin": lambda: (aec_env(Turns, POINTS, plugins=[(nothing, f"{__name__}.idle", "before")]), None),
+    "an idle plugin": lambda: (OURS(plugins=[(nothing, f"{__name__}.idle", "before")]), None),
     "a difference elsewhere": lambda: (
-        aec_env(Turns, POINTS),
+        OURS(),
         other_environment({Model.left: make_step(**DEFINITION | {"reward_mapping": difference(lambda model: 1.0)})}),
     ),
-    f"{NEIGHBOURS:,} other environments": lambda: (
-        aec_env(Turns, POINTS),
-        [other_environment() for _ in range(NEIGHBOURS)],
-    ),
-    f"{NEIGHBOURS:,} other decision points": lambda: (
-        aec_env(Turns, POINTS),
-        [other_point(number) for number in range(NEIGHBOURS)],
-    ),
+    f"{NEIGHBOURS:,} other environments": lambda: (OURS(), [other_environment() for _ in range(NEIGHBOURS)]),
+    f"{NEIGHBOURS:,} other decision points": lambda: (OURS(), [other_point(number) for number in range(NEIGHBOURS)]),
 }
 """Functions that make the environment to measure, and what stands beside it."""
 
@@ -80,9 +75,8 @@ def idle(model: Model) -> None:
 def groups(number: int) -> Iterator[Group]:
     """Yield the rows, with a number of decisions of each contender."""
     without, *others = ((extra, apart(extra, number)) for extra in EXTRAS)
-    yield Group(
-        [Row(f"AEC, {extra} / without", run, without[1], *LIMITS.get(extra, ())) for extra, run in others], most=9
-    )
+    rows = [Row(f"AEC, {extra} / without", run, without[1], *LIMITS.get(extra, ())) for extra, run in others]
+    yield Group(rows, most=9)
 
 
 def apart(extra: str, number: int) -> Contender:

@@ -61,12 +61,10 @@ def groups(number: int) -> Iterator[Group]:
         raise MissingError("joblib") from None
     with two_cores():
         zeros = {Model.left: lambda observations: np.zeros(len(observations), np.int64)}
-        two, one = (
-            at_once(Slow, zeros, number, DECISIONS // 10, time.perf_counter, workers=workers) for workers in (2, 0)
-        )
-        yield Group(
-            [Row("100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True)], most=7
-        )
+        few, clock = DECISIONS // 10, time.perf_counter
+        two, one = (at_once(Slow, zeros, number, few, clock, workers=workers) for workers in (2, 0))
+        row = Row("100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True)
+        yield Group([row], most=7)
 
 
 def network_policy() -> Callable[[Any], Any]:

@@ -254,18 +254,12 @@ class Table:
 
     def dump(self, path: Path) -> None:
         """Write all figures as JSON, by section and row."""
-        figures = {
-            section: {
-                figure.row.name: {
-                    "ratio": figure.ratio,
-                    "candidate": figure.candidate,
-                    "baseline": figure.baseline,
-                    "unit": figure.row.unit,
-                }
-                for figure in found
-            }
-            for section, found in self.figures.items()
-        }
+
+        def entry(figure: Figure) -> dict[str, Any]:
+            measured = {name: getattr(figure, name) for name in ("ratio", "candidate", "baseline")}
+            return measured | {"unit": figure.row.unit}
+
+        figures = {name: {figure.row.name: entry(figure) for figure in found} for name, found in self.figures.items()}
         path.write_text(json.dumps(figures, indent=1), encoding="utf-8")
 
 

@@ -12,12 +12,7 @@ from benchmarks.measure import Figure
 
 
 def draw(figures: Mapping[str, list[Figure]], path: Path) -> None:
-    """Draw the figures of the sections ``vector`` and ``suspended``.
-
-    Args:
-        figures: The figures of each section.
-        path: The file to write.
-    """
+    """Draw the figures of the sections ``vector`` and ``suspended`` in a file."""
     by_name = {figure.row.name: figure for figure in figures["vector"]}
     template, view = (
         [(int(name.split()[0].replace(",", "")), figure) for name, figure in by_name.items() if name.endswith(end)]

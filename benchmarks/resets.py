@@ -29,16 +29,16 @@ def groups(number: int) -> Iterator[Group]:
     """Yield the rows, with a tenth of the number of resets of each contender."""
     number = max(number // 10, 1)
     template = TemplateAECEnv(1, DECISIONS)
-    views = {
-        "single": (single_env(Short, Model.left), TemplateEnv(), play_single),
+    views: dict[str, Any] = {
+        "single": (single_env(Short, Model.left), TemplateEnv(), partial(play, 1)),
         "AEC": (aec_env(Short, Model.left), template, play_aec),
-        "parallel": (parallel_env(Short, Model.left), aec_to_parallel(template), play_parallel),
+        "parallel": (parallel_env(Short, Model.left), aec_to_parallel(template), partial(play, {"agent_0": 1})),
     }
     start, whole = (calls(play_greenlet, number, decisions) for decisions in (0, DECISIONS))
     rows = []
-    for view, (env, hand, play) in views.items():
+    for view, (env, hand, plays) in views.items():
         reset, reset_by_hand = calls(env.reset, number), both(calls(hand.reset, number), start)
-        episode, episode_by_hand = calls(play, number, env), both(calls(play, number, hand), whole)
+        episode, episode_by_hand = calls(plays, number, env), both(calls(plays, number, hand), whole)
         rows += [
             Row(f"{view}: a reset / template + a greenlet", reset, reset_by_hand),
             Row(f"{view}: three decisions / template + a greenlet", episode, episode_by_hand),
@@ -49,11 +49,11 @@ def groups(number: int) -> Iterator[Group]:
     yield Group(rows)
 
 
-def play_single(env: Any) -> None:
-    """Play an episode of a Gymnasium environment."""
+def play(action: Any, env: Any) -> None:
+    """Play an episode of a Gymnasium or a parallel environment."""
     env.reset()
     for _ in range(DECISIONS):
-        env.step(1)
+        env.step(action)
 
 
 def play_aec(env: Any) -> None:
@@ -64,13 +64,6 @@ def play_aec(env: Any) -> None:
         env.step(1)
     env.last()
     env.step(None)
-
-
-def play_parallel(env: Any) -> None:
-    """Play an episode of a parallel environment."""
-    env.reset()
-    for _ in range(DECISIONS):
-        env.step({"agent_0": 1})
 
 
 def play_greenlet(decisions: int) -> None:

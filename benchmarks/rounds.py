@@ -52,7 +52,6 @@ def groups(number: int) -> Iterator[Group]:
         env = turn_based_aec_to_parallel(TemplateAECEnv(size))
         env.reset(seed=0)
         one_decision = steps(env, dict.fromkeys(env.agents, 1), few if size == 2 else TURNS)
-        rows.append(
-            Row(f"{size:,} agents: ours beside turn_based_aec_to_parallel", ours[size], one_decision, faster=True)
-        )
+        name = f"{size:,} agents: ours beside turn_based_aec_to_parallel"
+        rows.append(Row(name, ours[size], one_decision, faster=True))
     yield Group(rows, most=3)

@@ -54,9 +54,8 @@ def groups(number: int) -> Iterator[Group]:
     with two_cores():
         envs = [vector_env(Slow, Model.left, num_envs=SIZE, workers=workers) for workers in (0, 2)]
         one, two = (vector(env, SIZE, min(SIZE * 20, number), clock) for env in envs)
-        yield Group(
-            [Row("100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True)], most=9
-        )
+        row = Row("100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True)
+        yield Group([row], most=9)
         for env in envs:
             env.close()
 

@@ -49,12 +49,9 @@ class Meadow(SimulationInterface):
 
     def outcome(self) -> Any:
         """Return the state at the end of a run."""
-        animals = [
-            (animal.unique_id, animal.energy, animal.cell.coordinate)
-            for kind in KINDS.values()
-            for animal in self.animals(kind)
-        ]
-        return animals, self.model.random.getstate()
+        animals = [animal for kind in KINDS.values() for animal in self.animals(kind)]
+        states = [(animal.unique_id, animal.energy, animal.cell.coordinate) for animal in animals]
+        return states, self.model.random.getstate()
 
 
 def wolves_and_sheep(seed: int | None) -> tuple[Any, Any]:

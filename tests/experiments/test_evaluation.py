@@ -129,7 +129,7 @@ def test_futures_of_an_agent_that_is_alone_end_with_max_steps():
         truncated.append(branch(_environment, lambda env, _: [env.step(RULE)[3] for _ in range(3 - len(truncated))], 1))
         return 1
 
-    evaluate(calling(*[choose] * 5), {"one": {choose: planner}}, seeds=[0], max_steps=3)
+    evaluate(calling(*[choose] * 5), {"one": {choose: planner}}, seeds=[0], points=choose, max_steps=3)
     assert truncated == [[[False, False, True]], [[False, True]], [[True]]]
 
 

@@ -134,7 +134,8 @@ def test_undecorated_models_variants_and_closures_reach_the_workers():
 
 def test_what_a_script_names_without_defining_it_is_not_sent(monkeypatch):
     monkeypatch.setattr(sys.modules["__main__"], "lock", threading.Lock(), raising=False)
-    found = simulate_many(script(lambda simulation: simulation.log.append("__main__.lock")), seeds=[1, 2], workers=2)
+    source = script(lambda simulation: simulation.log.append("__main__.lock"))
+    found = simulate_many(source, seeds=[1, 2], points=POINTS, workers=2)
     assert [simulation.log for simulation in found] == [["__main__.lock"]] * 2
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import combinations
 from math import ceil, inf, log, log2, sqrt
 from time import perf_counter
 from typing import Any, Final
@@ -19,13 +20,25 @@ from ..core.session import checked_seed
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE
-from .player import is_number, is_planning, player_of, try_out, warn_once
+from .player import Outcome, is_number, is_planning, player_of, try_out, warn_once
 from .states import Plan, States
 
 _KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
 
 _SEVERAL: Final = 4
 """The number of futures of a plan that are compared to find out whether they are all the same."""
+
+_MANY: Final = 16
+"""The number of futures, or of times between decisions, from which on their statistics are trusted."""
+
+_FRESH: Final = 8
+"""The least number of fresh futures in which a candidate is compared with the rule."""
+
+_LOW: Final = 0.1
+"""The correlation of returns below which the user is warned."""
+
+_VARIATION: Final = 0.1
+"""The coefficient of variation of times above which the user is warned."""
 
 _AT_ONCE: Final = 8
 """The number of branches that run before a tree is updated. It does not depend on the number of cores."""
@@ -43,6 +56,9 @@ class ActionValues:
         best: The best candidate.
         returns: ``(candidates, futures)``: the returns, nan where a candidate was not tried. A column is one future, so
             that the difference of two rows excludes the chance that affects both.
+        correlation: The mean correlation of the returns of pairs of candidates over their common futures; nan with
+            fewer than three of these, or where the returns do not vary. Where it is low, the same chance does not meet
+            all candidates, and differences take many futures to see.
     """
 
     actions: tuple[Any, ...]
@@ -51,6 +67,7 @@ class ActionValues:
     counts: NDArray[np.int64]
     best: Any
     returns: NDArray[np.float64]
+    correlation: float
 
 
 def action_values(
@@ -129,7 +146,7 @@ def action_values(
 def base_value(env: Any, base: Any) -> ActionValues:
     """Return the base's answer as the best action, without rollouts. In branches, planners act as their bases."""
     action, unknown = player_of(env, base).decide(), np.full(1, np.nan)
-    return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)))
+    return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)), np.nan)
 
 
 def is_count(value: Any) -> bool:
@@ -140,18 +157,21 @@ def is_count(value: Any) -> bool:
 class Rollouts:
     """The rollouts of the candidates for a pending decision. Future number i is the same for all candidates."""
 
-    def __init__(self, env: Any, policy: RolloutPolicy, *, legal: bool = False) -> None:
-        """Check the candidates and the base of a policy. Masked candidates are left out if ``legal``."""
+    def __init__(self, env: Any, policy: RolloutPolicy, *, planner: bool = False) -> None:
+        """Check the candidates and the base of a policy. For a ``planner``, leave out masked ones, and add ``RULE``."""
         self._env, self._policy = env, policy
         player = player_of(env, policy.base)
         player.check_base()
         if policy.timed and player.episode.clock is None:
             raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
-        self.actions = player.candidates(policy.actions, legal=legal)
+        self.actions = player.candidates(policy.actions, legal=planner)
+        if planner and len(self.actions) > 1 and not any(action is RULE for action in self.actions):
+            self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         self._outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
         self._states: States | None = None
         self._seconds = 0.0  # for a step
+        self._times: list[float] = []  # of the simulation, between decisions
         number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
@@ -182,24 +202,42 @@ class Rollouts:
         self.run(rollouts)
 
     def run(self, rollouts: Sequence[tuple[Plan, int]]) -> list[list[float]]:
-        """Run rollouts, given by their plans and the numbers of their futures; return what each ``rollout`` returns."""
+        """Run rollouts, given by their plans and the numbers of their futures; note and return the rewards of each."""
+        outcomes = self._outcomes_of(rollouts)
+        for (plan, _), outcome in zip(rollouts, outcomes, strict=True):
+            self.returns[plan[0]].append(sum(outcome.rewards))
+            self._outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen))
+            self._times += outcome.times
+            self._seconds = max(self._seconds, outcome.seconds)
+        return [outcome.rewards for outcome in outcomes]
+
+    def _outcomes_of(self, rollouts: Sequence[tuple[Plan, int]]) -> list[Outcome]:
         policy, seeds = self._policy, None
+        if self._states is not None:
+            return self._states.run([plan for plan, _ in rollouts])
         if self.reseeds:
             numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
             seeds = [numbers[future] for _, future in rollouts]
-        if self._states is not None:
-            outcomes = self._states.run([plan for plan, _ in rollouts])
-        else:
-            tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
-            outcomes = branch(
-                self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
-                time_limit=policy.time_limit,
-            )  # fmt: skip
-        for (plan, _), (rewards, seen, seconds) in zip(rollouts, outcomes, strict=True):
-            self.returns[plan[0]].append(sum(rewards))
-            self._outcomes.setdefault(plan, []).append((rewards, seen))
-            self._seconds = max(self._seconds, seconds)
-        return [rewards for rewards, _, _ in outcomes]
+        tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
+        return branch(
+            self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
+            time_limit=policy.time_limit,
+        )  # fmt: skip
+
+    def is_better_than_rule(self, plan: Plan) -> bool:
+        """Return whether a plan brings more than the rule, on fresh futures, which have not selected it."""
+        rule = next(place for place, action in enumerate(self.actions) if action is RULE)
+        if plan[0] == rule:
+            return False
+        if not self.reseeds:
+            both = [np.mean(self.returns[place]) if self.returns[place] else np.nan for place in (plan[0], rule)]
+            return bool(both[0] > both[1])
+        begin = max(map(len, self.returns))
+        futures = range(begin, begin + max(_FRESH, self._policy.futures))
+        outcomes = self._outcomes_of([(tried, future) for tried in (plan, (rule,)) for future in futures])
+        returns = np.array([sum(outcome.rewards) for outcome in outcomes]).reshape(2, -1)
+        gains = returns[0] - returns[1]
+        return bool(gains.mean() > self._policy.margin * gains.std(ddof=1) / np.sqrt(len(gains)))
 
     def keep_states(self) -> None:
         """From now on, keep the states of plans, if there is one exact future and a step takes longer than a fork."""
@@ -220,8 +258,8 @@ class Rollouts:
         if self._states is not None:
             self._states.close()
 
-    def check_futures(self) -> None:
-        """Warn if chance was drawn anew and all futures are the same nevertheless."""
+    def warn(self, correlation: float, most: int) -> None:
+        """Warn of a simulation whose futures tell little, once; at ``most`` futures of each candidate."""
         several = [outcomes for outcomes in self._outcomes.values() if len(outcomes) >= _SEVERAL]
         if self.reseeds and several and all(outcomes.count(outcomes[0]) == len(outcomes) for outcomes in several):
             warn_once(
@@ -231,10 +269,25 @@ class Rollouts:
                 " chance. reseed must seed each of them; global_rng=True reaches those of random and numpy.random"
                 " alone",
             )
+        if most >= _MANY and correlation < _LOW:
+            warn_once(
+                self._name,
+                f"the same future of {self._name} is a different one for each candidate: their returns correlate by"
+                f" {correlation:.2f}, so that differences take many futures to see. Give each process or entity a"
+                " generator for itself, and reseed each of them: an action then changes no chance but its own",
+            )
+        if self._policy.horizon is not None and self._policy.horizon_by == "decision" and len(self._times) >= _MANY:
+            mean = np.mean(self._times)
+            if mean > 0 and np.std(self._times) / mean > _VARIATION:
+                warn_once(
+                    self._name,
+                    f"the times between the decisions of {self._name} vary, so that a horizon of"
+                    f" {self._policy.horizon} decisions ends at another time for each candidate; use"
+                    ' horizon_by="time"',
+                )
 
     def values(self, finalists: Sequence[int]) -> ActionValues:
         """Estimate the values; the best candidate is one of the finalists, which are given by their places."""
-        self.check_futures()
         counts = np.array([len(values) for values in self.returns], np.int64)
         returns = np.full((len(counts), counts.max()), np.nan)
         means, errors = np.full((2, len(counts)), np.nan)
@@ -245,7 +298,19 @@ class Rollouts:
             if len(values) > 1:
                 errors[place] = np.std(values, ddof=1) / np.sqrt(len(values))
         best = max(finalists, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
-        return ActionValues(tuple(self.actions), means, errors, counts, self.actions[best], returns)
+        correlation = _correlation(returns)
+        self.warn(correlation, int(counts.max()))
+        return ActionValues(tuple(self.actions), means, errors, counts, self.actions[best], returns, correlation)
+
+
+def _correlation(returns: NDArray[np.float64]) -> float:
+    """Return the mean correlation of pairs of rows over their common columns; nan if there is none."""
+    found = []
+    for one, other in combinations(returns, 2):
+        both = ~np.isnan(one + other)
+        if both.sum() >= 3 and one[both].std() > 0 and other[both].std() > 0:
+            found.append(np.corrcoef(one[both], other[both])[0, 1])
+    return float(np.mean(found)) if found else float("nan")
 
 
 # -- policies -------------------------------------------------------------------------------------
@@ -256,7 +321,11 @@ class RolloutPolicy:
     """A policy that looks one decision ahead: it tries candidate actions in branches and takes the best one.
 
     It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds. In each round, all
-    remaining candidates are tried on the same futures, and the better half of them goes on.
+    remaining candidates are tried on the same futures, and the better half of them remains.
+
+    ``RULE`` is always a candidate. Another one is taken only if it is better than ``RULE`` by ``margin`` standard errors
+    of the paired difference, on at least eight fresh futures, which have not selected it. Where there is one exact
+    future, any gain is taken.
 
     The policy can be used like any policy that answers one decision at a time; it gets the environment as
     ``_environment``. In a branch of a planner it acts as its own base.
@@ -266,7 +335,9 @@ class RolloutPolicy:
     Attributes:
         actions: The candidates. Candidates that are masked at a decision are left out there. None: all legal actions of
             a ``Discrete``.
-        budget: The number of branches per decision. None: the number of candidates times ``futures``.
+        budget: The number of branches per decision. None: the number of candidates times ``futures``. The comparison
+            with the rule comes on top.
+        margin: By how many standard errors a candidate must be better than ``RULE`` to be taken.
         futures: The mean number of futures per candidate, if there is no ``budget``.
         seed: A number that distinguishes the futures from those of another planner.
 
@@ -286,6 +357,7 @@ class RolloutPolicy:
     method: str | None = None
     time_limit: float = 600.0
     budget: int | None = None
+    margin: float = 1.0
 
     def __post_init__(self) -> None:
         self.timed = "time" in (self.discount_by, self.horizon_by)
@@ -302,6 +374,7 @@ class RolloutPolicy:
         fine = self.terminal_value is None or callable(self.terminal_value)
         self.require("terminal_value", fine, "a callable of the environment")
         self.seed = checked_seed(self.seed)
+        self.require("margin", is_number(self.margin) and self.margin >= 0, "a number that is not negative")
         self.require("budget", self.budget is None or is_count(self.budget), "a number of branches or None")
         if isinstance(self.actions, Iterable) and not isinstance(self.actions, (str, Mapping)):
             self.actions = list(self.actions)  # an iterator would be used up by the first decision
@@ -326,15 +399,20 @@ class RolloutPolicy:
         """
         if is_planning():
             return base_value(env, self.base)
-        rollouts = Rollouts(env, self, legal=True)
+        rollouts = Rollouts(env, self, planner=True)
         number = len(rollouts.actions)
         budget = number * self.futures if self.budget is None else self.budget
         if budget < number:
             raise OptionValueError(f"a budget of {budget} branches is too small to try {number} candidates once")
-        return rollouts.values(self._search(rollouts, budget) if number > 1 else [0])
+        if number == 1:
+            return rollouts.values([0])
+        finalists = self._search(rollouts, budget)
+        values = rollouts.values([plan[0] for plan in finalists])
+        plan = next(plan for plan in finalists if rollouts.actions[plan[0]] is values.best)
+        return values if rollouts.is_better_than_rule(plan) else replace(values, best=RULE)
 
-    def _search(self, rollouts: Rollouts, budget: int) -> list[int]:
-        """Try candidates; return the places of the finalists."""
+    def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
+        """Try candidates; return the plans that are left."""
         left = list(range(len(rollouts.actions)))
         for rounds in range(ceil(log2(len(left))), 0, -1):
             more = min(max(1, budget // (len(left) * rounds)), budget // len(left))
@@ -344,7 +422,7 @@ class RolloutPolicy:
                 means = [np.mean(rollouts.returns[place]) for place in left]
                 better = np.argsort(-np.array(means), kind="stable")[: (len(left) + 1) // 2]
                 left = [left[place] for place in sorted(better.tolist())]
-        return left
+        return [(place,) for place in left]
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
         """Answer a decision, as policies do, with the best action; within a branch, with the answer of the base."""
@@ -381,7 +459,7 @@ class TreeSearchPolicy(RolloutPolicy):
         self.require("depth", is_count(self.depth), "a number of decisions")
         self.require("exploration", fine, "a number that is not negative")
 
-    def _search(self, rollouts: Rollouts, budget: int) -> list[int]:
+    def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
         tree = _Tree(len(rollouts.actions), self.depth, self.exploration)
         try:
             for begin in range(0, budget, _AT_ONCE):
@@ -433,6 +511,12 @@ class _Tree:
             self._returns.setdefault(node[: depth + 1], []).append(sum(rewards[depth:]))
         self._least, self._most = min(self._least, sum(rewards)), max(self._most, sum(rewards))
 
-    def best(self) -> int:
-        """Return the candidate with the largest lower confidence bound."""
-        return max(range(self._candidates), key=lambda place: self._bound((place,), -1.0))
+    def best(self) -> Plan:
+        """Return the candidate with the largest lower confidence bound, and below it the best of those tried most."""
+        plan: Plan = (max(range(self._candidates), key=lambda place: self._bound((place,), -1.0)),)
+        while len(plan) < self._depth:
+            below = [child for place in range(self._candidates) if (child := (*plan, place)) in self._returns]
+            if not below:
+                break
+            plan = max(below, key=lambda child: (self.visits[child], self._bound(child, -1.0)))
+        return plan

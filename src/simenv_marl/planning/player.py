@@ -13,7 +13,7 @@ from functools import partial
 from math import isfinite
 from numbers import Real
 from time import perf_counter
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
 from ..core.clone import pending_view
 from ..core.planner import PLANNING, PlannerPolicy, base_of, two_arguments
+from ..core.rng import is_seed
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
 from ..errors import (
@@ -33,7 +34,6 @@ from ..errors import (
     annotate,
     did_you_mean,
     short_repr,
-    warn_user,
 )
 from ..simulation import RULE
 
@@ -306,8 +306,13 @@ class Progress:
 
 
 class Outcome(NamedTuple):
-    """What comes of a rollout: its rewards, a digest of what the agent saw at its end, times between decisions, and
-    the real seconds for each decision.
+    """What comes of a rollout.
+
+    Attributes:
+        rewards: The discounted reward of each decision.
+        seen: A digest of what the agent saw at its end.
+        times: The simulation's times between decisions.
+        seconds: The real seconds for each decision.
     """
 
     rewards: list[float]
@@ -378,16 +383,11 @@ def _terminal_value(function: Callable[[Any], Any], env: Any) -> float:
     return float(value)
 
 
-_WARNED: Final[set[tuple[str, str]]] = set()
-
-
-def warn_once(name: str, message: str) -> None:
-    """Warn of a simulation, once for each message."""
-    if (name, message) not in _WARNED:
-        _WARNED.add((name, message))
-        warn_user(message)
-
-
 def is_number(value: Any) -> bool:
     """Return whether a value is one finite number."""
     return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
+
+
+def is_count(value: Any) -> bool:
+    """Return whether a value is a positive integer."""
+    return is_seed(value) and value > 0

@@ -5,69 +5,29 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import combinations
 from math import ceil, inf, log, log2, sqrt
 from time import perf_counter
 from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.clone import branch, clone
-from ..core.rng import is_seed
 from ..core.session import checked_seed
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE
-from .player import Outcome, is_number, is_planning, player_of, try_out, warn_once
+from .player import Outcome, is_count, is_number, is_planning, player_of, try_out
 from .states import Plan, States
+from .values import ActionValues, correlation_of, warn_of_futures, warn_of_times
 
 _KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
-
-_SEVERAL: Final = 4
-"""The number of futures of a plan that are compared to find out whether they are all the same."""
-
-_MANY: Final = 16
-"""The number of futures, or of times between decisions, from which on their statistics are trusted."""
 
 _FRESH: Final = 8
 """The least number of fresh futures in which a candidate is compared with the rule."""
 
-_LOW: Final = 0.1
-"""The correlation of returns below which the user is warned."""
-
-_VARIATION: Final = 0.1
-"""The coefficient of variation of times above which the user is warned."""
-
 _AT_ONCE: Final = 8
 """The number of branches that run before a tree is updated. It does not depend on the number of cores."""
-
-
-@dataclass(frozen=True, eq=False)
-class ActionValues:
-    """The estimated values of candidate actions. Made by ``action_values`` and by planners.
-
-    Attributes:
-        actions: The candidates.
-        means: ``(candidates,)``: the mean return of each candidate; nan if it was not tried.
-        standard_errors: ``(candidates,)``: the standard errors of the means; nan with fewer than two returns.
-        counts: ``(candidates,)`` int: the number of futures in which each candidate was tried.
-        best: The best candidate.
-        returns: ``(candidates, futures)``: the returns, nan where a candidate was not tried. A column is one future, so
-            that the difference of two rows excludes the chance that affects both.
-        correlation: The mean correlation of the returns of pairs of candidates over their common futures; nan with
-            fewer than three of these, or where the returns do not vary. Where it is low, the same chance does not meet
-            all candidates, and differences take many futures to see.
-    """
-
-    actions: tuple[Any, ...]
-    means: NDArray[np.float64]
-    standard_errors: NDArray[np.float64]
-    counts: NDArray[np.int64]
-    best: Any
-    returns: NDArray[np.float64]
-    correlation: float
 
 
 def action_values(
@@ -149,11 +109,6 @@ def base_value(env: Any, base: Any) -> ActionValues:
     return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)), np.nan)
 
 
-def is_count(value: Any) -> bool:
-    """Return whether a value is a positive integer."""
-    return is_seed(value) and value > 0
-
-
 class Rollouts:
     """The rollouts of the candidates for a pending decision. Future number i is the same for all candidates."""
 
@@ -165,13 +120,14 @@ class Rollouts:
         if policy.timed and player.episode.clock is None:
             raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
         self.actions = player.candidates(policy.actions, legal=planner)
-        if planner and len(self.actions) > 1 and not any(action is RULE for action in self.actions):
+        self.added = planner and len(self.actions) > 1 and not any(action is RULE for action in self.actions)
+        if self.added:
             self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         self._outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
         self._states: States | None = None
         self._seconds = 0.0  # for a step
-        self._times: list[float] = []  # of the simulation, between decisions
+        self._times: list[list[float]] = []  # the simulation's times between decisions, in each rollout
         number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
@@ -207,7 +163,7 @@ class Rollouts:
         for (plan, _), outcome in zip(rollouts, outcomes, strict=True):
             self.returns[plan[0]].append(sum(outcome.rewards))
             self._outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen))
-            self._times += outcome.times
+            self._times.append(outcome.times)
             self._seconds = max(self._seconds, outcome.seconds)
         return [outcome.rewards for outcome in outcomes]
 
@@ -230,14 +186,21 @@ class Rollouts:
         if plan[0] == rule:
             return False
         if not self.reseeds:
-            both = [np.mean(self.returns[place]) if self.returns[place] else np.nan for place in (plan[0], rule)]
-            return bool(both[0] > both[1])
+            return self.certain(plan) > self.certain((rule,))
         begin = max(map(len, self.returns))
         futures = range(begin, begin + max(_FRESH, self._policy.futures))
         outcomes = self._outcomes_of([(tried, future) for tried in (plan, (rule,)) for future in futures])
         returns = np.array([sum(outcome.rewards) for outcome in outcomes]).reshape(2, -1)
         gains = returns[0] - returns[1]
         return bool(gains.mean() > self._policy.margin * gains.std(ddof=1) / np.sqrt(len(gains)))
+
+    def certain(self, plan: Plan) -> float:
+        """Return what a plan has brought in the one exact future."""
+        return float(sum(self._outcomes[plan][0][0]))
+
+    def best_plan(self) -> Plan:
+        """Return the plan that has brought most in the one exact future."""
+        return max(self._outcomes, key=self.certain)
 
     def keep_states(self) -> None:
         """From now on, keep the states of plans, if there is one exact future and a step takes longer than a fork."""
@@ -258,34 +221,6 @@ class Rollouts:
         if self._states is not None:
             self._states.close()
 
-    def warn(self, correlation: float, most: int) -> None:
-        """Warn of a simulation whose futures tell little, once; at ``most`` futures of each candidate."""
-        several = [outcomes for outcomes in self._outcomes.values() if len(outcomes) >= _SEVERAL]
-        if self.reseeds and several and all(outcomes.count(outcomes[0]) == len(outcomes) for outcomes in several):
-            warn_once(
-                self._name,
-                f"all futures of {self._name} are the same, although it was reseeded for each: it is deterministic from"
-                " here, or its reseed does not reach the generators that it draws from, and the planner foresees"
-                " chance. reseed must seed each of them; global_rng=True reaches those of random and numpy.random"
-                " alone",
-            )
-        if most >= _MANY and correlation < _LOW:
-            warn_once(
-                self._name,
-                f"the same future of {self._name} is a different one for each candidate: their returns correlate by"
-                f" {correlation:.2f}, so that differences take many futures to see. Give each process or entity a"
-                " generator for itself, and reseed each of them: an action then changes no chance but its own",
-            )
-        if self._policy.horizon is not None and self._policy.horizon_by == "decision" and len(self._times) >= _MANY:
-            mean = np.mean(self._times)
-            if mean > 0 and np.std(self._times) / mean > _VARIATION:
-                warn_once(
-                    self._name,
-                    f"the times between the decisions of {self._name} vary, so that a horizon of"
-                    f" {self._policy.horizon} decisions ends at another time for each candidate; use"
-                    ' horizon_by="time"',
-                )
-
     def values(self, finalists: Sequence[int]) -> ActionValues:
         """Estimate the values; the best candidate is one of the finalists, which are given by their places."""
         counts = np.array([len(values) for values in self.returns], np.int64)
@@ -298,19 +233,12 @@ class Rollouts:
             if len(values) > 1:
                 errors[place] = np.std(values, ddof=1) / np.sqrt(len(values))
         best = max(finalists, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
-        correlation = _correlation(returns)
-        self.warn(correlation, int(counts.max()))
+        if self.reseeds:
+            warn_of_futures(self._name, list(self._outcomes.values()), returns)
+        if self._policy.horizon is not None and self._policy.horizon_by == "decision":
+            warn_of_times(self._name, self._times)
+        correlation = correlation_of(returns)
         return ActionValues(tuple(self.actions), means, errors, counts, self.actions[best], returns, correlation)
-
-
-def _correlation(returns: NDArray[np.float64]) -> float:
-    """Return the mean correlation of pairs of rows over their common columns; nan if there is none."""
-    found = []
-    for one, other in combinations(returns, 2):
-        both = ~np.isnan(one + other)
-        if both.sum() >= 3 and one[both].std() > 0 and other[both].std() > 0:
-            found.append(np.corrcoef(one[both], other[both])[0, 1])
-    return float(np.mean(found)) if found else float("nan")
 
 
 # -- policies -------------------------------------------------------------------------------------
@@ -323,9 +251,8 @@ class RolloutPolicy:
     It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds. In each round, all
     remaining candidates are tried on the same futures, and the better half of them remains.
 
-    ``RULE`` is always a candidate. Another one is taken only if it is better than ``RULE`` by ``margin`` standard errors
-    of the paired difference, on at least eight fresh futures, which have not selected it. Where there is one exact
-    future, any gain is taken.
+    ``RULE`` is always a candidate. Another one is taken only if its paired advantage over ``RULE``, on at least eight
+    fresh futures, exceeds ``margin`` standard errors. Where there is one exact future, any gain is taken.
 
     The policy can be used like any policy that answers one decision at a time; it gets the environment as
     ``_environment``. In a branch of a planner it acts as its own base.
@@ -391,7 +318,7 @@ class RolloutPolicy:
             env: The environment, as ``action_values`` takes it. It does not move.
 
         Returns:
-            The values. ``best`` is one of the candidates of the last round. A single candidate is not tried.
+            The values. ``best`` is ``RULE`` or a candidate of the last round. A single candidate is not tried.
 
         Raises:
             OptionValueError: The budget is too small to try each candidate.
@@ -460,7 +387,7 @@ class TreeSearchPolicy(RolloutPolicy):
         self.require("exploration", fine, "a number that is not negative")
 
     def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
-        tree = _Tree(len(rollouts.actions), self.depth, self.exploration)
+        tree = _Tree(len(rollouts.actions), self.depth, self.exploration, rollouts.added)
         try:
             for begin in range(0, budget, _AT_ONCE):
                 batch: list[tuple[Plan, int]] = []
@@ -473,14 +400,15 @@ class TreeSearchPolicy(RolloutPolicy):
                     rollouts.keep_states()
         finally:
             rollouts.close()
-        return [tree.best()]
+        return [tree.best() if rollouts.reseeds else rollouts.best_plan()]
 
 
 class _Tree:
-    """The results of sequences of candidates."""
+    """The results of sequences of candidates. If ``RULE`` was ``added`` as the last one, it is a leaf."""
 
-    def __init__(self, candidates: int, depth: int, exploration: float) -> None:
-        self._candidates, self._depth, self._exploration = candidates, depth, exploration
+    def __init__(self, candidates: int, depth: int, exploration: float, added: bool) -> None:
+        self._first, self._others = range(candidates), range(candidates - added)
+        self._depth, self._exploration = depth, exploration
         self.visits: dict[Plan, int] = {}  # the tries of each node, including those that are running
         self._returns: dict[Plan, list[float]] = {}  # returns from the node's own decision on
         self._least, self._most = inf, -inf
@@ -488,8 +416,8 @@ class _Tree:
     def descend(self) -> Plan:
         """Choose the sequence to try next: descend to an untried node, or to the depth."""
         node: Plan = ()
-        while len(node) < self._depth:
-            below = [(*node, place) for place in range(self._candidates)]
+        while len(node) < self._depth and (not node or node[0] in self._others):
+            below = [(*node, place) for place in (self._others if node else self._first)]
             new = [child for child in below if child not in self._returns]
             if new:
                 node = min(new, key=lambda child: self.visits.get(child, 0))
@@ -512,10 +440,10 @@ class _Tree:
         self._least, self._most = min(self._least, sum(rewards)), max(self._most, sum(rewards))
 
     def best(self) -> Plan:
-        """Return the candidate with the largest lower confidence bound, and below it the best of those tried most."""
-        plan: Plan = (max(range(self._candidates), key=lambda place: self._bound((place,), -1.0)),)
+        """Return the best plan, which the added ``RULE`` is compared with later: by lower bound, then by visits."""
+        plan: Plan = (max(self._others, key=lambda place: self._bound((place,), -1.0)),)
         while len(plan) < self._depth:
-            below = [child for place in range(self._candidates) if (child := (*plan, place)) in self._returns]
+            below = [child for place in self._others if (child := (*plan, place)) in self._returns]
             if not below:
                 break
             plan = max(below, key=lambda child: (self.visits[child], self._bound(child, -1.0)))

@@ -35,7 +35,13 @@ def planner(**given):
 
 def tame(**changes):
     """Points at which the one on the left is to come near to three, so that it matters what it does."""
-    return points(reward_mapping=lambda duel: -abs(duel.value - 3), **changes)
+    given = {"reward_mapping": lambda duel: -abs(duel.value - 3), "rule_action_mapping": lambda decision: decision}
+    return points(**given | changes)
+
+
+def known(answers):
+    """The actions of answers, where the rule's is 1."""
+    return [1 if answer is RULE else answer for answer in answers]
 
 
 def by_hand(seed=5):
@@ -72,18 +78,19 @@ def wide():
 
 
 def test_the_budget_is_divided_among_rounds(wide):
-    told = RolloutPolicy(budget=96).choose(wide)
-    assert sorted(told.counts.tolist()) == [4, 4, 4, 4, 12, 12, 28, 28]
+    told = RolloutPolicy([*range(8), RULE], budget=96).choose(wide)
+    assert told.actions == RolloutPolicy(budget=96).choose(wide).actions == (*range(8), RULE)
+    assert sorted(told.counts.tolist()) == [2, 2, 2, 2, 7, 7, 15, 29, 29]
     assert told.best == 7
-    assert told.counts[7] == 28
-    assert told.returns.shape == (8, 28)
-    assert np.isnan(told.returns[0, 4:]).all()
+    assert told.counts[7] == 29
+    assert told.returns.shape == (9, 29)
+    assert np.isnan(told.returns[0, 2:]).all()
     assert told.means[0] == pytest.approx(np.nanmean(told.returns[0]))
 
 
 @pytest.mark.parametrize(
     ("given", "budget"),
-    [*[({"budget": budget}, budget) for budget in (8, 9, 17, 50)], ({"actions": [1, 4, 2], "futures": 6}, 18)],
+    [*[({"budget": budget}, budget) for budget in (9, 10, 17, 50)], ({"actions": [1, 4, 2], "futures": 6}, 24)],
 )
 def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
     counts = RolloutPolicy(**given).choose(wide).counts
@@ -92,7 +99,7 @@ def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
 
 
 def test_candidates_of_a_round_meet_the_same_futures(wide):
-    told = RolloutPolicy([2, 2, 2, 2], budget=32).choose(wide)
+    told = RolloutPolicy([2, 2, 2, RULE], budget=32).choose(wide)
     assert told.counts.tolist() == [12, 12, 4, 4]
     assert told.returns[0].tolist() == told.returns[1].tolist()
     assert told.returns[2, :4].tolist() == told.returns[0, :4].tolist()
@@ -142,7 +149,9 @@ def test_many_episodes_ask_row_by_row(batch_size, policies):
     assert simulate_many(Duel, policies, **given) == list(found["left"].collected)
     for place, seed in enumerate([5, 6]):
         own = found["left"].actions[found["left"].episodes == place].tolist()
-        assert (own, found["left"].collected[place]) == by_hand(seed)
+        answers, value = by_hand(seed)
+        assert (own, found["left"].collected[place]) == (known(answers), value)
+        assert found["left"].by_rule[found["left"].episodes == place].tolist() == [a is RULE for a in answers]
     assert all(len(of_agent) == 12 for of_agent in found.values())
 
 
@@ -160,7 +169,7 @@ def test_batch_policies_of_others_go_on_in_branches(method):
 
 
 def test_planners_can_be_compared_with_the_rule():
-    given = {"points": tame(rule_action_mapping=lambda decision: decision), "seeds": [5, 6]}
+    given = {"points": tame(), "seeds": [5, 6]}
     told = compare_with_rule(Duel, {"left": planner()}, **given)["left"]
     env, wanted = single_env(Duel, given["points"], agent="left"), []
     for seed in (5, 6):
@@ -168,7 +177,7 @@ def test_planners_can_be_compared_with_the_rule():
         for _ in range(6):
             wanted.append(planner().choose(env).best)
             env.step(RULE)
-    assert told.policy_actions.tolist() == wanted
+    assert told.policy_actions.tolist() == known(wanted)
     assert told.trajectories.actions.tolist() == [1] * 12
 
 
@@ -177,7 +186,7 @@ def test_data_sets_are_recorded_of_planners(monkeypatch):
     monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
     monkeypatch.setattr("simenv_marl.data.demonstrations.save_dataset", saved)
     record_dataset("duels-v0", Duel, {"left": planner()}, points=tame(), seeds=[5])
-    assert saved.call_args.args[1].actions.tolist() == by_hand()[0]
+    assert saved.call_args.args[1].actions.tolist() == known(by_hand()[0])
 
 
 def test_planners_decide_in_vector_environments():
@@ -316,8 +325,8 @@ def test_two_decisions_that_are_worth_something_together(method):
     tree = TreeSearchPolicy(futures=10, exploration=1.4, method=method)
     rollouts = RolloutPolicy(futures=10, method=method)
     told = choice(tree)
-    assert (told.best, told.counts.sum()) == (2, 40)
-    assert choice(rollouts).best == choice(TreeSearchPolicy(futures=10, depth=1, method=method)).best == 0
+    assert (told.best, told.counts.sum()) == (2, 50)
+    assert choice(rollouts).best is choice(TreeSearchPolicy(futures=10, depth=1, method=method)).best is RULE
     assert simulate(Lock, {"thief": tree}, points=locked(), seed=1).tried[:2] == [2, 3]
     assert not simulate(Lock, {"thief": rollouts}, points=locked(), seed=1).open
 
@@ -326,7 +335,7 @@ def test_two_decisions_that_are_worth_something_together(method):
 def test_actions_that_are_masked_by_then_are_left_to_the_base():
     given = locked(action_mask_mapping=lambda lock: [1, 1, 1, not lock.tried])
     told = choice(TreeSearchPolicy(futures=10), given=given)
-    assert (told.best, told.counts.sum()) == (0, 40)
+    assert (told.best, told.counts.sum()) == (RULE, 50)
 
 
 def test_agents_that_end_before_the_depth():
@@ -334,7 +343,7 @@ def test_agents_that_end_before_the_depth():
         ceiling = 2.5
 
     told = TreeSearchPolicy(depth=4, futures=6).choose(made("agent", Short))
-    assert told.counts.sum() == 18
+    assert told.counts.sum() == 24
     assert not np.isnan(told.means).any()
 
 
@@ -355,8 +364,8 @@ def test_invalid_options_are_refused(option, values):
     for value in values:
         with pytest.raises(OptionValueError, match=option):
             TreeSearchPolicy(**{option: value})
-    with pytest.raises(OptionValueError, match="3 candidates once"):
-        RolloutPolicy(budget=2).choose(made("single"))
+    with pytest.raises(OptionValueError, match="4 candidates once"):
+        RolloutPolicy(budget=3).choose(made("single"))
 
 
 VALUES = best_values()
@@ -374,7 +383,7 @@ def share(policy, seeds):
     def watched(observation, info, *, _environment):
         order = policy(_environment)
         here = VALUES[state(observation)]
-        lost.append(here.max() - here[order])
+        lost.append(here.max() - here[1 if order is RULE else order])
         return order
 
     for seed in seeds:

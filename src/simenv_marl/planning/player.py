@@ -13,7 +13,7 @@ from functools import partial
 from math import isfinite
 from numbers import Real
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
 from ..core.clone import pending_view
 from ..core.planner import PLANNING, PlannerPolicy, base_of, two_arguments
+from ..core.rng import is_seed
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
 from ..errors import (
@@ -33,7 +34,6 @@ from ..errors import (
     annotate,
     did_you_mean,
     short_repr,
-    warn_user,
 )
 from ..simulation import RULE
 
@@ -293,6 +293,7 @@ class Progress:
         start: The time at its begin; None if time does not matter.
         seen: What the latest step has returned, by agent.
         over: Whether the agent's episode has ended.
+        times: The simulation's times between the agent's decisions, if it has a time.
         seconds: The real time that it took.
     """
 
@@ -300,11 +301,24 @@ class Progress:
     start: float | None = None
     seen: dict[str, Any] = field(default_factory=dict)
     over: bool = False
+    times: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
 
-Outcome = tuple[list[float], int, float]
-"""The rewards of a rollout, a digest of what the agent saw at its end, and the real seconds for each decision."""
+class Outcome(NamedTuple):
+    """What comes of a rollout.
+
+    Attributes:
+        rewards: The discounted reward of each decision.
+        seen: A digest of what the agent saw at its end.
+        times: The simulation's times between decisions.
+        seconds: The real seconds for each decision.
+    """
+
+    rewards: list[float]
+    seen: int
+    times: list[float]
+    seconds: float
 
 
 def try_out(env: Any, number: int, tries: Sequence[tuple[list[Any], int]], policy: Any) -> Outcome:
@@ -325,12 +339,12 @@ def rollout_from(
     try:
         player = player_of(env, policy.base)
         player.start(progress.seen)
-        made = replace(progress, rewards=progress.rewards.copy())
+        made = replace(progress, rewards=progress.rewards.copy(), times=progress.times.copy())
         _continue(made, player, actions, policy, stop)
         made.seen, made.over = player.seen, player.over
         made.seconds += perf_counter() - began
         digest = crc32(repr((player.record.observation, player.record.info)).encode(errors="replace"))
-        return made, (made.rewards, digest, made.seconds / max(1, len(made.rewards)))
+        return made, Outcome(made.rewards, digest, made.times, made.seconds / max(1, len(made.rewards)))
     except BaseException as error:
         tried = ", ".join(map(short_repr, actions))
         annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
@@ -341,11 +355,12 @@ def rollout_from(
 
 def _continue(made: Progress, player: Player, actions: Sequence[Any], options: Any, stop: int | None) -> None:
     """Take steps, and add their rewards."""
-    rewards = made.rewards
-    if options.timed and made.start is None:
-        made.start = player.now()
+    rewards, timed = made.rewards, player.episode.clock is not None
+    now = player.now() if timed else 0.0
+    if made.start is None:
+        made.start = now
     while not player.over and len(rewards) != stop:
-        number, elapsed = len(rewards), player.now() - made.start if made.start is not None else 0.0
+        number, elapsed = len(rewards), now - made.start
         weight = options.discount ** (elapsed if options.discount_by == "time" else number)
         reached = elapsed if options.horizon_by == "time" else number
         if number and options.horizon is not None and reached >= options.horizon:
@@ -354,6 +369,9 @@ def _continue(made: Progress, player: Player, actions: Sequence[Any], options: A
             return
         planned = number == 0 or (number < len(actions) and player.allows(actions[number]))
         rewards.append(weight * player.step(actions[number] if planned else player.decide()))
+        if timed and not player.over:
+            before, now = now, player.now()
+            made.times.append(now - before)
 
 
 def _terminal_value(function: Callable[[Any], Any], env: Any) -> float:
@@ -365,16 +383,11 @@ def _terminal_value(function: Callable[[Any], Any], env: Any) -> float:
     return float(value)
 
 
-_WARNED: Final[set[tuple[str, str]]] = set()
-
-
-def warn_once(name: str, message: str) -> None:
-    """Warn of a simulation, once for each message."""
-    if (name, message) not in _WARNED:
-        _WARNED.add((name, message))
-        warn_user(message)
-
-
 def is_number(value: Any) -> bool:
     """Return whether a value is one finite number."""
     return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
+
+
+def is_count(value: Any) -> bool:
+    """Return whether a value is a positive integer."""
+    return is_seed(value) and value > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import ceil, inf, log, log2, sqrt
 from time import perf_counter
@@ -11,46 +11,23 @@ from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.clone import branch, clone
-from ..core.rng import is_seed
 from ..core.session import checked_seed
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE
-from .player import is_number, is_planning, player_of, try_out, warn_once
+from .player import Outcome, is_count, is_number, is_planning, player_of, try_out
 from .states import Plan, States
+from .values import ActionValues, correlation_of, warn_of_futures, warn_of_times
 
 _KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
 
-_SEVERAL: Final = 4
-"""The number of futures of a plan that are compared to find out whether they are all the same."""
+_FRESH: Final = 8
+"""The least number of fresh futures in which a candidate is compared with the rule."""
 
 _AT_ONCE: Final = 8
 """The number of branches that run before a tree is updated. It does not depend on the number of cores."""
-
-
-@dataclass(frozen=True, eq=False)
-class ActionValues:
-    """The estimated values of candidate actions. Made by ``action_values`` and by planners.
-
-    Attributes:
-        actions: The candidates.
-        means: ``(candidates,)``: the mean return of each candidate; nan if it was not tried.
-        standard_errors: ``(candidates,)``: the standard errors of the means; nan with fewer than two returns.
-        counts: ``(candidates,)`` int: the number of futures in which each candidate was tried.
-        best: The best candidate.
-        returns: ``(candidates, futures)``: the returns, nan where a candidate was not tried. A column is one future, so
-            that the difference of two rows excludes the chance that affects both.
-    """
-
-    actions: tuple[Any, ...]
-    means: NDArray[np.float64]
-    standard_errors: NDArray[np.float64]
-    counts: NDArray[np.int64]
-    best: Any
-    returns: NDArray[np.float64]
 
 
 def action_values(
@@ -129,29 +106,28 @@ def action_values(
 def base_value(env: Any, base: Any) -> ActionValues:
     """Return the base's answer as the best action, without rollouts. In branches, planners act as their bases."""
     action, unknown = player_of(env, base).decide(), np.full(1, np.nan)
-    return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)))
-
-
-def is_count(value: Any) -> bool:
-    """Return whether a value is a positive integer."""
-    return is_seed(value) and value > 0
+    return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)), np.nan)
 
 
 class Rollouts:
     """The rollouts of the candidates for a pending decision. Future number i is the same for all candidates."""
 
-    def __init__(self, env: Any, policy: RolloutPolicy, *, legal: bool = False) -> None:
-        """Check the candidates and the base of a policy. Masked candidates are left out if ``legal``."""
+    def __init__(self, env: Any, policy: RolloutPolicy, *, planner: bool = False) -> None:
+        """Check the candidates and the base of a policy. For a ``planner``, leave out masked ones, and add ``RULE``."""
         self._env, self._policy = env, policy
         player = player_of(env, policy.base)
         player.check_base()
         if policy.timed and player.episode.clock is None:
             raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
-        self.actions = player.candidates(policy.actions, legal=legal)
+        self.actions = player.candidates(policy.actions, legal=planner)
+        self.added = planner and len(self.actions) > 1 and not any(action is RULE for action in self.actions)
+        if self.added:
+            self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         self._outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
         self._states: States | None = None
         self._seconds = 0.0  # for a step
+        self._times: list[list[float]] = []  # the simulation's times between decisions, in each rollout
         number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
@@ -182,24 +158,49 @@ class Rollouts:
         self.run(rollouts)
 
     def run(self, rollouts: Sequence[tuple[Plan, int]]) -> list[list[float]]:
-        """Run rollouts, given by their plans and the numbers of their futures; return what each ``rollout`` returns."""
+        """Run rollouts, given by their plans and the numbers of their futures; note and return the rewards of each."""
+        outcomes = self._outcomes_of(rollouts)
+        for (plan, _), outcome in zip(rollouts, outcomes, strict=True):
+            self.returns[plan[0]].append(sum(outcome.rewards))
+            self._outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen))
+            self._times.append(outcome.times)
+            self._seconds = max(self._seconds, outcome.seconds)
+        return [outcome.rewards for outcome in outcomes]
+
+    def _outcomes_of(self, rollouts: Sequence[tuple[Plan, int]]) -> list[Outcome]:
         policy, seeds = self._policy, None
+        if self._states is not None:
+            return self._states.run([plan for plan, _ in rollouts])
         if self.reseeds:
             numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
             seeds = [numbers[future] for _, future in rollouts]
-        if self._states is not None:
-            outcomes = self._states.run([plan for plan, _ in rollouts])
-        else:
-            tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
-            outcomes = branch(
-                self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
-                time_limit=policy.time_limit,
-            )  # fmt: skip
-        for (plan, _), (rewards, seen, seconds) in zip(rollouts, outcomes, strict=True):
-            self.returns[plan[0]].append(sum(rewards))
-            self._outcomes.setdefault(plan, []).append((rewards, seen))
-            self._seconds = max(self._seconds, seconds)
-        return [rewards for rewards, _, _ in outcomes]
+        tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
+        return branch(
+            self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
+            time_limit=policy.time_limit,
+        )  # fmt: skip
+
+    def is_better_than_rule(self, plan: Plan) -> bool:
+        """Return whether a plan brings more than the rule, on fresh futures, which have not selected it."""
+        rule = next(place for place, action in enumerate(self.actions) if action is RULE)
+        if plan[0] == rule:
+            return False
+        if not self.reseeds:
+            return self.certain(plan) > self.certain((rule,))
+        begin = max(map(len, self.returns))
+        futures = range(begin, begin + max(_FRESH, self._policy.futures))
+        outcomes = self._outcomes_of([(tried, future) for tried in (plan, (rule,)) for future in futures])
+        returns = np.array([sum(outcome.rewards) for outcome in outcomes]).reshape(2, -1)
+        gains = returns[0] - returns[1]
+        return bool(gains.mean() > self._policy.margin * gains.std(ddof=1) / np.sqrt(len(gains)))
+
+    def certain(self, plan: Plan) -> float:
+        """Return what a plan has brought in the one exact future."""
+        return float(sum(self._outcomes[plan][0][0]))
+
+    def best_plan(self) -> Plan:
+        """Return the plan that has brought most in the one exact future."""
+        return max(self._outcomes, key=self.certain)
 
     def keep_states(self) -> None:
         """From now on, keep the states of plans, if there is one exact future and a step takes longer than a fork."""
@@ -220,21 +221,8 @@ class Rollouts:
         if self._states is not None:
             self._states.close()
 
-    def check_futures(self) -> None:
-        """Warn if chance was drawn anew and all futures are the same nevertheless."""
-        several = [outcomes for outcomes in self._outcomes.values() if len(outcomes) >= _SEVERAL]
-        if self.reseeds and several and all(outcomes.count(outcomes[0]) == len(outcomes) for outcomes in several):
-            warn_once(
-                self._name,
-                f"all futures of {self._name} are the same, although it was reseeded for each: it is deterministic from"
-                " here, or its reseed does not reach the generators that it draws from, and the planner foresees"
-                " chance. reseed must seed each of them; global_rng=True reaches those of random and numpy.random"
-                " alone",
-            )
-
     def values(self, finalists: Sequence[int]) -> ActionValues:
         """Estimate the values; the best candidate is one of the finalists, which are given by their places."""
-        self.check_futures()
         counts = np.array([len(values) for values in self.returns], np.int64)
         returns = np.full((len(counts), counts.max()), np.nan)
         means, errors = np.full((2, len(counts)), np.nan)
@@ -245,7 +233,12 @@ class Rollouts:
             if len(values) > 1:
                 errors[place] = np.std(values, ddof=1) / np.sqrt(len(values))
         best = max(finalists, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
-        return ActionValues(tuple(self.actions), means, errors, counts, self.actions[best], returns)
+        if self.reseeds:
+            warn_of_futures(self._name, list(self._outcomes.values()), returns)
+        if self._policy.horizon is not None and self._policy.horizon_by == "decision":
+            warn_of_times(self._name, self._times)
+        correlation = correlation_of(returns)
+        return ActionValues(tuple(self.actions), means, errors, counts, self.actions[best], returns, correlation)
 
 
 # -- policies -------------------------------------------------------------------------------------
@@ -256,7 +249,10 @@ class RolloutPolicy:
     """A policy that looks one decision ahead: it tries candidate actions in branches and takes the best one.
 
     It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds. In each round, all
-    remaining candidates are tried on the same futures, and the better half of them goes on.
+    remaining candidates are tried on the same futures, and the better half of them remains.
+
+    ``RULE`` is always a candidate. Another one is taken only if its paired advantage over ``RULE``, on at least eight
+    fresh futures, exceeds ``margin`` standard errors. Where there is one exact future, any gain is taken.
 
     The policy can be used like any policy that answers one decision at a time; it gets the environment as
     ``_environment``. In a branch of a planner it acts as its own base.
@@ -266,7 +262,9 @@ class RolloutPolicy:
     Attributes:
         actions: The candidates. Candidates that are masked at a decision are left out there. None: all legal actions of
             a ``Discrete``.
-        budget: The number of branches per decision. None: the number of candidates times ``futures``.
+        budget: The number of branches per decision. None: the number of candidates times ``futures``. The comparison
+            with the rule comes on top.
+        margin: By how many standard errors a candidate must be better than ``RULE`` to be taken.
         futures: The mean number of futures per candidate, if there is no ``budget``.
         seed: A number that distinguishes the futures from those of another planner.
 
@@ -286,6 +284,7 @@ class RolloutPolicy:
     method: str | None = None
     time_limit: float = 600.0
     budget: int | None = None
+    margin: float = 1.0
 
     def __post_init__(self) -> None:
         self.timed = "time" in (self.discount_by, self.horizon_by)
@@ -302,6 +301,7 @@ class RolloutPolicy:
         fine = self.terminal_value is None or callable(self.terminal_value)
         self.require("terminal_value", fine, "a callable of the environment")
         self.seed = checked_seed(self.seed)
+        self.require("margin", is_number(self.margin) and self.margin >= 0, "a number that is not negative")
         self.require("budget", self.budget is None or is_count(self.budget), "a number of branches or None")
         if isinstance(self.actions, Iterable) and not isinstance(self.actions, (str, Mapping)):
             self.actions = list(self.actions)  # an iterator would be used up by the first decision
@@ -318,7 +318,7 @@ class RolloutPolicy:
             env: The environment, as ``action_values`` takes it. It does not move.
 
         Returns:
-            The values. ``best`` is one of the candidates of the last round. A single candidate is not tried.
+            The values. ``best`` is ``RULE`` or a candidate of the last round. A single candidate is not tried.
 
         Raises:
             OptionValueError: The budget is too small to try each candidate.
@@ -326,15 +326,20 @@ class RolloutPolicy:
         """
         if is_planning():
             return base_value(env, self.base)
-        rollouts = Rollouts(env, self, legal=True)
+        rollouts = Rollouts(env, self, planner=True)
         number = len(rollouts.actions)
         budget = number * self.futures if self.budget is None else self.budget
         if budget < number:
             raise OptionValueError(f"a budget of {budget} branches is too small to try {number} candidates once")
-        return rollouts.values(self._search(rollouts, budget) if number > 1 else [0])
+        if number == 1:
+            return rollouts.values([0])
+        finalists = self._search(rollouts, budget)
+        values = rollouts.values([plan[0] for plan in finalists])
+        plan = next(plan for plan in finalists if rollouts.actions[plan[0]] is values.best)
+        return values if rollouts.is_better_than_rule(plan) else replace(values, best=RULE)
 
-    def _search(self, rollouts: Rollouts, budget: int) -> list[int]:
-        """Try candidates; return the places of the finalists."""
+    def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
+        """Try candidates; return the plans that are left."""
         left = list(range(len(rollouts.actions)))
         for rounds in range(ceil(log2(len(left))), 0, -1):
             more = min(max(1, budget // (len(left) * rounds)), budget // len(left))
@@ -344,7 +349,7 @@ class RolloutPolicy:
                 means = [np.mean(rollouts.returns[place]) for place in left]
                 better = np.argsort(-np.array(means), kind="stable")[: (len(left) + 1) // 2]
                 left = [left[place] for place in sorted(better.tolist())]
-        return left
+        return [(place,) for place in left]
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
         """Answer a decision, as policies do, with the best action; within a branch, with the answer of the base."""
@@ -381,8 +386,8 @@ class TreeSearchPolicy(RolloutPolicy):
         self.require("depth", is_count(self.depth), "a number of decisions")
         self.require("exploration", fine, "a number that is not negative")
 
-    def _search(self, rollouts: Rollouts, budget: int) -> list[int]:
-        tree = _Tree(len(rollouts.actions), self.depth, self.exploration)
+    def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
+        tree = _Tree(len(rollouts.actions), self.depth, self.exploration, rollouts.added)
         try:
             for begin in range(0, budget, _AT_ONCE):
                 batch: list[tuple[Plan, int]] = []
@@ -395,14 +400,15 @@ class TreeSearchPolicy(RolloutPolicy):
                     rollouts.keep_states()
         finally:
             rollouts.close()
-        return [tree.best()]
+        return [tree.best() if rollouts.reseeds else rollouts.best_plan()]
 
 
 class _Tree:
-    """The results of sequences of candidates."""
+    """The results of sequences of candidates. If ``RULE`` was ``added`` as the last one, it is a leaf."""
 
-    def __init__(self, candidates: int, depth: int, exploration: float) -> None:
-        self._candidates, self._depth, self._exploration = candidates, depth, exploration
+    def __init__(self, candidates: int, depth: int, exploration: float, added: bool) -> None:
+        self._first, self._others = range(candidates), range(candidates - added)
+        self._depth, self._exploration = depth, exploration
         self.visits: dict[Plan, int] = {}  # the tries of each node, including those that are running
         self._returns: dict[Plan, list[float]] = {}  # returns from the node's own decision on
         self._least, self._most = inf, -inf
@@ -410,8 +416,8 @@ class _Tree:
     def descend(self) -> Plan:
         """Choose the sequence to try next: descend to an untried node, or to the depth."""
         node: Plan = ()
-        while len(node) < self._depth:
-            below = [(*node, place) for place in range(self._candidates)]
+        while len(node) < self._depth and (not node or node[0] in self._others):
+            below = [(*node, place) for place in (self._others if node else self._first)]
             new = [child for child in below if child not in self._returns]
             if new:
                 node = min(new, key=lambda child: self.visits.get(child, 0))
@@ -433,6 +439,12 @@ class _Tree:
             self._returns.setdefault(node[: depth + 1], []).append(sum(rewards[depth:]))
         self._least, self._most = min(self._least, sum(rewards)), max(self._most, sum(rewards))
 
-    def best(self) -> int:
-        """Return the candidate with the largest lower confidence bound."""
-        return max(range(self._candidates), key=lambda place: self._bound((place,), -1.0))
+    def best(self) -> Plan:
+        """Return the best plan, which the added ``RULE`` is compared with later: by lower bound, then by visits."""
+        plan: Plan = (max(self._others, key=lambda place: self._bound((place,), -1.0)),)
+        while len(plan) < self._depth:
+            below = [child for place in self._others if (child := (*plan, place)) in self._returns]
+            if not below:
+                break
+            plan = max(below, key=lambda child: (self.visits[child], self._bound(child, -1.0)))
+        return plan

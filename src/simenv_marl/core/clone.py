@@ -222,7 +222,7 @@ def _fork_of(env: Any, view: Any, method: str | None) -> Callable[[], Fork] | No
         fork = None if method == "replay" else view._session.request("fork", method)
         return None if fork is None else lambda: fork
     separate = separator_of(view, method)
-    return None if separate is None else partial(Fork.begin, Host(env, view).serve, separate)
+    return None if separate is None else partial(Fork.begin, Host(env, view).serve, separate, wait=True)
 
 
 # -- branches: clones for one call ----------------------------------------------------------------
@@ -261,7 +261,7 @@ def _call_in_forks(
     try:
         while started < n or running:
             while started < n and len(running) < cores:
-                fork = Fork.begin(main, separate)
+                fork = Fork.begin(main, separate, wait=False)
                 fork.limit(time_limit)  # for the parts of a message; the time until it comes is limited below
                 descriptor = fork.connection.fileno()
                 running[descriptor] = started, fork, time.monotonic() + time_limit

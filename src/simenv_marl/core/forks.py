@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]  # without the enums of signal, which a fork would have to copy
 import gc
 import os
 import select
@@ -22,6 +23,8 @@ CAN_FORK: Final = sys.platform == "linux"
 
 if CAN_FORK:
     import fcntl
+
+_KILL: Final = int(signal.SIGKILL)
 
 _LENGTH: Final = struct.Struct("!Q")
 """The number of bytes of a message, which precedes it."""
@@ -104,8 +107,8 @@ def _end_with(descriptor: int) -> None:
     os.dup2(own, descriptor, inheritable=False)
     os.close(own)
     fcntl.fcntl(descriptor, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGKILL)
-    fcntl.fcntl(descriptor, fcntl.F_SETFL, fcntl.fcntl(descriptor, fcntl.F_GETFL) | os.O_ASYNC)
+    fcntl.fcntl(descriptor, fcntl.F_SETSIG, _KILL)
+    fcntl.fcntl(descriptor, fcntl.F_SETFL, os.O_NONBLOCK | os.O_ASYNC)
     end = select.poll()
     end.register(descriptor, select.POLLHUP)
     if end.poll(0):  # it was closed before
@@ -137,8 +140,10 @@ class Fork:
         self._alive = True
 
     @classmethod
-    def begin(cls, main: Callable[[socket.socket], None], separate: Callable[[], None]) -> Fork:
+    def begin(cls, main: Callable[[socket.socket], None], separate: Callable[[], None], *, wait: bool) -> Fork:
         """Fork a process that separates itself from this one, and runs ``main`` with its end of the connection.
+
+        ``wait``: This process may go on to change what they share, so it waits until they are separated.
 
         Raises:
             BranchError: There are no more descriptors or processes. Nothing is left behind.
@@ -147,7 +152,7 @@ class Fork:
         here, there = pair()
         with there:
             try:
-                process = start(there, (*_this.lives, life.reading), separate)
+                process = start(here, there, (*_this.lives, life.reading), separate, wait=wait)
             except BaseException:
                 here.close()
                 raise
@@ -226,8 +231,12 @@ def pair() -> tuple[socket.socket, socket.socket]:
     return here, there
 
 
-def start(connection: socket.socket, lives: tuple[int, ...], separate: Callable[[], None]) -> int:
+def start(
+    here: socket.socket, there: socket.socket, lives: tuple[int, ...], separate: Callable[[], None], *, wait: bool
+) -> int:
     """Fork a process that ends with the given lives; return its number, and 0 in that process.
+
+    The sockets are the two ends of its connection. ``wait``: Return after the process was separated.
 
     Raises:
         BranchError: There are no more processes.
@@ -242,14 +251,19 @@ def start(connection: socket.socket, lives: tuple[int, ...], separate: Callable[
     if process == 0:
         try:
             gc.freeze()  # the collector would write to what is shared with the parent, and so copy it
-            _this.lives, _this.connection = lives, connection
+            _this.lives, _this.connection = lives, there
             for life in lives:
                 _end_with(life)
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the user's process
-            signal.set_wakeup_fd(-1)
+            _signal.signal(_signal.SIGINT, _signal.SIG_IGN)  # an interrupt is for the user's process
+            _signal.set_wakeup_fd(-1)
             separate()
+            if wait:
+                there.sendall(b".")
         except BaseException:
             os._exit(1)
+    elif wait and not here.recv(1):
+        os.waitpid(process, 0)
+        raise BranchError("the forked process died before it was separated from this one")
     return process
 
 

@@ -80,7 +80,7 @@ class Host:
             separate = separator_of(self._view, method)
             if separate is not None:
                 here, there = pair()
-                process = start(there, lives_above(), separate)
+                process = start(here, there, lives_above(), separate, wait=True)
                 if process == 0:
                     here.close()
                     return there

@@ -83,7 +83,7 @@ def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
     twin = copied(env)
     assert getattr(twin, "agents", []) == []
     for _ in range(2):
-        with pytest.raises(NotResetError, match=r"copy.*reset\(\).*branch\(\)"):
+        with pytest.raises(NotResetError, match=r"copy.*reset\(\).*clone\(\)"):
             twin.step(RULE)
     env.step(RULE)  # where it stood
     assert twin.simulation is not env.simulation

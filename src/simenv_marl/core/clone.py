@@ -81,23 +81,18 @@ def clone(env: Any, *, seed: int | None = None, method: str | None = None, time_
         if not is_seed(seed):
             raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
         view._session.check_reseed()
-    original, eager = view._session, view._solo or isinstance(view._session, ForkedSession)
-    begin = _fork_of(env, view, method)
-    session: Any = Session(original.plan) if begin is None else ForkedSession(original, time_limit)
+    original, fork = view._session, _fork_of(env, view, method)
+    session: Any = Session(original.plan) if fork is None else ForkedSession(original, fork, time_limit)
     try:
-        if begin is None:
+        if fork is None:
             with preserve_generators():  # the model may draw from the process's generators, then and now
                 session.replay(original)
-        elif eager:
-            session.attach(begin())
-        if begin is not None:
+        else:
             session.begin(view)
         twin = view._cloned(session)
         twin._begin_branch()
         made = copy.deepcopy(env, {id(view): twin})  # copies each wrapper with its state
         twin._outermost = weakref.ref(made)
-        if begin is not None and not eager:  # last: what this process changes after the fork is not shared
-            session.attach(begin())
         if seed is not None:
             session.reseed(int(seed))
     except BaseException as error:
@@ -188,7 +183,7 @@ def branch(
     if separate is not None:
         return _call_in_forks(partial(call, env), n, separate, time_limit)
     with reuse_resources():
-        return [_call_in_replay(env, view, call, number) for number in range(n)]
+        return [_call_in_replay(env, call, number) for number in range(n)]
 
 
 def pending_view(env: Any, user: str) -> Any:
@@ -216,19 +211,19 @@ def _checked_view(env: Any, user: str, method: str | None, time_limit: float) ->
     return view
 
 
-def _fork_of(env: Any, view: Any, method: str | None) -> Callable[[], Fork] | None:
-    """Return a function that forks a process for a clone; None if the episode must be replayed."""
+def _fork_of(env: Any, view: Any, method: str | None) -> Fork | None:
+    """Fork a process for a clone; return None if the episode must be replayed."""
     if isinstance(view._session, ForkedSession):
-        fork = None if method == "replay" else view._session.request("fork", method)
-        return None if fork is None else lambda: fork
+        fork: Fork | None = None if method == "replay" else view._session.request("fork", method)
+        return fork
     separate = separator_of(view, method)
-    return None if separate is None else partial(Fork.begin, Host(env, view).serve, separate, wait=True)
+    return None if separate is None else Fork.begin(Host(env, view).serve, separate, wait=True)
 
 
 # -- branches: clones for one call ----------------------------------------------------------------
 
 
-def _call_in_replay(env: Any, view: Any, function: Callable[[Any, int], Result], number: int) -> Result:
+def _call_in_replay(env: Any, function: Callable[[Any, int], Result], number: int) -> Result:
     """Call a function on a clone of this process."""
     twin: Any = None
     with preserve_generators():  # the function and the model may draw from the process's generators

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any, Final
 from greenlet import getcurrent
 
 from ..errors import AgentError, InvalidActionError, NoDecisionError, UnknownAgentError, short_repr, warn_user
-from ..hooks.hook import BOUND, Hook
+from ..hooks.hook import Hook
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
@@ -243,12 +243,12 @@ class Episode(Run):
         """The live agents that ``expected_calls`` announces, with the bound arguments of the first call of each."""
         announced: dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]] = {}
         for point in self.plan.active:
-            calls = (point.point.bind(call, BOUND) or (tuple(call), BOUND) for call in expected_calls(point.point.name))
-            for args, kwargs in point.decisions_of(calls):
-                name = point.agent or point.name_agent(*args, **kwargs)
-                agent = None if name is None else self.agent_for(point, name)
-                if agent is not None and not agent.delegated:
-                    announced.setdefault(agent, (args, kwargs))
+            for call in expected_calls(point.point.name):
+                for args, kwargs in point.decisions_of(call):
+                    name = point.agent or point.name_agent(*args, **kwargs)
+                    agent = None if name is None else self.agent_for(point, name)
+                    if agent is not None and not agent.delegated:
+                        announced.setdefault(agent, (args, kwargs))
         return announced
 
     def end_agent(self, agent: Agent) -> None:

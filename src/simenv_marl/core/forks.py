@@ -227,7 +227,8 @@ def pair() -> tuple[socket.socket, socket.socket]:
         here, there = socket.socketpair()
     except OSError as error:
         raise exhausted(error) from error
-    there.settimeout(None)  # whatever is the default
+    for end in (here, there):
+        end.settimeout(None)  # whatever is the default
     return here, there
 
 

@@ -9,10 +9,10 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 from contextvars import ContextVar
-from typing import Any, Final
+from operator import attrgetter
+from typing import Any, Final, NamedTuple
 
 from ..errors import BranchError
-from .agent import Agent
 from .episode import Episode
 from .forks import CAN_FORK, flush, lives_above, pair, receive, send, start
 from .packing import Pickler, pack_error, pack_plainly, unpack
@@ -29,9 +29,7 @@ DEPTH: Final[ContextVar[int]] = ContextVar("simenv_marl.core.host", default=0)
 FIELDS: Final = ("observation", "reward", "info", "mask", "acted", "decided", "ended", "present", "consultations")
 """What views read of an agent."""
 
-State = tuple[Any, ...]
-"""What views read of an episode: see ``_state_of``."""
-
+_fields: Final = attrgetter(*FIELDS)
 
 MOVES: Final = {"step": False, "begin": True, "start": True, "call": True}
 """The requests after which the state of the episode is sent, and whether all of it is."""
@@ -57,7 +55,6 @@ class Host:
     def _answer(self, name: str, *args: Any) -> bytes:
         """Do what a request asks for; return the reply: a value, or an error, and the state of the episode."""
         value = error = state = None
-        left_out: list[str] = []
         try:
             value = getattr(self if hasattr(self, name) else self._session, name)(*args)
             value = None if value is None else pack_plainly(value)
@@ -66,11 +63,11 @@ class Host:
         episode = self._session.episode
         whole = MOVES.get(name)
         if whole is not None and episode is not None:
-            state, left_out = pack_state(episode, whole=whole)
+            state = state_of(episode, whole=whole)
             if not episode.in_rounds:
                 episode.just_ended = []  # the view in the other process reports them
         flush()
-        return pickle.dumps((value, error, state, left_out), 5)
+        return pack_reply(value, error, state)
 
     def _fork(self, connection: socket.socket, method: str | None) -> socket.socket:
         """Fork this process. Send the connection of the new one; return the connection to serve from now on."""
@@ -84,9 +81,9 @@ class Host:
                 if process == 0:
                     here.close()
                     return there
-            reply = pickle.dumps((pack_plainly(process), None, None, []))
+            reply = pack_reply(pack_plainly(process), None, None)
         except Exception as error:
-            reply = pickle.dumps((None, pack_error(error), None, []))
+            reply = pack_reply(None, pack_error(error), None)
         socket.send_fds(connection, [b"."], [here.fileno()] if here is not None and process else [])
         for end in (here, there):
             if end is not None:
@@ -138,47 +135,68 @@ class Host:
             os.waitpid(process, 0)
 
 
-def _state_of(episode: Episode, *, whole: bool) -> State:
-    """Return what views read of an episode; without the agents that have not changed, unless it is the ``whole``."""
-    agents, plan, pending = [*episode.just_ended], episode.plan, episode.pending
+class State(NamedTuple):
+    """What views read of an episode.
+
+    Attributes:
+        agents: The name, the number of the point and the ``FIELDS`` of each agent that is sent.
+        just_ended: The names of the agents whose end is not reported yet. The other attributes are those of ``Run``.
+    """
+
+    in_rounds: bool
+    pending: str | None
+    over: bool
+    terminated: bool
+    truncated: bool
+    turns: int
+    time: float | None
+    others: list[str]
+    agents: list[tuple[str, int, tuple[Any, ...]]]
+    just_ended: list[str]
+    unreported_end: bool
+    last_time: float | None
+
+
+def state_of(episode: Episode, *, whole: bool) -> State:
+    """Return the state of an episode; without the agents that have not changed, unless it is the ``whole``."""
+    agents, points, pending = [*episode.just_ended], episode.plan.points, episode.pending
     if whole:
         agents = [*episode.ended.values(), *episode.agents.values()]
     elif episode.over or episode.in_rounds or episode.skips:  # forced moves update others, too
         agents += episode.agents.values()
     elif pending is not None:
         agents.append(pending)
-    return (
+    return State(
+        episode.in_rounds,
         None if pending is None else pending.name,
         episode.over,
         episode.terminated,
         episode.truncated,
         episode.turns,
         None if episode.clock is None else float(episode.clock()),
-        list(episode.others) if whole else (),
-        [(a.name, plan.points.index(a.point), _fields(a)) for a in agents],
+        list(episode.others) if whole else [],
+        [(agent.name, points.index(agent.point), _fields(agent)) for agent in agents],
         [agent.name for agent in episode.just_ended],
         episode.unreported_end,
         episode.last_time,
     )
 
 
-def _fields(agent: Agent) -> tuple[Any, ...]:
-    seen = agent.observation, agent.reward, dict(agent.info), agent.mask
-    return *seen, agent.acted, agent.decided, agent.ended, agent.present, agent.consultations
-
-
-def pack_state(episode: Episode, *, whole: bool) -> tuple[bytes, list[str]]:
-    """Pickle whether an episode is played in rounds, and its state; return also the keys that infos had to lose."""
-    state = episode.in_rounds, _state_of(episode, whole=whole)
-    left_out: dict[str, None] = {}
+def pack_reply(value: bytes | None, error: bytes | None, state: State | None) -> bytes:
+    """Pickle a reply, with the keys that infos had to lose because their values cannot be pickled."""
     try:
-        return pickle.dumps(state, 5), []
+        return pickle.dumps((value, error, state, []), 5)
     except Exception:
-        for _, _, (_, _, info, *_) in state[1][7]:
-            for key in [key for key, value in info.items() if not _can_be_pickled(value)]:
-                del info[key]
-                left_out[repr(key)] = None
-        return pickle.dumps(state, 5), list(left_out)
+        if state is None:
+            raise
+    left_out: dict[str, None] = {}
+    agents = []
+    for name, point, values in state.agents:
+        fields = dict(zip(FIELDS, values, strict=True))
+        kept = {key: part for key, part in fields["info"].items() if _can_be_pickled(part)}
+        left_out |= {repr(key): None for key in fields["info"].keys() - kept.keys()}
+        agents.append((name, point, (*(fields | {"info": kept}).values(),)))
+    return pickle.dumps((value, error, state._replace(agents=agents), list(left_out)), 5)
 
 
 def _can_be_pickled(value: Any) -> bool:

@@ -17,7 +17,7 @@ from .agent import Agent
 from .context import ExclusiveLock
 from .episode import Episode, Rounds
 from .forks import Fork, exhausted
-from .host import FIELDS, MOVES, State, layers_of, pack_env, pack_state, unpack_env
+from .host import FIELDS, MOVES, State, layers_of, pack_env, pack_reply, state_of, unpack_env
 from .packing import pack, pack_plainly, unpack, unpack_error
 from .session import Session
 
@@ -32,28 +32,29 @@ class Mirror(Episode):
         nothing: Any = None
         self.remote, self.plan, self.seed = remote, remote.plan, remote.seed or 0
         self.simulation = self.driver = self.latest = self.consulted = self.script = nothing
-        self.clock = None if state[5] is None else partial(getattr, remote, "time")
+        self.clock = None if state.time is None else partial(getattr, remote, "time")
         self.agents, self.others, self.ended, self.entities = {}, {}, {}, {}
         self.running, self.skips = True, False
-        *_, self.unreported_end, self.last_time = state
+        self.unreported_end, self.last_time = state.unreported_end, state.last_time
         self.load(state)
 
     def load(self, state: State) -> None:
         """Take over a state. What the view itself notes in an episode stays."""
-        pending, self.over, self.terminated, self.truncated, self.turns, time, others, agents, ended, *_ = state
-        self.remote.time = time
-        for name, point, values in agents:
-            agent = self.agents.get(name) or self.ended.get(name)
+        self.over, self.turns, self.remote.time = state.over, state.turns, state.time
+        self.terminated, self.truncated = state.terminated, state.truncated
+        for name, point, values in state.agents:
+            agent = self.agent(name)
             if agent is None:
                 agent = Agent(name, self.plan.points[point], self.plan, self.clock)
-                (self.ended if values[6] else self.agents)[name] = agent
             for field, value in zip(FIELDS, values, strict=True):
                 setattr(agent, field, value)
-        self.others.update(dict.fromkeys(others))
-        for name in ended:
-            self.ended[name] = self.agents.pop(name) if name in self.agents else self.ended[name]
-        self.just_ended = [self.ended[name] for name in ended]
-        self.pending = None if pending is None else self.agents[pending]
+            if agent.ended:
+                self.agents.pop(name, None)
+            (self.ended if agent.ended else self.agents)[name] = agent
+        nobody: Any = None  # only their names matter
+        self.others.update(dict.fromkeys(state.others, nobody))
+        self.just_ended = [self.ended[name] for name in state.just_ended]
+        self.pending = None if state.pending is None else self.agents[state.pending]
 
     def single_out(self, agent: Agent) -> None:
         """Do nothing: the clone's process has done it."""
@@ -82,34 +83,27 @@ class ForkedSession(Session):
 
     __slots__ = ("_fork", "_gone", "_limit", "_made_from", "_renewed", "_stepped", "_warned", "time")
 
-    def __init__(self, original: Session, time_limit: float) -> None:
-        """Prepare a session that goes on where another one stands, in a process that ``attach`` brings."""
+    def __init__(self, original: Session, fork: Fork, time_limit: float) -> None:
+        """Take over a process in which the episode of a session goes on."""
         self.plan, self.bound_plan = original.plan, None
         self.state, self.options, self.seed = original.state, original.options, original.seed
         self.np_random_seed, self._np_random = original.np_random_seed, copy.deepcopy(original._np_random)
         self.exclusive = self.lock = ExclusiveLock()
-        self._limit = time_limit
-        self._made_from = original if isinstance(original, ForkedSession) else None  # whose process forks this one's
-        self._fork: Any = None
-        self._gone: str | None = "its process was not forked"  # why there is none
+        self._fork, self._limit = fork, time_limit
+        self._made_from = original if isinstance(original, ForkedSession) else None  # whose process forked this one's
+        self._gone: str | None = None  # why the process is gone
         self._renewed = self._warned = False
         self._stepped: bool = self._made_from is not None and self._made_from._stepped
-        self.episode = self.time = None
-
-    def attach(self, fork: Fork) -> None:
-        """Take over a process."""
-        self._fork, self._gone = fork, None
-        fork.limit(self._limit)
+        self.episode = None
+        self.time: float | None = None
+        fork.limit(time_limit)
 
     def begin(self, view: Any) -> None:
         """Mirror the episode of the view that was cloned."""
         if view._solo:  # from now on, it waits for one agent only
             self.request("begin")
         else:
-            self._mirror(*pickle.loads(pack_state(view.episode, whole=True)[0]))
-
-    def _mirror(self, in_rounds: bool, state: State) -> None:
-        self.episode = (MirrorOfRounds if in_rounds else Mirror)(self, state)
+            self._unpack("begin", pack_reply(None, None, state_of(view.episode, whole=True)))
 
     @property
     def simulation(self) -> Any:
@@ -182,11 +176,10 @@ class ForkedSession(Session):
             warn_user(f"infos of clones lack what cannot be pickled: {', '.join(left_out)}")
         whole = MOVES.get(name)
         if state is not None:
-            in_rounds, state = pickle.loads(state)
             if isinstance(self.episode, Mirror) and not whole:
                 self.episode.load(state)
             else:
-                self._mirror(in_rounds, state)
+                self.episode = (MirrorOfRounds if state.in_rounds else Mirror)(self, state)
         elif whole is not None:
             self.episode = None
         if error is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,6 +15,7 @@ from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
 from ..errors import InvalidActionError, MaskError, short_repr, warn_user
+from ..hooks.hook import BOUND
 from ..simulation import RULE, asks_for, positional
 from . import actions, spaces
 from .actions import ILLEGAL, MASK
@@ -93,14 +94,11 @@ class Point:
             agent = episode.agent_for(self, name)
         return agent.handle(episode, args, kwargs)
 
-    def decisions_of(self, calls: Iterable[tuple[Any, Any]]) -> Iterator[tuple[tuple[Any, ...], dict[str, Any]]]:
-        """Yield the arguments of the decisions of some calls: of each call, or of each of its items."""
+    def decisions_of(self, call: Any) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
+        """Return the bound arguments of the decisions of a call: its own, or those of each of its items."""
+        args, kwargs = self.point.bind(call, BOUND) or (tuple(call), BOUND)
         split = self.definition.split
-        for args, kwargs in calls:
-            if split is None:
-                yield args, kwargs
-            else:
-                yield from (((item, *args), kwargs) for item in split(*args, **kwargs))
+        return [(args, kwargs)] if split is None else [((item, *args), kwargs) for item in split(*args, **kwargs)]
 
     def warn_of_several(self, agent: str) -> None:
         """Warn once that several objects decide under the name of one agent."""

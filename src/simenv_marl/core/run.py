@@ -138,7 +138,7 @@ class Run:
         Raises:
             ReentrancyError, WrongThreadError: The simulation is moving, or suspended in another thread.
         """
-        if self.driver.lost or self.driver.given_up is not None:
+        if self.running and (self.driver.lost or self.driver.given_up is not None):
             self.running, self.over = False, True
         if self.pending is None and not self.over:
             raise self.refusal()

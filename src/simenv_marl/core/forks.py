@@ -169,10 +169,6 @@ class Fork:
         """Whether the process was not ended, and belongs to this one, which may have been forked itself."""
         return self._alive and self._owner == os.getpid()
 
-    def send(self, message: bytes) -> None:
-        """Send a message."""
-        send(self.connection, message)
-
     def limit(self, seconds: float) -> None:
         """Limit the time for which a message is awaited."""
         whole, part = divmod(max(seconds, 1e-6), 1) if seconds < _LONGEST else (0, 0)  # zeros: there is no limit

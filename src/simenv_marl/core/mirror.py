@@ -16,7 +16,7 @@ from ..errors import BranchError, ClosedError, annotate, describe_error, short_r
 from .agent import Agent
 from .context import ExclusiveLock
 from .episode import Episode, Rounds
-from .forks import Fork, exhausted
+from .forks import Fork, exhausted, send
 from .host import FIELDS, MOVES, State, layers_of, pack_env, pack_reply, state_of, unpack_env
 from .packing import pack, pack_plainly, unpack, unpack_error
 from .session import Session
@@ -151,7 +151,7 @@ class ForkedSession(Session):
         try:
             if limit is not None:
                 fork.limit(limit)
-            fork.send(message)
+            send(fork.connection, message)
             if name == "fork":
                 descriptors = fork.receive_descriptors()
             reply = fork.receive()

@@ -1,6 +1,7 @@
 """Planning: estimates the values of actions on possible futures of an episode; policies that decide by these values."""
 
-from .rollouts import RolloutPolicy, TreeSearchPolicy, action_values
+from .rollouts import RolloutPolicy, action_values
+from .tree import TreeSearchPolicy
 from .values import ActionValues
 
 __all__ = [

@@ -280,11 +280,6 @@ def player_of(env: Any, base: Any) -> Player:
     return next((player for kind, player in players.items() if isinstance(view, kind)), Player)(env, base)
 
 
-def is_planning() -> bool:
-    """Return whether this code runs in a branch in which a planner tries a candidate."""
-    return PLANNING.get()
-
-
 @dataclass
 class Progress:
     """How far a rollout has come.

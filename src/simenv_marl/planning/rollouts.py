@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import ceil, inf, log, log2, sqrt
-from time import perf_counter
+from math import ceil, log2
 from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
 
-from ..core.clone import branch, clone
+from ..core.clone import branch
+from ..core.planner import PLANNING
 from ..core.session import checked_seed
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE
-from .player import Outcome, is_count, is_number, is_planning, player_of, try_out
-from .states import Plan, States
+from .player import Outcome, is_count, is_number, player_of, try_out
 from .values import ActionValues, correlation_of, warn_of_futures, warn_of_times
 
 _KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
@@ -26,8 +25,8 @@ _KEY: Final = 0x706C616E  # separates the seeds of futures from others that are 
 _FRESH: Final = 8
 """The least number of fresh futures in which a candidate is compared with the rule."""
 
-_AT_ONCE: Final = 8
-"""The number of branches that run before a tree is updated. It does not depend on the number of cores."""
+Plan = tuple[int, ...]
+"""The places of the candidates to take at the agent's next decisions, beginning with the pending one."""
 
 
 def action_values(
@@ -92,7 +91,7 @@ def action_values(
         actions, base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
         discount=discount, discount_by=discount_by, seed=seed, method=method, time_limit=time_limit,
     )  # fmt: skip
-    if is_planning():
+    if PLANNING.get():
         return base_value(env, base)
     rollouts = Rollouts(env, policy)
     candidates = range(len(rollouts.actions))
@@ -114,7 +113,7 @@ class Rollouts:
 
     def __init__(self, env: Any, policy: RolloutPolicy, *, planner: bool = False) -> None:
         """Check the candidates and the base of a policy. For a ``planner``, leave out masked ones, and add ``RULE``."""
-        self._env, self._policy = env, policy
+        self.env, self._policy = env, policy
         player = player_of(env, policy.base)
         player.check_base()
         if policy.timed and player.episode.clock is None:
@@ -124,9 +123,9 @@ class Rollouts:
         if self.added:
             self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
-        self._outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
-        self._states: States | None = None
-        self._seconds = 0.0  # for a step
+        self.outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
+        self.states: Any = None  # those that are kept, if a search keeps some: see ``tree``
+        self.seconds = 0.0  # for a step
         self._times: list[list[float]] = []  # the simulation's times between decisions, in each rollout
         number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
@@ -162,21 +161,22 @@ class Rollouts:
         outcomes = self._outcomes_of(rollouts)
         for (plan, _), outcome in zip(rollouts, outcomes, strict=True):
             self.returns[plan[0]].append(sum(outcome.rewards))
-            self._outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen))
+            self.outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen))
             self._times.append(outcome.times)
-            self._seconds = max(self._seconds, outcome.seconds)
+            self.seconds = max(self.seconds, outcome.seconds)
         return [outcome.rewards for outcome in outcomes]
 
     def _outcomes_of(self, rollouts: Sequence[tuple[Plan, int]]) -> list[Outcome]:
         policy, seeds = self._policy, None
-        if self._states is not None:
-            return self._states.run([plan for plan, _ in rollouts])
+        if self.states is not None:
+            kept: list[Outcome] = self.states.run([plan for plan, _ in rollouts])
+            return kept
         if self.reseeds:
             numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
             seeds = [numbers[future] for _, future in rollouts]
         tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
         return branch(
-            self._env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
+            self.env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
             time_limit=policy.time_limit,
         )  # fmt: skip
 
@@ -196,30 +196,7 @@ class Rollouts:
 
     def certain(self, plan: Plan) -> float:
         """Return what a plan has brought in the one exact future."""
-        return float(sum(self._outcomes[plan][0][0]))
-
-    def best_plan(self) -> Plan:
-        """Return the plan that has brought most in the one exact future."""
-        return max(self._outcomes, key=self.certain)
-
-    def keep_states(self) -> None:
-        """From now on, keep the states of plans, if there is one exact future and a step takes longer than a fork."""
-        if self.reseeds or self._policy.method == "replay":
-            return
-        began = perf_counter()
-        try:
-            root = clone(self._env, method="fork", time_limit=self._policy.time_limit)
-        except (BranchError, OptionValueError):  # only a replay is possible
-            return
-        if self._seconds > perf_counter() - began:
-            self._states = States(root, self._policy, self.actions)
-        else:
-            root.close()
-
-    def close(self) -> None:
-        """End the states that were kept."""
-        if self._states is not None:
-            self._states.close()
+        return float(sum(self.outcomes[plan][0][0]))
 
     def values(self, finalists: Sequence[int]) -> ActionValues:
         """Estimate the values; the best candidate is one of the finalists, which are given by their places."""
@@ -234,7 +211,7 @@ class Rollouts:
                 errors[place] = np.std(values, ddof=1) / np.sqrt(len(values))
         best = max(finalists, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
         if self.reseeds:
-            warn_of_futures(self._name, list(self._outcomes.values()), returns)
+            warn_of_futures(self._name, list(self.outcomes.values()), returns)
         if self._policy.horizon is not None and self._policy.horizon_by == "decision":
             warn_of_times(self._name, self._times)
         correlation = correlation_of(returns)
@@ -324,7 +301,7 @@ class RolloutPolicy:
             OptionValueError: The budget is too small to try each candidate.
             BaseException: As ``action_values``.
         """
-        if is_planning():
+        if PLANNING.get():
             return base_value(env, self.base)
         rollouts = Rollouts(env, self, planner=True)
         number = len(rollouts.actions)
@@ -354,97 +331,3 @@ class RolloutPolicy:
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
         """Answer a decision, as policies do, with the best action; within a branch, with the answer of the base."""
         return self.choose(_environment).best
-
-
-@dataclass(kw_only=True, eq=False, repr=False)
-class TreeSearchPolicy(RolloutPolicy):
-    """A policy that looks several decisions ahead, by open-loop UCT over branches.
-
-    At each of the next ``depth`` decisions it tries the candidates that seem best, and those of which it knows little
-    (UCB1); then the base decides. A node of the tree is a sequence of candidates, whatever chance events lie between
-    them. All candidates for the pending decision meet the same futures in the same order.
-
-    It needs more branches than ``RolloutPolicy``. They pay off if an action is only good with the right actions after
-    it.
-
-    Attributes:
-        actions: The candidates for this decision and the next ones. If a candidate is masked at a next decision, the
-            base decides there.
-        depth: The number of decisions that are tried, including this one.
-        exploration: The weight of exploration, in units of the spread of the returns.
-
-    Raises:
-        OptionValueError: An argument has an invalid value.
-    """
-
-    depth: int = 2
-    exploration: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        fine = is_number(self.exploration) and self.exploration >= 0
-        self.require("depth", is_count(self.depth), "a number of decisions")
-        self.require("exploration", fine, "a number that is not negative")
-
-    def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
-        tree = _Tree(len(rollouts.actions), self.depth, self.exploration, rollouts.added)
-        try:
-            for begin in range(0, budget, _AT_ONCE):
-                batch: list[tuple[Plan, int]] = []
-                for _ in range(min(_AT_ONCE, budget - begin)):
-                    plan = tree.descend()
-                    batch.append((plan, tree.visits[plan[:1]] - 1 if rollouts.reseeds else 0))
-                for (plan, _), rewards in zip(batch, rollouts.run(batch), strict=True):
-                    tree.learn(plan, rewards)
-                if begin == 0 and self.depth > 1:
-                    rollouts.keep_states()
-        finally:
-            rollouts.close()
-        return [tree.best() if rollouts.reseeds else rollouts.best_plan()]
-
-
-class _Tree:
-    """The results of sequences of candidates. If ``RULE`` was ``added`` as the last one, it is a leaf."""
-
-    def __init__(self, candidates: int, depth: int, exploration: float, added: bool) -> None:
-        self._first, self._others = range(candidates), range(candidates - added)
-        self._depth, self._exploration = depth, exploration
-        self.visits: dict[Plan, int] = {}  # the tries of each node, including those that are running
-        self._returns: dict[Plan, list[float]] = {}  # returns from the node's own decision on
-        self._least, self._most = inf, -inf
-
-    def descend(self) -> Plan:
-        """Choose the sequence to try next: descend to an untried node, or to the depth."""
-        node: Plan = ()
-        while len(node) < self._depth and (not node or node[0] in self._others):
-            below = [(*node, place) for place in (self._others if node else self._first)]
-            new = [child for child in below if child not in self._returns]
-            if new:
-                node = min(new, key=lambda child: self.visits.get(child, 0))
-                break
-            doubt = sqrt(log(sum(self.visits[child] for child in below)))
-            node = max(below, key=lambda child: self._bound(child, doubt))
-        for depth in range(1, len(node) + 1):
-            self.visits[node[:depth]] = self.visits.get(node[:depth], 0) + 1
-        return node
-
-    def _bound(self, node: Plan, doubt: float) -> float:
-        """Return the confidence bound of a node's value: upper for a positive ``doubt``, lower for a negative one."""
-        returns, spread = self._returns[node], self._most - self._least
-        return sum(returns) / len(returns) + doubt * self._exploration * spread / sqrt(self.visits[node])
-
-    def learn(self, node: Plan, rewards: list[float]) -> None:
-        """Add the rewards of a try, decision by decision; the agent may have ended before the node."""
-        for depth in range(min(len(node), len(rewards))):
-            self._returns.setdefault(node[: depth + 1], []).append(sum(rewards[depth:]))
-        self._least, self._most = min(self._least, sum(rewards)), max(self._most, sum(rewards))
-
-    def best(self) -> Plan:
-        """Return the best plan, which the added ``RULE`` is compared with later: by lower bound, then by visits."""
-        plan: Plan = (max(self._others, key=lambda place: self._bound((place,), -1.0)),)
-        while len(plan) < self._depth:
-            below = [child for place in self._others if (child := (*plan, place)) in self._returns]
-            if not below:
-                break
-            plan = max(below, key=lambda child: (self.visits[child], self._bound(child, -1.0)))
-        return plan

@@ -43,8 +43,8 @@ from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
 from .driver import WAIT
-from .planner import two_arguments
 from .points import declared_agents, overrides
+from .policies import two_arguments
 from .run import Run
 from .spaces import duplicate
 
@@ -159,6 +159,7 @@ class Episode(Run):
                 self.pending = agent
             raise
         agent.answered_at = agent.now
+        agent.answered += 1
         if turn:
             self.turns = turns = self.turns + 1
             if len(self.tape) < self.tape_size:

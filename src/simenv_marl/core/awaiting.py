@@ -56,6 +56,7 @@ class Answer:
         def end(task: asyncio.Task[None]) -> None:
             if task.cancelled():
                 self.error = asyncio.CancelledError()
+                getattr(value, "close", int)()  # a coroutine that was cancelled before it began
             report(self)
 
         loop.call_soon_threadsafe(begin)

@@ -99,6 +99,19 @@ def has_fallback(policy: Any) -> bool:
     return isinstance(policy, PolicyWrapper)
 
 
+def policy_in_branch(policy: Any, agent: str, episode: Any) -> Callable[[Any, Any], Any]:
+    """Return what answers for a policy in the episode of a branch, as a callable of observation and info."""
+    base = stand_in(base_of(policy, agent))
+    if is_planner(base) or not callable(base):
+        return lambda observation, info: RULE
+    asked = two_arguments(base)
+    if not isinstance(asked, AskingPolicy):
+        return asked
+    return lambda observation, info: asked.ask(
+        observation, info, episode, episode.consulted or episode.pending, None, in_clone=True
+    )
+
+
 class PolicyWrapper:
     """A policy that asks another policy, and itself asks for what that one asks for.
 

@@ -242,7 +242,7 @@ def _action(space: spaces.Space[Any], labels: Any, value: Any, legal: Mapping[st
         return named[said] if said in named else int(said)
     if isinstance(space, spaces.Dict):
         keys = {(labels or {}).get(key, key): key for key in space.spaces}
-        given = {keys.get(name, name): part for name, part in value.items()}
+        given = {keys.get(name, name): part for name, part in dict(value).items()}
         return {key: _action(part, None, given[key], {}) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
         listed = [value[str(place)] for place in range(len(value))] if isinstance(value, Mapping) else value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from inspect import cleandoc
@@ -11,7 +12,9 @@ from itertools import chain
 from time import perf_counter
 from typing import Any, Final
 from uuid import uuid4
+from weakref import finalize
 
+from ..core.awaiting import Answer
 from ..core.pending import Decision
 from ..core.policies import COUNTS
 from ..errors import InvalidActionError, LanguageModelError, OptionValueError, describe_error, short_repr
@@ -210,7 +213,9 @@ class LanguageModelPolicy:
 
     def _made_client(self, openai: Any) -> Any:
         if self._own_client is None:
-            self._own_client = openai.AsyncOpenAI(base_url=self._base_url, api_key=self._api_key, max_retries=0)
+            made = openai.AsyncOpenAI(base_url=self._base_url, api_key=self._api_key, max_retries=0)
+            self._own_client = made
+            finalize(self, _close, made, os.getpid()).atexit = False
         return self._own_client
 
     def _count(self, **numbers: float) -> None:
@@ -225,6 +230,12 @@ class _PassingError(Exception):
     def __init__(self, text: str, seconds: float = 0.0) -> None:
         super().__init__(text)
         self.seconds = seconds
+
+
+def _close(client: Any, process: int) -> None:
+    """Close the connections of a client, without waiting for it."""
+    if os.getpid() == process:
+        Answer(client.close(), lambda answer: None)
 
 
 def _seconds_to_wait(error: Exception) -> float:

@@ -120,7 +120,7 @@ def test_labels_may_be_made_for_each_call():
     env = env_of(replace(FILL, action_labels=lambda tank: [f"{litres} of {tank.level}" for litres in range(3)]))
     assert parse(env, "2 of 5.0") == 2
     bad = env_of(replace(FILL, action_labels=lambda tank: ["one"]))
-    with pytest.raises(DefinitionError, match=r"returned .*, which are not texts for the parts"):
+    with pytest.raises(DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"):
         describe(bad)
 
 

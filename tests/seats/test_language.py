@@ -16,6 +16,7 @@ from .test_descriptions import of_space
 
 pytest.importorskip("openai")
 
+
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
     monkeypatch.setattr("simenv_marl.seats.language.LONGEST_WAIT", 0.01)

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
 
-from ..decision import fit_labels, inverse
-from ..errors import DefinitionError, short_repr
 from .spaces import duplicate
 
 if TYPE_CHECKING:
@@ -64,12 +62,8 @@ class Decision:
 
 def decision_of(episode: Episode, agent: Agent, *, in_clone: bool = False) -> Decision:
     """Describe the decision of an agent that is pending, or is put to a policy."""
-    point, definition, choices = agent.point, agent.point.definition, agent.choices
-    space, texts = definition.action_space, definition.action_labels
-    if choices is not None:
-        texts = dict(enumerate(map(str, choices))) if texts is None else texts
-    elif texts is None and isinstance(space, spaces.Discrete):
-        texts = {action: str(decision) for decision, action in (inverse(definition) or {}).items()}
+    point, choices = agent.point, agent.choices
+    call = agent.arguments() or (), agent.kwargs
 
     def count_fallback() -> None:
         agent.fallbacks += 1
@@ -81,39 +75,14 @@ def decision_of(episode: Episode, agent: Agent, *, in_clone: bool = False) -> De
         number=agent.answered + 1,
         time=agent.now,
         observation=duplicate(agent.observation),
-        action_space=space,
+        action_space=point.definition.action_space,
         mask=None if agent.mask is None else duplicate(agent.mask),
         choices=None if choices is None else list(choices),
-        action_labels=_labels(space, texts, agent, "action_labels"),
-        observation_labels=_labels(
-            definition.observation_space, definition.observation_labels, agent, "observation_labels"
-        ),
+        action_labels=point.action_labels(choices, *call),
+        observation_labels=point.observation_labels(*call),
         reward=agent.reward,
         doc=point.point.function.__doc__,
         in_clone=in_clone or episode.plan.solo,
         checked=lambda action: point.checked(action, agent.name, agent.mask),
         count_fallback=count_fallback,
     )
-
-
-def _labels(space: Any, given: Any, agent: Agent, name: str) -> Texts:
-    """Return the texts for the parts of a space."""
-    if callable(given):
-        arguments = agent.arguments()
-        given = given(*(arguments or ()), **agent.kwargs)
-        if not (isinstance(given, Mapping) and isinstance(space, spaces.Discrete)) and not fit_labels(space, given):
-            raise DefinitionError(
-                f"{name} of {agent.point.point.name} returned {short_repr(given)}, which are not texts for the parts of"
-                f" {short_repr(space)}"
-            )
-    if isinstance(space, spaces.Discrete):
-        start = int(space.start)
-        texts = given if isinstance(given, Mapping) else dict(enumerate(given or (), start))
-        return {action: str(texts.get(action, action)) for action in range(start, start + int(space.n))}
-    if isinstance(space, spaces.Dict):
-        return {key: key for key in space.spaces} if given is None else dict(given)
-    if space.shape is not None and len(space.shape) == 1:
-        if given is None:
-            return tuple(map(str, range(space.shape[0])))
-        return tuple(given[place] for place in range(len(given)))
-    return None

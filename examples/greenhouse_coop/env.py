@@ -141,6 +141,8 @@ WATERING: Final[dict[Any, Definition]] = {
         rule_action_mapping=from_litres,
         reward_mapping=reward,
         agent=WATERER,
+        action_labels=["share of 1000 litres of water"],
+        observation_labels=OBSERVED,
     )
 }
 """The waterer's decision point."""
@@ -154,6 +156,8 @@ VENTILATION: Final[dict[Any, Definition]] = {
         rule_action_mapping=usual_exchange,
         reward_mapping=reward,
         agent=VENTILATOR,
+        action_labels=["share of the air that is exchanged"],
+        observation_labels=OBSERVED,
     )
 }
 """The ventilator's decision point."""

@@ -63,9 +63,9 @@ class Run:
 
     __slots__ = (
         "_lock", "_rng", "actions", "agents", "clock", "consulted", "decide", "driver", "ended", "entities",
-        "failed_in_model", "given", "items", "just_ended", "last_time", "latest", "most_steps", "others", "over", "pending",
-        "plan", "running", "script", "seed", "simulation", "skips", "stalled", "tape", "tape_size", "terminated",
-        "truncated", "turns", "unreported_end", "unused",
+        "failed_in_model", "given", "items", "just_ended", "last_time", "latest", "most_steps", "others", "over",
+        "pending", "plan", "running", "script", "seed", "simulation", "skips", "stalled", "tape", "tape_size",
+        "terminated", "truncated", "turns", "unreported_end", "unused",
     )  # fmt: skip
 
     in_rounds: ClassVar[bool] = False

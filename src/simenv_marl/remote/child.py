@@ -29,8 +29,9 @@ from ..errors import (
     short_repr,
     warn_user,
 )
+from ..simulation import RULE
 from . import guardian
-from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, decode
+from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, decode, encode_answer
 
 CHUNK: Final = 1 << 16
 """The number of bytes to read at once; pipes hold no more."""
@@ -49,6 +50,12 @@ MOST_BYTES: Final = 1 << 30
 
 MOST_WAITS: Final = 20
 """How many times the time to wait for a line the frames between two calls may take."""
+
+KINDS: Final = frozenset({"hello", "decide", "decided", "expect", "update", "remove", "end", "error"})
+"""The frames that a simulator sends: each has one of these keys."""
+
+RESERVED: Final = frozenset({"entity", "point", "time"})
+"""What a call has besides its arguments. No argument can have such a name."""
 
 LOST: Final = 1 << 16
 """The exit code of a process whose exit code was lost. No process can exit with it."""
@@ -159,9 +166,9 @@ class Child:
         return frame
 
     def next_frame(self) -> dict[str, Any]:
-        """Wait for the next frame of the episode, a "decide", "update", "remove" or "end", and check it.
+        """Wait for the next frame of the episode, a "decide", "expect", "update", "remove" or "end", and check it.
 
-        The first three always get an item "entity".
+        All but the last always get an item "entity"; of "expect", each item gets it.
 
         Raises:
             ProcessDiedError, ProcessTimeoutError: As ``receive``.
@@ -169,9 +176,13 @@ class Child:
             RemoteError: The model raised an error.
         """
         frame = self.receive()
+        if len(kinds := KINDS.intersection(frame)) > 1:
+            what = f"{' and '.join(sorted(kinds))} in one frame, {short_repr(frame)}; each needs a line of its own"
+            self.fail(WireError(f"{self} has sent {what}"))
         if "end" in frame:
-            if not isinstance(frame["end"], dict):
-                what = f'the end {short_repr(frame["end"])}; it must be an object with "truncated" and "result"'
+            end = frame["end"]
+            if not isinstance(end, dict) or type(end.get("truncated", False)) is not bool:
+                what = f'the end {short_repr(end)}; it must be an object with "truncated" (true or false) and "result"'
                 self.fail(WireError(f"{self} has sent {what}"))
             self.state = "idle"
         elif "decide" in frame:
@@ -184,8 +195,12 @@ class Child:
             self._check_call(frame, frame["update"])
         elif "remove" in frame:
             self._check_call(frame, frame["remove"])
+        elif "expect" in frame and "expect" in self.can:
+            self._check_expected(frame["expect"])
         else:
-            self.refuse(frame, f"has sent {short_repr(frame)}, which is not a frame of the wire")
+            unasked = [name for name in ("decided", "expect") if name in frame]
+            why = 'is not due, or not in the "can" of its hello' if unasked else "is not a frame of the wire"
+            self.refuse(frame, f"has sent {short_repr(frame)}, which {why}")
         if self.state == "running":
             self._check_flood()
         return frame
@@ -212,6 +227,9 @@ class Child:
             self.fail(WireError(f"{self} has sent {what}"))
         if arguments is not None and not isinstance(arguments, dict):
             self.fail(WireError(f"{self} has sent args for {name} that are not an object: {short_repr(arguments)}"))
+        if arguments and not RESERVED.isdisjoint(arguments):
+            what = f"an argument {min(RESERVED & arguments.keys())!r} for {name}; calls have this besides: rename it"
+            self.fail(WireError(f"{self} has sent {what}"))
         if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
             time = float(time)
         if type(time) is float:
@@ -219,6 +237,33 @@ class Child:
         elif time is not None:
             self.fail(WireError(f"{self} has sent the time {short_repr(time)} for {name}, which is not a number"))
         frame["entity"] = entity
+
+    def _check_expected(self, items: Any) -> None:
+        """Check the calls that are going to come."""
+        keys = {"point", "entity", "args", "time"}
+        if not isinstance(items, list) or not all(isinstance(item, dict) and item.keys() <= keys for item in items):
+            what = f'"expect" with {short_repr(items)}; it must be a list of objects with "point", "entity" and "args"'
+            self.fail(WireError(f"{self} has sent {what}"))
+        for item in items:
+            self._check_call(item, item.get("entity"))
+
+    def leave_to_rule(self, before: bytes = b"") -> Any:
+        """Answer the call by the process's rule, after other lines.
+
+        Returns:
+            The rule's decision; ``RULE`` if the process does not tell it.
+
+        Raises:
+            WireError: The process tells another thing. Other errors are those of ``receive``.
+        """
+        self.answer(before + encode_answer(self.number, RULE))
+        if "decided" not in self.can:
+            return RULE
+        frame = self.receive()
+        if frame.get("decided") != self.number or type(frame["decided"]) is not int or "value" not in frame:
+            due = f'{{"decided": {self.number}, "value": ...}} was due: what its rule decided'
+            self.refuse(frame, f"has sent {short_repr(frame)} where {due}")
+        return frame["value"]
 
     def answer(self, lines: bytes) -> None:
         """Send the lines that answer the call for which it waits."""

@@ -11,25 +11,18 @@ from simenv_marl_client import Client
 import outside
 
 client = Client(["reservoir.inflow", "broker.price", "sheep.graze"])
-running: outside.Reservoirs
 
 
 def reservoirs(episode):
     """The reservoirs of ``outside.py``."""
-    global running
-    running = model = outside.Reservoirs(episode.seed, episode.options)
+    model = outside.Reservoirs(episode.seed, episode.options)
+    client.on_reseed(model.random.seed)
     model.run(
         lambda point, entity, time, args, rule: client.decide(point, entity, rule=rule, time=time, **args),
         client.remove,
         lambda point, entity, args: client.update(point, entity, **args),
     )
     client.end(model.result(), episode.options.get("truncated", False))
-
-
-@client.on_reseed
-def reseed(seed):
-    """Draw new numbers from here on."""
-    running.random.seed(seed)
 
 
 def flock(episode):
@@ -51,4 +44,6 @@ def flock(episode):
 
 
 if __name__ == "__main__":
+    if sys.argv[1] == "reservoirs":
+        client.on_reseed(lambda seed: None)  # each episode sets its own
     client.run({"reservoirs": reservoirs, "flock": flock}[sys.argv[1]])

@@ -66,6 +66,7 @@ class Child:
 
     Attributes:
         pid: The id of the process.
+        hello: Its first frame.
         points: The names of its decision points.
         can: Its further abilities, such as "reseed".
         timeout: The time to wait for each line, in seconds.
@@ -107,6 +108,7 @@ class Child:
         except BaseException:  # an interrupt, too
             self.close(patience=0.0)
             raise
+        self.hello = hello
         version, points, can = hello.get("hello"), hello.get("points", ()), hello.get("can", [])
         if version is None:
             self.refuse(hello, f"began with {short_repr(hello)}, not with a hello")

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from simenv_marl.__main__ import main
 from simenv_marl.errors import WireError
 from simenv_marl.remote.check import check_wire
-from simenv_marl.remote.child import KINDS
-from simenv_marl.remote.wire import decode, encode
+from simenv_marl.remote.wire import KEYS, decode, encode
 from tests.outside.reservoirs import EXITS_AFTER_STOP, changed, command
 
 pytestmark = pytest.mark.greenlet("no environment is made")
@@ -91,7 +90,7 @@ def test_invalid_frames_are_refused(line):
 def test_the_page_shows_frames_that_the_wire_has():
     text = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
     shown = [decode(line.encode()) for line in re.findall("^(?:->|<-)  (.*)$", text, re.MULTILINE)]
-    assert {next(iter(frame)) for frame in shown} == {*KINDS, "start", "act", "reseed", "stop"}
+    assert {next(iter(frame)) for frame in shown} == {*KEYS, "start", "act", "reseed", "stop"}
 
 
 def found(report):

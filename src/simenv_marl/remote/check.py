@@ -17,7 +17,7 @@ from ..core.rng import is_seed
 from ..errors import OptionValueError, ProcessDiedError, ProcessError, WireError, did_you_mean, short_repr
 from ..simulation import RULE
 from .child import MOST_FRAMES, Child
-from .wire import DESCRIPTORS, decode, encode, encode_answer
+from .wire import DESCRIPTORS, KEYS, decode, encode, encode_answer
 
 OK, NOTE, WRONG = "ok", "note", "wrong"
 
@@ -35,17 +35,6 @@ INVALID: Final = {
 
 ABILITIES: Final = ("decided", "expect", "reseed")
 """What the "can" of a hello may list."""
-
-KEYS: Final[Mapping[str, frozenset[str]]] = {
-    "hello": frozenset({"points", "can"}),
-    "decide": frozenset({"point", "entity", "time", "args"}),
-    "decided": frozenset({"value"}),
-    "update": frozenset({"point", "entity", "time", "args"}),
-    "remove": frozenset({"point", "entity", "time", "args"}),
-    "expect": frozenset(),
-    "end": frozenset(),
-}
-"""The kinds of frames, and the other keys of each."""
 
 GUESSES: Final = ((0, 1, 100), (False, True))
 """Values that a decision may have, for simulators that do not tell what their rules decide."""
@@ -361,7 +350,7 @@ def _check_keys(frame: Mapping[str, Any]) -> None:
     Raises:
         WireError: It has one.
     """
-    (kind,) = (kind for kind in KEYS if kind in frame)
+    kind = next(kind for kind in KEYS if kind in frame)
     parts = [(frame, {kind, *KEYS[kind]})]
     if kind == "end":
         parts.append((frame["end"], {"truncated", "result"}))

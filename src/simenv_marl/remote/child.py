@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
-from types import NoneType
 from typing import Any, Final, NoReturn
 from weakref import WeakSet, finalize
 
@@ -31,7 +30,7 @@ from ..errors import (
 )
 from ..simulation import RULE
 from . import guardian
-from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, decode, encode_answer
+from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, check_frame, decode, encode_answer
 
 CHUNK: Final = 1 << 16
 """The number of bytes to read at once; pipes hold no more."""
@@ -50,12 +49,6 @@ MOST_BYTES: Final = 1 << 30
 
 MOST_WAITS: Final = 20
 """How many times the time to wait for a line the frames between two calls may take."""
-
-KINDS: Final = frozenset({"hello", "decide", "decided", "expect", "update", "remove", "end", "error"})
-"""The frames that a simulator sends: each has one of these keys."""
-
-RESERVED: Final = frozenset({"entity", "point", "time"})
-"""What a call has besides its arguments. No argument can have such a name."""
 
 LOST: Final = 1 << 16
 """The exit code of a process whose exit code was lost. No process can exit with it."""
@@ -178,28 +171,20 @@ class Child:
             RemoteError: The model raised an error.
         """
         frame = self.receive()
-        if len(kinds := KINDS.intersection(frame)) > 1:
-            what = f"{' and '.join(sorted(kinds))} in one frame, {short_repr(frame)}; each needs a line of its own"
-            self.fail(WireError(f"{self} has sent {what}"))
+        try:
+            time = check_frame(frame, self.points)
+        except WireError as error:
+            self.fail(WireError(f"{self} has {error}"))
+        if time is not None:
+            self.time = time
         if "end" in frame:
-            end = frame["end"]
-            if not isinstance(end, dict) or type(end.get("truncated", False)) is not bool:
-                what = f'the end {short_repr(end)}; it must be an object with "truncated" (true or false) and "result"'
-                self.fail(WireError(f"{self} has sent {what}"))
             self.state = "idle"
         elif "decide" in frame:
             number, due = frame["decide"], self.number + 1
             if type(number) is not int or number != due:
                 self.fail(WireError(f"{self} has made call {short_repr(number)} where call {due} was due"))
-            self._check_call(frame, frame.get("entity"))
             self.number, self.state, self._frames = number, "waiting", 0
-        elif "update" in frame:
-            self._check_call(frame, frame["update"])
-        elif "remove" in frame:
-            self._check_call(frame, frame["remove"])
-        elif "expect" in frame and "expect" in self.can:
-            self._check_expected(frame["expect"])
-        else:
+        elif not ("update" in frame or "remove" in frame or ("expect" in frame and "expect" in self.can)):
             unasked = [name for name in ("decided", "expect") if name in frame]
             why = 'is not due, or not in the "can" of its hello' if unasked else "is not a frame of the wire"
             self.refuse(frame, f"has sent {short_repr(frame)}, which {why}")
@@ -218,36 +203,6 @@ class Child:
         if monotonic() - self._since > MOST_WAITS * self.timeout:
             what = f"has sent updates and removals for {MOST_WAITS * self.timeout:g} s, and neither a call nor an end"
             self.fail(ProcessTimeoutError(f"{self} {what}"))
-
-    def _check_call(self, frame: dict[str, Any], entity: Any) -> None:
-        """Check a frame's point, entity, arguments and time; note entity and time."""
-        name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
-        if not isinstance(name, str) or name not in self.points:
-            self.fail(WireError(f"{self} has named the point {short_repr(name)}, which is not in its hello"))
-        if type(entity) not in (str, int, NoneType):
-            what = f"the entity {short_repr(entity)} for {name}; an entity must be a string or an integer"
-            self.fail(WireError(f"{self} has sent {what}"))
-        if arguments is not None and not isinstance(arguments, dict):
-            self.fail(WireError(f"{self} has sent args for {name} that are not an object: {short_repr(arguments)}"))
-        if arguments and not RESERVED.isdisjoint(arguments):
-            what = f"an argument {min(RESERVED & arguments.keys())!r} for {name}; calls have this besides: rename it"
-            self.fail(WireError(f"{self} has sent {what}"))
-        if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
-            time = float(time)
-        if type(time) is float:
-            self.time = time
-        elif time is not None:
-            self.fail(WireError(f"{self} has sent the time {short_repr(time)} for {name}, which is not a number"))
-        frame["entity"] = entity
-
-    def _check_expected(self, items: Any) -> None:
-        """Check the calls that are going to come."""
-        keys = {"point", "entity", "args", "time"}
-        if not isinstance(items, list) or not all(isinstance(item, dict) and item.keys() <= keys for item in items):
-            what = f'"expect" with {short_repr(items)}; it must be a list of objects with "point", "entity" and "args"'
-            self.fail(WireError(f"{self} has sent {what}"))
-        for item in items:
-            self._check_call(item, item.get("entity"))
 
     def leave_to_rule(self, before: bytes = b"") -> Any:
         """Answer the call by the process's rule, after other lines.

@@ -122,7 +122,9 @@ class Client:
         if frame is None:
             return None
         start = frame.get("start")
-        seed = start.get("seed") if isinstance(start, dict) else ""
+        if not isinstance(start, dict):
+            start = {"seed": "none"}
+        seed = start.get("seed")
         if seed is None:
             seed = random.SystemRandom().randrange(1 << 31)
         if type(seed) is not int:

@@ -270,8 +270,8 @@ class ProcessSimulation(SimulationInterface):
             if value is not ruled[0] and value is not RULE:
                 raise SimulationError(
                     f"the rule of {call.point} has decided {short_repr(ruled[0])} for {call.entity!r}, and the process"
-                    f" continues with that: {short_repr(value)} cannot replace it. Let the handler or apply that asked"
-                    " the rule return what the rule decided"
+                    f" continues with that: {short_repr(value)} cannot replace it. A handler or apply that asks the"
+                    " rule must return what it decided; of a call that is split, answer all items by RULE, or none"
                 )
         elif value is RULE:
             rule()

@@ -144,6 +144,8 @@ class PolicyWrapper:
 class DeferredPolicy:
     """A policy that answers many decisions in one call. An episode waits for it as it waits for the user."""
 
+    waits = False  # whether it has to be awaited
+
     alone: Any  # a method of episode and agent: answers at once, in a branch that waits for one agent only
 
 

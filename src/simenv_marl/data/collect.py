@@ -105,7 +105,7 @@ def learners_plan(
     callables = {key: policy.policy if isinstance(policy, LeftToRule) else policy for key, policy in policies.items()}
     callables = {key: _follow_rule if policy is RULE else policy for key, policy in callables.items()}
     options = {**options, "policies": policy_keys(callables, rewarded=True, alone=alone)}
-    others = PolicyKey(len(policies), BatchPolicy(_follow_rule)) if all_points else None
+    others = PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone)) if all_points else None
     plan = Plan(simulation, points, options, unattended=True, rewarded=True, others=others)
     for place, policy in enumerate(policies.values()):
         for point in plan.points if isinstance(policy, LeftToRule) else ():

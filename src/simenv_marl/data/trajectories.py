@@ -291,7 +291,7 @@ class Recorder:
             trajectory.rows.append(row)
             turns.append(episode.turns)
             row += 1
-        log.observations.append(observations)
+        log.observations.append(group.stack(observations))
         log.rewards.extend([0.0] * len(agents))
         log.elapsed.extend([nan] * len(agents))
         if group.point.legal is not None:

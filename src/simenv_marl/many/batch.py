@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final, Protocol
@@ -175,30 +175,6 @@ class Group:
             annotate(error, f"simenv_marl: in {asked!r}, asked for {number} decisions at once; {seeds}")
             raise
 
-    def ask_each(self, waiting: Sequence[Episode]) -> Answers:
-        """Ask a policy that answers one decision at a time, one after the other."""
-        answers = []
-        for episode in waiting:
-            with _noted(episode), episode.context() if episode.plan.options.global_rng else nullcontext():
-                answers.append(begun(episode, AskingPolicy.__call__))
-        return self.together(answers)
-
-    def together(self, answers: Sequence[Any]) -> Answers:
-        """Put answers to single decisions together."""
-        together: Any = answers
-        if all(type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping) for answer in answers):
-            extras = {name: np.stack([np.asarray(extra[name]) for _, extra in answers]) for name in answers[0][1]}
-            together = [action for action, _ in answers], extras
-        return read_answers(together, self.asked, len(answers), integers=self._discrete)
-
-
-def begun(episode: Episode, ask: Callable[..., Any]) -> Any:
-    """Ask the policy of the agent whose decision is pending."""
-    agent: Any = episode.pending
-    info, agent.info = agent.info, {}  # a policy may change its info; the next decision gets a new one
-    observation, policy = duplicate(agent.observation), agent.policy
-    return ask(policy, observation, info) if isinstance(policy, AskingPolicy) else policy(observation, info)
-
 
 def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = False) -> Answers:
     """Return the actions and the extras in what a policy has returned for a number of decisions."""
@@ -222,7 +198,7 @@ class Watcher(Protocol):
     """An observer of the episodes."""
 
     def record(self, group: Group, places: list[int], waiting: list[Any], observations: Any, answers: Answers) -> None:
-        """Note what a policy has answered, before the simulations move. The watcher may keep the observations."""
+        """Note what a policy has answered, before the simulations move. The list has an observation for each."""
 
     def pay(self, episode: Episode) -> None:
         """Note the rewards when an episode has reached its next decision or its end."""
@@ -285,19 +261,17 @@ class _Simulations:
         while self.backlog and len(self.awaited) < self.concurrency:
             place, episode = self.backlog.popleft()
             with _noted(episode):
-                self.awaited.add((place, episode), begun(episode, AskingPolicy.begin))
+                self.awaited.add((place, episode), _ask_alone(episode, AskingPolicy.begin))
         # Waiting for large groups saves calls of policies.
         group = max(self.groups, key=lambda group: len(group.waiting), default=None)
         if group is not None and group.waiting and not self.awaited.ready:
             self.answer(group)
-            return
-        (place, episode), answer = self.awaited.take()
-        agent: Any = episode.pending
-        group = agent.policy.asked.group(agent.point)
-        recorded = None if self.watcher is None else group.stack([agent.observation])
-        with _noted(episode):
-            answers = group.together([answer.result()])
-        self.move(group, [place], [episode], recorded, answers)
+        elif self.awaited:
+            (place, episode), answer = self.awaited.take()
+            with _noted(episode):
+                answered = answer.result()
+            self.step(place, episode, answered)
+            self._queue(place, episode)
         self.refill()
 
     def answer(self, group: Group) -> None:
@@ -305,20 +279,9 @@ class _Simulations:
         waiting, group.waiting = group.waiting, []
         places, group.places = group.places, []
         observations, group.observations = group.observations, []
-        watcher, number, start = self.watcher, len(waiting), perf_counter()
-        recorded = None if watcher is None else group.stack(observations)  # policies may change what they get
-        if group.asked.alone:
-            answers = group.ask_each(waiting)
-        else:
-            answers = group.ask(group.stack(observations), waiting, [episode.pending for episode in waiting])
+        number, start = len(waiting), perf_counter()
+        answers = group.ask(group.stack(observations), waiting, [episode.pending for episode in waiting])
         asked = perf_counter()
-        self.move(group, places, waiting, recorded, answers)
-        if 2 * number > self.crowd < self.size and asked - start > perf_counter() - asked:
-            self.crowd = min(self.size, 2 * self.crowd)
-        self.refill()
-
-    def move(self, group: Group, places: list[int], waiting: list[Any], observations: Any, answers: Answers) -> None:
-        """Run simulations whose decisions were answered to their next ones."""
         actions = list(map(_checked, waiting, answers[0]))
         if self.watcher is not None:
             self.watcher.record(group, places, waiting, observations, answers)
@@ -326,6 +289,34 @@ class _Simulations:
         waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
         for place in places:
             self._queue(place, waiting.pop())
+        if 2 * number > self.crowd < self.size and asked - start > perf_counter() - asked:
+            self.crowd = min(self.size, 2 * self.crowd)
+
+    def answer_alone(self, place: int, episode: Episode) -> None:
+        """Have a decision answered at once, by a policy that answers one at a time."""
+        try:
+            if episode.plan.options.global_rng:
+                with episode.context():
+                    answer = _ask_alone(episode, _call)
+            else:
+                answer = _ask_alone(episode, _call)
+        except BaseException as error:
+            episode.annotate(error)
+            raise
+        self.step(place, episode, answer)
+
+    def step(self, place: int, episode: Episode, answer: Any) -> None:
+        """Take the answer to one decision, and run its simulation to the next one."""
+        agent: Any = episode.pending
+        extras: Mapping[str, Any] = {}
+        if type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping):
+            answer, extras = answer
+        action = _checked(episode, answer)
+        if self.watcher is not None:
+            extras = {name: np.asarray(value)[None] for name, value in extras.items()}
+            group = agent.group = agent.group or agent.policy.asked.group(agent.point)
+            self.watcher.record(group, [place], [episode], [agent.observation], ([action], extras))
+        episode.step(action)
 
     def refill(self) -> None:
         """Start simulations until the limit is reached."""
@@ -345,10 +336,15 @@ class _Simulations:
         if self.watcher is not None:
             self.watcher.pay(episode)
         agent = episode.pending
+        while agent is not None and agent.policy.asked.alone and not agent.policy.waits:
+            self.answer_alone(place, episode)
+            if self.watcher is not None:
+                self.watcher.pay(episode)
+            agent = episode.pending
         if agent is None:
             self._end(place)
             return
-        if getattr(agent.policy, "waits", False):
+        if agent.policy.waits:
             self.crowd = min(self.size, max(self.crowd, self.concurrency))
             self.backlog.append((place, episode))
             return
@@ -385,6 +381,17 @@ def _checked(episode: Episode, action: Any) -> Any:
     except InvalidActionError as error:
         episode.annotate(error)
         raise
+
+
+def _ask_alone(episode: Episode, ask: Callable[[Any, Any, Any], Any]) -> Any:
+    """Ask the policy of the agent whose decision is pending."""
+    agent: Any = episode.pending
+    info, agent.info = agent.info, {}  # a policy may change its info; the next decision gets a new one
+    return ask(agent.policy, duplicate(agent.observation), info)
+
+
+def _call(policy: Any, observation: Any, info: Any) -> Any:
+    return policy(observation, info)
 
 
 @contextmanager

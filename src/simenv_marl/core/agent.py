@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from math import isfinite
+from math import exp, isfinite
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 from weakref import ref
@@ -48,6 +48,7 @@ class Agent:
         offered: The choices of the latest decision, among which the rule's decision is looked up.
         rule_action: The action that corresponds to the rule's latest decision. None if it is not known.
         informs_rule_action: Whether the next info contains ``rule_action``.
+        rate: The rate at which infos discount. None: they do not.
         now, answered_at: The times of the latest decision and of the one before.
         entity, rest, kwargs: The arguments of the latest decision: see ``keep``.
         group, notes: Used by runners of many episodes.
@@ -57,12 +58,13 @@ class Agent:
         "acted", "answered_at", "applying", "asked", "carried", "choices", "clock", "consultations", "decided",
         "delegated", "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "kwargs",
         "mask", "memory", "name", "notes", "now", "observation", "offered", "plugins", "point", "policy", "present",
-        "report", "rest", "reward", "rule_action", "update",
+        "rate", "report", "rest", "reward", "rule_action", "update",
     )  # fmt: skip
 
     def __init__(self, name: str, point: Point, plan: Plan, clock: Any) -> None:
         self.name, self.point, self.clock, self.plugins = name, point, clock, plan.plugins
         self.policy = policy = plan.policy_of(name, point)
+        self.rate = plan.options.discount_rate
         self.delegated = policy is not None and not (plan.rewarded and isinstance(policy, DeferredPolicy))
         self.deliver, self.report = point.deliver, point.report
         self.update: Callable[..., None] = point.updates[0]
@@ -220,11 +222,14 @@ class Agent:
         return info
 
     def read_clock(self) -> dict[str, Any]:
-        """Note the time. Return it, and the time elapsed since the agent's previous decision, as an info."""
+        """Note the time. Return an info of it, the time since the agent's previous decision, and its discount."""
         clock: Any = self.clock
         time, before = clock(), self.answered_at
         self.now = now = time if type(time) is float else float(time)
-        return {"time": now, "elapsed": 0.0 if before is None else now - before}
+        info = {"time": now, "elapsed": 0.0 if before is None else now - before}
+        if self.rate is not None:
+            info["discount"] = exp(-self.rate * info["elapsed"])
+        return info
 
     def clear_observation(self) -> None:
         """Set the reward to 0.0, and the info to that of an agent with nothing to observe and all actions legal."""

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from inspect import cleandoc
 from math import inf
-from numbers import Real
 from textwrap import indent
 from typing import Any, Literal, TypedDict, TypeVar
 
@@ -116,7 +115,7 @@ class Options:
         groups = agents.values() if isinstance(agents, Mapping) else () if agents is None else (agents,)
         is_space = space is None or isinstance(space, spaces.Space) or space == "observations"
         is_count = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool) and steps >= 1
-        is_rate = isinstance(rate, Real) and not isinstance(rate, bool) and 0 <= rate < inf
+        is_rate = isinstance(rate, (int, float, np.number)) and not isinstance(rate, bool) and 0 <= rate < inf
         policies = {} if self.policies is None else self.policies
         for name, is_allowed, expected in (
             ("driver", self.driver in ("greenlet", "thread"), '"greenlet" or "thread"'),

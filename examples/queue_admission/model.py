@@ -45,8 +45,8 @@ class Queue:
         generators: The random generator of each kind.
     """
 
-    def __init__(self, seed: int | None = None) -> None:
-        self.clock = simpy.Environment()
+    def __init__(self, seed: int | None = None, clock: Any = None) -> None:
+        self.clock = clock or simpy.Environment()
         self.server = simpy.PriorityResource(self.clock)
         self._jobs, self._earned, self._booked = 0, 0.0, 0.0
         self.generators = [default_rng(stream) for stream in SeedSequence(seed).spawn(len(KINDS))]
@@ -72,13 +72,17 @@ class Queue:
         cost = HOLDING_COST * self._jobs / INTEREST
         return self._earned - cost * (exp(-INTEREST * self._booked) - exp(-INTEREST * self.clock.now))
 
+    def take(self, kind: int, work: float) -> None:
+        """Let a job arrive, which comes in if there is room and it is admitted."""
+        if len(self.server.queue) < PLACES and self.admit(kind):
+            self.clock.process(self._serve(kind, work))
+
     def _arrive(self, kind: int, generator: Any) -> Generator[Any, Any, Any]:
         """Let jobs of a kind arrive. A job has the same work in each run of a seed, whoever is admitted."""
         for _ in count():
             yield self.clock.timeout(generator.exponential(1 / KINDS[kind].arrivals))
             work = generator.exponential(1 / KINDS[kind].services)
-            if len(self.server.queue) < PLACES and self.admit(kind):
-                self.clock.process(self._serve(kind, work))
+            self.take(kind, work)
 
     def _serve(self, kind: int, work: float) -> Generator[Any, Any, Any]:
         """Wait for the server, work, and pay."""
@@ -97,4 +101,4 @@ class Queue:
 if __name__ == "__main__":
     queue = Queue(1)
     queue.clock.run(until=100)
-    print(f"present value of 100 units of time in which all jobs are admitted: {queue.present_value():.2f}")
+    print(f"present value of 100 units of time, all jobs admitted: {queue.present_value():.2f}")

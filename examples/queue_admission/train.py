@@ -26,7 +26,6 @@ from simenv_marl import evaluate
 
 from .env import AGENT, QueueSimulation, env, observation
 from .exact import ADMIT_ALL, DECISIONS, Table, best_table, worth
-from .model import KINDS
 
 OUT: Final = Path(__file__).parent / "out" / "results.csv"
 FIGURE: Final = Path(__file__).parents[2] / "docs" / "figures" / "queue-admission.png"
@@ -158,9 +157,8 @@ def draw(tables: dict[str, Table], path: Path) -> None:
     rows = [[table[decision] for decision in DECISIONS] for table in tables.values()]
     axes.imshow(rows, cmap="RdYlGn", vmin=-0.3, vmax=1.3)
     axes.set_yticks(range(len(tables)), [f"{name}: {worth(table):.2f}" for name, table in tables.items()])
-    names = [kind.name for kind in KINDS]
     labels = [
-        f"{names[kind]} arrives\n{'idle' if serving is None else f'serves {names[serving]}'}\n{'A' * a}{'B' * b}"
+        f"{'AB'[kind]} arrives\n{'idle' if serving is None else 'serves ' + 'AB'[serving]}\n{'A' * a}{'B' * b}"
         for kind, (a, b, serving) in DECISIONS
     ]
     axes.set_xticks(range(len(DECISIONS)), labels, fontsize=7)
@@ -174,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Train the admission of jobs.")
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each learner (default: %(default)s)")
     parser.add_argument("--steps", type=int, help="decisions of a training (default: 60,000 of DQN, 120,000 of PPO)")
-    parser.add_argument("--runs", type=int, default=200, help="simulations of each policy (default: %(default)s)")
+    parser.add_argument("--runs", type=int, default=200, help="paired simulations of each (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=OUT, help="file for the results (default: %(default)s)")
     parser.add_argument("--figure", type=Path, default=FIGURE, help="file for the figure (default: %(default)s)")
     options = parser.parse_args(arguments)
@@ -186,15 +184,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ]
     for gamma in GAMMAS:
         trainings.append((f"DQN, {gamma} a decision", partial(train_dqn, gamma=gamma, **steps)))
-    optimum = worth(best_table())
+    rows, tables, optimum = [], {"optimum": best_table()}, worth(best_table())
     print(f"optimum {optimum:.3f}; all admitted {worth(ADMIT_ALL):.3f}, {worth(ADMIT_ALL) / optimum:.3f} of it")
-    rows, tables = [], {"optimum": best_table()}
     for name, train in trainings:
         learners = [train(seed) for seed in range(options.seeds)]
         found = simulated({str(seed): policy_of(learner) for seed, learner in enumerate(learners)}, options.runs)
         made = [table_of(learner) for learner in learners]
         for seed, table in enumerate(made):
-            told = found.loc[str(seed)]
             rows.append(
                 {
                     "training": name,
@@ -202,7 +198,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     "exact": round(worth(table), 4),
                     "share": round(worth(table) / optimum, 4),
                     "admitted": "".join(str(int(answer)) for answer in table.values()),
-                    **{column: round(float(told[column]), 3) for column in ("mean", "low", "high", "difference")},
+                    **{
+                        column: round(float(found[column][str(seed)]), 3)
+                        for column in ("mean", "difference", "difference_low")
+                    },
                 }
             )
             print(rows[-1], flush=True)

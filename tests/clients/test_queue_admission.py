@@ -37,7 +37,7 @@ def test_advantages_have_the_discounts_of_their_times():
     second = 2.0 - 1.5  # an episode ends after it
     expected = [1.0 + 0.9 * 1.5 - 0.5 + 0.5 * 0.9 * second, second, 3.0 + 0.7 * 3.5 - 2.5 + 0.5 * 0.7 * last, last]
     assert buffer.advantages.ravel().tolist() == pytest.approx(expected)
-    assert buffer.returns.ravel().tolist() == pytest.approx(np.array(expected) + [0.5, 1.5, 2.5, 3.5])
+    assert buffer.returns.ravel().tolist() == pytest.approx(np.add(expected, [0.5, 1.5, 2.5, 3.5]))
 
 
 def test_a_short_training_by_time_beats_all_trainings_by_decision():

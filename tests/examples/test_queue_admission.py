@@ -20,7 +20,9 @@ def policy_of(table):
 
 
 def earned(policies, seeds):
-    return np.array(simulate_many(QueueSimulation, policies, seeds=seeds, collect=lambda run: run.model.present_value()))
+    return np.array(
+        simulate_many(QueueSimulation, policies, seeds=seeds, collect=lambda run: run.model.present_value())
+    )
 
 
 def test_the_optimum_and_what_discounting_by_decision_makes_of_it():

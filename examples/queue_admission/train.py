@@ -191,19 +191,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found = simulated({str(seed): policy_of(learner) for seed, learner in enumerate(learners)}, options.runs)
         made = [table_of(learner) for learner in learners]
         for seed, table in enumerate(made):
-            rows.append(
-                {
-                    "training": name,
-                    "seed": seed,
-                    "exact": round(worth(table), 4),
-                    "share": round(worth(table) / optimum, 4),
-                    "admitted": "".join(str(int(answer)) for answer in table.values()),
-                    **{
-                        column: round(float(found[column][str(seed)]), 3)
-                        for column in ("mean", "difference", "difference_low")
-                    },
-                }
-            )
+            exact = {"exact": round(worth(table), 4), "share": round(worth(table) / optimum, 4)}
+            admitted = "".join(str(int(answer)) for answer in table.values())
+            paired = found.loc[str(seed), ["mean", "difference", "difference_low", "difference_high"]].astype(float)
+            rows.append({"training": name, "seed": seed, **exact, "admitted": admitted, **paired.round(3)})
             print(rows[-1], flush=True)
         tables[name] = sorted(made, key=worth)[len(made) // 2]
     options.out.parent.mkdir(parents=True, exist_ok=True)

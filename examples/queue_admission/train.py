@@ -1,8 +1,9 @@
 """Train the admission of jobs with DQN and PPO of Stable-Baselines3, discounting by time and by decision.
 
-``python -m examples.queue_admission.train`` trains each learner three times, evaluates each trained table of decisions
-exactly, and by simulation. It writes ``out/results.csv`` beside this file, and ``docs/figures/queue-admission.png``. It
-needs Stable-Baselines3 2.7 or newer and SimPy (the extra ``clients``), and half an hour.
+``python -m examples.queue_admission.train`` trains each learner three times by time, and DQN once for each discount by
+decision. It evaluates each trained table of decisions exactly, and by simulation, and writes ``out/results.csv`` beside
+this file, and ``docs/figures/queue-admission.png``. It needs Stable-Baselines3 2.7 or newer and SimPy (the extra
+``clients``), and ten to thirty minutes.
 """
 
 from __future__ import annotations
@@ -178,16 +179,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     steps = {} if options.steps is None else {"steps": options.steps}
-    trainings: list[tuple[str, Callable[[int], Any]]] = [
-        ("DQN, by time", partial(train_dqn, **steps)),
-        ("PPO, by time", partial(train_ppo, **steps)),
+    trainings: list[tuple[str, Callable[[int], Any], int]] = [
+        ("DQN, by time", partial(train_dqn, **steps), options.seeds),
+        ("PPO, by time", partial(train_ppo, **steps), options.seeds),
     ]
     for gamma in GAMMAS:
-        trainings.append((f"DQN, {gamma} a decision", partial(train_dqn, gamma=gamma, **steps)))
+        trainings.append((f"DQN, {gamma} a decision", partial(train_dqn, gamma=gamma, **steps), 1))
     rows, tables, optimum = [], {"optimum": best_table()}, worth(best_table())
     print(f"optimum {optimum:.3f}; all admitted {worth(ADMIT_ALL):.3f}, {worth(ADMIT_ALL) / optimum:.3f} of it")
-    for name, train in trainings:
-        learners = [train(seed) for seed in range(options.seeds)]
+    for name, train, number in trainings:
+        learners = [train(seed) for seed in range(number)]
         found = simulated({str(seed): policy_of(learner) for seed, learner in enumerate(learners)}, options.runs)
         made = [table_of(learner) for learner in learners]
         for seed, table in enumerate(made):

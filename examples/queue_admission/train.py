@@ -153,17 +153,19 @@ def simulated(policies: dict[str, Any], runs: int) -> Any:
 
 def draw(tables: dict[str, Table], path: Path) -> None:
     """Draw which jobs are admitted in which state, a row for each table."""
-    figure = Figure(figsize=(9, 0.5 * len(tables) + 1.6), layout="constrained")
+    figure = Figure(figsize=(9, 0.35 * len(tables) + 1.2), layout="constrained")
     axes = figure.subplots()
     rows = [[table[decision] for decision in DECISIONS] for table in tables.values()]
-    axes.imshow(rows, cmap="RdYlGn", vmin=-0.3, vmax=1.3)
-    axes.set_yticks(range(len(tables)), [f"{name}: {worth(table):.2f}" for name, table in tables.items()])
+    axes.pcolormesh(rows, cmap="Blues", vmin=-0.2, vmax=1.4, edgecolors="white", linewidth=2)
+    axes.invert_yaxis()
+    axes.set_yticks(np.arange(len(tables)) + 0.5, [f"{name}: {worth(table):.2f}" for name, table in tables.items()])
     labels = [
-        f"{'AB'[kind]} arrives\n{'idle' if serving is None else 'serves ' + 'AB'[serving]}\n{'A' * a}{'B' * b}"
+        f"{'AB'[kind]} comes\n{'idle' if serving is None else 'AB'[serving] + ' served'}\n"
+        + " ".join([*["A waits"] * a, *["B waits"] * b])
         for kind, (a, b, serving) in DECISIONS
     ]
-    axes.set_xticks(range(len(DECISIONS)), labels, fontsize=7)
-    axes.set_title("Green: admitted; red: rejected. Below: who arrives, who is in service, who waits", fontsize=9)
+    axes.set_xticks(np.arange(len(DECISIONS)) + 0.5, labels, fontsize=7)
+    axes.set_title("Dark: admitted; light: rejected", fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
 

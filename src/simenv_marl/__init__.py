@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .core.clone import branch, clone
-    from .core.rng import reseed_generators
+    from .core.rng import Streams, reseed_generators
     from .decision import Definition, difference, make_step
     from .envs import aec_env, generate_env, joint_env, parallel_env, single_env, vector_env
     from .errors import SimEnvError
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "aec_env", "branch",
-    "clone", "difference", "evaluate", "generate_env", "joint_env", "make_step", "parallel_env", "register_simulation",
-    "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
+    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "Streams",
+    "aec_env", "branch", "clone", "difference", "evaluate", "generate_env", "joint_env", "make_step", "parallel_env",
+    "register_simulation", "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
 ]  # fmt: skip
 
 ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote", "seats", "testing")
@@ -59,7 +59,7 @@ ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote
 
 _MODULES = {
     "core.clone": ("branch", "clone"),
-    "core.rng": ("reseed_generators",),
+    "core.rng": ("Streams", "reseed_generators"),
     "decision": ("Definition", "difference", "make_step"),
     "envs": ("aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "vector_env"),
     "errors": ("SimEnvError",),

@@ -1,12 +1,14 @@
 """What the views tell beside observations: goals, masks, the time, the state and pictures."""
 
+from math import exp
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env, vector_env
 from simenv_marl.errors import (
     DefinitionError,
     InvalidActionError,
@@ -314,6 +316,67 @@ def test_policies_know_the_time_and_how_much_has_gone_by(action):
 
     simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy})
     assert seen == [(1.0, 0.0), (3.0, 2.0), (7.0, 4.0)]
+
+
+def told(env):
+    """The infos of the agent "ant_0" from the reset to the end, in any view."""
+    if hasattr(env, "agent_iter"):
+        return [turn.info for turn in play(env, 1)]
+    *_, info = env.reset()
+    infos, rounds = [info], hasattr(env, "possible_agents")
+    for _ in range(3):
+        *_, info = env.step({"ant_0": 1} if rounds or isinstance(env.action_space, spaces.Dict) else 1)
+        infos.append(info)
+    return [info["ant_0"] for info in infos] if rounds else infos
+
+
+@EVERY_VIEW
+def test_a_rate_gives_each_elapsed_time_its_discount(make):
+    ant = decision(agent="ant_0")
+    for rate in (0.25, 0, None):
+        env = make(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, discount_rate=rate)
+        infos = told(env)
+        assert [info["elapsed"] for info in infos] == [0.0, 2.0, 4.0, 1.0]
+        expected = [None if rate is None else exp(-rate * info["elapsed"]) for info in infos]
+        assert [info.get("discount") for info in infos] == expected
+
+
+def test_forced_moves_are_discounted_with_the_decision_after_them():
+    masks = iter([[1, 1], [1, 0], [1, 1], [1, 1]])
+    ant = decision(
+        agent="ant_0", action_space=spaces.Discrete(2), action_mask_mapping=lambda: np.array(next(masks), np.int8)
+    )
+    env = single_env(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, skip_forced=True, discount_rate=0.5)
+    env.reset()
+    assert env.step(1)[-1]["discount"] == exp(-3.0)
+
+
+def test_policies_and_vectors_of_simulations_know_the_discount():
+    ant, seen = decision(agent="ant_0"), []
+
+    def policy(observation, info):
+        seen.append(info["discount"])
+        return 1
+
+    simulate(lambda: Clock((1, ant), (3, ant), end=8), {ant: policy}, discount_rate=0.5)
+    assert seen == [1.0, exp(-1.0)]
+    env = vector_env(lambda: Clock((1, ant), (3, ant), end=8), ant, num_envs=2, discount_rate=0.5)
+    env.reset()
+    assert env.step(np.array([1, 1]))[-1]["discount"].tolist() == [exp(-1.0)] * 2
+
+
+@pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
+def test_rates_that_do_not_discount_are_refused(rate):
+    with pytest.raises(OptionValueError, match="discount_rate must be a finite number that is not negative, or None"):
+        aec_env(lambda: Clock(end=1), decision(agent="ant_0"), discount_rate=rate)
+
+
+def test_a_rate_needs_a_simulation_that_has_a_time():
+    ant = decision(agent="ant_0")
+    env = aec_env(calling(ant), ant, discount_rate=0.1)
+    for _ in range(2):
+        with pytest.raises(OptionValueError, match=r"has no method time\(\); add one"):
+            env.reset()
 
 
 # -- the state ------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
-"""``reseed_generators``: the generators that a simulation holds are found and seeded in place."""
+"""``reseed_generators``: the generators that a simulation holds are found and seeded in place; ``Streams`` by name."""
 
+import copy
 import functools
+import pickle
 import random
 from collections import deque
 from types import SimpleNamespace
@@ -10,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simenv_marl import reseed_generators
+from simenv_marl import Streams, reseed_generators
 from simenv_marl.errors import OptionValueError, SimulationError
 from tests.core.test_global_rng import world
 
@@ -122,3 +124,56 @@ def test_where_there_are_none_it_says_what_to_do(model):
 def test_seeds_are_integers(seed):
     with pytest.raises(OptionValueError, match="seed must be a non-negative integer"):
         reseed_generators(random.Random(), seed)
+
+
+# -- streams by name ------------------------------------------------------------------------------
+
+
+def draws(streams, *names):
+    return [streams[name].random() for name in names]
+
+
+def test_a_stream_depends_on_the_seed_and_its_name_alone():
+    one, other = Streams(3), Streams(3)
+    other["b"].random(100)
+    assert draws(one, "a", "a") == draws(other, "a", "a")
+    names = ["a", "b", "ab", "ba", "a\0", "", "\0", "\u00e4", *map(str, range(300))]
+    assert len(set(draws(Streams(3), *names) + draws(Streams(4), *names))) == 2 * len(names)
+    assert draws(Streams(), "a") != draws(Streams(), "a")
+
+
+@pytest.mark.parametrize("reseed", [Streams.reseed, reseed_generators])
+def test_streams_are_reseeded_in_place_and_those_to_come_as_well(reseed):
+    def future(seed, used):
+        streams = Streams(3)
+        held = streams["a"]
+        held.random(used)
+        reseed(streams, seed)
+        assert streams["a"] is held
+        return draws(streams, "a", "later")
+
+    assert future(1, 0) == future(1, 7)
+    assert not {*future(1, 0), *future(3, 0)} & {*future(2, 0), *draws(Streams(3), "a", "later")}
+
+
+def test_entities_that_hold_their_streams_are_reseeded_with_them():
+    model = SimpleNamespace(streams=Streams(3))
+    model.entities = [SimpleNamespace(chance=model.streams[name]) for name in "ab"]
+    assert reseed_generators(model, 5) == 1
+    assert [entity.chance.random() for entity in model.entities] != draws(Streams(3), "a", "b")
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda streams: pickle.loads(pickle.dumps(streams))])
+def test_streams_are_copied_as_they_stand(duplicate):
+    streams = Streams(3)
+    streams["a"].random()
+    twin = duplicate(streams)
+    assert draws(twin, "a", "b") == draws(streams, "a", "b")
+    assert twin["a"] is not streams["a"]
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "7", True])
+def test_streams_take_seeds(seed):
+    for refused in (Streams, Streams(1).reseed):
+        with pytest.raises(OptionValueError, match="seed must be a non-negative integer"):
+            refused(seed)

@@ -1,13 +1,18 @@
 """Each study runs from its command line to its figures, in a small way; those of learners are in ``tests/clients``."""
 
+import numpy as np
 import pytest
 from examples.greenhouse_coop import plan, train
 from examples.greenhouse_coop.env import DAYS, GreenhouseSim
+from examples.queue_admission.model import Queue
 from studies.debt_collection import study as debts
 from studies.demo import picture
 from studies.greenhouse_matrix import matrix, variants
 from studies.greenhouse_plans import figures as plans
 from studies.pension import study as pension
+from studies.queue_network import study as network
+
+from simenv_marl import simulate
 
 
 def big(path):
@@ -103,3 +108,15 @@ def test_pages_state_the_figures_of_the_finals():
 
     finals = pd.read_csv(results.DATA / "finals.csv", dtype={"library": str, "question": str})
     assert results.table(finals) == (results.FIGURES / "experiment.md").read_text()
+
+
+def test_queue_network_compares_two_learners_with_their_rules(capsys):
+    network.main(["--episodes", "150", "--trainings", "1", "--runs", "20"])
+    shown = capsys.readouterr().out
+    assert shown.count("both learned") == 3
+    alone = Queue(np.random.SeedSequence(3).generate_state(2).tolist()[0])
+    alone.clock.run(until=network.HORIZON)
+    both = simulate(network.NetworkSimulation, seed=3).model
+    assert both.first.present_value() == alone.present_value()  # what comes after it does not change it
+    first = network.train(150)["first"].table()
+    assert network.worth(first) > 1.1 * network.worth(network.ADMIT_ALL)

@@ -17,7 +17,7 @@ import pytest
 from examples.greenhouse_coop.env import GreenhouseSim
 from gymnasium import spaces
 
-from simenv_marl import TRUNCATED, SimEnvError
+from simenv_marl import TRUNCATED, SimEnvError, Streams
 from simenv_marl.errors import (
     CheckFailedError,
     OptionValueError,
@@ -135,6 +135,41 @@ def test_models_whose_agents_come_and_go_are_clean(simulation, points):
     if simulation is GreenhouseSim:
         assert re.fullmatch(r"\(update_air_exchange choose_water_amount\)\{\d+\}", report.calls)
         assert [part.agents for part in report.statistics] == ["waterer_0", "ventilator_0"]
+
+
+class Drunk(Walk):
+    """One of several that walk."""
+
+    def __init__(self, name, generator):
+        self.name, self.random, self.place, self.log = name, generator, 0.0, []
+
+
+class Crowd:
+    """Several walk, and draw from one generator."""
+
+    def reset(self, seed=None):
+        generators = self.generators(seed)
+        self.walkers = [Drunk(name, generators[name]) for name in ("ann", "bob", "cid")]
+
+    def generators(self, seed):
+        return dict.fromkeys(("ann", "bob", "cid"), np.random.default_rng(seed))
+
+    def run(self):
+        for walker in self.walkers:
+            walker.run()
+
+
+class CrowdOfStreams(Crowd):
+    def generators(self, seed):
+        return Streams(seed)
+
+
+def test_entities_that_share_generators_are_noted():
+    definitions = points(Drunk, agent=lambda walker: walker.name)
+    noted = finding(check_simulation(Crowd, definitions, episodes=2), "share random generators")
+    assert noted.severity == "note"
+    assert "1 for 3 agents, ann and bob among them" in noted.evidence
+    assert check_simulation(CrowdOfStreams, definitions, episodes=2).findings == ()
 
 
 def test_generators_and_functions_are_left_as_they_were():

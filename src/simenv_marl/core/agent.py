@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from math import isfinite
+from math import exp, isfinite
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 from weakref import ref
@@ -49,6 +49,8 @@ class Agent:
         offered: The choices of the latest decision, among which the rule's decision is looked up.
         rule_action: The action that corresponds to the rule's latest decision. None if it is not known.
         informs_rule_action: Whether the next info contains ``rule_action``.
+        rate: The rate at which infos discount. None: they do not.
+        read_clock: Notes the time, and returns an info: ``read_clock``, or ``read_discounted`` if there is a rate.
         now, answered_at: The times of the latest decision and of the one before.
         entity, rest, kwargs: The arguments of the latest decision: see ``keep``.
         group, notes: Used by runners of many episodes.
@@ -58,12 +60,14 @@ class Agent:
         "acted", "answered", "answered_at", "applying", "asked", "carried", "choices", "clock", "decided", "delegated",
         "deliver", "ended", "entity", "fallbacks", "group", "handed_out", "info", "informs_rule_action", "kwargs",
         "mask", "memory", "name", "notes", "now", "observation", "offered", "plugins", "point", "policy", "present",
-        "report", "rest", "reward", "rule_action", "update",
+        "rate", "read_clock", "report", "rest", "reward", "rule_action", "update",
     )  # fmt: skip
 
     def __init__(self, name: str, point: Point, plan: Plan, clock: Any) -> None:
         self.name, self.point, self.clock, self.plugins = name, point, clock, plan.plugins
         self.policy = policy = plan.policy_of(name, point)
+        self.rate = plan.options.discount_rate
+        self.read_clock: Callable[[Agent], dict[str, Any]] = read_clock if self.rate is None else read_discounted
         self.delegated = policy is not None and not (plan.rewarded and isinstance(policy, DeferredPolicy))
         self.deliver, self.report = point.deliver, point.report
         self.update: Callable[..., None] = point.updates[0]
@@ -215,7 +219,7 @@ class Agent:
 
     def inform(self) -> dict[str, Any]:
         """Make the info of an observation: the time, the action mask and the rule's action."""
-        info: dict[str, Any] = {} if self.clock is None else self.read_clock()
+        info: dict[str, Any] = {} if self.clock is None else self.read_clock(self)
         mask = self.mask
         if mask is not None:
             info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
@@ -223,19 +227,26 @@ class Agent:
             info["rule_action"], self.informs_rule_action = duplicate(self.rule_action), False
         return info
 
-    def read_clock(self) -> dict[str, Any]:
-        """Note the time. Return it, and the time elapsed since the agent's previous decision, as an info."""
-        clock: Any = self.clock
-        time, before = clock(), self.answered_at
-        self.now = now = time if type(time) is float else float(time)
-        return {"time": now, "elapsed": 0.0 if before is None else now - before}
-
     def clear_observation(self) -> None:
         """Set the reward to 0.0, and the info to that of an agent with nothing to observe and all actions legal."""
         self.reward, self.present = 0.0, False
-        self.info = {} if self.clock is None else self.read_clock()
+        self.info = {} if self.clock is None else self.read_clock(self)
         if self.point.legal is not None:
             self.info[MASK] = self.point.open_mask()
+
+
+def read_clock(agent: Agent) -> dict[str, Any]:
+    """Note the time. Return it, and the time elapsed since the agent's previous decision, as an info."""
+    clock: Any = agent.clock
+    time, before = clock(), agent.answered_at
+    agent.now = now = time if type(time) is float else float(time)
+    return {"time": now, "elapsed": 0.0 if before is None else now - before}
+
+
+def read_discounted(agent: Agent) -> dict[str, Any]:
+    """Read the clock, and add the discount of the elapsed time."""
+    info, rate = read_clock(agent), agent.rate or 0.0
+    return {**info, "discount": exp(-rate * info["elapsed"])}
 
 
 def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]]:
@@ -291,7 +302,7 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
         if type(reward) is not float or reward - reward != 0.0:  # spares nearly all rewards the call
             reward = checked_reward(agent, reward)
         agent.reward = reward
-        agent.info = {} if agent.clock is None else agent.read_clock()
+        agent.info = {} if agent.clock is None else agent.read_clock(agent)
         agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
 
     again = update_plainly if plain else update

@@ -445,7 +445,7 @@ def decide(agent: Agent, episode: Rounds, args: tuple[Any, ...], kwargs: dict[st
     if agent.point.legal is not None:
         agent.mask, agent.choices = agent.point.legal(args, kwargs)
     if agent.clock is not None:
-        agent.read_clock()
+        agent.read_clock(agent)
     return episode.use_action(agent)
 
 

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from inspect import cleandoc
+from math import inf
 from textwrap import indent
 from typing import Any, Literal, TypedDict, TypeVar
 
@@ -35,6 +36,7 @@ class _CommonOptions(TypedDict, total=False):
     agent: str | None
     skip_forced: bool
     clip_actions: bool
+    discount_rate: float | None
     plugins: Iterable[Any]
     global_rng: bool
     flatten: bool
@@ -75,6 +77,8 @@ class Options:
             agent of the only active decision point.
         skip_forced: Whether a decision with one legal choice is taken without asking for an action.
         clip_actions: Whether an action outside a ``Box`` space is clipped instead of refused.
+        discount_rate: The rate of continuous discounting, per unit of the simulation's ``time()``. Each info that has
+            ``elapsed`` then has ``discount``, which is exp(-discount_rate * elapsed). None: infos have no discount.
         max_steps: The number of calls of ``step`` with an action after which an episode is truncated. None: no limit.
         policies: Policies that decide instead of the environment's user: a dict from the name of an agent, or from a
             decision point (dotted name or function), to a callable. The callable gets the observation, or the
@@ -96,6 +100,7 @@ class Options:
     agent: str | None = None
     skip_forced: bool = False
     clip_actions: bool = False
+    discount_rate: float | None = None
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
     plugins: Iterable[Any] = ()
@@ -106,15 +111,18 @@ class Options:
 
     def __post_init__(self) -> None:
         agents, agent, space, steps = self.possible_agents, self.agent, self.state_space, self.max_steps
+        rate: Any = self.discount_rate
         groups = agents.values() if isinstance(agents, Mapping) else () if agents is None else (agents,)
         is_space = space is None or isinstance(space, spaces.Space) or space == "observations"
         is_count = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool) and steps >= 1
+        is_rate = isinstance(rate, (int, float, np.number)) and not isinstance(rate, bool) and 0 <= rate < inf
         policies = {} if self.policies is None else self.policies
         for name, is_allowed, expected in (
             ("driver", self.driver in ("greenlet", "thread"), '"greenlet" or "thread"'),
             ("possible_agents", all(map(_is_list, groups)), "a list of names, or a dict from points to lists of names"),
             ("undeclared", self.undeclared in ("error", "rule"), '"error" or "rule"'),
             ("agent", agent is None or (isinstance(agent, str) and agent), "the name of an agent or None"),
+            ("discount_rate", rate is None or is_rate, "a finite number that is not negative, or None"),
             ("clip_actions", isinstance(self.clip_actions, bool), "True or False"),
             ("global_rng", isinstance(self.global_rng, bool), "True or False"),
             ("skip_forced", isinstance(self.skip_forced, bool), "True or False"),

@@ -80,7 +80,46 @@ _SIMULATION: Final = 2
 """Whose generators are seeded: the three have separate streams. A base policy that draws from the generators of the
 process must not get the same numbers as the simulation."""
 
-_GENERATORS: Final = (random.Random, np.random.Generator, np.random.RandomState, np.random.BitGenerator)
+
+class Streams(dict[str, np.random.Generator]):
+    """The random generators of a model, by name: one for each entity or process, made when it is first asked for.
+
+    ::
+
+        self.streams = Streams(seed)
+        self.failures = self.streams[f"failures of {self.name}"]
+
+    What a generator draws depends on the seed and its name alone. So further entities, and their actions, change no
+    other entity's chance. This makes runs that differ in one action, or in one entity, comparable with few seeds.
+    """
+
+    def __init__(self, seed: int | None = None) -> None:
+        """Begin with no generators. ``seed``: a non-negative integer; None: one that the system draws."""
+        super().__init__()
+        self._key = np.random.SeedSequence(None if seed is None else _checked(seed))
+
+    def __missing__(self, name: str) -> np.random.Generator:
+        self[name] = generator = np.random.default_rng(self._stream(name))
+        return generator
+
+    def reseed(self, seed: int) -> None:
+        """Seed all generators in place, and those that are asked for later: for a simulation's ``reseed``.
+
+        Raises:
+            OptionValueError: The seed is not a non-negative integer.
+        """
+        self._key = np.random.SeedSequence(_checked(seed), spawn_key=(_FUTURES, _SIMULATION))
+        for name, generator in self.items():
+            _seed_bits(generator.bit_generator, self._stream(name))
+
+    def _stream(self, name: str) -> np.random.SeedSequence:
+        return np.random.SeedSequence(self._key.entropy, spawn_key=(*self._key.spawn_key, _NAMES, *name.encode()))
+
+
+_GENERATORS: Final = (Streams, random.Random, np.random.Generator, np.random.RandomState, np.random.BitGenerator)
+
+_NAMES: Final = 2**32 - 2
+"""The spawn key before the name of a stream. A model that spawns from the same seed never gets this key."""
 
 _ELSEWHERE: Final = (type, ModuleType, CodeType, np.ndarray, str, int, float, random.SystemRandom)
 """Classes that are not searched: they lead to everything in the process, or to nothing. Nor are functions."""
@@ -104,11 +143,11 @@ def generator_of_torch() -> Any:
 def reseed_generators(simulation: Any, seed: int) -> int:
     """Seed all random generators of a simulation, each with a stream of its own.
 
-    The generators are found in its attributes, in the attributes of these, and so on: ``random.Random``, and NumPy's
-    ``Generator``, ``RandomState`` and ``BitGenerator``. In a Mesa model these are ``random`` and ``rng``, which all of
-    its agents share. Each generator is seeded in place, so that all references to it stay valid. The same seed gives
-    the same states, whatever was drawn before. Several generators in one ``set`` get their streams in the order of the
-    set.
+    The generators are found in its attributes, in the attributes of these, and so on: ``random.Random``, NumPy's
+    ``Generator``, ``RandomState`` and ``BitGenerator``, and ``Streams``. In a Mesa model these are ``random`` and
+    ``rng``, which all of its agents share. Each generator is seeded in place, so that all references to it stay valid.
+    The same seed gives the same states, whatever was drawn before. Several generators in one ``set`` get their streams
+    in the order of the set.
 
     Modules, classes, functions and arrays are not searched. The global generators of Python and NumPy are left alone:
     an environment with ``global_rng=True`` seeds its own copies of these.
@@ -124,30 +163,28 @@ def reseed_generators(simulation: Any, seed: int) -> int:
         SimulationError: There are no generators.
         OptionValueError: The seed is not a non-negative integer.
     """
-    if not is_seed(seed):
-        raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
-    found = list(_generators(simulation))
+    key = np.random.SeedSequence(_checked(seed), spawn_key=(_FUTURES, _SIMULATION))
+    found = list(generators_of(simulation))
     if not found:
         raise SimulationError(
             f"{short_repr(simulation)} holds no random generator to seed: keep a random.Random or"
             " numpy.random.Generator in an attribute; make the environment with global_rng=True if the model draws from"
             " random or numpy.random; seed other libraries' generators in the simulation's reseed"
         )
-    streams = np.random.SeedSequence(int(seed), spawn_key=(_FUTURES, _SIMULATION)).spawn(len(found))
-    for generator, stream in zip(found, streams, strict=True):
-        if isinstance(generator, random.Random):
-            generator.seed(_integer(stream))
+    for generator, stream in zip(found, key.spawn(len(found)), strict=True):
+        if isinstance(generator, (Streams, random.Random)):
+            (generator.reseed if isinstance(generator, Streams) else generator.seed)(_integer(stream))
             continue
         legacy = isinstance(generator, np.random.RandomState)
         bits = getattr(generator, "_bit_generator" if legacy else "bit_generator", generator)
-        bits.__setstate__(type(bits)(stream).__getstate__())  # new NumPy: the seed sequence for ``spawn``, too
+        _seed_bits(bits, stream)
         if legacy:
             generator.set_state(bits.state)  # this drops the second normally distributed number
     return len(found)
 
 
-def _generators(simulation: Any) -> Iterator[Any]:
-    """Yield the generators that an object holds, the nearest first, each of them once."""
+def generators_of(simulation: Any) -> Iterator[Any]:
+    """Yield the generators that an object holds, the nearest first, each of them once. ``Streams`` count as one."""
     known = {id(PYTHON), id(NUMPY)}
     kinds: dict[type, bool | None] = {}  # whether objects of a class are generators; None: they are not searched
     level = [simulation]
@@ -163,9 +200,22 @@ def _generators(simulation: Any) -> Iterator[Any]:
             known.add(id(thing))
             if kinds[kind]:
                 yield thing
+                if isinstance(thing, Streams):
+                    known.update(map(id, thing.values()))
             else:
                 following.append(thing)
         level = get_referents(*following)
+
+
+def _seed_bits(bits: Any, stream: np.random.SeedSequence) -> None:
+    """Seed a bit generator in place."""
+    bits.__setstate__(type(bits)(stream).__getstate__())  # new NumPy: the seed sequence for ``spawn``, too
+
+
+def _checked(seed: Any) -> int:
+    if not is_seed(seed):
+        raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
+    return int(seed)
 
 
 def _integer(stream: np.random.SeedSequence) -> int:

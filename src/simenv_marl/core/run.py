@@ -11,6 +11,7 @@ from ..errors import (
     ClosedError,
     EpisodeOverError,
     NotResetError,
+    OptionValueError,
     ReentrancyError,
     annotate,
     clear_frames,
@@ -81,6 +82,11 @@ class Run:
         self.plan, self.simulation, self.driver, self.seed = plan, simulation, driver, seed
         self._rng, self._lock = rng, lock
         clock = getattr(simulation, "time", None)
+        if clock is None and plan.options.discount_rate is not None:
+            raise OptionValueError(
+                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no method time(); add"
+                " one that returns its clock, or leave out discount_rate"
+            )
         if clock is not None and (plan.plugins is not None or rng is not None):
             clock = _in_context(plan.plugins, rng, clock)  # views call it, too, outside of the context
         self.clock: Callable[[], float] | None = clock

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from copy import deepcopy
+from math import exp
 from typing import Any
 
 import numpy as np
@@ -97,6 +98,9 @@ class Joint:
             before, now = episode.last_time, float(episode.clock())
             episode.last_time = info["time"] = now
             info["elapsed"] = 0.0 if before is None else now - before
+            rate = episode.plan.options.discount_rate
+            if rate is not None:
+                info["discount"] = exp(-rate * info["elapsed"])
         return info
 
 

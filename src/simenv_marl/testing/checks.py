@@ -15,6 +15,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 
 from ..core.actions import MASK
 from ..core.plan import Plan
+from ..core.rng import Streams, generators_of
 from ..envs import VIEWS, view_class
 from ..errors import AgentError, InvalidActionError, error_text, short_repr
 from ..simulation import RULE, make_simulation, takes
@@ -226,7 +227,7 @@ class PointRecord:
         return PointStatistics(point, agents, self.decisions, observations, rewards, never)
 
 
-def _collect(records: Mapping[Any, PointRecord], acted: set[str], env: Any, agent: str, step: Any) -> None:
+def _collect(records: Mapping[Any, PointRecord], acted: dict[str, Any], env: Any, agent: str, step: Any) -> None:
     """Record a step of an episode. Rewards count only for agents that have acted in it."""
     bound = env._point(agent)
     record = records[bound.point.name, bound.agent]
@@ -237,7 +238,7 @@ def _collect(records: Mapping[Any, PointRecord], acted: set[str], env: Any, agen
         record.unfit = f"{agent} has observed {short_repr(observation)}; the space is {space}"
     if agent in acted:
         record.record("reward", reward)
-    acted.add(agent)
+    acted[agent] = bound
     if not (terminated or truncated):
         record.decisions += 1
         if isinstance(info.get(MASK), np.ndarray):
@@ -248,19 +249,23 @@ def check_episodes(subject: Subject, report: Report) -> None:
     """Play episodes with random legal actions; collect statistics; compare episodes of the same seed."""
     records = {(bound.point.name, bound.agent): PointRecord(bound) for bound in subject.plan.active}
     first, failures = None, 0
+    acted: dict[str, Any] = {}
     with report.opened(subject, max_steps=subject.max_steps) as env:
         seeds = islice(chain(subject.seeds, count(max(subject.seeds) + 1)), subject.episodes)
         for number, seed in enumerate(seeds, 1):
             if subject.late or failures == 3:
                 break
-            run = subject.run_randomly(env, seed, collect=partial(_collect, records, set()))
+            acted.clear()
+            run = subject.run_randomly(env, seed, collect=partial(_collect, records, acted))
             if run.error is not None:
                 failures += 1
                 report.add_error(run, f"in episode {number} of random legal actions, seed {seed}")
                 if isinstance(run.error, LimitReached):
                     break
                 continue
-            first = run if number == 1 else first
+            if number == 1:
+                first = run
+                _compare_generators(report, env.simulation, [agent for agent in acted if acted[agent].agent is None])
             report.episodes[run.result if len(run.actions) < subject.max_steps else "cut"] += 1
         called = {name for run in subject.plain.values() for name in run.calls}
         report.statistics = tuple(record.results(report, called) for record in records.values())
@@ -272,6 +277,14 @@ def check_episodes(subject: Subject, report: Report) -> None:
         if first is not None and not failures and subject.repeats:
             _compare_episodes(subject, report, env, first)
         subject.play(partial(env.reset, seed=subject.seeds[0]))  # to be closed in mid-episode
+
+
+def _compare_generators(report: Report, simulation: Any, entities: list[str]) -> None:
+    """Report fewer generators than entities that decide. A model without any was reported before."""
+    generators = list(generators_of(simulation))
+    number = sum(len(found) if isinstance(found, Streams) else 1 for found in generators)
+    if 0 < number < len(entities):
+        report.add("few_generators", f"{number} for {len(entities)} agents, {entities[0]} and {entities[1]} among them")
 
 
 def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -> None:

@@ -95,6 +95,9 @@ process share. The comparisons leave it out.""",
 If the model draws random numbers, reset() does not seed them. If it draws none, agents may memorise the episode.""",
         "same_rewards": """Rewards at {point} are always the same
 All random actions earned the same. Check the reward_mapping, unless only the length of the episode should count.""",
+        "few_generators": """Entities that decide share random generators
+What one of them draws changes what all others draw afterwards, so that actions are hard to compare on the same seeds
+and futures. Give each a generator of its own: see Streams, and "One stream for each entity" (docs/branches.md).""",
         "never_legal": """Some actions at {point} were never legal
 Either there were too few episodes for them to be legal, or the action space is larger than necessary.""",
     },

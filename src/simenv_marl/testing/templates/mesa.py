@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from mesa.discrete_space import CellAgent, OrthogonalVonNeumannGrid
 
-from simenv_marl import SteppedSimulation, aec_env, difference, evaluate, make_step
+from simenv_marl import SteppedSimulation, Streams, aec_env, difference, evaluate, make_step, reseed_generators
 
 # -- 1. The model: Mesa's agents, and a rule of their own -----------------------------------------
 
@@ -22,14 +22,19 @@ class Rabbit(CellAgent):
     def __init__(self, model: Any, cell: Any, energy: float) -> None:
         super().__init__(model)
         self.cell, self.energy, self.eaten = cell, energy, 0.0
+        self.chance = model.streams[f"rabbit_{self.unique_id}"]  # its own, which no other rabbit changes
 
     def places(self) -> list[Any]:
         """List the cells that it can be in next: its own, and the four beside it."""
         return [self.cell, *self.cell.connections.values()]
 
+    def anywhere(self) -> Any:
+        """Choose one of the places at random."""
+        return self.places()[self.chance.integers(len(self.places()))]
+
     def choose_cell(self) -> Any:
         """The rule: stay while there is something to eat, then go anywhere."""
-        return self.cell if self.model.grass[self.cell.coordinate] > 0.5 else self.random.choice(self.places())
+        return self.cell if self.model.grass[self.cell.coordinate] > 0.5 else self.anywhere()
 
     def step(self) -> None:
         """Do what a rabbit does in a day."""
@@ -50,6 +55,7 @@ class MyModel(mesa.Model):
 
     def __init__(self, rng: int | None = None) -> None:
         super().__init__(rng=rng)  # the model's own generators: the same seed brings the same run
+        self.streams = Streams(rng)
         self.grid = OrthogonalVonNeumannGrid((12, 12), torus=True, random=self.random)
         self.grass = self.rng.random((12, 12))
         for cell in self.random.sample(list(self.grid.all_cells), 12):
@@ -92,6 +98,10 @@ class MySimulation(SteppedSimulation):
 
     def __init__(self) -> None:
         super().__init__(MyModel, 50)
+
+    def reseed(self, seed: int) -> None:
+        """Draw another future, for planning."""
+        reseed_generators(self, seed)
 
 
 # -- 4. The environment, training, and what it is worth -------------------------------------------

@@ -3,7 +3,6 @@
 ``python -m simenv_marl.testing.templates.simpy`` trains the agent and compares it with the model's own rule.
 """
 
-import random
 import sys
 from collections import namedtuple
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import simpy
 from gymnasium.spaces import Box, Discrete
 
-from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, make_step, single_env
+from simenv_marl import TRUNCATED, SimulationInterface, Streams, difference, evaluate, make_step, single_env
 
 # -- 1. The model: SimPy's processes, and a rule of its own ---------------------------------------
 
@@ -24,7 +23,7 @@ class MyModel:
     """A paint shop. Jobs come at random, wait, and are painted one by one."""
 
     def __init__(self, seed: int | None = None) -> None:
-        self.random = random.Random(seed)  # the model's own generator: the same seed brings the same run
+        self.streams = Streams(seed)  # generators by name: the same seed brings the same run
         self.clock = simpy.Environment()
         self.waiting: list[Job] = []
         self.late = 0.0  # minutes of all finished jobs
@@ -33,10 +32,11 @@ class MyModel:
 
     def receive_orders(self) -> Any:
         """Let jobs come in: one in four is urgent."""
+        arrivals, kinds = self.streams["arrivals"], self.streams["kinds of jobs"]  # independent of each other
         while True:
-            due = self.clock.now + self.random.choice([20.0, 120.0, 120.0, 120.0])
-            self.waiting.append(Job(self.random.choice([4.0, 8.0, 20.0]), due))
-            yield self.clock.timeout(self.random.expovariate(1 / 11.0))
+            due = self.clock.now + kinds.choice([20.0, 120.0, 120.0, 120.0])
+            self.waiting.append(Job(kinds.choice([4.0, 8.0, 20.0]), due))
+            yield self.clock.timeout(arrivals.exponential(11.0))
 
     def paint(self) -> Any:
         """Paint one job after the other, as long as there are any."""
@@ -94,6 +94,10 @@ class MySimulation(SimulationInterface):
         """The clock, for ``info["time"]`` and ``info["elapsed"]``: decisions are not equally far apart."""
         return float(self.model.clock.now)
 
+    def reseed(self, seed: int) -> None:
+        """Draw another future, for planning."""
+        self.model.streams.reseed(seed)
+
 
 # -- 4. The environment, training, and what it is worth -------------------------------------------
 
@@ -119,6 +123,6 @@ def train(candidates: int, days: int) -> Any:
 if __name__ == "__main__":
     quick = "--quick" in sys.argv  # only to see that everything runs
     policies: dict[str, Any] = {"rule": {}, "trained": {"dispatcher_0": train(*(5, 2) if quick else (40, 20))}}
-    seeds = range(100_000, 100_005 if quick else 100_050)  # days that it was not trained on
+    seeds = range(100_000, 100_010 if quick else 100_050)  # days that it was not trained on
     print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")
     print(evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True).summary().round(1).to_string())

@@ -1,0 +1,132 @@
+"""Recordings of what was decided on the page: lines of JSON, and the episode that they describe."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from ... import RULE, aec_env
+from ...data import collect_episodes
+from ...errors import InvalidActionError, OptionValueError, ResetNeededError, StoreError, short_repr
+
+
+def jsonable(value: Any) -> Any:
+    """Return a value as JSON has it: arrays as lists, numbers that are not finite and other things as text."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(part) for part in value]
+    if isinstance(value, float) and not isfinite(value):
+        return str(value)
+    return value if value is None or isinstance(value, (str, int, float)) else short_repr(value)
+
+
+def action_of(space: spaces.Space[Any], value: Any) -> Any:
+    """Return the action for its JSON; what does not fit stays as it is, and the environment refuses it."""
+    if isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)):
+        with suppress(ValueError, OverflowError):
+            array = np.asarray(value)
+            return array.astype(space.dtype) if array.dtype.kind == "i" else value
+    if isinstance(space, spaces.Dict) and isinstance(value, dict) and value.keys() == space.spaces.keys():
+        return {key: action_of(part, value[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple) and isinstance(value, list) and len(value) == len(space.spaces):
+        return tuple(map(action_of, space.spaces, value))
+    return value
+
+
+def digest(observation: Any) -> str:
+    """Return a text that differs between observations that differ."""
+    return hashlib.sha256(json.dumps(jsonable(observation), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write(path: Path | None, line: Mapping[str, Any]) -> None:
+    """Append a line; nothing without a path. The file is open only meanwhile, so that clones need not copy it."""
+    if path is not None:
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(jsonable(line)) + "\n")
+        except OSError as error:
+            raise StoreError(f"the recording {path} cannot be written: {error}") from error
+
+
+def read(path: Any) -> list[tuple[int, list[dict[str, Any]]]]:
+    """Read the episodes of a recording: seeds, and the lines of decisions, each of which replaces those from its turn."""
+    episodes: list[tuple[int, list[dict[str, Any]]]] = []
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise StoreError(f"the recording {path} cannot be read: {error}") from error
+    for number, text in enumerate(lines, 1):
+        try:
+            line = json.loads(text)
+            if "seed" in line:
+                episodes.append((line["seed"], []))
+            elif "turn" in line:
+                episodes[-1][1][line["turn"] :] = [line]
+        except (ValueError, TypeError, LookupError) as error:
+            if number < len(lines):  # a last line may be torn
+                raise StoreError(f"line {number} of the recording {path} cannot be read: {error!r}") from error
+    return episodes
+
+
+def replay(path: Any, simulation: Any, points: Any = None, *, episode: int = -1, **options: Any) -> dict[str, Any]:
+    """Repeat a recorded episode, bit for bit, and return its trajectories, which ``save_dataset`` writes.
+
+    Args:
+        path: The file of ``--record``.
+        simulation: The simulation that was played, as ``aec_env`` takes it.
+        points: As ``aec_env`` takes them.
+        episode: Which of the file's episodes: an index. It is truncated after its last recorded decision.
+        **options: The options of ``aec_env``, as they were in the recorded episode: the page sets none.
+
+    Returns:
+        A dict from the name of each agent to its ``Trajectories``. What people decided has ``by_rule`` False.
+
+    Raises:
+        StoreError: The file cannot be read.
+        OptionValueError: There is no such episode, or the simulation does not repeat it.
+        BaseException: Any exception of the model.
+    """
+    episodes = read(path)
+    try:
+        seed, decisions = episodes[episode]
+    except IndexError:
+        raise OptionValueError(f"{path} has {len(episodes)} episodes, but not number {episode}") from None
+    if not decisions:
+        raise OptionValueError(f"nothing was decided in episode {episode} of {path}")
+    env, actions = aec_env(simulation, points, **options), list[Any]()
+    env.reset(seed=seed)
+    try:
+        for turn, line in enumerate(decisions):
+            while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
+                env.step(None)
+            agent = env.agent_selection if env.agents else None
+            if agent != line["agent"] or digest(env.observe(agent)) != line["seen"]:
+                raise OptionValueError(
+                    f"{short_repr(simulation)} does not repeat {path}: decision {turn} was one of {line['agent']!r},"
+                    f" and is now one of {agent!r}, or with another observation"
+                )
+            rule = line["action"] is None
+            actions.append(RULE if rule else action_of(env.action_space(agent), line["action"]))
+            env.step(actions[-1])
+    except (InvalidActionError, ResetNeededError) as error:
+        raise OptionValueError(f"{short_repr(simulation)} does not repeat {path}: {error}") from error
+    finally:
+        env.close()
+
+    def policy(observations: Any, infos: Any, identities: Any) -> list[Any]:
+        return [actions[turn] for _, turn in identities]
+
+    agents = dict.fromkeys((line["agent"] for line in decisions), policy)
+    extent: Any = {**options, "max_steps": len(actions)}
+    return collect_episodes(simulation, agents, seeds=[seed], points=points, **extent)

@@ -27,7 +27,10 @@ import numpy as np
 from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from ..errors import MissingExtraError, OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 
-EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots", "pyDOE": "design", "SALib": "design"}
+EXTRAS: Final = {
+    **{"joblib": "many", "tqdm": "many", "matplotlib": "plots", "pyDOE": "design", "SALib": "design"},
+    **dict.fromkeys(("starlette", "uvicorn", "websockets"), "play"),
+}
 """The extra that installs a package. All other packages belong to ``experiments``."""
 
 

@@ -12,11 +12,10 @@ import numpy as np
 from gymnasium import spaces
 
 from ...decision import inverse
-from ...errors import short_repr
+from ...errors import describe_error, short_repr
 from .recording import digest, jsonable
 
-MOST: Final = 12
-"""The most candidates of a decision, and the most entries of its observation in the history."""
+MOST: Final = 12  # candidates of a decision, and entries of its observation in the history
 
 
 def pending_decision(env: Any) -> dict[str, Any]:
@@ -68,18 +67,21 @@ def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
 
 
 def candidates_of(space: spaces.Space[Any], mask: Any) -> list[Any]:
-    """Return actions to try out, as JSON: the legal ones of a ``Discrete``, five of a bounded ``Box`` of one element."""
+    """Return actions to try out, as JSON: the legal ones of a ``Discrete``, five of a bounded ``Box`` of one number."""
     if isinstance(space, spaces.Discrete):
         legal = np.arange(space.n) if mask is None else np.flatnonzero(mask)
         return [int(space.start) + int(place) for place in legal[: MOST - 1]]
     if isinstance(space, spaces.Box) and space.low.size == 1 and space.is_bounded():
-        values = np.unique(np.linspace(space.low, space.high, 5).astype(space.dtype), axis=0)
-        return [value.tolist() for value in values]
+        return list(np.unique(np.linspace(space.low, space.high, 5).astype(space.dtype), axis=0).tolist())
     return []
 
 
-def picture_of(rendered: Any) -> dict[str, Any] | None:
-    """Return what ``render`` has returned as JSON: text, or the PNG of an array ``(height, width, 3)``, uint8."""
+def picture_of(env: Any) -> dict[str, Any] | None:
+    """Return what ``render`` returns as JSON: text, or the PNG of an array ``(height, width, 3)``, uint8."""
+    try:
+        rendered = None if env.render_mode is None else env.render()
+    except Exception as error:
+        rendered = f"render has failed: {describe_error(error)}"
     if not isinstance(rendered, np.ndarray):
         return None if rendered is None else {"text": str(rendered)[:20_000]}
     if rendered.ndim != 3 or rendered.shape[2] != 3 or rendered.dtype != np.uint8 or not rendered.size:

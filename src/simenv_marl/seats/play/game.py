@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from time import monotonic
@@ -18,32 +18,15 @@ from typing import Any, Final
 import numpy as np
 
 from ... import RULE, aec_env, clone
-from ...errors import (
-    InvalidActionError,
-    OptionValueError,
-    SimEnvError,
-    SimulationError,
-    StoreError,
-    UnknownAgentError,
-    describe_error,
-    did_you_mean,
-    error_text,
-    short_repr,
-)
+from ...errors import InvalidActionError, OptionValueError, SimEnvError, describe_error, did_you_mean, short_repr
 from .forms import MOST, candidates_of, pending_decision, picture_of
 from .recording import action_of, jsonable, write
 
-FUTURES: Final = 16
-"""The number of futures in which each candidate is tried out."""
+FUTURES: Final = 16  # in which each candidate is tried out
+CHECKPOINTS: Final = 24  # at most: each is a process
+SHOWN: Final = 150  # decisions that the page gets
 
-CHECKPOINTS: Final = 24
-"""The most checkpoints, each of which is a process."""
-
-SHOWN: Final = 150
-"""The number of decisions that the page gets."""
-
-Row = dict[str, Any]
-"""A decision as the page and the recording have it. ``before`` is the agent's return before it."""
+Row = dict[str, Any]  # a decision, as the page and the recording have it; "before" is the agent's return before it
 
 
 class Game:
@@ -53,24 +36,24 @@ class Game:
         self, simulation: Any, *, name: str, seats: Sequence[str], seed: int, limit: float | None, record: Path | None
     ) -> None:
         """Begin an episode. Without ``seats``, people play all agents."""
-        self.root = aec_env(simulation)
-        modes = self.root.metadata["render_modes"]
+        if limit is not None and not 0 < limit < 1e6:
+            raise OptionValueError(f"limit must be a positive number of seconds, not {limit}")
+        modes = aec_env(simulation).metadata["render_modes"]
         mode = next((mode for mode in ("rgb_array", "ansi") if mode in modes), None)
-        if mode is not None:
-            self.root = aec_env(simulation, render_mode=mode)
-        known = getattr(self.root, "possible_agents", None)
-        for seat in seats if known is not None else ():
-            if seat not in known:
-                raise UnknownAgentError(f"there is no agent {seat!r}; the agents are {known}{did_you_mean(seat, known)}")
+        self.root = aec_env(simulation, render_mode=mode)
+        known: list[str] = getattr(self.root, "possible_agents", [])
+        for seat in set(seats).difference(known or seats):
+            raise OptionValueError(f"there is no agent {seat!r}; the agents are {known}{did_you_mean(seat, known)}")
         self.name, self.given, self.limit, self.record = name, list(seats), limit, record
-        self.known = dict.fromkeys(self.given or known or ())
+        self.known = dict.fromkeys(self.given or known)
         self.taken: set[str] = set()  # the seats that somebody has
         self.late: Counter[str] = Counter()  # decisions that the rule took because of the limit
         self.checkpoints: dict[int, Any] = {}
+        self.ends: dict[str, tuple[int, float]] = {}  # of agents: when, and their returns
         self.env, self.horizon, self.forks = self.root, 8, True
         self.restart(seed)
         if self.failure or self.notice:
-            raise SimulationError(f"{name} cannot be played: {self.failure or self.notice}")
+            raise OptionValueError(f"{name} cannot be played: {self.failure or self.notice}")
 
     def restart(self, seed: int) -> None:
         """Begin another episode."""
@@ -80,7 +63,8 @@ class Game:
         self.delegated: Counter[str] = Counter()  # how many decisions of a seat are left to the rule
         self.skipping: str | None = None  # the seat for whose next decision the rule plays on
         self._return_to(None)
-        self._write({"simulation": self.name, "seed": seed, "seats": list(self.known)})
+        head = {"simulation": self.name, "seed": seed, "seats": list(self.known)}
+        self.notice = write(self.record, head) or self.notice
 
     def decide(self, action: Any, by: str) -> None:
         """Take the pending decision, by JSON or None for the rule. After an ``InvalidActionError``, it is pending."""
@@ -89,10 +73,10 @@ class Game:
         self.forget(self.turn)
         del self.line[self.turn + 1 :]
         row |= {"action": action, "by": by, "reward": None}
-        self._write({key: row[key] for key in ("turn", "agent", "action", "by", "seen", "time")})
+        kept = {key: row[key] for key in ("turn", "agent", "action", "by", "seen", "time")}
         self._arrive(self.turn + 1)
-        if self.over:
-            self._write({"end": self.over, "returns": self.returns()})
+        end = {"end": self.over, "returns": self.returns()} if self.over else {}
+        self.notice = write(self.record, kept | end) or self.notice
 
     def jump(self, turn: int) -> None:
         """Go to the decision of a person at a turn, or the one before it: from a checkpoint, or from the beginning."""
@@ -100,7 +84,7 @@ class Game:
         turn = max((place for place in persons if place <= turn), default=min(persons, default=0))
         self._return_to(max((key for key in self.checkpoints if key <= turn), default=None))
         for row in self.line[self.turn : turn]:
-            if not self.over:
+            if not self.over and self.line[self.turn] is row:  # else it does not repeat itself
                 self._step(row["agent"], row["action"])
                 self._arrive(self.turn + 1)
         self.delegated.clear()
@@ -117,14 +101,8 @@ class Game:
 
     def returns(self) -> dict[str, float]:
         """The return of each agent so far."""
-        pending = {agent: self.line[place]["before"] for agent, place in self.latest.items()}
-        return pending | {agent: total for agent, (_, total) in self.ends.items()}
-
-    def _write(self, line: Row) -> None:
-        try:
-            write(self.record, line)
-        except StoreError as error:
-            self.notice = str(error)
+        going = {agent: self.line[place]["before"] for agent, place in self.latest.items()}
+        return going | {agent: total for agent, (_, total) in self.ends.items()}
 
     def _step(self, agent: str, action: Any) -> None:
         legal = RULE if action is None else action_of(self.env.action_space(agent), action)
@@ -138,8 +116,7 @@ class Game:
     def _return_to(self, key: int | None) -> None:
         """Continue at a checkpoint, or at the beginning."""
         old, self.failure = self.env, ""
-        self.ends: dict[str, tuple[int, float]] = {} if key is None else self.ends
-        self.ends = {agent: end for agent, end in self.ends.items() if end[0] <= (key or 0)}
+        self.ends = {} if key is None else {agent: end for agent, end in self.ends.items() if end[0] <= key}
         self.latest: dict[str, int] = {row["agent"]: row["turn"] for row in self.line[: key or 0]}
         if key is not None:
             self.env = clone(self.checkpoints[key])
@@ -160,7 +137,7 @@ class Game:
         self.deadline: float | None = None
         self.fan: list[dict[str, Any]] = []
         self.told: dict[str, Any] = {"note": ""}  # with the rule's action, if it is known
-        self.picture = None
+        self.picture: dict[str, Any] | None = None
         while env.agents and not self.failure:
             agent = env.agent_selection
             _, reward, terminated, truncated, _ = env.last(observe=False)
@@ -217,7 +194,7 @@ class Game:
                 try:
                     changed = self.handle(seat, message)
                 except Exception as error:
-                    text = error_text(error) if isinstance(error, SimEnvError) else describe_error(error)
+                    text = str(error) if isinstance(error, SimEnvError) else describe_error(error)
                     reply, changed = {"type": "error", "text": text}, not isinstance(error, ValueError)
                 connection.send((number, reply))
                 if not changed:
@@ -239,9 +216,9 @@ class Game:
                 raise InvalidActionError("another decision is pending by now")
             if self.now["agent"] != seat:
                 raise InvalidActionError(f"it is not your turn: {self.now['agent']} decides")
-            action = message.get("action")
-            if (action is None) != (do == "rule"):
-                raise InvalidActionError("an action is missing, or is one too many")
+            action = message.get("action") if do != "rule" else None
+            if action is None and do != "rule":
+                raise InvalidActionError("the message has no action")
             if do == "try":
                 self._try(action)
             else:
@@ -250,11 +227,10 @@ class Game:
             self.delegated[seat], self.skipping = _whole(message, 0, 100_000), None
         elif do == "skip":
             self.skipping = seat
-        elif do == "undo":
-            self.jump(max((row["turn"] for row in self.line[: self.turn] if row["agent"] == seat), default=0))
-        elif do == "redo":
-            later = [row["turn"] for row in self.line[self.turn + 1 :] if row["agent"] == seat]
-            self.jump(min(later, default=len(self.line)))
+        elif do in ("undo", "redo"):
+            own = [row["turn"] for row in self.line if row["agent"] == seat and row["turn"] != self.turn]
+            before = max((turn for turn in own if turn < self.turn), default=0)
+            self.jump(before if do == "undo" else min((t for t in own if t > self.turn), default=len(self.line)))
         elif do == "jump":
             self.jump(_whole(message, 0, len(self.line)))
         elif do == "restart":
@@ -279,7 +255,7 @@ class Game:
 
     # -- what takes time ---------------------------------------------------------------------------
 
-    def work(self) -> Iterator[dict[str, Any] | None]:
+    def work(self) -> Generator[dict[str, Any] | None]:
         """Let the rule decide where no person does; then show the decision, and try out what may be decided."""
         shown = monotonic()
         while self.now is not None and self._leaves_to_rule(self.now["agent"]):
@@ -295,7 +271,7 @@ class Game:
             listed = [None, *candidates_of(space, self.now["mask"])]
             self.fan = self.fan or [{"action": action, "courses": []} for action in listed]
             self._set_deadline()
-        self.picture = self._render()
+        self.picture = None if self.failure else picture_of(self.env)
         yield self.snapshot()
         if self.now is not None:
             yield from self._think(self.now["agent"])
@@ -316,9 +292,8 @@ class Game:
             self.checkpoints[self.turn] = clone(self.env, method="fork")
         except SimEnvError:
             self.forks = False  # from now on, the way back is a replay
-        if len(self.checkpoints) > CHECKPOINTS:
-            for key in sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2]:
-                self.checkpoints.pop(key).close()
+        for key in sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2] if len(self.checkpoints) > CHECKPOINTS else ():
+            self.checkpoints.pop(key).close()
 
     def _think(self, agent: str) -> Iterator[dict[str, Any] | None]:
         """Try out the candidates, in futures that are the same for all of them."""
@@ -326,7 +301,7 @@ class Game:
         try:
             clone(self.env, seed=seeds[0]).close()
         except Exception as error:
-            self.told["note"], seeds = f"One future, in which chance is known: {error_text(error)}", [None]
+            self.told["note"], seeds = f"One future, in which chance is known: {error!s}", [None]
         for place, seed in enumerate(seeds):
             for candidate in [one for one in self.fan if len(one["courses"]) <= place]:
                 course: list[float] = []
@@ -363,14 +338,6 @@ class Game:
             fans.append({"action": candidate["action"], "n": len(courses), "bands": bands})
         return {"type": "fan", "turn": self.turn, "horizon": self.horizon, "candidates": fans} | self.told
 
-    def _render(self) -> dict[str, Any] | None:
-        if self.root.render_mode is None or self.failure:
-            return None
-        try:
-            return picture_of(self.env.render())
-        except Exception as error:
-            return {"text": f"render has failed: {describe_error(error)}"}
-
     def snapshot(self) -> dict[str, Any]:
         """Return all that the page shows but the futures, as JSON."""
         return {
@@ -405,7 +372,8 @@ def run_game(connection: Any, find: Callable[[], Any], options: dict[str, Any]) 
     try:
         game = Game(find(), **options)
     except Exception as error:
-        connection.send((None, {"type": "failed", "text": describe_error(error)}))
+        text = str(error) if isinstance(error, SimEnvError) else describe_error(error)
+        connection.send((None, {"type": "failed", "text": text}))
         return
     with suppress(EOFError, ConnectionError):
         game.serve(connection)

@@ -49,33 +49,29 @@ def digest(observation: Any) -> str:
     return hashlib.sha256(json.dumps(jsonable(observation), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def write(path: Path | None, line: Mapping[str, Any]) -> None:
-    """Append a line; nothing without a path. The file is open only meanwhile, so that clones need not copy it."""
-    if path is not None:
-        try:
+def write(path: Path | None, line: Mapping[str, Any]) -> str:
+    """Append a line, if there is a path; return what is wrong. It is open only meanwhile: clones need not copy it."""
+    try:
+        if path is not None:
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(jsonable(line)) + "\n")
-        except OSError as error:
-            raise StoreError(f"the recording {path} cannot be written: {error}") from error
+    except OSError as error:
+        return f"The recording {path} cannot be written: {error}"
+    return ""
 
 
 def read(path: Any) -> list[tuple[int, list[dict[str, Any]]]]:
-    """Read the episodes of a recording: seeds, and the lines of decisions, each of which replaces those from its turn."""
+    """Read the episodes of a recording: seeds and decisions, each of which replaces those from its turn on."""
     episodes: list[tuple[int, list[dict[str, Any]]]] = []
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise StoreError(f"the recording {path} cannot be read: {error}") from error
-    for number, text in enumerate(lines, 1):
-        try:
+        for text in Path(path).read_text(encoding="utf-8").splitlines():
             line = json.loads(text)
             if "seed" in line:
                 episodes.append((line["seed"], []))
-            elif "turn" in line:
+            else:
                 episodes[-1][1][line["turn"] :] = [line]
-        except (ValueError, TypeError, LookupError) as error:
-            if number < len(lines):  # a last line may be torn
-                raise StoreError(f"line {number} of the recording {path} cannot be read: {error!r}") from error
+    except (OSError, ValueError, TypeError, LookupError) as error:
+        raise StoreError(f"the recording {path} cannot be read: {error!r}") from error
     return episodes
 
 
@@ -95,22 +91,18 @@ def replay(path: Any, simulation: Any, points: Any = None, *, episode: int = -1,
     Raises:
         StoreError: The file cannot be read.
         OptionValueError: There is no such episode, or the simulation does not repeat it.
-        BaseException: Any exception of the model.
     """
     episodes = read(path)
-    try:
-        seed, decisions = episodes[episode]
-    except IndexError:
-        raise OptionValueError(f"{path} has {len(episodes)} episodes, but not number {episode}") from None
-    if not decisions:
-        raise OptionValueError(f"nothing was decided in episode {episode} of {path}")
+    if not -len(episodes) <= episode < len(episodes) or not episodes[episode][1]:
+        raise OptionValueError(f"nothing was decided in episode {episode} of the {len(episodes)} of {path}")
+    seed, decisions = episodes[episode]
     env, actions = aec_env(simulation, points, **options), list[Any]()
     env.reset(seed=seed)
     try:
         for turn, line in enumerate(decisions):
             while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
                 env.step(None)
-            agent = env.agent_selection if env.agents else None
+            agent = env.agent_selection if env.agents else ""
             if agent != line["agent"] or digest(env.observe(agent)) != line["seen"]:
                 raise OptionValueError(
                     f"{short_repr(simulation)} does not repeat {path}: decision {turn} was one of {line['agent']!r},"
@@ -128,5 +120,4 @@ def replay(path: Any, simulation: Any, points: Any = None, *, episode: int = -1,
         return [actions[turn] for _, turn in identities]
 
     agents = dict.fromkeys((line["agent"] for line in decisions), policy)
-    extent: Any = {**options, "max_steps": len(actions)}
-    return collect_episodes(simulation, agents, seeds=[seed], points=points, **extent)
+    return collect_episodes(simulation, agents, seeds=[seed], points=points, **{**options, "max_steps": len(actions)})

@@ -231,6 +231,8 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
         OptionValueError: An option has an invalid value, or the simulation cannot be played.
         ProcessDiedError: The process that plays has ended.
     """
+    if not 0 <= port < 65_536:
+        raise OptionValueError(f"there is no port {port}")
     context = get_context("spawn")  # which inherits nothing: neither threads nor sockets reach the clones
     connection, there = context.Pipe()
     options["seed"] = secrets.randbelow(2**31) if seed is None else seed
@@ -258,7 +260,7 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
     except EOFError:
         process.join()
         raise ProcessDiedError(f"the process of the game has ended, with exit code {process.exitcode}") from None
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         raise OptionValueError(f"nobody can connect to {host}, port {port}: {error}") from error
     finally:
         end()

@@ -122,7 +122,7 @@ class Table:
         if message.get("do") == "take":
             link.seat = seat
             self._tell_people()
-        elif link.open >= OPEN:
+        elif link.open >= OPEN or self.inbox.qsize() > OPEN * PAGES:
             return "the game is busy; try again"
         else:
             link.open += 1

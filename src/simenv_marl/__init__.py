@@ -24,6 +24,7 @@ All other names are in rooms, which are imported when they are first used:
 - ``simenv_marl.experiments``: evaluations, designs, resumable experiments, effects, variants;
 - ``simenv_marl.data``: trajectories, data sets, comparisons with the rule, plots;
 - ``simenv_marl.remote``: simulators in processes of their own;
+- ``simenv_marl.seats``: people and language models decide;
 - ``simenv_marl.testing``: checks of a simulation;
 - ``simenv_marl.errors``: the exception classes.
 
@@ -53,7 +54,7 @@ __all__ = [
     "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
 ]  # fmt: skip
 
-ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote", "testing")
+ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote", "seats", "testing")
 """The modules in which all other public names are."""
 
 _MODULES = {

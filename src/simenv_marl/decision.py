@@ -5,7 +5,7 @@ behaves like the function, whose body is the *rule*. But if the calling simulati
 environment for its decision. One function is one decision point, its hook, with any number of definitions.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
@@ -23,6 +23,9 @@ from .hooks.stacks import DIFFERENCES, EVALUATING
 
 Mapped = Callable[..., Any]
 """A mapping: a callable of the decision call's arguments, bound to the signature of the function that decides."""
+
+Labels = Mapped | Mapping[Any, str] | Sequence[str] | None
+"""Texts for the parts of a space, or a callable of the call's arguments that returns them."""
 
 
 # -- definitions ----------------------------------------------------------------------------------
@@ -55,6 +58,8 @@ class Definition:
     achieved_goal_mapping: Mapped | None
     desired_goal_mapping: Mapped | None
     compute_reward: Callable[[Any, Any, Any], Any] | None
+    action_labels: Labels
+    observation_labels: Labels
 
     def __post_init__(self) -> None:
         """Check the definition, and make callables of dicts; also after ``dataclasses.replace``.
@@ -116,6 +121,8 @@ def make_step(
     achieved_goal_mapping: Mapped | None = None,
     desired_goal_mapping: Mapped | None = None,
     compute_reward: Callable[[Any, Any, Any], Any] | None = None,
+    action_labels: Labels = None,
+    observation_labels: Labels = None,
 ) -> Definition:
     """Define a decision point: what its agent observes, may do and is rewarded with (paper, section 3.3).
 
@@ -162,6 +169,11 @@ def make_step(
         desired_goal_mapping: A callable like ``observation_space_mapping`` that returns the desired goal.
         compute_reward: A callable of achieved goals, desired goals and infos, of one step or stacked (shape ``(n,
             *goal_space.shape)``). It returns the reward of each, for learners that replay with other goals.
+        action_labels: What people and language models read instead of numbers: for a ``Discrete`` a sequence of texts,
+            or a dict from action to text; for a space with one dimension a sequence, with a text for each component;
+            for a ``Dict`` a dict; or a callable of the call's arguments that returns one of these. Default: choices
+            and decisions as text, else numbers.
+        observation_labels: The same for the parts of observations.
 
     Returns:
         The definition, which is a decorator for the function that decides.
@@ -189,6 +201,9 @@ def _problems(definition: Definition) -> Iterator[str]:
             fits, kind = fits or (isinstance(part, str) and part != ""), "a name or a callable"
         elif name in ("action_space_mapping", "rule_action_mapping"):
             fits, kind = fits or isinstance(part, Mapping), "a callable or a dict"
+        elif name.endswith("_labels"):
+            space = getattr(definition, name.removesuffix("_labels") + "_space")
+            fits, kind = fits or fit_labels(space, part), f"texts for the parts of {short_repr(space)}, or a callable"
         if not fits:
             yield f"{name} must be {kind}, not {short_repr(part)}"
     given = [name for name in ("action_space_mapping", "apply", "choices") if getattr(definition, name) is not None]
@@ -215,7 +230,7 @@ def _problems(definition: Definition) -> Iterator[str]:
         return
     if not isinstance(space, spaces.Discrete):
         yield f"a dict as action_space_mapping needs a Discrete action_space, not {space}"
-    actions = range(int(space.start), int(space.start + space.n))  # type: ignore[attr-defined]
+    actions = range(int(space.start), int(space.start + space.n))
     absent = [action for action in actions if action not in answers]
     surplus = [action for action in answers if action not in actions]
     if absent or surplus:
@@ -223,6 +238,21 @@ def _problems(definition: Definition) -> Iterator[str]:
             f"the dict action_space_mapping must have just the actions of {space}; missing: {absent}, not in the space:"
             f" {surplus}"
         )
+
+
+def fit_labels(space: Any, labels: Any) -> bool:
+    """Return whether labels are texts for the parts of a space."""
+    parts: Any = ()
+    if isinstance(space, spaces.Discrete):
+        parts = range(int(space.start), int(space.start + space.n))
+    elif isinstance(space, spaces.Dict):
+        parts = space.spaces
+    elif space is not None and space.shape is not None and len(space.shape) == 1:
+        parts = range(space.shape[0])
+    if isinstance(labels, Mapping):
+        return set(labels) == set(parts) and all(isinstance(text, str) for text in labels.values())
+    listed = isinstance(labels, Sequence) and not isinstance(labels, str) and not isinstance(space, spaces.Dict)
+    return listed and len(labels) == len(parts) and all(isinstance(text, str) for text in labels)
 
 
 def _answers(mapping: Any) -> Mapping[Any, Any] | None:

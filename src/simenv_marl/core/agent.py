@@ -18,7 +18,7 @@ from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
 from .actions import MASK, only_choice
 from .driver import WAIT
-from .planner import DeferredPolicy, PlannerPolicy
+from .policies import AskingPolicy, DeferredPolicy
 from .spaces import duplicate
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ class Agent:
         asked: Whether the user was asked for an action in this episode. Used where forced moves are skipped.
         carried: The sum of the rewards of forced moves. It is added to the agent's next reward.
         applying: How many of its actions are being applied, on the simulation's side. Meanwhile its calls run the rule.
-        consultations: How many decisions were put to a policy that gets the environment.
+        answered: How many of its decisions were answered: by the user, by a policy, or as forced moves.
+        fallbacks: How many of them a fallback has answered.
         observation: The latest observation, cast to its space. None before the first one.
         handed_out: The observation that a view has returned and must not return a second time.
         mask, choices: The legal actions of the pending decision, if the decision point restricts them.
@@ -54,8 +55,8 @@ class Agent:
     """
 
     __slots__ = (
-        "acted", "answered_at", "applying", "asked", "carried", "choices", "clock", "consultations", "decided",
-        "delegated", "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "kwargs",
+        "acted", "answered", "answered_at", "applying", "asked", "carried", "choices", "clock", "decided", "delegated",
+        "deliver", "ended", "entity", "fallbacks", "group", "handed_out", "info", "informs_rule_action", "kwargs",
         "mask", "memory", "name", "notes", "now", "observation", "offered", "plugins", "point", "policy", "present",
         "report", "rest", "reward", "rule_action", "update",
     )  # fmt: skip
@@ -68,7 +69,7 @@ class Agent:
         self.update: Callable[..., None] = point.updates[0]
         self.decided = self.acted = self.ended = self.present = self.asked = self.informs_rule_action = False
         self.reward = self.carried = 0.0
-        self.consultations = self.applying = 0
+        self.answered = self.applying = self.fallbacks = 0
         nothing: Any = None
         self.observation = self.handed_out = self.mask = self.choices = self.offered = self.rule_action = nothing
         self.entity = self.group = self.notes = nothing
@@ -122,16 +123,19 @@ class Agent:
         if policy is RULE:
             return RULE
         episode.latest = self
-        self.point.updates[0](self, args, kwargs, reward=False)
+        alone = isinstance(policy, AskingPolicy)
+        rewarded = alone and policy.asks
+        self.point.updates[0](self, args, kwargs, reward=rewarded)
         forced = self.only_action() if episode.skips else None
+        if rewarded and episode.skips:
+            self.add_carried_reward(carry_on=forced is not None)
         if forced is not None:
             return self.answer_forced(episode, forced)
         deferred = isinstance(policy, DeferredPolicy)
         if deferred and not episode.plan.solo:
             episode.pending = self
             return WAIT
-        if isinstance(policy, PlannerPolicy):
-            self.consultations += 1
+        if alone:
             self.keep(episode, args, kwargs)
         if episode.script:
             action = episode.script.popleft()

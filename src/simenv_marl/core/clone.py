@@ -172,6 +172,7 @@ def branch(
         try:
             twin = getattr(continuation, "unwrapped", continuation)
             twin._begin_branch()
+            twin._session.is_copy = True
             if seeds is not None:
                 seed_globals(int(seeds[number]), PROCESS)
                 twin._session.reseed(int(seeds[number]))

@@ -43,8 +43,8 @@ from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
 from .driver import WAIT
-from .planner import two_arguments
 from .points import declared_agents, overrides
+from .policies import policy_in_branch
 from .run import Run
 from .spaces import duplicate
 
@@ -159,6 +159,7 @@ class Episode(Run):
                 self.pending = agent
             raise
         agent.answered_at = agent.now
+        agent.answered += 1
         if turn:
             self.turns = turns = self.turns + 1
             if len(self.tape) < self.tape_size:
@@ -283,7 +284,9 @@ class Episode(Run):
     def delegate(self, policies: Mapping[str, Any]) -> None:
         """In a branch, let policies, given by agent, answer for agents that neither the user nor a policy answers."""
         given = {name: policy for name, policy in policies.items() if policy is not RULE and name not in self.agents}
-        self.plan = self.plan.with_policies({name: two_arguments(policy) for name, policy in given.items()})
+        self.plan = self.plan.with_policies(
+            {name: policy_in_branch(policy, name, self) for name, policy in given.items()}
+        )
         for name, agent in self.others.items():
             if name in given and agent.policy is RULE:
                 agent.policy = self.plan.policies[name]

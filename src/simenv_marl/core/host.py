@@ -26,7 +26,7 @@ DEEPEST: Final = 4
 DEPTH: Final[ContextVar[int]] = ContextVar("simenv_marl.core.host", default=0)
 """The depth of this branch."""
 
-FIELDS: Final = ("observation", "reward", "info", "mask", "acted", "decided", "ended", "present", "consultations")
+FIELDS: Final = ("observation", "reward", "info", "mask", "acted", "decided", "ended", "present", "answered")
 """What views read of an agent."""
 
 _fields: Final = attrgetter(*FIELDS)

@@ -86,6 +86,7 @@ class ForkedSession(Session):
     def __init__(self, original: Session, fork: Fork, time_limit: float) -> None:
         """Take over a process in which the episode of a session goes on."""
         self.plan, self.bound_plan = original.plan, None
+        self.is_copy = True
         self.state, self.options, self.seed = original.state, original.options, original.seed
         self.np_random_seed, self._np_random = original.np_random_seed, copy.deepcopy(original._np_random)
         self.exclusive = self.lock = ExclusiveLock()

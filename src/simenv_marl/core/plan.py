@@ -33,7 +33,6 @@ from .agent import make_updates
 from .driver import Driver
 from .greenlets import GreenletDriver
 from .options import Options
-from .planner import DeferredPolicy, PlannerPolicy, bind_session
 from .point import Point, Removal, given_simulation
 from .points import (
     agent_names,
@@ -46,6 +45,7 @@ from .points import (
     resolve_policies,
     resolve_roster,
 )
+from .policies import AskingPolicy, DeferredPolicy, bind_session
 from .split import Split
 from .threads import ThreadDriver
 
@@ -85,7 +85,7 @@ class Plan:
         active: The decision points that the environment's user answers.
         events: For each hook, the event that the simulation sends when its function is called.
         policies: By agent name, the policies of agents that are not agents of the environment.
-        is_bound_to_simulation: Whether a mapping asks for the simulation, or a policy asks for the environment.
+        is_bound_to_simulation: Whether a mapping asks for the simulation, or a policy is asked alone.
         has_planner: Whether a policy asks for the environment, and so may branch it.
         solo: Whether this is the plan of a branch that waits for one agent only.
         unmatched_names: The agents that ``policies`` and ``possible_agents`` name. Agents that do not appear in an
@@ -160,8 +160,9 @@ class Plan:
         self.plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
         self.unmatched_names = {*self.policies, *declared_agents(options.possible_agents)}
         policies = (*self._by_point.values(), *self.policies.values())
-        self.has_planner = any(isinstance(policy, PlannerPolicy) for policy in policies)
-        self.is_bound_to_simulation = self.has_planner or any(
+        alone = [policy for policy in policies if isinstance(policy, AskingPolicy)]
+        self.has_planner = any(policy.plans for policy in alone)
+        self.is_bound_to_simulation = bool(alone) or any(
             given_simulation(definition, None) is not definition for definition in self._definitions.values()
         )
         self._prepare_points()

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces as gym_spaces
 
-from ..decision import DecisionPoint, Definition, inverse
-from ..errors import InvalidActionError, MaskError, short_repr, warn_user
+from ..decision import DecisionPoint, Definition, fit_labels, inverse
+from ..errors import DefinitionError, InvalidActionError, MaskError, short_repr, warn_user
 from ..hooks.hook import BOUND
 from ..simulation import RULE, asks_for, positional
 from . import actions, spaces
@@ -128,6 +128,34 @@ class Point:
                 observation = {**observation, MASK: mask}
         return observation
 
+    # -- labels -----------------------------------------------------------------------------------
+
+    def action_labels(self, choices: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Return the texts of the actions for a call. Default: those of choices and decisions, else numbers."""
+        given, space = self.definition.action_labels, self.definition.action_space
+        if given is None and choices is not None:
+            given = dict(enumerate(map(str, choices)))
+        elif given is None and isinstance(space, gym_spaces.Discrete):
+            given = {action: str(decision) for decision, action in (inverse(self.definition) or {}).items()}
+        elif callable(given):
+            given = self._labels_for_call(given, space, args, kwargs)
+        return _labels(space, given)
+
+    def observation_labels(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Return the texts of the parts of an observation for a call."""
+        given, space = self.definition.observation_labels, self.definition.observation_space
+        return _labels(space, self._labels_for_call(given, space, args, kwargs) if callable(given) else given)
+
+    def _labels_for_call(self, function: Any, space: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        given = function(*args, **kwargs)
+        some = isinstance(given, Mapping) and isinstance(space, gym_spaces.Discrete)  # those of the legal actions
+        if not some and not fit_labels(space, given):
+            raise DefinitionError(
+                f"the labels of {self.point.name} for a call are {short_repr(given)}, which are not texts for the parts"
+                f" of {short_repr(space)}"
+            )
+        return given
+
     # -- actions ----------------------------------------------------------------------------------
 
     def open_mask(self) -> Any:
@@ -154,6 +182,19 @@ class Point:
 
 def _same(action: Any) -> Any:
     return action
+
+
+def _labels(space: Any, given: Any) -> Any:
+    """Return labels as a dict for a ``Discrete`` or ``Dict``, as a tuple for a space with one dimension, else None."""
+    if isinstance(space, gym_spaces.Discrete):
+        start = int(space.start)
+        texts = given if isinstance(given, Mapping) else dict(enumerate(given or (), start))
+        return {action: str(texts.get(action, action)) for action in range(start, start + int(space.n))}
+    if isinstance(space, gym_spaces.Dict):
+        return {key: key for key in space.spaces} if given is None else dict(given)
+    if space.shape is None or len(space.shape) != 1:
+        return None
+    return tuple(str(place) if given is None else given[place] for place in range(space.shape[0]))
 
 
 def _masked_parts(space: gym_spaces.Space[Any]) -> list[str]:

@@ -27,7 +27,7 @@ from ..errors import (
 from ..hooks.hook import unwrap
 from ..hooks.places import PlacedHook, all_classes, find_hook, is_importable, raw_attribute, resolve
 from ..simulation import RULE
-from .planner import two_arguments
+from .policies import two_arguments
 
 if TYPE_CHECKING:
     from .point import Point

@@ -38,18 +38,19 @@ class Session:
         seed, options: The seed of the latest episode, and the options that the latest ``reset`` got.
         episode: The current or latest episode. None before the first one, and after it was closed.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
+        is_copy: Whether it belongs to a clone or a branch.
         exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
         lock: The same lock, if steps need it, too. None if only the thread that began an episode can step it.
     """
 
     __slots__ = (
         "__weakref__", "_close", "_driver", "_installed", "_np_random", "_reset", "_rng", "bound_plan", "episode",
-        "exclusive", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state",
+        "exclusive", "is_copy", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state",
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:
         """Make the simulation, and set the plan's decision functions in the model."""
-        self.plan, self.state = plan, "new"
+        self.plan, self.state, self.is_copy = plan, "new", False
         self.bound_plan: Plan | None = None
         self.seed: int | None = None
         self.options: dict[str, Any] | None = None
@@ -194,6 +195,7 @@ class Session:
 
     def replay(self, other: Session) -> None:
         """Bring the simulation to the current decision of another session with the same plan, or raise an error."""
+        self.is_copy = True
         seed, options, in_rounds, tape, decision, last_time = other.recording()
         again = self.start(seed, options, in_rounds=in_rounds, script=tape)
         while again.script:
@@ -220,6 +222,7 @@ class Session:
 
     def inherit(self) -> None:
         """In a forked process: leave the episode's stack and simulation as they are when it ends, not unwound."""
+        self.is_copy = True
         self._driver.given_up, self._close = "belongs to the environment that was cloned", None
 
     def ask(self, name: str, *args: Any) -> Any:

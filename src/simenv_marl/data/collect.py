@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from inspect import isawaitable
 from math import isfinite
 from typing import Any, Final, Unpack
 
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
-from ..core.planner import PlannerPolicy, is_planner
 from ..core.points import Points
+from ..core.policies import PolicyWrapper, is_asked_alone
 from ..core.spaces import same
 from ..core.stacking import stacker, taken
 from ..errors import DefinitionError, OptionValueError, short_repr
@@ -34,6 +35,7 @@ def collect_episodes(
     points: Points = None,
     collect: Callable[[Any], Any] | None = None,
     batch_size: int = 1024,
+    concurrency: int = 64,
     workers: int = 0,
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
@@ -52,6 +54,7 @@ def collect_episodes(
         points: As ``simulate_many`` takes them.
         collect: A callable of a simulation that has just ended. What it returns is in ``collected``.
         batch_size: As ``simulate_many`` takes it.
+        concurrency: As ``simulate_many`` takes it.
         workers: As ``simulate_many`` takes them.
         progress: As ``simulate_many`` takes it.
         **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that has a policy counts as
@@ -65,9 +68,9 @@ def collect_episodes(
         BaseException: All other errors are those of ``simulate_many``.
     """
     policies, episodes = checked_policies(policies), list(enumerate(checked_seeds(seeds)))
-    check_options(batch_size, workers, collect)
+    check_options(batch_size, workers, collect, concurrency)
     plan = learners_plan(simulation, policies, points, options)
-    arguments = (simulation, policies, points, options), None if workers else plan, collect, batch_size
+    arguments = (simulation, policies, points, options), None if workers else plan, collect, batch_size, concurrency
     with progress_bar(len(episodes), progress) as bar:
         parts = list(spread(_play, arguments, episodes, workers, batch_size, bar))
     all_seeds = tuple(seed for _, seed in episodes)
@@ -86,15 +89,22 @@ class LeftToRule:
 
 
 def learners_plan(
-    simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any], *, all_points: bool = False
+    simulation: Any,
+    policies: Mapping[Any, Any],
+    points: Any,
+    options: Mapping[str, Any],
+    *,
+    all_points: bool = False,
+    alone: bool = False,
 ) -> Plan:
     """Return the plan of the episodes, in which a ``PolicyKey`` has the place of each policy.
 
-    With ``all_points``, entities without a policy are agents as well, whose decisions follow the rule.
+    With ``all_points``, entities without a policy are agents as well, whose decisions follow the rule. ``alone``: each
+    policy answers one decision at a time.
     """
     callables = {key: policy.policy if isinstance(policy, LeftToRule) else policy for key, policy in policies.items()}
     callables = {key: _follow_rule if policy is RULE else policy for key, policy in callables.items()}
-    options = {**options, "policies": policy_keys(callables, rewarded=True)}
+    options = {**options, "policies": policy_keys(callables, rewarded=True, alone=alone)}
     others = PolicyKey(len(policies), BatchPolicy(_follow_rule)) if all_points else None
     plan = Plan(simulation, points, options, unattended=True, rewarded=True, others=others)
     for place, policy in enumerate(policies.values()):
@@ -116,6 +126,7 @@ def _play(
     plan: Plan | None,
     collect: Callable[[Any], Any] | None,
     batch_size: int,
+    concurrency: int,
     episodes: list[tuple[int, int]],
     bar: Any,
 ) -> tuple[list[Records], list[Any]]:
@@ -129,7 +140,7 @@ def _play(
             collected[place] = collect(simulation)
         bar.update()
 
-    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder)
+    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder, concurrency)
     _, policies, *_ = arguments
     return recorder.records(plan, policies), collected
 
@@ -168,8 +179,10 @@ class Mixture:
                 raise OptionValueError(
                     f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
                 )
-            if is_planner(policy):
-                raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
+            if is_asked_alone(policy):
+                raise OptionValueError(
+                    f"{short_repr(policy)} answers one decision at a time, and a mixture asks in batches"
+                )
             number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
             if not number or not isfinite(weight) or weight < 0:
                 raise OptionValueError(
@@ -292,8 +305,8 @@ def compare_with_rule(
     shadows: dict[int, Any] = {}  # policies that record an action; one for each, so that keys share batches
     for policy in policies.values():
         shadows[id(policy)] = partial(_record, policy, BatchPolicy(policy))
-        if is_planner(policy):
-            shadows[id(policy)] = partial(_record_one, PlannerPolicy(policy))
+        if is_asked_alone(policy):
+            shadows[id(policy)] = _Shadow(policy)
     deciding = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
     collected = collect_episodes(simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options)
     return {key: _compare(collected[key], float(tolerance)) for key in policies}
@@ -305,10 +318,20 @@ def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: An
     return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 
 
-def _record_one(policy: PlannerPolicy, observation: Any, info: Any, *, _environment: Any) -> Any:
-    recorded = np.empty((), object)
-    recorded[()] = policy.answer(observation, info, _environment)
-    return RULE, {SHADOW: recorded}
+class _Shadow(PolicyWrapper):
+    """The same for a policy that answers one decision at a time."""
+
+    def __call__(self, observation: Any, info: Any, **asked: Any) -> Any:
+        answer = self.ask(self.policy, observation, info, asked)
+        return self._await(answer) if isawaitable(answer) else self._record(answer)
+
+    async def _await(self, answer: Any) -> Any:
+        return self._record(await answer)
+
+    def _record(self, action: Any) -> Any:
+        recorded = np.empty((), object)
+        recorded[()] = action
+        return RULE, {SHADOW: recorded}
 
 
 def _compare(found: Trajectories, tolerance: float) -> Comparison:

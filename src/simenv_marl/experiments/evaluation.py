@@ -20,7 +20,18 @@ from ..core.points import Points
 from ..data.plots import ABSENT, COLOURS, INK, PALE, interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
-from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Outcome, Returns, Runner, distinct_seeds, make_table, noting
+from .runner import (
+    FALLBACKS,
+    RUN_COLUMNS,
+    STATUS_COLUMNS,
+    TEAM,
+    Outcome,
+    Returns,
+    Runner,
+    distinct_seeds,
+    make_table,
+    noting,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -31,6 +42,9 @@ FIRST: Final = 16
 
 MOST_SEEDS: Final = 10_000_000
 """A difference that needs more seeds than this counts as none."""
+
+FALLBACK_LIMIT: Final = 0.05
+"""A contender with a larger share of decisions by fallbacks is marked."""
 
 LINES: Final = 200
 """The largest number of seeds that are drawn as lines."""
@@ -44,7 +58,8 @@ class Evaluation:
         frame: A ``DataFrame`` with one row for each contender, seed and agent, and one for the team, whose ``agent`` is
             ``"team"``. Columns: ``contender``, ``seed``, ``agent``, ``return`` (the undiscounted sum of rewards),
             ``length`` (the number of decisions; for the team, of all agents) and the metrics, which are the same in all
-            rows of an episode.
+            rows of an episode. Where a contender has a ``FallbackPolicy``, ``fallbacks`` is the number of decisions
+            that a fallback answered.
         baseline: The contender that all others are compared with, or None.
         confidence: The confidence level of the intervals.
 
@@ -80,7 +95,8 @@ class Evaluation:
             A table indexed by contender, with the columns ``mean``, ``low`` and ``high``. With a baseline also
             ``difference``, ``difference_low`` and ``difference_high``: the mean paired difference from the baseline on
             the same seeds. Bounds of which nothing is known are nan; the column ``note``, which is there only then,
-            says why.
+            says why. Where fallbacks are counted, ``fallbacks`` is the share of decisions that they answered, and the
+            note of a contender with more than 5 % of them says so.
         """
         values = self.values(metric)
         columns, rows, notes = ["mean", "low", "high"], {}, {}
@@ -96,6 +112,11 @@ class Evaluation:
                 rows[name] += [difference.mean(), low, high]
                 notes[name] = notes[name] or (note and f"differences: {note}")
             rows[self.baseline] += [0.0] * 3
+        for name, share in self._fallback_shares().items():
+            columns += [] if FALLBACKS in columns else [FALLBACKS]
+            rows[name].append(share)
+            if share > FALLBACK_LIMIT:
+                notes[name] = "; ".join(filter(None, [notes[name], f"{share:.0%} of decisions by a fallback"]))
         table = _by_contender(rows, columns)
         return table.assign(note=notes) if any(notes.values()) else table
 
@@ -155,6 +176,11 @@ class Evaluation:
             for row in values.to_numpy()[:LINES]:
                 axes[0].plot(range(len(names)), row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
             _draw_dots(axes[0], values, names, summary[["mean", "low", "high"]], 0.0)
+            shares = self._fallback_shares()
+            marked = {
+                name: f"{name}\n{share:.0%} fallbacks" for name, share in shares.items() if share > FALLBACK_LIMIT
+            }
+            label_below(axes[0], [marked.get(name, name) for name in names])
             axes[0].set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
             each = "each a line" if len(values) <= LINES else f"lines for {LINES} of them"
             each = "each a dot" if len(names) == 1 else each
@@ -167,6 +193,13 @@ class Evaluation:
                 axes[1].set_ylabel(f"difference from {baseline}, same seed")
                 axes[1].set_title("differences")
         return figure
+
+    def _fallback_shares(self) -> dict[str, float]:
+        """Return the share of decisions that a fallback answered, by contender; empty if they are not counted."""
+        if FALLBACKS not in self.frame:
+            return {}
+        team = self.frame[self.frame["agent"] == TEAM].groupby("contender", sort=False)[[FALLBACKS, "length"]].sum()
+        return {str(name): number / max(1, length) for name, number, length in team.itertuples()}
 
     def _differences(self, metric: str) -> dict[str, NDArray[np.float64]]:
         """Return the differences from the baseline, by other contender, in the order of the seeds."""
@@ -229,6 +262,7 @@ def evaluate(
     width: float | None = None,
     batched: bool = False,
     batch_size: int = 1024,
+    concurrency: int = 64,
     workers: int = 0,
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
@@ -253,6 +287,7 @@ def evaluate(
             growing distances.
         batched: Whether the policies are those of ``simulate_many``, which answer many decisions at once.
         batch_size: As ``simulate_many`` takes it, if ``batched``.
+        concurrency: As ``simulate_many`` takes it.
         workers: As ``simulate_many`` takes them.
         progress: As ``simulate_many`` takes it.
         **options: The options of ``simulate``.
@@ -270,7 +305,15 @@ def evaluate(
     """
     import_extra("pandas", "evaluate"), import_extra("scipy.stats", "evaluate")
     runner = Runner(
-        contenders, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers
+        contenders,
+        points,
+        options,
+        metric,
+        team,
+        batched=bool(batched),
+        batch_size=batch_size,
+        concurrency=concurrency,
+        workers=workers,
     )
     if not contenders:
         raise OptionValueError("contenders must be a dict, such as {'rule': {}}, but there are none")
@@ -300,7 +343,7 @@ def evaluate(
             for part in spread(_run, arguments, runs, workers, runner.batch_size, bar):
                 rows += part
             rows.sort(key=lambda row: names.index(row[0]))
-            evaluation = Evaluation(make_table((*RUN_COLUMNS, *runner.metrics), rows), baseline, float(confidence))
+            evaluation = Evaluation(make_table(runner.columns, rows), baseline, float(confidence))
             done = end
             if done == number or (width is not None and done >= FIRST and evaluation._widest() <= width):
                 break
@@ -324,7 +367,7 @@ def _run(
         for name, own in groupby(runs, itemgetter(0)):
             with noting(f"of the contender {name!r}"):
                 plan = runner.plan(simulation, name) if plans is None else plans[name]
-                runner.run(plan, [seed for _, seed in own], partial(report, name))
+                runner.run(plan, name, [seed for _, seed in own], partial(report, name))
     return [row for run in runs for row in rows[run]]
 
 

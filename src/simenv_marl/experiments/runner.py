@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -13,9 +13,8 @@ import numpy as np
 from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.planner import PlannerPolicy
 from ..core.points import declared_agents
-from ..core.session import Session
+from ..core.policies import has_fallback, waits
 from ..data.collect import learners_plan
 from ..decision import decision_points
 from ..errors import (
@@ -23,12 +22,10 @@ from ..errors import (
     OptionValueError,
     UnknownPointError,
     annotate,
-    close_after,
     did_you_mean,
     short_repr,
     warn_user,
 )  # fmt: skip
-from ..hooks.stacks import outside_simulation
 from ..many.batch import Group, run, takes_identities
 from ..many.parallel import import_extra
 from ..many.simulate import check_options, checked_seeds
@@ -43,16 +40,23 @@ TEAM: Final = "team"
 RUN_COLUMNS: Final = ("contender", "seed", "agent", "return", "length")
 """The first columns of tables, after the factors."""
 
+FALLBACKS: Final = "fallbacks"
+"""The column, after these, with the number of decisions that a fallback answered, if a contender has one."""
+
 STATUS_COLUMNS: Final = ("status", "error")
 """The last columns of the table of an experiment, after the metrics."""
 
 
 class Outcome(NamedTuple):
-    """The results of one episode: each agent's undiscounted return and number of decisions, and the metrics."""
+    """The results of one episode: each agent's undiscounted return and number of decisions, and the metrics.
+
+    ``fallbacks`` has the agents for which a fallback has answered, and how often.
+    """
 
     returns: dict[str, float]
     lengths: dict[str, int]
     metrics: dict[str, Any]
+    fallbacks: dict[str, int]
 
 
 class Returns(tuple[float, ...]):
@@ -101,10 +105,10 @@ class Runner:
 
     def __init__(
         self, contenders: Any, points: Any, options: Mapping[str, Any], metric: Any, team: Any, *, batched: bool,
-        batch_size: int, workers: int, factors: Sequence[str] = (),
+        batch_size: int, concurrency: int, workers: int, factors: Sequence[str] = (),
     ) -> None:  # fmt: skip
         """Check the arguments. ``factors`` are the columns of the design, whose names metrics must not have."""
-        check_options(batch_size, workers)
+        check_options(batch_size, workers, None, concurrency)
         if not isinstance(contenders, Mapping):
             raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
         for name, policies in contenders.items():
@@ -136,9 +140,11 @@ class Runner:
                 raise OptionValueError(
                     f"metric must be a callable of the simulation, or a dict of them, not {short_repr(metric)}"
                 )
-            if name in (*RUN_COLUMNS, *STATUS_COLUMNS, *factors):
+            if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS, *factors):
                 raise OptionValueError(f"the metric {name!r} has the name of another column; rename it")
-        self.batch_size = int(batch_size) if batched else 0
+        self.batch_size, self._concurrency = int(batch_size) if batched else 0, int(concurrency)
+        policies = [policy for own in contenders.values() for policy in own.values()]
+        self._fallbacks = (FALLBACKS,) if any(map(has_fallback, policies)) else ()
         self._team = team
         # They may be iterators, and every plan reads them.
         self._points = list(points) if isinstance(points, Iterator) else points
@@ -147,9 +153,10 @@ class Runner:
     def plan(self, simulation: Any, contender: str) -> Plan:
         """Return the plan of a contender's episodes. All agents whose rewards count decide in it."""
         policies, points, options = self.contenders[contender], self._points, self._options
+        alone = not self.batch_size
         with noting(f"of the contender {contender!r}"):
             try:
-                return learners_plan(simulation, policies, points, options, all_points=True)
+                return learners_plan(simulation, policies, points, options, all_points=True, alone=alone)
             except (AgentError, UnknownPointError) as error:
                 if points is not None:
                     raise
@@ -157,7 +164,9 @@ class Runner:
                 keys = dict.fromkeys(key for own in self.contenders.values() for key in own)
                 points = [key for key in keys if not isinstance(key, str) or "." in key] or None
                 with suppress(AgentError, UnknownPointError):
-                    plan = learners_plan(simulation, policies, points, options, all_points=points is not None)
+                    plan = learners_plan(
+                        simulation, policies, points, options, all_points=points is not None, alone=alone
+                    )
                     if points is None and decision_points():
                         warn_user(f"returns are not counted, because the decision points are not known: {error}")
                     return plan
@@ -177,57 +186,36 @@ class Runner:
                 f"{did_you_mean(name, present)}"
             )
 
-    def run(self, plan: Plan, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
+    def together(self, contender: str) -> int:
+        """Return how many episodes of a contender run together."""
+        waiting = any(map(waits, self.contenders[contender].values()))
+        return self.batch_size or (self._concurrency if waiting else 1)
+
+    def run(self, plan: Plan, contender: str, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
         """Run one episode for each seed. ``report`` gets the seed and its results when the simulation is closed."""
-        if not self.batch_size:
-            for seed in seeds:
-                self._run_alone(plan, seed, report)
-            return
         tally = Tally()
 
         def finish(place: int, simulation: Any) -> Callable[[], None]:
             return partial(report, seeds[place], tally.outcome(place, simulation, self.metrics))
 
-        run(plan, seeds, self.batch_size, finish, tally)
+        run(plan, seeds, self.together(contender), finish, tally, self._concurrency)
 
-    def _run_alone(self, plan: Plan, seed: int, report: Callable[[int, Outcome], None]) -> None:
-        """Run an episode whose policies answer one decision at a time."""
-        tally = Tally()
-        with noting(f"while the simulation was made; seed {seed}"):
-            session = Session(plan)
-        try:
-            with outside_simulation():
-                episode = session.start(seed, None)
-                context = episode.context if plan.options.global_rng else nullcontext
-                tally.pay(episode)
-                while (agent := episode.pending) is not None:
-                    tally.count(0, agent)
-                    if isinstance(agent.policy, PlannerPolicy):
-                        agent.consultations += 1
-                    try:
-                        with context():
-                            action = agent.policy(agent.observation, agent.info)
-                    except BaseException as error:
-                        episode.fail(error)
-                        raise
-                    episode.step(action)
-                    tally.pay(episode)
-                session.end()
-                with noting(f"after the simulation's end; seed {seed}"):
-                    outcome = tally.outcome(0, session.simulation, self.metrics)
-                    session.close()
-                    report(seed, outcome)
-        except BaseException as error:
-            close_after(error, session.close, "the simulation")
-            raise
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of ``rows``, with those of contender and seed before them."""
+        return (*RUN_COLUMNS, *self._fallbacks, *self.metrics)
 
     def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
-        """Return agent, return, length and metrics for each agent and for the team."""
+        """Return agent, return, length, fallbacks and metrics for each agent and for the team."""
         metrics = [outcome.metrics.get(name) for name in self.metrics]
-        rows = [(agent, value, outcome.lengths[agent], *metrics) for agent, value in outcome.returns.items()]
+        rows = []
+        for agent, of_agent in outcome.returns.items():
+            own = [outcome.fallbacks.get(agent, 0) for _ in self._fallbacks]
+            rows.append((agent, of_agent, outcome.lengths[agent], *own, *metrics))
         value: Any = sum(outcome.returns.values()) if self._team is None else self._team(Returns(outcome.returns))
+        fallbacks = [sum(outcome.fallbacks.values()) for _ in self._fallbacks]
         try:
-            return [*rows, (TEAM, float(value), sum(outcome.lengths.values()), *metrics)]
+            return [*rows, (TEAM, float(value), sum(outcome.lengths.values()), *fallbacks, *metrics)]
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
 
@@ -236,13 +224,13 @@ class Tally:
     """Counts the returns of agents while episodes run: a ``Watcher`` for ``run``, and for one episode alone."""
 
     def __init__(self) -> None:
-        self._accounts: dict[int, dict[str, list[Any]]] = {}  # by place of the episode, and by agent: return and length
+        self._accounts: dict[int, dict[str, list[Any]]] = {}  # by place and agent: return, length, fallbacks
 
     def count(self, place: int, agent: Agent) -> None:
         """Count a decision of an agent."""
         account = agent.notes
         if account is None:
-            account = agent.notes = self._accounts.setdefault(place, {}).setdefault(agent.name, [0.0, 0])
+            account = agent.notes = self._accounts.setdefault(place, {}).setdefault(agent.name, [0.0, 0, 0])
         account[1] += 1
 
     def record(self, group: Group, places: list[int], waiting: list[Any], *_: Any) -> None:
@@ -259,6 +247,7 @@ class Tally:
         for agent in paid:
             if agent.notes is not None:
                 agent.notes[0] += agent.reward
+                agent.notes[2] = agent.fallbacks
 
     def outcome(self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]) -> Outcome:
         """Return the results of an episode that is over."""
@@ -268,7 +257,8 @@ class Tally:
         returns = {name: float(account[0]) for name, account in accounts.items()}
         lengths = {name: account[1] for name, account in accounts.items()}
         values = {name: plain_value(f"the metric {name!r}", metric(simulation)) for name, metric in metrics.items()}
-        return Outcome(returns, lengths, values)
+        fallbacks = {name: account[2] for name, account in accounts.items() if account[2]}
+        return Outcome(returns, lengths, values, fallbacks)
 
 
 # -- seeds, values and tables ---------------------------------------------------------------------

@@ -27,7 +27,17 @@ from ..core.provenance import as_json, describe
 from ..errors import OptionValueError, SimEnvError, SimulationError, StoreError, describe_error, short_repr
 from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
 from ..simulation import make_simulation
-from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Returns, Runner, distinct_seeds, make_table, plain_value
+from .runner import (
+    FALLBACKS,
+    RUN_COLUMNS,
+    STATUS_COLUMNS,
+    TEAM,
+    Returns,
+    Runner,
+    distinct_seeds,
+    make_table,
+    plain_value,
+)
 from .store import Provenance, Result, Run, Store, Writer, to_json
 
 if TYPE_CHECKING:
@@ -49,6 +59,7 @@ def run_experiment(
     store: str | os.PathLike[str],
     batched: bool = False,
     batch_size: int = 1024,
+    concurrency: int = 64,
     workers: int = 0,
     progress: bool = False,
     retry_errors: bool = False,
@@ -71,6 +82,7 @@ def run_experiment(
         store: The folder of the experiment. It is created if it is missing.
         batched: As ``evaluate`` takes it. The seeds of a row then run together.
         batch_size: As ``evaluate`` takes it.
+        concurrency: As ``evaluate`` takes it.
         workers: As ``evaluate`` takes them. All of them write to the folder.
         progress: As ``evaluate`` takes it. The bar shows the remaining time.
         retry_errors: Whether failed runs are repeated.
@@ -92,7 +104,8 @@ def run_experiment(
     table, rows = _checked_design(design)
     keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
     runner = Runner(
-        contenders or {}, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
+        contenders or {}, points, options, metric, team, batched=bool(batched), batch_size=batch_size,
+        concurrency=concurrency, workers=workers,
         factors=list(table.columns),
     )  # fmt: skip
     if runner.contenders.get(BY_RULE):
@@ -157,7 +170,7 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
     for name in names:
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
-        if name in (*RUN_COLUMNS, *STATUS_COLUMNS):
+        if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS):
             raise OptionValueError(f"the factor {name!r} has the name of another column of the table; rename it")
         if names.count(name) > 1:
             raise OptionValueError(f"the factor {name!r} occurs twice")
@@ -298,11 +311,13 @@ def _run_seeds(make: Any, runner: Runner, write: Any, key: str, contender: str, 
         provenance: dict[str, Any] = {}  # unknown if the simulation cannot be made
         try:
             plan, provenance = _prepare(make, runner, key, contender)
-            runner.run(plan, list(remaining), report)
+            runner.run(plan, contender, list(remaining), report)
         except (KeyboardInterrupt, StoreError):
             raise
         except BaseException as error:
-            if runner.batch_size > 1 and len(remaining) > 1:  # running them one by one shows which of them failed
+            if (
+                runner.together(contender) > 1 and len(remaining) > 1
+            ):  # running them one by one shows which of them failed
                 for seed in remaining:
                     _run_seeds(make, runner, write, key, contender, [seed], bar)
                 return
@@ -327,11 +342,11 @@ def _make_frame(
                 own = [(*row, "ok", None) for row in runner.rows(result)]
             except Exception as error:  # raised by team=, which is called for stored runs, too
                 result = describe_error(error)
-        for row in own or [(TEAM, nan, 0, *[None] * len(runner.metrics), "error", result)]:
+        for row in own or [(TEAM, nan, 0, *[None] * (len(runner.columns) - len(RUN_COLUMNS)), "error", result)]:
             places.append(place)
             rows.append((contender, seed, *row))
     factors = table.iloc[places].reset_index(drop=True)
-    return factors.join(make_table((*RUN_COLUMNS, *runner.metrics, *STATUS_COLUMNS), rows))
+    return factors.join(make_table((*runner.columns, *STATUS_COLUMNS), rows))
 
 
 # -- variants -------------------------------------------------------------------------------------

@@ -138,7 +138,8 @@ class Store:
             returns = {name: float(value) for name, value in entry["returns"].items()}
             lengths = {name: int(entry["lengths"][name]) for name in returns}
             metrics = {name: plain_value(name, value) for name, value in entry["metrics"].items()}
-            result = Outcome(returns, lengths, metrics)
+            fallbacks = {name: int(number) for name, number in entry.get("fallbacks", {}).items()}
+            result = Outcome(returns, lengths, metrics, fallbacks)
             if row in texts and self.sample in ("", row) and run[1] not in self._parts:
                 parts = {run[1]: _parts_of(provenance)}
         self._versions.update(versions)

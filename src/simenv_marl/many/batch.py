@@ -12,7 +12,9 @@ decisions are asked in ``Group``s; all decisions of a group have the same spaces
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final, Protocol
@@ -20,12 +22,13 @@ from typing import Any, Final, Protocol
 import numpy as np
 from greenlet import getcurrent
 
+from ..core.awaiting import Answers as Awaited
 from ..core.context import reuse_resources
 from ..core.driver import WAIT
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.planner import DeferredPolicy, PlannerPolicy, is_planner, two_arguments
 from ..core.point import Point
+from ..core.policies import AskingPolicy, DeferredPolicy, is_asked_alone, two_arguments, waits
 from ..core.session import Session
 from ..core.spaces import duplicate
 from ..core.stacking import rows, stacker
@@ -47,15 +50,15 @@ class BatchPolicy:
         keys: The keys of ``policies`` that have this policy.
         policy: The policy, a callable of observations and infos.
         informed, identifying: Whether it takes the infos, and the identities of the decisions.
-        asking: Whether it asks for the environment and therefore answers one decision at a time.
+        alone: Whether it answers one decision at a time.
     """
 
-    def __init__(self, policy: Callable[..., Any]) -> None:
+    def __init__(self, policy: Callable[..., Any], *, alone: bool = False) -> None:
         self.keys: list[Any] = []
         self.policy: Callable[..., Any] = two_arguments(policy)
         self.informed = self.policy is policy
         self.identifying = self.informed and takes_identities(policy)
-        self.asking = isinstance(self.policy, PlannerPolicy)
+        self.alone = alone or isinstance(self.policy, AskingPolicy)
         self.groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
@@ -94,36 +97,36 @@ class PolicyKey(DeferredPolicy):
 
     def alone(self, episode: Any, agent: Any) -> Any:
         """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
-        if self.asked.asking:
+        if self.asked.alone:
             return self(agent.observation, agent.info)
         group = self.asked.group(agent.point)
         actions, _ = group.ask(group.stack([agent.observation]), [episode], [agent])
         return actions[0]
 
 
-class PlannerKey(PlannerPolicy, PolicyKey):
-    """A ``PolicyKey`` of a policy that asks for the environment and therefore answers one decision at a time."""
+class AskingKey(AskingPolicy, PolicyKey):
+    """A ``PolicyKey`` of a policy that is asked one decision at a time, because of what it asks for."""
 
     def __init__(self, place: int, asked: BatchPolicy, policy: Callable[..., Any]) -> None:
-        PlannerPolicy.__init__(self, policy)
+        AskingPolicy.__init__(self, policy)
         PolicyKey.__init__(self, place, asked)
 
 
-def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[Any, Any]:
+def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False, alone: bool = False) -> dict[Any, Any]:
     """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
-    ``rewarded``: whether episodes wait for policies that ask for the environment, too. Otherwise, such a policy is
-    called where it decides, since it answers one decision at a time.
+    ``rewarded``: whether episodes wait for all policies. Otherwise, a policy that is asked one decision at a time is
+    called where it decides, unless it has to be awaited. ``alone``: all are asked so.
     """
     known: dict[int, BatchPolicy] = {}
     found: dict[Any, Any] = {}
     for place, (key, policy) in enumerate(policies.items()):
         found[key] = policy
-        asks = is_planner(policy)
-        if policy is not RULE and callable(policy) and (rewarded or not asks):
-            asked = known.setdefault(id(policy), BatchPolicy(policy))
+        asks = is_asked_alone(policy)
+        if policy is not RULE and callable(policy) and (rewarded or not asks or waits(policy)):
+            asked = known.setdefault(id(policy), BatchPolicy(policy, alone=alone))
             asked.keys.append(key)
-            found[key] = PlannerKey(place, asked, policy) if asks else PolicyKey(place, asked)
+            found[key] = AskingKey(place, asked, policy) if asks else PolicyKey(place, asked)
     return found
 
 
@@ -164,13 +167,37 @@ class Group:
             agent.info = {}  # a policy may change its info; the next decision gets a new one
         try:
             identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
-            answers = _each(agents) if asked.asking else asked.answers(observations, infos, identities)
+            answers = asked.answers(observations, infos, identities)
             return read_answers(answers, asked, len(waiting), integers=self._discrete)
         except BaseException as error:
             number, seeds = len(waiting), ", ".join(str(episode.seed) for episode in waiting[:5])
             seeds = f"{'seed' if number == 1 else 'seeds'} {seeds}{' and others' if number > 5 else ''}"
             annotate(error, f"simenv_marl: in {asked!r}, asked for {number} decisions at once; {seeds}")
             raise
+
+    def ask_each(self, waiting: Sequence[Episode]) -> Answers:
+        """Ask a policy that answers one decision at a time, one after the other."""
+        answers = []
+        for episode in waiting:
+            with _noted(episode), episode.context() if episode.plan.options.global_rng else nullcontext():
+                answers.append(begun(episode, AskingPolicy.__call__))
+        return self.together(answers)
+
+    def together(self, answers: Sequence[Any]) -> Answers:
+        """Put answers to single decisions together."""
+        together: Any = answers
+        if all(type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping) for answer in answers):
+            extras = {name: np.stack([np.asarray(extra[name]) for _, extra in answers]) for name in answers[0][1]}
+            together = [action for action, _ in answers], extras
+        return read_answers(together, self.asked, len(answers), integers=self._discrete)
+
+
+def begun(episode: Episode, ask: Callable[..., Any]) -> Any:
+    """Ask the policy of the agent whose decision is pending."""
+    agent: Any = episode.pending
+    info, agent.info = agent.info, {}  # a policy may change its info; the next decision gets a new one
+    observation, policy = duplicate(agent.observation), agent.policy
+    return ask(policy, observation, info) if isinstance(policy, AskingPolicy) else policy(observation, info)
 
 
 def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = False) -> Answers:
@@ -186,19 +213,6 @@ def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = Fal
             " one action for each row of the observations, in their order"
         )
     return actions, extras
-
-
-def _each(agents: Sequence[Any]) -> Any:
-    """Ask a policy that asks for the environment, one decision after the other."""
-    answers = []
-    for agent in agents:
-        agent.consultations += 1
-        answers.append(agent.policy(duplicate(agent.observation), agent.info))
-        agent.info = {}
-    if not all(type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping) for answer in answers):
-        return answers
-    extras = {name: np.stack([np.asarray(extra[name]) for _, extra in answers]) for name in answers[0][1]}
-    return [action for action, _ in answers], extras
 
 
 # -- all of them ----------------------------------------------------------------------------------
@@ -225,20 +239,23 @@ def run(
     size: int,
     finish: Callable[[int, Any], Callable[[], None] | None],
     watcher: Watcher | None = None,
+    concurrency: int = 1,
 ) -> None:
-    """Run one simulation per seed, ``size`` at a time. After an error, all simulations are unwound.
+    """Run one simulation per seed, ``size`` at a time, of which ``concurrency`` wait for policies that are awaited.
+
+    After an error, these policies are cancelled, and all simulations are unwound.
 
     The plan has a ``PolicyKey`` for each policy. ``finish`` is called with the index of a seed and its simulation when
     the simulation has ended. If it returns a callable, that is called after the simulation is closed.
     """
-    simulations = _Simulations(plan, seeds, size, finish, watcher)
+    simulations = _Simulations(plan, seeds, size, finish, watcher, concurrency)
     with outside_simulation(), reuse_resources():
         try:
             simulations.refill()
             while simulations.sessions:
-                # Waiting for large groups saves calls of policies.
-                simulations.answer(max(simulations.groups, key=lambda group: len(group.waiting)))
+                simulations.proceed()
         except BaseException as error:
+            simulations.awaited.cancel()
             left = simulations.sessions.items()
             close_all(((f"the simulation of seed {seeds[place]}", session) for place, session in left), error)
             raise
@@ -253,33 +270,62 @@ class _Simulations:
     size: int
     finish: Callable[[int, Any], Callable[[], None] | None]
     watcher: Watcher | None
+    concurrency: int
 
     def __post_init__(self) -> None:
         self.crowd = min(self.size, CROWD)
+        self.backlog: deque[tuple[int, Episode]] = deque()  # decisions for policies that are awaited
+        self.awaited = Awaited()
         self.next = 0
         self.sessions: dict[int, Session] = {}  # by the place of their seed
         self.groups: dict[Group, None] = {}
+
+    def proceed(self) -> None:
+        """Have decisions answered, and run their simulations to their next decisions."""
+        while self.backlog and len(self.awaited) < self.concurrency:
+            place, episode = self.backlog.popleft()
+            with _noted(episode):
+                self.awaited.add((place, episode), begun(episode, AskingPolicy.begin))
+        # Waiting for large groups saves calls of policies.
+        group = max(self.groups, key=lambda group: len(group.waiting), default=None)
+        if group is not None and group.waiting and not self.awaited.ready:
+            self.answer(group)
+            return
+        (place, episode), answer = self.awaited.take()
+        agent: Any = episode.pending
+        group = agent.policy.asked.group(agent.point)
+        recorded = None if self.watcher is None else group.stack([agent.observation])
+        with _noted(episode):
+            answers = group.together([answer.result()])
+        self.move(group, [place], [episode], recorded, answers)
+        self.refill()
 
     def answer(self, group: Group) -> None:
         """Have the decisions of a group answered, and run each simulation to its next decision."""
         waiting, group.waiting = group.waiting, []
         places, group.places = group.places, []
         observations, group.observations = group.observations, []
-        watcher, number, begun = self.watcher, len(waiting), perf_counter()
+        watcher, number, start = self.watcher, len(waiting), perf_counter()
         recorded = None if watcher is None else group.stack(observations)  # policies may change what they get
-        agents = [episode.pending for episode in waiting]
-        answers = group.ask(group.stack(observations), waiting, agents)
+        if group.asked.alone:
+            answers = group.ask_each(waiting)
+        else:
+            answers = group.ask(group.stack(observations), waiting, [episode.pending for episode in waiting])
         asked = perf_counter()
+        self.move(group, places, waiting, recorded, answers)
+        if 2 * number > self.crowd < self.size and asked - start > perf_counter() - asked:
+            self.crowd = min(self.size, 2 * self.crowd)
+        self.refill()
+
+    def move(self, group: Group, places: list[int], waiting: list[Any], observations: Any, answers: Answers) -> None:
+        """Run simulations whose decisions were answered to their next ones."""
         actions = list(map(_checked, waiting, answers[0]))
-        if watcher is not None:
-            watcher.record(group, places, waiting, recorded, answers)
+        if self.watcher is not None:
+            self.watcher.record(group, places, waiting, observations, answers)
         step_all(waiting, actions)
         waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
         for place in places:
             self._queue(place, waiting.pop())
-        if 2 * number > self.crowd < self.size and asked - begun > perf_counter() - asked:
-            self.crowd = min(self.size, 2 * self.crowd)
-        self.refill()
 
     def refill(self) -> None:
         """Start simulations until the limit is reached."""
@@ -301,6 +347,10 @@ class _Simulations:
         agent = episode.pending
         if agent is None:
             self._end(place)
+            return
+        if getattr(agent.policy, "waits", False):
+            self.crowd = min(self.size, max(self.crowd, self.concurrency))
+            self.backlog.append((place, episode))
             return
         group = agent.group
         if group is None:
@@ -333,6 +383,16 @@ def _checked(episode: Episode, action: Any) -> Any:
     try:
         return action if action is RULE else agent.point.checked(action, agent.name, agent.mask)
     except InvalidActionError as error:
+        episode.annotate(error)
+        raise
+
+
+@contextmanager
+def _noted(episode: Episode) -> Iterator[None]:
+    """Note in errors at which decision they arose."""
+    try:
+        yield
+    except BaseException as error:
         episode.annotate(error)
         raise
 

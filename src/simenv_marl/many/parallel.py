@@ -25,11 +25,19 @@ from typing import Any, Final
 import numpy as np
 
 from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
+from ..core.policies import COUNTS, add_counts
 from ..errors import MissingExtraError, OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 
 EXTRAS: Final = {
-    **{"joblib": "many", "tqdm": "many", "matplotlib": "plots", "pyDOE": "design", "SALib": "design"},
-    **dict.fromkeys(("starlette", "uvicorn", "websockets"), "play"),
+    "joblib": "many",
+    "tqdm": "many",
+    "matplotlib": "plots",
+    "pyDOE": "design",
+    "SALib": "design",
+    "openai": "language",
+    "starlette": "play",
+    "uvicorn": "play",
+    "websockets": "play",
 }
 """The extra that installs a package. All other packages belong to ``experiments``."""
 
@@ -80,18 +88,20 @@ def spread(
     processes = max(1, joblib.effective_n_jobs(workers))
     size = max(1, ceil(len(items) / (share * processes)), min(least, ceil(len(items) / processes)))
     parts = [items[start : start + size] for start in range(0, len(items), size)]
-    parcel = _pack_with_names((work, arguments))
+    parcel, home = _pack_with_names((work, arguments)), os.getpid()
     try:
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
     except ValueError:  # this backend returns nothing before all work is done
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
     # Errors are packed in the worker, because each backend would pass them on in its own way.
-    outcomes = parallel(joblib.delayed(pack_outcome)(pack, _work, parcel, part) for part in parts)
+    outcomes = parallel(joblib.delayed(pack_outcome)(pack, _work, parcel, home, part) for part in parts)
     try:
         for part, outcome in zip(parts, outcomes, strict=True):
             result, error = unpack_outcome(outcome)
             if error is not None:
                 raise error
+            result, counts = result
+            add_counts(counts)
             bar.update(len(part))
             yield result
     finally:
@@ -115,15 +125,21 @@ def _pack_with_names(thing: Any) -> bytes:
     return pack((thing, named)) if named else parcel
 
 
-def _work(parcel: bytes, items: list[Any]) -> Any:
-    """Call the function, in a worker. The functions it refers to by name are put into the main module."""
+def _work(parcel: bytes, home: int, items: list[Any]) -> tuple[Any, dict[str, dict[str, float]]]:
+    """Call the function, in a worker; return its result, and what policies have counted, unless it is at ``home``.
+
+    The functions it refers to by name are put into the main module.
+    """
+    is_away = os.getpid() != home
+    if is_away:
+        COUNTS.clear()
     (work, arguments), named = unpack(parcel)
     main = sys.modules["__main__"]
     for name, found in named.items():
         if name in _received or not hasattr(main, name):
             setattr(main, name, found)
             _received.add(name)
-    return work(*arguments, items, NO_BAR)
+    return work(*arguments, items, NO_BAR), COUNTS if is_away else {}
 
 
 # -- processes of their own -----------------------------------------------------------------------

@@ -62,6 +62,7 @@ def simulate_many(
     points: Points = None,
     collect: Callable[[Any], Any] | None = None,
     batch_size: int = 1024,
+    concurrency: int = 64,
     workers: int = 0,
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
@@ -69,7 +70,7 @@ def simulate_many(
     """Run one simulation per seed, with policies that answer the decisions of many simulations in batches.
 
     Each simulation ends as it would end with ``simulate`` and the same policies. The results do not depend on
-    ``batch_size`` and ``workers``, as long as a policy's answer to one row does not depend on the other rows.
+    ``batch_size``, ``concurrency`` and ``workers``, as long as a policy's answer to one row does not depend on others.
 
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
@@ -82,7 +83,8 @@ def simulate_many(
             sequence, or a dict of these. ``RULE`` in place of one action, or of all, leaves the decision to the model.
             A tuple of actions and a dict is allowed; the dict is ignored here (see ``collect_episodes``). If several
             keys have the same policy object, their decisions share batches. One batch never mixes different spaces. The
-            policies of a ``Variant`` answer one decision at a time.
+            policies of a ``Variant`` answer one decision at a time; so do policies that ask for ``_environment`` or
+            ``_decision``, and coroutine functions, which are awaited.
         seeds: The seeds of the simulations, non-negative integers.
         points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor ``policies``, there are
             no decision points and the plain models run.
@@ -90,6 +92,7 @@ def simulate_many(
             simulation itself.
         batch_size: The largest number of simulations that are suspended together, in each worker process. At most 256
             are suspended while the policies take less time than the simulations.
+        concurrency: How many decisions of each process wait at once for policies that are coroutine functions.
         workers: The number of worker processes, which ``joblib`` runs. 0: this process alone. -1: as many as joblib's
             backend has. The simulation, points, policies, options and collected values must be picklable, by reference
             or by value.
@@ -108,9 +111,9 @@ def simulate_many(
             All other simulations are unwound first.
     """
     checked, episodes = checked_seeds(seeds), (simulation, checked_policies(policies), points, options)
-    check_options(batch_size, workers, collect)
+    check_options(batch_size, workers, collect, concurrency)
     plan = _draw_up(*episodes)  # errors show up before any work starts
-    arguments = episodes, None if workers else plan, collect, batch_size
+    arguments = episodes, None if workers else plan, collect, batch_size, concurrency
     with progress_bar(len(checked), progress) as bar:
         return list(chain.from_iterable(spread(_simulate, arguments, checked, workers, batch_size, bar)))
 
@@ -120,7 +123,13 @@ def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options:
 
 
 def _simulate(
-    episodes: tuple[Any, ...], plan: Plan | None, collect: Any, batch_size: int, seeds: list[int], bar: Any
+    episodes: tuple[Any, ...],
+    plan: Plan | None,
+    collect: Any,
+    batch_size: int,
+    concurrency: int,
+    seeds: list[int],
+    bar: Any,
 ) -> list[Any]:
     """Simulate some of the seeds, in this process."""
     results: list[Any] = [None] * len(seeds)
@@ -129,7 +138,7 @@ def _simulate(
         results[place] = ended if collect is None else collect(ended)
         bar.update()
 
-    run(plan or _draw_up(*episodes), seeds, batch_size, finish)
+    run(plan or _draw_up(*episodes), seeds, batch_size, finish, concurrency=concurrency)
     return results
 
 
@@ -154,11 +163,15 @@ def checked_policies(policies: Any) -> Mapping[Any, Any]:
     return policies or {}
 
 
-def check_options(batch_size: Any, workers: Any, collect: Any = None) -> None:
+def check_options(batch_size: Any, workers: Any, collect: Any = None, concurrency: Any = 1) -> None:
     """Check the options that all functions for many simulations have."""
     if collect is not None and not callable(collect):
         raise OptionValueError(f"collect must be a callable of a simulation, or None, not {short_repr(collect)}")
-    for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
+    for name, value, least in (
+        ("batch_size", batch_size, 1),
+        ("concurrency", concurrency, 1),
+        ("workers", workers, -1),
+    ):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"
             raise OptionValueError(f"{name} must be {what}, not {short_repr(value)}")

@@ -23,7 +23,7 @@ from gymnasium import spaces
 from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
 from ..core.clone import pending_view
-from ..core.planner import PLANNING, PlannerPolicy, base_of, two_arguments
+from ..core.policies import PLANNING, AskingPolicy, base_of, stand_in, two_arguments
 from ..core.rng import is_seed
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
@@ -140,9 +140,11 @@ class Player:
         policy: Any = self._policies.get(name)
         if policy is None:
             base: Any = base_of(self.base, name) if name == self.agent or isinstance(self.base, Mapping) else RULE
+            base = stand_in(base)
             policy = base if base is RULE else two_arguments(base)
-            if isinstance(policy, PlannerPolicy):
-                policy = partial(policy.answer, environment=self.env)
+            if isinstance(policy, AskingPolicy):
+                record = self.record if name == self.agent else self.episode.agents[name]
+                policy = partial(policy.ask, episode=self.episode, agent=record, environment=self.env, in_clone=True)
             self._policies[name] = policy
         return RULE if policy is RULE else policy(*self._observe(name))
 

@@ -12,7 +12,7 @@ from zlib import crc32
 import numpy as np
 
 from ..core.clone import branch
-from ..core.planner import PLANNING
+from ..core.policies import PLANNING, AskingPolicy
 from ..core.session import checked_seed
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
@@ -127,7 +127,8 @@ class Rollouts:
         self.states: Any = None  # those that are kept, if a search keeps some: see ``tree``
         self.seconds = 0.0  # for a step
         self._times: list[list[float]] = []  # the simulation's times between decisions, in each rollout
-        number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
+        consulted = isinstance(player.record.policy, AskingPolicy)
+        number = player.record.answered if consulted else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
         self._name = player.view._plan.name

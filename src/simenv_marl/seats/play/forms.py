@@ -11,37 +11,34 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from ...decision import inverse
+from ...core.pending import decision_of
 from ...errors import describe_error, short_repr
-from .recording import digest, jsonable
+from ..descriptions import labelled
+from ..policies import digest_of
+from .recording import jsonable
 
 MOST: Final = 12  # candidates of a decision, and entries of its observation in the history
 
 
 def pending_decision(env: Any) -> dict[str, Any]:
     """Return the pending decision of an AEC environment as JSON; called in the process where it lives."""
-    agent, record = env.agent_selection, env.episode.pending
-    observation, reward, _, _, info = env.last()
-    space, labels = env.action_space(agent), dict[Any, Any]()
-    if isinstance(space, spaces.Discrete):
-        answers = inverse(record.point.definition) or {}
-        labels = dict(enumerate(record.choices or ())) or {action: answer for answer, action in answers.items()}
+    decision = decision_of(env.episode, env.episode.pending)
     return {
-        "agent": agent,
-        "time": jsonable(info.get("time")),
-        "doc": (record.point.point.function.__doc__ or "").strip().partition("\n")[0],
-        "reward": reward,
-        "observation": [list(entry) for entry in _entries(observation)][:64],
-        "space": describe_space(space),
-        "mask": jsonable(info.get("action_mask")),
-        "labels": {str(int(action)): str(label)[:80] for action, label in labels.items()},
-        "seen": digest(observation),
+        "agent": decision.agent,
+        "number": decision.number,
+        "time": jsonable(decision.time),
+        "doc": (decision.doc or "").strip().partition("\n")[0],
+        "reward": decision.reward,
+        "observation": [*_entries(labelled(decision.observation, decision.observation_labels))][:64],
+        "space": describe_space(decision.action_space),
+        "mask": jsonable(decision.mask),
+        "labels": jsonable(decision.action_labels),
+        "seen": digest_of(decision.observation),
     }
 
 
 def _entries(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the entries of an observation: name, and number or text."""
-    value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
     if isinstance(value, Mapping):
         for key, part in value.items():
             yield from _entries(part, f"{name} {key}".strip())

@@ -8,7 +8,8 @@ let socket, state = null, fan = null, people = { taken: {}, spectators: 0 }, wid
 
 const show = (value) => typeof value === "number" ? (Number.isInteger(value) ? String(value) : String(+value.toPrecision(3)))
   : Array.isArray(value) ? value.map(show).join(", ") : typeof value === "string" ? value : JSON.stringify(value);
-const name = (action) => action === null ? "the rule" : state.pending?.labels[action] ?? show(action);
+const name = (action) => action === null ? "the rule"
+  : (state.pending?.space.kind === "discrete" && state.pending.labels?.[action]) || show(action);
 const mine = () => Boolean(seat && state.pending && state.pending.agent === seat);
 const send = (message) => socket.readyState === 1 && socket.send(JSON.stringify({ ...message, seat, key }));
 const decide = (message) => mine() && send({ turn: state.turn, ...message });
@@ -39,9 +40,9 @@ function scale(values) { // to the height of a drawing
 
 // -- inputs: an element, and functions that get and set the JSON of the action -----------------------
 
-function boxInput(low, high, whole, label) {
+function boxInput(low, high, whole, label, labels) {
   if (Array.isArray(low)) {
-    const parts = low.map((part, i) => boxInput(part, high[i], whole, low.length > 1 ? `${label}[${i}]` : label));
+    const parts = low.map((part, i) => boxInput(part, high[i], whole, labels?.[i] ?? (low.length > 1 ? `${label}[${i}]` : label)));
     return { element: make("div", {}, ...parts.map((part) => part.element)), get: () => parts.map((part) => part.get()),
       set: (values) => parts.forEach((part, i) => part.set(values[i])) };
   }
@@ -55,19 +56,19 @@ function boxInput(low, high, whole, label) {
   return { element, get: () => number.value === "" ? "" : Number(number.value), set: (value) => { number.value = slider.value = value; } };
 }
 
-function gridInput({ sizes, starts }, mask) {
+function gridInput({ sizes, starts }, mask, labels) {
   const parts = sizes.map((size, i) => [...Array(size).keys()].map((j) =>
     make("input", { type: "radio", name: `part${i}`, value: j + starts[i], disabled: Boolean(mask && !mask[i][j]) })));
   parts.forEach((radios) => { radios.find((radio) => !radio.disabled).checked = true; });
   const texts = (radios) => radios.map((radio) => make("label", { className: "pick" }, radio, ` ${radio.value}`));
-  return { element: make("div", {}, ...parts.map((radios, i) => make("fieldset", {}, make("legend", {}, `Part ${i}`), ...texts(radios)))),
+  return { element: make("div", {}, ...parts.map((radios, i) => make("fieldset", {}, make("legend", {}, labels?.[i] ?? `Part ${i}`), ...texts(radios)))),
     get: () => parts.map((radios) => Number(radios.find((radio) => radio.checked).value)),
     set: (values) => parts.forEach((radios, i) => radios.forEach((radio) => { radio.checked = +radio.value === values[i]; })) };
 }
 
-function inputFor(space, mask) {
-  if (space.kind === "box" && [space.low].flat(9).length <= 64) return boxInput(space.low, space.high, space.whole, "Action");
-  if (space.kind === "grid" && space.sizes.length <= 64) return gridInput(space, mask);
+function inputFor(space, mask, labels) {
+  if (space.kind === "box" && [space.low].flat(9).length <= 64) return boxInput(space.low, space.high, space.whole, "Action", labels);
+  if (space.kind === "grid" && space.sizes.length <= 64) return gridInput(space, mask, labels);
   const text = make("textarea", { rows: 3 }), element = make("label", {}, `The action, as JSON: ${space.text || "numbers"}`, text);
   return { element, get: () => JSON.parse(text.value), set: (value) => { text.value = JSON.stringify(value); } };
 }
@@ -84,12 +85,12 @@ function actionButton(action, text, shortcut, disabled = false) {
 }
 
 function drawDecision() {
-  const { space, mask, doc, agent } = state.pending;
+  const { space, mask, doc, agent, labels } = state.pending, few = space.kind === "discrete" && space.n <= 200;
   $("whose").textContent = `Decide for ${agent}`;
   $("doc").textContent = doc;
   for (const id of ["inputs", "actions"]) $(id).replaceChildren();
-  widget = space.kind === "discrete" ? null : inputFor(space, mask);
-  for (let i = 0; i < space.n; i++)
+  widget = few ? null : inputFor(space, mask, labels);
+  for (let i = 0; few && i < space.n; i++)
     actionButton(i + space.start, name(i + space.start), i < 10 ? String((i + 1) % 10) : "", Boolean(mask && !mask[i]));
   if (widget) {
     const submit = (what) => { try { decide({ do: what, action: widget.get() }); } catch { problem("This is not JSON."); } };

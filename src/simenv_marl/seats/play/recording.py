@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,6 +15,7 @@ from gymnasium import spaces
 from ... import RULE, aec_env
 from ...data import collect_episodes
 from ...errors import InvalidActionError, OptionValueError, ResetNeededError, StoreError, short_repr
+from ..policies import digest_of
 
 
 def jsonable(value: Any) -> Any:
@@ -42,11 +42,6 @@ def action_of(space: spaces.Space[Any], value: Any) -> Any:
     if isinstance(space, spaces.Tuple) and isinstance(value, list) and len(value) == len(space.spaces):
         return tuple(map(action_of, space.spaces, value))
     return value
-
-
-def digest(observation: Any) -> str:
-    """Return a text that differs between observations that differ."""
-    return hashlib.sha256(json.dumps(jsonable(observation), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def write(path: Path | None, line: Mapping[str, Any]) -> str:
@@ -103,7 +98,7 @@ def replay(path: Any, simulation: Any, points: Any = None, *, episode: int = -1,
             while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
                 env.step(None)
             agent = env.agent_selection if env.agents else ""
-            if agent != line["agent"] or digest(env.observe(agent)) != line["seen"]:
+            if agent != line["agent"] or digest_of(env.observe(agent)) != line["seen"]:
                 raise OptionValueError(
                     f"{short_repr(simulation)} does not repeat {path}: decision {turn} was one of {line['agent']!r},"
                     f" and is now one of {agent!r}, or with another observation"

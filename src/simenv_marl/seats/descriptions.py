@@ -1,0 +1,260 @@
+"""Pending decisions in words, and words as actions, by the labels of ``make_step``."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from ..core.clone import pending_view
+from ..core.pending import Decision, decision_of
+from ..errors import InvalidActionError, ViewError, short_repr
+
+MOST: int = 200
+"""The largest number of parts of an observation that are listed one by one."""
+
+
+def describe(env_or_decision: Any, *, as_json: bool = False) -> Any:
+    """Describe the pending decision: who decides, when, what is observed, which actions are legal, the last reward.
+
+    Args:
+        env_or_decision: An environment in mid-episode, with or without wrappers; or a ``Decision``, which policies get
+            as ``_decision``.
+        as_json: Whether to return a dict for ``json.dumps`` instead of a text. Its keys are ``agent``, ``point``,
+            ``number``, ``time``, ``observation``, ``actions`` and ``reward``; ``actions`` is a JSON schema of what
+            ``parse`` takes.
+
+    Raises:
+        ResetNeededError: No decision is pending.
+        ViewError: The actions cannot be described, because their space has no names or numbers.
+    """
+    if not isinstance(env_or_decision, Decision):
+        return pending_view(env_or_decision, "describe").call(_describe_pending, as_json)
+    decision = env_or_decision
+    observation = labelled(decision.observation, decision.observation_labels)
+    if as_json:
+        return {
+            "agent": decision.agent,
+            "point": decision.point,
+            "number": decision.number,
+            "time": decision.time,
+            "observation": observation,
+            "actions": action_schema(decision),
+            "reward": decision.reward,
+        }
+    time = "" if decision.time is None else f", time {decision.time:.6g}"
+    lines = [f"{decision.agent} decides (decision {decision.number}{time}).", "Observation:"]
+    lines += _listed(observation)
+    lines += [f"Reward of the previous action: {decision.reward:.6g}", "Legal actions:"]
+    return "\n".join([*lines, *_legal_lines(decision)])
+
+
+def parse(env_or_decision: Any, text: str) -> Any:
+    """Return the action that a text names: by its label, by its value, or as JSON such as ``{"action": "open"}``.
+
+    Components of arrays and dicts are a JSON list, or a JSON object with their labels or keys.
+
+    Raises:
+        InvalidActionError: The text names no legal action. The error says which are legal.
+        ResetNeededError: No decision is pending.
+    """
+    if not isinstance(env_or_decision, Decision):
+        return pending_view(env_or_decision, "parse").call(_parse_pending, text)
+    decision, said = env_or_decision, text.strip()
+    try:
+        value = json.loads(said)
+    except ValueError:
+        value = said
+    is_wrapped = isinstance(value, Mapping) and set(value) == {"action"}
+    if is_wrapped and not (isinstance(decision.action_space, spaces.Dict) and "action" in decision.action_space.spaces):
+        value = value["action"]
+    elif isinstance(decision.action_space, spaces.Discrete) and not isinstance(value, str):
+        value = said  # a label may look like a number
+    try:
+        action = _action(decision.action_space, decision.action_labels, value, legal_labels(decision))
+        return _checked(decision, action)
+    except (InvalidActionError, ValueError, TypeError, LookupError, OverflowError):
+        legal = "\n".join(_legal_lines(decision))
+        raise InvalidActionError(
+            f"{short_repr(text)} names no legal action of {decision.agent!r}; these are legal:\n{legal}"
+        ) from None
+
+
+def _checked(decision: Decision, action: Any) -> Any:
+    """Check an action, and return it as a member of the action space."""
+    decision.checked(action)
+    return action
+
+
+def _pending(env: Any) -> Decision:
+    """Return the pending decision of an environment of this process."""
+    episode = env.unwrapped.episode
+    return decision_of(episode, episode.pending or episode.consulted)
+
+
+def _describe_pending(env: Any, as_json: bool) -> Any:
+    return describe(_pending(env), as_json=as_json)
+
+
+def _parse_pending(env: Any, text: str) -> Any:
+    return parse(_pending(env), text)
+
+
+# -- what is observed -----------------------------------------------------------------------------
+
+
+def labelled(value: Any, labels: Any) -> Any:
+    """Return an observation as values for JSON, by the labels of its parts."""
+    if isinstance(value, Mapping):
+        return {str((labels or {}).get(key, key)): labelled(part, None) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return [labelled(part, None) for part in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        plain = [_plain(number) for number in value.tolist()] if np.ndim(value) == 1 else _plain(value.tolist())
+        if isinstance(labels, Sequence) and labels and np.ndim(value) == 1:
+            return dict(zip(labels, plain, strict=True))
+        value = plain
+    if isinstance(labels, Mapping) and not isinstance(value, (list, dict)):
+        return labels.get(value, value)  # of a Discrete
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """Round numbers of 32 bits to the digits that they have, and return others as they are."""
+    if isinstance(value, list):
+        return [_plain(part) for part in value]
+    return float(f"{value:.7g}") if isinstance(value, float) else value
+
+
+def _listed(observation: Any) -> list[str]:
+    if isinstance(observation, Mapping) and len(observation) <= MOST:
+        return [f"- {name}: {_text(part)}" for name, part in observation.items()]
+    return [f"- {_text(observation)}"]
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else json.dumps(value, default=str, ensure_ascii=False)
+
+
+# -- what is legal --------------------------------------------------------------------------------
+
+
+def legal_labels(decision: Decision) -> dict[str, int]:
+    """Return the legal actions of a ``Discrete`` space by label; an empty dict for other spaces."""
+    space: Any = decision.action_space
+    if not isinstance(space, spaces.Discrete):
+        return {}
+    mask, start = decision.mask, int(space.start)
+    labels: Any = decision.action_labels
+    legal = [action for action in range(start, start + int(space.n)) if mask is None or mask[action - start]]
+    occurrences = Counter(labels[action] for action in legal)
+    return {
+        labels[action] if occurrences[labels[action]] == 1 else f"{labels[action]} ({action})": action
+        for action in legal
+    }
+
+
+def _legal_lines(decision: Decision) -> list[str]:
+    labels = legal_labels(decision)
+    if labels:
+        return [f"- {label}" for label in labels]
+    space = decision.action_space
+    lines = _parts(space, decision.action_labels)
+    if decision.mask is not None:
+        lines.append(f"- of these, the mask allows {short_repr(decision.mask)}")
+    return lines
+
+
+def _parts(space: spaces.Space[Any], labels: Any) -> list[str]:
+    """Return lines that say what the parts of an action are."""
+    if isinstance(space, spaces.Dict):
+        return [f"- {labels[key] if labels else key}: {_limits(part)}" for key, part in space.spaces.items()]
+    if isinstance(space, spaces.Tuple):
+        return [f"- {place}: {_limits(part)}" for place, part in enumerate(space.spaces)]
+    if labels and isinstance(space, spaces.Box) and len(labels) > 1:
+        limits = zip(labels, space.low.tolist(), space.high.tolist(), strict=True)
+        return [f"- {label}: a number from {low:.6g} to {high:.6g}" for label, low, high in limits]
+    if labels and isinstance(space, spaces.MultiDiscrete):
+        limits = zip(labels, space.start.tolist(), (space.start + space.nvec - 1).tolist(), strict=True)
+        return [f"- {label}: an integer from {low} to {high}" for label, low, high in limits]
+    return [f"- {_limits(space)}"]
+
+
+def _limits(space: spaces.Space[Any]) -> str:
+    if isinstance(space, spaces.Discrete):
+        return f"an integer from {space.start} to {space.start + space.n - 1}"
+    if isinstance(space, spaces.Box) and space.shape in ((), (1,)):
+        return f"a number from {space.low.item():.6g} to {space.high.item():.6g}"
+    return str(space)
+
+
+def action_schema(decision: Decision) -> dict[str, Any]:
+    """Return the JSON schema of the actions that ``parse`` takes."""
+    labels = legal_labels(decision)
+    return {"enum": list(labels)} if labels else _schema(decision.action_space, decision.action_labels)
+
+
+def _schema(space: spaces.Space[Any], labels: Any) -> dict[str, Any]:
+    parts: dict[str, Any] | None = None
+    if isinstance(space, spaces.Discrete):
+        return {"type": "integer", "minimum": int(space.start), "maximum": int(space.start + space.n - 1)}
+    if isinstance(space, spaces.Dict):
+        parts = {labels[key] if labels else str(key): _schema(part, None) for key, part in space.spaces.items()}
+    elif isinstance(space, spaces.Tuple):
+        parts = {str(place): _schema(part, None) for place, part in enumerate(space.spaces)}
+    elif isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)) and len(space.shape) < 2:
+        numbers = [_bounded(*bounds) for bounds in zip(*_bounds(space), strict=True)]
+        names = labels or tuple(map(str, range(len(numbers))))
+        if len(numbers) == 1 and isinstance(space, spaces.Box):
+            return numbers[0]
+        parts = dict(zip(names, numbers, strict=True))
+    if parts is None:
+        raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
+    return {"type": "object", "properties": parts, "required": list(parts), "additionalProperties": False}
+
+
+def _bounds(space: Any) -> tuple[list[Any], list[Any]]:
+    """Return the smallest and the largest value of each component."""
+    if isinstance(space, spaces.MultiBinary):
+        return [0] * space.shape[0], [1] * space.shape[0]
+    low, high = (space.start, space.start + space.nvec - 1) if hasattr(space, "nvec") else (space.low, space.high)
+    return low.reshape(-1).tolist(), high.reshape(-1).tolist()
+
+
+def _bounded(low: Any, high: Any) -> dict[str, Any]:
+    schema: dict[str, Any] = {"type": "number" if isinstance(low, float) else "integer"}
+    limits = {"minimum": low, "maximum": high}
+    return schema | {name: limit for name, limit in limits.items() if np.isfinite(limit)}
+
+
+# -- what is said ---------------------------------------------------------------------------------
+
+
+def _action(space: spaces.Space[Any], labels: Any, value: Any, legal: Mapping[str, int]) -> Any:
+    """Return the action that a value of JSON means, which may be illegal; raise a builtin error if it means none."""
+    if isinstance(space, spaces.Discrete):
+        named = {label.casefold(): action for label, action in legal.items()}
+        said = str(value).strip().strip("\"'").casefold()
+        return named[said] if said in named else int(said)
+    if isinstance(space, spaces.Dict):
+        keys = {(labels or {}).get(key, key): key for key in space.spaces}
+        given = {keys.get(name, name): part for name, part in dict(value).items()}
+        return {key: _action(part, None, given[key], {}) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        listed = [value[str(place)] for place in range(len(value))] if isinstance(value, Mapping) else value
+        return tuple(_action(part, None, listed[place], {}) for place, part in enumerate(space.spaces))
+    if isinstance(value, Mapping):
+        names = labels or tuple(map(str, range(len(value))))
+        if set(value) != set(names):
+            raise ValueError("components are missing, or unknown")
+        value = [value[name] for name in names]
+    if isinstance(value, str):
+        value = [float(part) for part in value.replace(",", " ").split()]
+    numbers = np.asarray(value, np.float64).reshape(space.shape)
+    if space.dtype is not None and space.dtype.kind in "iu" and (numbers != np.round(numbers)).any():
+        raise ValueError("these must be integers")
+    return numbers.astype(space.dtype)

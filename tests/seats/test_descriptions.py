@@ -1,0 +1,217 @@
+"""Pending decisions as text and as JSON, and texts as actions, by the labels of the model."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import RULE, aec_env, clone, joint_env, make_step, parallel_env, simulate, single_env
+from simenv_marl.errors import DefinitionError, InvalidActionError, NotResetError, SimEnvError, ViewError
+from simenv_marl.seats import describe, parse
+
+from .tank import FILL, POINTS, Tank
+
+
+def env_of(definition=FILL, seed=1, view=single_env):
+    env = view(Tank, {Tank.fill: definition})
+    env.reset(seed=seed)
+    return env
+
+
+def test_a_pending_decision_is_described_in_words():
+    env = aec_env(Tank, POINTS)
+    env.reset(seed=1)
+    env.step(2)
+    env.step(RULE)
+    assert describe(env).splitlines() == [
+        "filler decides (decision 2, time 1).",
+        "Observation:",
+        f"- level: {env.observe('filler')[0]:.6g}",
+        f"Reward of the previous action: {env.unwrapped.simulation.level:.6g}",
+        "Legal actions:",
+        "- closed",
+        "- half",
+        "- open",
+    ]
+
+
+def test_it_is_described_as_json():
+    found = describe(env_of(), as_json=True)
+    assert json.loads(json.dumps(found)) == {
+        "agent": "filler",
+        "point": "tests.seats.tank.Tank.fill",
+        "number": 1,
+        "time": 0.0,
+        "observation": {"level": 5.0},
+        "actions": {"enum": ["closed", "half", "open"]},
+        "reward": 0.0,
+    }
+
+
+@pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
+def test_every_view_and_its_clones_are_described_alike(view):
+    env = env_of(view=view)
+    words = describe(env_of())
+    assert describe(env) == words
+    assert parse(env, "open") == 2
+    for method in ("fork", "replay"):
+        twin = clone(env, method=method)
+        assert describe(twin) == words
+        assert parse(twin, "open") == 2
+        twin.close()
+
+
+def test_what_a_policy_gets_is_described_as_the_environment_is():
+    said = []
+
+    def policy(observation, *, _decision):
+        said.append(describe(_decision))
+        return parse(_decision, "closed")
+
+    simulate(Tank, {"filler": policy}, points=POINTS, seed=1)
+    assert said[0] == describe(env_of())
+
+
+def test_without_a_pending_decision_there_is_nothing_to_describe():
+    env = single_env(Tank, {Tank.fill: FILL})
+    for use in (describe, lambda env: parse(env, "open")):
+        with pytest.raises(NotResetError):
+            use(env)
+
+
+@pytest.mark.parametrize("text", ["open", " Open ", '"open"', '{"action": "open"}', "2", '{"action": 2}'])
+def test_an_action_is_named_by_label_or_value(text):
+    assert parse(env_of(), text) == 2
+
+
+@pytest.mark.parametrize("text", ["ajar", "3", "-1", "", "{}", '{"action": null}', "[1]", "true", "1.5", "open closed"])
+def test_what_names_no_legal_action_is_an_error_that_lists_them(text):
+    env = env_of()
+    with pytest.raises(InvalidActionError, match=r"'filler'; these are legal:\n- closed\n- half\n- open"):
+        parse(env, text)
+
+
+def test_masked_actions_are_neither_listed_nor_taken():
+    env = env_of(replace(FILL, action_mask_mapping=lambda tank: [1, 0, 1]))
+    assert "half" not in describe(env)
+    assert describe(env, as_json=True)["actions"] == {"enum": ["closed", "open"]}
+    for text in ("half", "1"):
+        with pytest.raises(InvalidActionError, match=r"legal:\n- closed\n- open$"):
+            parse(env, text)
+
+
+def test_choices_and_decisions_are_labels_where_none_are_given():
+    decisions = replace(FILL, action_labels=None)
+    assert describe(env_of(decisions), as_json=True)["actions"] == {"enum": ["0.0", "1.0", "2.0"]}
+    moves = replace(decisions, action_space_mapping=None, choices=lambda tank: [3.0, 4.0, 4.0][: 3 - tank.day])
+    env = env_of(moves)
+    assert describe(env, as_json=True)["actions"] == {"enum": ["3.0", "4.0 (1)", "4.0 (2)"]}
+    assert (parse(env, "3.0"), parse(env, "4.0 (2)")) == (0, 2)
+
+
+def test_a_label_that_looks_like_another_action_is_the_label():
+    env = env_of(replace(FILL, action_labels={0: "1", 1: "2", 2: "3"}))
+    assert [parse(env, text) for text in ("1", "2", '{"action": "3"}')] == [0, 1, 2]
+
+
+def test_labels_may_be_made_for_each_call():
+    env = env_of(replace(FILL, action_labels=lambda tank: [f"{litres} of {tank.level}" for litres in range(3)]))
+    assert parse(env, "2 of 5.0") == 2
+    bad = env_of(replace(FILL, action_labels=lambda tank: ["one"]))
+    with pytest.raises(DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"):
+        describe(bad)
+
+
+SPACES = {
+    "number": (spaces.Box(0, 2, (1,)), None, ["1.5", "[1.5]", '{"action": 1.5}'], [1.5]),
+    "numbers": (spaces.Box(0, 2, (2,)), ["in", "out"], ['{"in": 1, "out": 0.5}', "[1, 0.5]", "1, 0.5"], [1, 0.5]),
+    "counts": (spaces.MultiDiscrete([3, 4]), ["a", "b"], ['{"a": 2, "b": 3}', "[2, 3]"], [2, 3]),
+    "switches": (spaces.MultiBinary(2), None, ["[1, 0]", '{"0": 1, "1": 0}'], [1, 0]),
+    "parts": (
+        spaces.Dict({"kind": spaces.Discrete(3), "size": spaces.Box(0, 9, (1,))}),
+        {"kind": "Kind", "size": "Size in m"},
+        ['{"Kind": 2, "Size in m": 4}', '{"kind": 2, "size": 4}'],
+        {"kind": 2, "size": [4]},
+    ),
+    "pair": (spaces.Tuple([spaces.Discrete(3), spaces.Discrete(2)]), None, ["[2, 1]", '{"0": 2, "1": 1}'], (2, 1)),
+}  # fmt: skip
+
+
+def of_space(space, labels):
+    return make_step(
+        observation_space=spaces.Box(-50, 50, (1,)),
+        observation_space_mapping=lambda tank: [tank.level],
+        action_space=space,
+        action_space_mapping=lambda action: 1.0,
+        reward_mapping=lambda tank: 0.0,
+        action_labels=labels,
+    )
+
+
+@pytest.mark.parametrize("kind", SPACES)
+def test_actions_of_other_spaces_are_said_as_json(kind):
+    space, labels, texts, action = SPACES[kind]
+    env = env_of(of_space(space, labels))
+    for text in texts:
+        found = parse(env, text)
+        assert space.contains(found)
+        np.testing.assert_equal(spaces.flatten(space, found), spaces.flatten(space, _member(space, action)))
+    for name in labels or ():
+        assert (labels[name] if isinstance(labels, dict) else name) in describe(env)
+
+
+def _member(space, action):
+    if isinstance(space, spaces.Dict):
+        return {key: _member(part, action[key]) for key, part in space.spaces.items()}
+    return action if isinstance(space, (spaces.Discrete, spaces.Tuple)) else np.asarray(action, space.dtype)
+
+
+@pytest.mark.parametrize("kind", SPACES)
+@pytest.mark.parametrize("text", ["[9, 9, 9]", '{"valve": 1}', "many", "[77, 77]", "{}"])
+def test_wrong_components_are_illegal(kind, text):
+    env = env_of(of_space(*SPACES[kind][:2]))
+    with pytest.raises(InvalidActionError, match="these are legal"):
+        parse(env, text)
+
+
+def test_the_schema_of_numbers_has_their_bounds():
+    space = spaces.Dict(
+        {"a": spaces.Box(0, 2, (1,)), "b": spaces.Box(-np.inf, 1, (2,)), "c": spaces.Discrete(3, start=1)}
+    )
+    schema = describe(env_of(of_space(space, None)), as_json=True)["actions"]
+    assert schema["required"] == ["a", "b", "c"]
+    assert schema["additionalProperties"] is False
+    assert schema["properties"]["a"] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
+    assert schema["properties"]["b"]["properties"]["1"] == {"type": "number", "maximum": 1.0}
+    assert schema["properties"]["c"] == {"type": "integer", "minimum": 1, "maximum": 3}
+
+
+def test_actions_without_names_and_numbers_cannot_be_put_into_words():
+    env = env_of(of_space(spaces.Box(0, 1, (2, 2)), None))
+    with pytest.raises(ViewError, match="cannot be put into words"):
+        describe(env, as_json=True)
+
+
+def test_parts_of_an_observation_have_their_labels():
+    definition = replace(
+        FILL,
+        observation_space=spaces.Dict({"level": spaces.Box(-50, 50, (1,)), "day": spaces.Discrete(9)}),
+        observation_space_mapping=lambda tank: {"level": [tank.level], "day": tank.day},
+        observation_labels={"level": "Level in m", "day": "Day"},
+    )
+    assert describe(env_of(definition), as_json=True)["observation"] == {"Day": 0, "Level in m": [5.0]}
+
+
+@pytest.mark.parametrize("labels", [
+    {"action_labels": ["a", "b"]},
+    {"action_labels": {0: "a", 1: "b"}},
+    {"action_labels": "abc"},
+    {"action_labels": ["a", "b", 3]},
+    {"observation_labels": ["a", "b"]},
+    {"observation_labels": {"level": "a"}},
+])  # fmt: skip
+def test_labels_that_do_not_fit_their_space_are_refused(labels):
+    with pytest.raises(SimEnvError, match=f"{next(iter(labels))} must be texts for the parts"):
+        replace(FILL, **labels)

@@ -1,0 +1,207 @@
+"""A language model decides: over an endpoint that answers right, wrong, late, with garbage, or not at all."""
+
+import json
+import sys
+
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import RULE, clone, simulate, simulate_many, single_env
+from simenv_marl.errors import InvalidActionError, LanguageModelError, MissingExtraError, OptionValueError
+from simenv_marl.seats import FallbackPolicy, LanguageModelPolicy, describe
+
+from .endpoint import endpoint, fails, says
+from .tank import FILL, POINTS, Tank, level_of
+from .test_descriptions import of_space
+
+pytest.importorskip("openai")
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    monkeypatch.setattr("simenv_marl.seats.language.LONGEST_WAIT", 0.01)
+
+
+OPEN = says('{"action": "open"}')
+
+
+def model(address, **options):
+    return LanguageModelPolicy("fake", base_url=address, api_key="a key", **options)
+
+
+def played(policy, seed=3):
+    return simulate(Tank, {"filler": policy}, points=POINTS, seed=seed).log
+
+
+def test_a_language_model_decides_by_labels():
+    with endpoint([OPEN]) as (address, requests):
+        policy = model(address, temperature=0.0)
+        assert played(policy) == played(lambda observation: 2)
+    assert len(requests) == 5
+    assert requests[0]["temperature"] == 0.0
+    assert requests[0]["key"] == "Bearer a key"
+    system, question = requests[0]["messages"]
+    assert "Choose how much water flows in." in system["content"]
+    assert "level: 5" in question["content"]
+    schema = requests[0]["response_format"]["json_schema"]["schema"]
+    assert schema["properties"]["action"] == {"enum": ["closed", "half", "open"]}
+    assert json.dumps(schema) in system["content"]  # for endpoints that do not enforce it
+    assert policy.usage["requests"] == 5
+    assert policy.usage["prompt_tokens"] == 50
+    assert policy.usage["completion_tokens"] == 15
+    assert policy.usage["seconds"] > 0
+
+
+@pytest.mark.parametrize("text", ["open", "Open", '"open"', "2", '{"action": 2}'])
+def test_an_answer_in_plain_text_is_parsed(text):
+    with endpoint([says(text)]) as (address, _):
+        assert played(model(address)) == played(lambda observation: 2)
+
+
+def test_numbers_are_checked_against_their_bounds_here_as_well():
+    points = {Tank.fill: of_space(spaces.Box(0, 2, (1,)), None)}
+    with endpoint([says('{"action": 7}'), says('{"action": 1.5}')]) as (address, requests):
+        simulate(Tank, {"fill_0": model(address)}, points=points, seed=1)
+    assert requests[0]["response_format"]["json_schema"]["schema"]["properties"]["action"]["maximum"] == 2.0
+    assert "number from 0 to 2" in requests[1]["messages"][-1]["content"]
+
+
+def test_a_wrong_answer_is_corrected_in_the_conversation():
+    with endpoint([says("ajar"), OPEN]) as (address, requests):
+        assert played(model(address))[0] == played(lambda observation: 2)[0]
+    answer, correction = requests[1]["messages"][-2:]
+    assert answer == {"role": "assistant", "content": "ajar"}
+    assert correction["role"] == "user"
+    assert "- closed\n- half\n- open" in correction["content"]
+
+
+@pytest.mark.parametrize("answers", [
+    [fails(500), OPEN],
+    [fails(503), OPEN],
+    [fails(429, retry_after="0"), OPEN],
+    ["<html>busy</html>", OPEN],
+    [says(None, refusal="I would rather not"), OPEN],
+    [says("  "), OPEN],
+    [{"object": "something else"}, OPEN],
+    [2.0, OPEN],
+], ids=["500", "503", "429", "HTML", "refusal", "nothing", "garbage", "late"])  # fmt: skip
+def test_what_may_pass_is_tried_again(answers):
+    with endpoint(answers) as (address, requests):
+        assert played(model(address, timeout=1.0))[0] == played(lambda observation: 2)[0]
+    assert len(requests) == 6
+
+
+@pytest.mark.parametrize("answer", [fails(500), "<html>down</html>", says(None, refusal="no")])
+def test_what_does_not_pass_is_an_error_and_a_fallback_answers(answer):
+    with endpoint([answer]) as (address, requests):
+        with pytest.raises(LanguageModelError, match="fake gave no answer"):
+            played(model(address, retries=0))
+        guarded = FallbackPolicy(model(address, retries=0))
+        assert played(guarded) == played(RULE)
+    assert guarded.counts["failed"] == 5
+    assert len(requests) == 6
+
+
+def test_a_model_that_stays_wrong_is_an_illegal_answer():
+    with endpoint([says("ajar")]) as (address, requests):
+        with pytest.raises(InvalidActionError, match="'ajar' names no legal action"):
+            played(model(address, retries=2))
+        assert len(requests) == 3
+        guarded = FallbackPolicy(model(address, retries=0))
+        played(guarded)
+    assert guarded.counts["illegal"] == 5
+
+
+def test_a_refused_key_is_not_tried_again():
+    with endpoint([fails(401, "unknown key")]) as (address, requests):
+        policy = model(address)
+        with pytest.raises(LanguageModelError, match=r"refuses to ask fake: .*unknown key"):
+            played(policy)
+    assert len(requests) == 1
+
+
+def test_a_missing_key_is_told_of(monkeypatch):
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    with pytest.raises(LanguageModelError, match="api_key"):
+        played(LanguageModelPolicy("fake", base_url="http://127.0.0.1:9/v1"))
+
+
+def test_an_endpoint_without_structured_output_is_asked_without():
+    def answer(request):
+        if "response_format" in request:
+            return fails(400, "response_format is not supported")
+        return OPEN
+
+    with endpoint(answer) as (address, requests):
+        assert played(model(address)) == played(lambda observation: 2)
+    assert ["response_format" in request for request in requests] == [True] + [False] * 5
+
+
+def test_requests_contain_the_latest_decisions_of_the_agent():
+    with endpoint([says("open"), says("half"), says("closed")]) as (address, requests):
+        played(model(address, history=2))
+    roles = [[message["role"][0] for message in request["messages"]] for request in requests[:4]]
+    assert ["".join(own) for own in roles] == ["su", "suau", "suauau", "suauau"]
+    assert [message["content"] for message in requests[3]["messages"] if message["role"] == "assistant"] == [
+        "half", "closed"
+    ]  # fmt: skip
+
+
+def test_many_simulations_are_decided_at_once():
+    with endpoint([OPEN]) as (address, requests):
+        found = simulate_many(
+            Tank, {"filler": model(address)}, seeds=range(6), points=POINTS, collect=level_of, concurrency=3
+        )
+    assert found == [tuple(played(lambda observation: 2, seed)) for seed in range(6)]
+    assert len(requests) == 30
+
+
+def test_a_client_of_the_user_and_own_words_are_taken():
+    from types import SimpleNamespace
+
+    asked = []
+
+    async def create(**request):
+        asked.append(request)
+        return SimpleNamespace(choices=[SimpleNamespace(message=SimpleNamespace(content="open"))])
+
+    client = SimpleNamespace(chat=SimpleNamespace(completions=SimpleNamespace(create=create)))
+    policy = LanguageModelPolicy(
+        "own", client=client, instructions="Be quick.", describe=lambda decision: f"at {decision.observation[0]:.0f} m"
+    )
+    assert played(policy) == played(lambda observation: 2)
+    assert asked[0]["messages"][0]["content"].endswith("Be quick.")
+    assert asked[0]["messages"][1]["content"] == "at 5 m"
+
+
+def test_the_prompt_of_a_pending_decision_is_shown():
+    env = single_env(Tank, {Tank.fill: FILL})
+    env.reset(seed=1)
+    found = LanguageModelPolicy("fake", instructions="Be quick.").prompt(env)
+    assert found.startswith("You decide for 'filler'")
+    assert "Be quick." in found
+    assert found.endswith(describe(env))
+
+
+def test_in_clones_no_request_is_sent():
+    with endpoint([OPEN]) as (address, requests):
+        env = single_env(Tank, POINTS, agent="drainer", policies={"filler": model(address)})
+        env.reset(seed=1)
+        number = len(requests)
+        for method in ("fork", "replay"):
+            twin = clone(env, method=method)
+            twin.step(0)
+            twin.close()
+        assert len(requests) == number
+
+
+def test_without_the_package_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "openai", None)
+    with pytest.raises(MissingExtraError, match=r"simenv-marl\[language\]"):
+        played(LanguageModelPolicy("fake"))
+
+
+@pytest.mark.parametrize("arguments", [{"history": -1}, {"retries": 1.5}, {"describe": "words"}])
+def test_arguments_that_cannot_be_used_are_refused(arguments):
+    with pytest.raises(OptionValueError, match=next(iter(arguments))):
+        LanguageModelPolicy("fake", **arguments)

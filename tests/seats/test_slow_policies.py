@@ -1,0 +1,387 @@
+"""Policies that are coroutine functions, and policies that get the pending decision."""
+
+import asyncio
+import contextlib
+import gc
+import os
+import signal
+import threading
+import time
+
+import greenlet
+import numpy as np
+import pytest
+
+from simenv_marl import RULE, aec_env, branch, clone, evaluate, simulate, simulate_many, single_env
+from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
+from simenv_marl.errors import InvalidActionError, OptionValueError
+from simenv_marl.experiments import run_experiment
+from simenv_marl.planning import RolloutPolicy, action_values
+
+from .tank import POINTS, Tank, level_of
+
+
+def action_for(observation):
+    return int(observation[0] < 5) * 2
+
+
+async def slow(observation):
+    await asyncio.sleep(0.002)
+    return action_for(observation)
+
+
+def quick(observation):
+    return action_for(observation)
+
+
+def levels(policy, **options):
+    return simulate_many(Tank, {"filler": policy}, seeds=range(6), points=POINTS, collect=level_of, **options)
+
+
+def test_a_coroutine_function_answers_as_a_function_does():
+    plain = simulate(Tank, {"filler": quick}, points=POINTS, seed=3)
+    assert simulate(Tank, {"filler": slow}, points=POINTS, seed=3).log == plain.log
+    env = aec_env(Tank, POINTS, policies={"filler": slow})
+    env.reset(seed=3)
+    while env.agents:
+        env.step(None if env.terminations[env.agent_selection] else RULE)
+    assert env.unwrapped.simulation.log == plain.log
+
+
+@pytest.mark.parametrize("concurrency", [1, 3, 64])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_results_do_not_depend_on_concurrency_and_workers(concurrency, workers):
+    expected = [level_of(simulate(Tank, {"filler": quick}, points=POINTS, seed=seed)) for seed in range(6)]
+    assert levels(slow, concurrency=concurrency, workers=workers) == expected
+
+
+def test_as_many_decisions_wait_at_once_as_concurrency_says():
+    waiting, most = 0, 0
+
+    async def counted(observation):
+        nonlocal waiting, most
+        waiting += 1
+        most = max(most, waiting)
+        await asyncio.sleep(0.02)
+        waiting -= 1
+        return 0
+
+    levels(counted, concurrency=4)
+    assert most == 4
+
+
+def test_quick_policies_are_asked_in_batches_beside_slow_ones():
+    sizes = []
+
+    def batched(observations):
+        sizes.append(len(observations))
+        return np.zeros(len(observations), int)
+
+    policies = {"filler": slow, "drainer": batched}
+    found = simulate_many(Tank, policies, seeds=range(6), points=POINTS, collect=level_of)
+    plain = {"filler": quick, "drainer": lambda observation: 0}
+    assert found == [level_of(simulate(Tank, plain, points=POINTS, seed=seed)) for seed in range(6)]
+    assert sum(sizes) == 6 * Tank.days
+
+
+def test_trajectories_of_slow_policies_are_those_of_quick_ones():
+    one = collect_episodes(Tank, {"filler": slow}, seeds=range(4), points=POINTS, concurrency=3)["filler"]
+    other = collect_episodes(
+        Tank, {"filler": lambda rows: [action_for(row) for row in rows]}, seeds=range(4), points=POINTS
+    )
+    np.testing.assert_array_equal(one.actions, other["filler"].actions)
+    np.testing.assert_array_equal(one.observations, other["filler"].observations)
+    np.testing.assert_array_equal(one.rewards, other["filler"].rewards)
+
+
+def test_evaluations_and_experiments_wait_for_many_episodes_at_once(tmp_path):
+    waiting, most = 0, 0
+
+    async def counted(observation, info):
+        nonlocal waiting, most
+        waiting += 1
+        most = max(most, waiting)
+        await asyncio.sleep(0.005)
+        waiting -= 1
+        return action_for(observation)
+
+    contenders = {"slow": {"filler": counted}, "quick": {"filler": quick}}
+    found = evaluate(Tank, contenders, seeds=range(6), points=POINTS, concurrency=5)
+    assert most == 5
+    values = found.values()
+    assert (values["slow"] == values["quick"]).all()
+    table = run_experiment(
+        lambda days: Tank(),
+        [{"days": 5}],
+        contenders=contenders,
+        seeds=range(6),
+        points=POINTS,
+        store=tmp_path,
+        concurrency=5,
+    )
+    team = table[table["agent"] == "team"].set_index(["contender", "seed"])["return"]
+    assert (team["slow"] == team["quick"]).all()
+    assert (team["slow"] == values["slow"]).all()
+
+
+def test_a_row_that_fails_does_not_stop_the_others_that_wait(tmp_path):
+    async def sometimes(observation, *, _decision):
+        await asyncio.sleep(0.001)
+        if _decision.seed == 2:
+            raise ZeroDivisionError("no")
+        return 0
+
+    table = run_experiment(
+        lambda days: Tank(),
+        [{"days": 5}],
+        contenders={"slow": {"filler": sometimes}},
+        seeds=range(4),
+        points=POINTS,
+        store=tmp_path,
+    )
+    failed = table[table["status"] == "error"]
+    assert failed[["contender", "seed"]].to_numpy().tolist() == [["slow", 2]]
+    assert "no" in failed["error"].iloc[0]
+
+
+def test_comparisons_with_the_rule_take_policies_that_are_asked_alone():
+    plain = lambda rows: [action_for(row) for row in rows]  # noqa: E731
+    points = {Tank.fill: POINTS[Tank.fill]}
+    one = compare_with_rule(Tank, {"filler": slow}, seeds=range(3), points=points)["filler"]
+    other = compare_with_rule(Tank, {"filler": plain}, seeds=range(3), points=points)["filler"]
+    np.testing.assert_array_equal(one.policy_actions, other.policy_actions)
+
+
+@pytest.mark.parametrize("run", [
+    lambda policy: simulate(Tank, {"filler": policy}, points=POINTS, seed=0),
+    lambda policy: levels(policy, concurrency=2),
+    lambda policy: evaluate(Tank, {"it": {"filler": policy}}, seeds=range(4), points=POINTS),
+])  # fmt: skip
+def test_an_error_of_a_coroutine_surfaces_and_nothing_is_left(run):
+    ended = []
+
+    async def failing(observation, info, *, _decision):
+        try:
+            await asyncio.sleep(0.001 if _decision.seed == 0 else 60)
+        finally:
+            ended.append(_decision.seed)
+        raise ZeroDivisionError("of a coroutine")
+
+    greenlets = sum(isinstance(thing, greenlet.greenlet) and not thing.dead for thing in gc.get_objects())
+    with pytest.raises(ZeroDivisionError, match="of a coroutine") as caught:
+        run(failing)
+    assert any("'filler'" in note and "seed 0" in note for note in caught.value.__notes__)
+    started = len(ended)
+    caught = None
+    gc.collect()
+    assert started >= 1
+    assert sum(isinstance(thing, greenlet.greenlet) and not thing.dead for thing in gc.get_objects()) == greenlets
+
+
+def test_an_exit_in_a_coroutine_surfaces_and_later_coroutines_are_answered():
+    async def leaves(observation):
+        raise SystemExit(3)
+
+    with pytest.raises(SystemExit):
+        levels(leaves)
+    assert levels(slow) == levels(lambda rows: [action_for(row) for row in rows])
+
+
+def test_ctrl_c_cancels_the_coroutines_and_unwinds_the_simulations():
+    cancelled, begun = [], threading.Event()
+
+    async def endless(observation, *, _decision):
+        try:
+            begun.set()
+            await asyncio.sleep(600)
+        except asyncio.CancelledError:
+            await asyncio.sleep(0.01)
+            cancelled.append(_decision.seed)
+            raise
+
+    def interrupt():
+        begun.wait(10)
+        time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        levels(endless, concurrency=3)
+    thread.join()
+    assert sorted(cancelled) == [0, 1, 2]
+
+
+def test_it_works_where_an_event_loop_runs_already():
+    async def notebook():
+        return levels(slow, concurrency=3)
+
+    assert asyncio.run(notebook()) == levels(slow)
+
+
+def test_clients_keep_their_event_loop_from_call_to_call():
+    loops = set()
+
+    async def noting(observation):
+        loops.add(asyncio.get_running_loop())
+        return 0
+
+    levels(noting)
+    simulate(Tank, {"filler": noting}, points=POINTS, seed=0)
+    assert len(loops) == 1
+
+
+def test_a_coroutine_cannot_get_the_environment():
+    async def planner(observation, *, _environment):
+        return 0
+
+    with pytest.raises(OptionValueError, match="waits, and asks for _environment"):
+        simulate(Tank, {"filler": planner}, points=POINTS, seed=0)
+
+
+def test_a_mixture_refuses_policies_that_are_asked_alone():
+    with pytest.raises(OptionValueError, match="one decision at a time"):
+        Mixture({slow: 1.0})
+
+
+def test_an_illegal_answer_of_a_coroutine_is_an_error():
+    async def illegal(observation):
+        return 9
+
+    with pytest.raises(InvalidActionError, match="action 9"):
+        levels(illegal)
+
+
+# -- the pending decision -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("waits", [False, True])
+@pytest.mark.parametrize("many", [False, True])
+def test_a_policy_gets_the_pending_decision(waits, many):
+    seen = []
+
+    def answer(observation, _decision):
+        seen.append(_decision)
+        np.testing.assert_array_equal(observation, _decision.observation)
+        return 1
+
+    def plain(observation, *, _decision):
+        return answer(observation, _decision)
+
+    async def coroutine(observation, *, _decision):
+        return answer(observation, _decision)
+
+    policies = {"filler": coroutine if waits else plain}
+    if many:
+        simulate_many(Tank, policies, seeds=[7], points=POINTS)
+    else:
+        simulate(Tank, policies, points=POINTS, seed=7)
+    first, second = seen[:2]
+    assert (first.agent, first.seed, first.time, first.reward) == ("filler", 7, 0.0, 0.0)
+    assert first.point.endswith("Tank.fill")
+    assert first.doc == "Choose how much water flows in."
+    assert [decision.number for decision in seen] == [1, 2, 3, 4, 5]
+    assert second.time == 1.0
+    assert second.reward == pytest.approx(second.observation[0])  # the level since the first decision
+    assert first.action_labels == {0: "closed", 1: "half", 2: "open"}
+    assert first.observation_labels == ("level",)
+    assert first.mask is None
+    assert first.choices is None
+    assert not first.in_clone
+
+
+def test_rewards_of_forced_moves_add_up_in_the_pending_decision():
+    rewards = []
+
+    def plain(observation, *, _decision):
+        rewards.append((_decision.number, _decision.reward))
+        return 0
+
+    def forced(tank):
+        return [1, 1, 1] if tank.day % 2 == 0 else [1, 0, 0]
+
+    points = {Tank.fill: make_masked(forced)}
+    tank = simulate(Tank, {"filler": plain}, points=points, seed=0, skip_forced=True)
+    assert [number for number, _ in rewards] == [1, 3, 5]
+    assert rewards[1][1] == pytest.approx(tank.log[0] + tank.log[1])
+
+
+def make_masked(mask):
+    from dataclasses import replace
+
+    return replace(POINTS[Tank.fill], action_mask_mapping=mask)
+
+
+# -- in clones ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["fork", "replay"])
+def test_a_coroutine_is_not_asked_in_clones_and_branches(method):
+    asked = []
+
+    async def noting(observation):
+        asked.append(float(observation[0]))
+        return 2
+
+    env = single_env(Tank, POINTS, agent="drainer", policies={"filler": noting})
+    env.reset(seed=1)
+    number = len(asked)
+    by_rule = single_env(Tank, POINTS, agent="drainer", policies={"filler": lambda observation: 2})
+    by_rule.reset(seed=1)
+
+    def rest(env, _=0):
+        rewards = []
+        with contextlib.suppress(Exception):
+            while True:
+                _, reward, terminated, *_rest = env.step(0)
+                rewards.append(reward)
+                if terminated:
+                    break
+        return rewards
+
+    twin = clone(env, method=method)
+    values = rest(twin)
+    twin.close()
+    assert len(asked) == number  # the fork would hide it, the replay not
+    assert values == branch(env, rest, 1, method=method)[0]
+    assert values != rest(by_rule)
+    assert len(values) == Tank.days
+
+
+def test_planners_leave_the_decisions_of_coroutines_to_the_rule():
+    async def never(observation):
+        raise AssertionError("it is asked in a branch")
+
+    env = aec_env(Tank, POINTS)
+    env.reset(seed=1)
+    one = action_values(env, base={"drainer": never}, futures=3, horizon=2)
+    other = action_values(env, futures=3, horizon=2)
+    np.testing.assert_array_equal(one.means, other.means)
+
+
+def test_a_base_that_asks_for_the_decision_gets_it_in_branches():
+    def base(observation, *, _decision):
+        assert _decision.in_clone
+        assert _decision.agent == "drainer"
+        return _decision.number % 2
+
+    env = single_env(Tank, POINTS, agent="drainer")
+    env.reset(seed=1)
+    plain = action_values(env, base=lambda observation: 1, futures=2, horizon=2, method="replay")
+    found = action_values(env, base=base, futures=2, horizon=2, method="replay")
+    assert found.means[0] > plain.means[0]  # the second decision of the base is 0
+
+
+def test_a_base_of_another_agent_that_waits_is_the_rule_and_one_that_asks_gets_the_decision():
+    async def never(observation):
+        raise AssertionError("it is asked in a branch")
+
+    def odd(observation, *, _decision):
+        return 2 * (_decision.number % 2)
+
+    def plan(base):
+        planner = RolloutPolicy(base={"filler": base}, futures=2, horizon=3, margin=0.0, method="replay")
+        return simulate(Tank, {"drainer": planner}, points=POINTS, seed=4).log
+
+    assert plan(never) == plan(RULE)
+    assert len(plan(odd)) == Tank.days

@@ -1,0 +1,317 @@
+"""Fallbacks for policies that fail, and recordings of answers."""
+
+import asyncio
+import copy
+import json
+import pickle
+import time
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import RULE, clone, evaluate, make_step, simulate, simulate_many, single_env
+from simenv_marl.errors import InvalidActionError, OptionValueError
+from simenv_marl.experiments import run_experiment
+from simenv_marl.seats import FallbackPolicy, RecordedPolicy
+
+from .tank import POINTS, Tank, level_of
+
+
+def played(policy, seed=3):
+    return simulate(Tank, {"filler": policy}, points=POINTS, seed=seed).log
+
+
+def counted(**numbers):
+    return dict.fromkeys(("asked", "retried", "late", "failed", "illegal", "fallbacks"), 0) | numbers
+
+
+def raises(observation):
+    raise ZeroDivisionError("of the policy")
+
+
+async def raises_later(observation):
+    await asyncio.sleep(0.001)
+    raise ZeroDivisionError("of the policy")
+
+
+def late(observation):
+    time.sleep(0.003)
+    return 2
+
+
+async def never(observation):
+    await asyncio.sleep(600)
+
+
+def illegal(observation):
+    return 9
+
+
+async def illegal_later(observation):
+    return 9
+
+
+@pytest.mark.parametrize("retries", [0, 2])
+@pytest.mark.parametrize(("policy", "kind"), [
+    (raises, "failed"), (raises_later, "failed"), (late, "late"), (never, "late"), (illegal, "illegal"),
+    (illegal_later, "illegal"),
+])  # fmt: skip
+def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, retries):
+    guarded = FallbackPolicy(policy, lambda observation: 1, timeout=0.002, retries=retries)
+    assert played(guarded) == played(lambda observation: 1)
+    tries = Tank.days * (1 + retries)
+    assert guarded.counts == counted(asked=5, fallbacks=5, retried=tries - 5, **{kind: tries})
+    assert guarded.last_error is not None
+
+
+def test_without_faults_the_policy_itself_answers():
+    guarded = FallbackPolicy(lambda observation, info: 2, timeout=60)
+    assert played(guarded) == played(lambda observation: 2)
+    assert guarded.counts == counted(asked=5)
+    assert guarded.last_error is None
+
+
+def test_the_rule_is_the_default_fallback_and_a_legal_answer():
+    assert played(FallbackPolicy(raises)) == played(RULE)
+    guarded = FallbackPolicy(lambda observation: RULE)
+    assert played(guarded) == played(RULE)
+    assert guarded.counts["fallbacks"] == 0
+
+
+def test_an_answer_after_a_retry_is_used():
+    tries = []
+
+    def second(observation):
+        tries.append(1)
+        if len(tries) % 2:
+            raise ZeroDivisionError
+        return 2
+
+    guarded = FallbackPolicy(second, retries=1)
+    assert played(guarded) == played(lambda observation: 2)
+    assert guarded.counts == counted(asked=5, retried=5, failed=5)
+
+
+def test_the_fallback_may_ask_for_the_decision_and_wait():
+    async def fallback(observation, *, _decision):
+        await asyncio.sleep(0)
+        return _decision.number % 3
+
+    def expected(observation, *, _decision):
+        return _decision.number % 3
+
+    assert played(FallbackPolicy(raises, fallback)) == played(expected)
+
+
+def test_a_planner_can_be_guarded():
+    def planner(observation, *, _environment):
+        return int(_environment.unwrapped.simulation.level < 5) * 2
+
+    guarded = FallbackPolicy(planner)
+    assert played(guarded) == played(lambda observation: int(observation[0] < 5) * 2)
+    assert guarded.counts == counted(asked=5)
+
+
+def test_an_illegal_answer_of_the_fallback_is_an_error():
+    with pytest.raises(InvalidActionError, match="action 9"):
+        played(FallbackPolicy(raises, illegal))
+
+
+@pytest.mark.parametrize("arguments", [
+    {"policy": 3}, {"fallback": 3}, {"timeout": 0}, {"timeout": "1"}, {"retries": -1}, {"retries": True},
+])  # fmt: skip
+def test_arguments_that_cannot_be_used_are_refused(arguments):
+    with pytest.raises(OptionValueError, match=next(iter(arguments))):
+        FallbackPolicy(**{"policy": raises, **arguments})
+
+
+# -- in tables ------------------------------------------------------------------------------------
+
+
+async def sometimes(observation, *, _decision):
+    if _decision.seed % 2 and _decision.number == 1:
+        raise ZeroDivisionError
+    return 1
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
+    guarded = FallbackPolicy(sometimes)
+    contenders = {"guarded": {"filler": guarded}, "plain": {"filler": lambda observation: 1}}
+    found = evaluate(Tank, contenders, seeds=range(4), points=POINTS, workers=workers)
+    own = found.frame[(found.frame["contender"] == "guarded")]
+    for agent, expected in (("filler", [0, 1, 0, 1]), ("drainer", [0] * 4), ("team", [0, 1, 0, 1])):
+        assert own[own["agent"] == agent].sort_values("seed")["fallbacks"].tolist() == expected
+    assert guarded.counts == counted(asked=20, failed=2, fallbacks=2)
+    table = run_experiment(
+        lambda days: Tank(),
+        [{"days": 5}],
+        contenders=contenders,
+        seeds=range(4),
+        points=POINTS,
+        store=tmp_path,
+        workers=workers,
+    )
+    again = run_experiment(
+        lambda days: Tank(), [{"days": 5}], contenders=contenders, seeds=range(4), points=POINTS, store=tmp_path
+    )
+    for frame in (table, again):
+        team = frame[(frame["agent"] == "team") & (frame["contender"] == "guarded")]
+        assert team["fallbacks"].tolist() == [0, 1, 0, 1]
+    assert guarded.counts == counted(asked=40, failed=4, fallbacks=4)
+
+
+def test_workers_of_simulate_many_add_their_counts():
+    guarded = FallbackPolicy(sometimes)
+    simulate_many(Tank, {"filler": guarded}, seeds=range(6), points=POINTS, collect=level_of, workers=2)
+    assert guarded.counts == counted(asked=30, failed=3, fallbacks=3)
+
+
+def test_contenders_with_many_fallbacks_are_marked():
+    contenders = {"bad": {"filler": FallbackPolicy(raises)}, "good": {"filler": FallbackPolicy(lambda observation: 1)}}
+    found = evaluate(Tank, contenders, seeds=range(3), points={Tank.fill: POINTS[Tank.fill]})
+    summary = found.summary()
+    assert summary["fallbacks"].tolist() == [1.0, 0.0]
+    assert summary["note"].tolist() == ["100% of decisions by a fallback", ""]
+    assert [label.get_text() for label in found.plot().axes[0].get_xticklabels()] == ["bad\n100% fallbacks", "good"]
+    assert "fallbacks" in str(found)
+
+
+def test_tables_without_a_fallback_have_no_column_for_it():
+    found = evaluate(Tank, {"plain": {"filler": lambda observation: 1}}, seeds=range(2), points=POINTS)
+    assert "fallbacks" not in found.frame
+    assert "fallbacks" not in found.summary()
+
+
+@pytest.mark.parametrize("method", ["fork", "replay"])
+@pytest.mark.parametrize("policy", [lambda observation: 9, illegal_later])
+def test_in_clones_nothing_is_counted(policy, method):
+    guarded = FallbackPolicy(policy, lambda observation: 2)
+    env = single_env(Tank, POINTS, agent="drainer", policies={"filler": guarded})
+    env.reset(seed=1)
+    before = guarded.counts
+    twin = clone(env, method=method)
+    levels = [float(twin.step(0)[0][0]) for _ in range(3)]
+    assert guarded.counts == before
+    twin.close()
+    assert levels == [float(env.step(0)[0][0]) for _ in range(3)]
+
+
+def test_copies_and_pickles_count_together():
+    guarded = FallbackPolicy(raises)
+    played(copy.deepcopy(guarded))
+    played(pickle.loads(pickle.dumps(guarded)))
+    assert guarded.counts == counted(asked=10, failed=10, fallbacks=10)
+
+
+# -- recordings -----------------------------------------------------------------------------------
+
+
+class Asked:
+    """A policy that counts how often it is asked."""
+
+    def __init__(self):
+        self.times = 0
+
+    def __call__(self, observation, *, _decision):
+        self.times += 1
+        return RULE if _decision.number == 2 else int(observation[0] * 1000) % 3
+
+
+class Waiting(Asked):
+    async def __call__(self, observation, *, _decision):
+        await asyncio.sleep(0)
+        return super().__call__(observation, _decision=_decision)
+
+
+@pytest.mark.parametrize("kind", [Asked, Waiting])
+def test_the_same_seeds_run_again_without_one_call(kind, tmp_path):
+    first, path = kind(), tmp_path / "answers.jsonl"
+    recorded = simulate_many(
+        Tank, {"filler": RecordedPolicy(first, path)}, seeds=range(4), points=POINTS, collect=level_of
+    )
+    assert first.times == 20
+    assert len(path.read_text().splitlines()) == 20
+    entry = json.loads(path.read_text().splitlines()[0])
+    assert entry.keys() == {"seed", "agent", "number", "observation", "answer"}
+    assert entry["agent"] == "filler"
+    second = kind()
+    policy = RecordedPolicy(second, path)
+    assert simulate_many(Tank, {"filler": policy}, seeds=range(5), points=POINTS, collect=level_of)[:4] == recorded
+    assert second.times == 5  # those of the new seed
+    assert recorded == simulate_many(Tank, {"filler": kind()}, seeds=range(4), points=POINTS, collect=level_of)
+
+
+def test_a_recording_can_be_used_after_a_crash(tmp_path):
+    path = tmp_path / "answers.jsonl"
+    played(RecordedPolicy(Asked(), path))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-9])  # the last line was not finished
+    second = Asked()
+    assert played(RecordedPolicy(second, path)) == played(Asked())
+    assert second.times == 1
+    third = Asked()
+    with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
+        played(RecordedPolicy(third, path))
+    assert third.times == 0
+
+
+def test_an_answer_to_another_observation_is_not_repeated(tmp_path):
+    path = tmp_path / "answers.jsonl"
+    played(RecordedPolicy(Asked(), path))
+    lines = path.read_text().splitlines()
+    entry = json.loads(lines[0])
+    path.write_text("\n".join([json.dumps({**entry, "observation": "other"}), *lines[1:]]) + "\n")
+    again = Asked()
+    played(RecordedPolicy(again, path))
+    assert again.times == 1
+
+
+def test_illegal_answers_are_not_recorded(tmp_path):
+    path = tmp_path / "answers.jsonl"
+    guarded = FallbackPolicy(RecordedPolicy(illegal, path))
+    assert played(guarded) == played(RULE)
+    assert not path.exists()
+    assert guarded.counts["illegal"] == 5
+
+
+PARTS = {
+    "box": (spaces.Box(-1, 1, (2,), np.float32), np.array([0.1, -0.7], np.float32)),
+    "scalar": (spaces.Box(0, 1, (1,), np.float64), 0.1 + 0.2),
+    "nested": (
+        spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Tuple([spaces.Box(0, 1, (1,)), spaces.MultiBinary(2)])}),
+        {"a": 2, "b": (0.25, np.array([1, 0], np.int8))},
+    ),
+    "many": (spaces.MultiDiscrete([3, 4]), np.array([2, 3])),
+}
+
+
+@pytest.mark.parametrize("kind", PARTS)
+def test_actions_of_any_space_are_repeated_exactly(kind, tmp_path):
+    space, action = PARTS[kind]
+    seen = []
+    points = {
+        Tank.fill: make_step(
+            observation_space=spaces.Dict({"level": spaces.Box(-50, 50, (1,)), "day": spaces.Discrete(9)}),
+            observation_space_mapping=lambda tank: {"level": [tank.level], "day": tank.day},
+            action_space=space,
+            action_space_mapping=lambda action: seen.append(action) or 1.0,
+            reward_mapping=lambda tank: 0.0,
+        )
+    }
+    for policy in (lambda observation: action, raises):
+        simulate(Tank, {"fill_0": RecordedPolicy(policy, tmp_path / "answers")}, points=points, seed=1)
+    assert len(seen) == 10
+    for one, other in zip(seen[:5], seen[5:], strict=True):
+        assert space.contains(other)
+        np.testing.assert_equal(spaces.flatten(space, other), spaces.flatten(space, _full(space, one)))
+
+
+def _full(space, action):
+    """Return an action with scalars in place of one-element boxes as a member of its space."""
+    if isinstance(space, spaces.Dict):
+        return {key: _full(part, action[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_full(part, action[place]) for place, part in enumerate(space.spaces))
+    return np.asarray(action, space.dtype).reshape(space.shape)

@@ -160,8 +160,7 @@ class Game:
             if there:
                 self.notice = "The simulation does not repeat itself: its randomness does not all come from the seed."
         self.latest[agent] = turn
-        if not self.given:
-            self.known.setdefault(agent)
+        self.known |= {} if self.given else {agent: None}
 
     def _reward(self, agent: str, reward: float) -> float:
         """Add the reward of an agent's previous action to it, and return the agent's return."""

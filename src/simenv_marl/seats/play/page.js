@@ -86,8 +86,7 @@ function actionButton(action, text, shortcut, disabled = false) {
 
 function drawDecision() {
   const { space, mask, doc, agent, labels } = state.pending, few = space.kind === "discrete" && space.n <= 200;
-  $("whose").textContent = `Decide for ${agent}`;
-  $("doc").textContent = doc;
+  [$("whose").textContent, $("doc").textContent] = [`Decide for ${agent}`, doc];
   for (const id of ["inputs", "actions"]) $(id).replaceChildren();
   widget = few ? null : inputFor(space, mask, labels);
   for (let i = 0; few && i < space.n; i++)
@@ -171,9 +170,8 @@ function drawState() {
   }
   drawn = current;
   for (const drawPart of [drawHead, drawFans, drawCharts, drawWay]) drawPart();
-  $("picture").hidden = !picture;
+  [$("picture").hidden, $("text").hidden, $("image").hidden] = [!picture, !picture?.text, !picture?.png];
   $("text").textContent = picture?.text ?? "";
-  $("image").hidden = !picture?.png;
   if (picture?.png) $("image").src = `data:image/png;base64,${picture.png}`;
   if (document.activeElement !== $("seed")) $("seed").value = state.seed;
 }

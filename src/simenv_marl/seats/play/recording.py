@@ -103,8 +103,8 @@ def replay(path: Any, simulation: Any, points: Any = None, *, episode: int = -1,
                     f"{short_repr(simulation)} does not repeat {path}: decision {turn} was one of {line['agent']!r},"
                     f" and is now one of {agent!r}, or with another observation"
                 )
-            rule = line["action"] is None
-            actions.append(RULE if rule else action_of(env.action_space(agent), line["action"]))
+            action = line["action"]
+            actions.append(RULE if action is None else action_of(env.action_space(agent), action))
             env.step(actions[-1])
     except (InvalidActionError, ResetNeededError) as error:
         raise OptionValueError(f"{short_repr(simulation)} does not repeat {path}: {error}") from error

@@ -6,6 +6,7 @@ import asyncio
 import hmac
 import json
 import secrets
+import select
 import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
@@ -242,7 +243,8 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
 
     def end() -> None:
         with suppress(OSError):
-            connection.send((None, None, None))
+            if select.select([], [connection], [], 0)[1]:  # a game that does not read is killed
+                connection.send((None, None, None))
         process.join(2.0)
         process.kill()
         process.join()

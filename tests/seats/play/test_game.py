@@ -136,6 +136,9 @@ def test_the_end_can_be_undone(make_game):
     returns = game.returns()
     game.handle("buyer", {"do": "undo"})
     assert (game.turn, game.over, game.now["agent"]) == (14, "", "buyer")
+    game.handle("buyer", {"do": "redo"})
+    assert (game.turn, game.over, game.returns()) == (16, "terminated", returns)
+    game.handle("buyer", {"do": "undo"})
     assert play(game, [2])["returns"] == returns
 
 
@@ -155,7 +158,9 @@ def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(m
     ]
     connection = Connection(*((number, *each) for number, each in enumerate(wrong)))
     game.serve(connection)
-    assert [number for number, reply in connection.sent if reply and reply["type"] == "error"] == list(range(len(wrong)))
+    assert [number for number, reply in connection.sent if reply and reply["type"] == "error"] == list(
+        range(len(wrong))
+    )
     texts = connection.errors()
     assert "4" in texts[0]
     assert "another decision" in texts[3]
@@ -253,7 +258,8 @@ def test_after_the_limit_the_rule_decides_and_is_counted(make_game, monkeypatch)
     assert settle(game)["left"] is None  # nobody is there
     game.handle(None, {"taken": ["buyer"]})
     assert 0 < game.snapshot()["left"] <= 30
-    monkeypatch.setattr("simenv_marl.seats.play.game.monotonic", lambda now=iter(range(0, 10**9, 10)): next(now))
+    times = iter(range(0, 10**9, 10))
+    monkeypatch.setattr("simenv_marl.seats.play.game.monotonic", lambda: next(times))
     game.deadline = 0.0
     game.serve(Connection())
     assert game.late["buyer"] >= 1

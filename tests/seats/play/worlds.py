@@ -91,9 +91,10 @@ class BreakingShop(Shop):
     """It breaks on the day after three pieces were ordered."""
 
     def run(self):
-        for self.day in range(self.days):
+        while self.day < self.days:
             if self.order() == 3:
                 raise ZeroDivisionError("the till is broken")
+            self.day += 1
 
 
 BreakingShop.points = [Shop.order]

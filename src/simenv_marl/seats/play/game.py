@@ -79,16 +79,16 @@ class Game:
         self.notice = write(self.record, kept | end) or self.notice
 
     def jump(self, turn: int) -> None:
-        """Go to the decision of a person at a turn, or the one before it: from a checkpoint, or from the beginning."""
+        """Go to the end, or to a person's decision at or before a turn: from a checkpoint, or from the beginning."""
         persons = [row["turn"] for row in self.line if self.plays(row["agent"])]
-        turn = max((place for place in persons if place <= turn), default=min(persons, default=0))
+        if turn < len(self.line) or "action" not in self.line[-1]:
+            turn = max((place for place in persons if place <= turn), default=min(persons, default=0))
         self._return_to(max((key for key in self.checkpoints if key <= turn), default=None))
         for row in self.line[self.turn : turn]:
             if not self.over and self.line[self.turn] is row:  # else it does not repeat itself
                 self._step(row["agent"], row["action"])
                 self._arrive(self.turn + 1)
-        self.delegated.clear()
-        self.skipping = None
+        self.delegated, self.skipping = Counter(), None
 
     def forget(self, turn: int) -> None:
         """Close the checkpoints after a turn."""

@@ -52,7 +52,8 @@ function boxInput(low, high, whole, label, labels) {
   const slider = make("input", { type: "range", step: whole ? 1 : "any", ...limits, value: middle, ariaLabel: `${label}, slider` });
   slider.oninput = () => { number.value = +Number(slider.value).toPrecision(3); };
   number.oninput = () => { slider.value = number.value; };
-  const element = make("div", {}, make("label", {}, `${label} `, number), ...(bounded ? [" ", show(low), " ", slider, " ", show(high)] : []));
+  const range = bounded ? [" ", make("span", { className: "range" }, show(low), slider, show(high))] : [];
+  const element = make("div", {}, make("label", {}, `${label} `, number), ...range);
   return { element, get: () => number.value === "" ? "" : Number(number.value), set: (value) => { number.value = slider.value = value; } };
 }
 
@@ -203,5 +204,4 @@ document.onkeydown = (event) => {
   if (event.key === "u" || event.key === "y") $(event.key === "u" ? "undo" : "redo").click();
   if (/^\d$/.test(event.key) && mine() && !widget) $("actions").children[(+event.key + 9) % 10]?.click();
 };
-setInterval(() => { if (state && state.left !== null) drawHead(); }, 500);
-connect();
+setInterval(() => { if (state && state.left !== null) drawHead(); }, 500); connect();

@@ -33,8 +33,9 @@ class Server:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
         command = [sys.executable, "-m", "simenv_marl", "play", simulation, "--port", "0", *arguments]
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT
-        )
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT,
+            start_new_session=True,
+        )  # fmt: skip
         self.base = re.search(r"http://\S+", self.process.stdout.readline())[0]
         self.host = self.base.split("/")[2]
         self.links = {}
@@ -54,7 +55,7 @@ class Server:
         return [int(number) for number in path.read_text().split()]
 
     def end(self):
-        self.process.send_signal(signal.SIGINT)
+        os.killpg(self.process.pid, signal.SIGINT)  # as Ctrl-C does
         out, err = self.process.communicate(timeout=60)
         return self.process.returncode, out, err
 

@@ -145,13 +145,15 @@ inline void write_double(std::string& out, double value) {
 
 }  // namespace detail
 
-/// A JSON value. Integers have 64 bits; {"float": "nan"} and the like are read as doubles.
+/// A JSON value. Pairs in braces are always an object, `Json{{"level", 3}}`; an array is a `Json::Array{1, 2}` or a
+/// std::vector. Integers have 64 bits; {"float": "nan"} and the like are read as doubles.
 class Json {
   public:
     using Array = std::vector<Json>;
     using Object = std::vector<std::pair<std::string, Json>>;
 
     Json() = default;
+    Json(std::initializer_list<std::pair<std::string_view, Json>> members);
     Json(std::nullptr_t) {}
     template <class T, std::enable_if_t<std::is_arithmetic_v<T>, int> = 0> Json(T value) {
         if constexpr (std::is_same_v<T, bool>) value_ = value;
@@ -460,6 +462,8 @@ class Reader {
 
 }  // namespace detail
 
+inline Json::Json(std::initializer_list<std::pair<std::string_view, Json>> members)
+    : value_(Object(members.begin(), members.end())) {}
 inline Json Json::parse(std::string_view text) { return detail::Reader(text).all(); }
 inline void Json::write(std::string& out) const {
     std::visit([&](const auto& value) { detail::write(out, value); }, value_);
@@ -551,6 +555,10 @@ class Client {
     /// Sets the function that reseeds the model's generators during an episode. Call it before the first episode.
     void on_reseed(std::function<void(std::uint64_t)> reseed) { reseed_ = std::move(reseed); }
 
+    /// Whether the environment is told what rules decide, as it is by default. Rules that ask for other decisions need
+    /// false. Call it before the first episode.
+    void report_rules(bool reports) { reports_ = reports; }
+
     /// Runs the model once for each episode, and returns the exit status for main(). The model's return value is the
     /// result of the episode; its exceptions are reported. Without an environment, the model runs once, with this seed
     /// and these options.
@@ -584,7 +592,7 @@ class Client {
         if (!start || !start->is_object() || !sent)
             return fail("expected the start of an episode with a 64-bit seed, got: " + frame->text()), std::nullopt;
         const Json* given = start->find("options");
-        calls_ = 0, refused_ = 0;
+        calls_ = 0, refused_ = 0, due_ = 0;
         state_ = State::running;
         return Episode{*sent, given && !given->is_null() ? *given : Json::Object()};
     }
@@ -596,10 +604,14 @@ class Client {
                 double time = NO_TIME) -> std::decay_t<decltype(rule())> {
         if (!connected_) return rule();
         auto decision = ask<std::decay_t<decltype(rule())>>(point, entity, arguments, time);
-        return decision ? *std::move(decision) : rule();
+        if (decision) return *std::move(decision);
+        if (!due_) return rule();
+        std::decay_t<decltype(rule())> value = ruled(point, rule);
+        decided(value);
+        return value;
     }
 
-    /// Returns the environment's decision; nothing if the model's rule should decide.
+    /// Returns the environment's decision; nothing if the model's rule should decide. Report that to `decided`.
     template <class T>
     std::optional<T> ask(std::string_view point, Value entity, const Arguments& arguments, double time = NO_TIME) {
         if (!connected_) return std::nullopt;
@@ -607,6 +619,29 @@ class Client {
         if (!value) return std::nullopt;
         return detail::taken<T>(
             *value, [&] { return "decision " + std::to_string(calls_) + ", at " + std::string(point); });
+    }
+
+    /// Reports what the rule has decided after `ask` returned nothing. If that is not reported, it is null.
+    template <class T> void decided(const T& value) {
+        if (!due_) return;
+        append([&](std::string& out) {
+            out += "{\"decided\":";
+            detail::write(out, due_);
+            out += ",\"value\":";
+            detail::write(out, value);
+            out += '}';
+        });
+        due_ = 0;
+    }
+
+    /// Reports that an entity is going to decide, with the arguments that it has now. So agents that are born together
+    /// act in one round of the parallel view. Call it for all of them before the first of them decides.
+    void expect(std::string_view point, Value entity, const Arguments& arguments, double time = NO_TIME) {
+        if (state_ != State::running) return;
+        add([&](std::string& out) {
+            named(out, "{\"expect\":[{\"entity\":", entity, point, &arguments, time);
+            out += "]}";
+        });
     }
 
     /// Reports the current arguments of an entity, for its last observation and reward. Call it before the entity is
@@ -684,7 +719,10 @@ class Client {
             const Json *rule = frame->find("rule"), *stop = frame->find("stop");
             const bool answered = act && act->integer<std::uint64_t>() == calls_;
             if (answered && value) return *value;
-            if (answered && rule && rule->is_true()) return std::nullopt;
+            if (answered && rule && rule->is_true()) {
+                due_ = reports_ ? calls_ : 0;
+                return std::nullopt;
+            }
             if (seed && reseed_ && seed->integer<std::uint64_t>()) {
                 reseed_(*seed->integer<std::uint64_t>());
             } else if (stop && stop->is_true()) {
@@ -695,6 +733,16 @@ class Client {
             }
         }
         return unwind();
+    }
+
+    /// The rule's decision. Meanwhile, nothing else can be sent.
+    template <class Rule> auto ruled(std::string_view point, Rule& rule) {
+        struct Ruling {
+            Client& client;
+            ~Ruling() { client.ruling_ = {}; }
+        } ruling{*this};
+        ruling_ = point;
+        return rule();
     }
 
     /// Unwinds the model. During another exception, the rule decides instead: a second exception would end the process.
@@ -722,11 +770,15 @@ class Client {
         add([&](std::string& out) {
             out += "{\"hello\":1,\"points\":";
             detail::write(out, points_);
-            out += reseed_ ? ",\"can\":[\"reseed\"]}" : ",\"can\":[]}";
+            out += ",\"can\":[\"expect\"";
+            if (reports_) out += ",\"decided\"";
+            if (reseed_) out += ",\"reseed\"";
+            out += "]}";
         });
     }
 
     void report(std::string_view type, std::string_view text, std::string_view trace) {
+        due_ = 0;
         add([&](std::string& out) {
             constexpr std::size_t most = std::size_t{1} << 16;
             out += "{\"error\":{\"type\":";
@@ -772,8 +824,17 @@ class Client {
         return {};
     }
 
-    /// Appends a line to the send buffer: the whole line, or nothing if writing it throws.
+    /// Adds a line to those that are sent before the next wait.
     template <class Write> void add(Write&& write) {
+        if (!ruling_.empty())
+            throw std::logic_error("the rule of " + std::string(ruling_) + " has asked for a decision, or reported on " +
+                                   "an entity; it must only decide, or call client.report_rules(false) before");
+        decided(nullptr);
+        append(write);
+    }
+
+    /// Appends a line to the send buffer: the whole line, or nothing if writing it throws.
+    template <class Write> void append(Write&& write) {
         const std::size_t before = sending_.size();
         try {
             write(sending_);
@@ -820,10 +881,12 @@ class Client {
 
     std::vector<std::string> points_;
     std::function<void(std::uint64_t)> reseed_;
-    bool connected_ = false, greeted_ = false, alone_ = false, failed_ = false;
+    bool connected_ = false, greeted_ = false, alone_ = false, failed_ = false, reports_ = true;
     State state_ = State::idle;
     int in_ = -1, out_ = -1;
     std::uint64_t calls_ = 0;
+    std::uint64_t due_ = 0;  ///< The call whose rule has not reported its decision.
+    std::string_view ruling_;  ///< The point whose rule is running.
     int refused_ = 0;  ///< How often `decide` has thrown Stop in this episode.
     std::string sending_, received_;
     std::size_t line_ = 0;  ///< How many received bytes have been read.

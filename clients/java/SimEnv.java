@@ -62,6 +62,7 @@ public final class SimEnv {
     private static final long SECONDS_TO_LEAVE = 5;
     private static final Object RULE = new Object();
     private static final SimEnv WIRE = connect();
+    private static boolean reports = true;
 
     private final InputStream input;
     private final OutputStream output;
@@ -72,6 +73,8 @@ public final class SimEnv {
     private int to;
     private LongConsumer reseed;
     private long calls;
+    private long due; // the call whose rule has not told its decision
+    private String ruling; // the point whose rule is running, while its decision is due
     private boolean running; // an episode is in progress
     private boolean stopped; // the episode is being unwound: nothing more is sent
     private boolean busy; // a frame is being written or waits for its answer
@@ -135,6 +138,14 @@ public final class SimEnv {
         return WIRE != null;
     }
 
+    /**
+     * Sets whether the environment is told what rules decide, as it is by default. Rules that ask for other decisions,
+     * or whose decisions cannot be sent, need false. Call it before {@code run}.
+     */
+    public static void reportRules(boolean report) {
+        reports = report;
+    }
+
     /** As {@link #run(List, Episode, LongConsumer)}, for a model that cannot be reseeded during an episode. */
     public static boolean run(List<String> points, Episode episode) {
         return run(points, episode, null);
@@ -159,7 +170,14 @@ public final class SimEnv {
         reseed = callback;
         try {
             frame.begin().key("hello").number(VERSION).key("points").value(points);
-            send(frame.key("can").value(callback == null ? List.of() : List.of("reseed")).close());
+            List<String> can = new ArrayList<>(List.of("expect"));
+            if (reports) {
+                can.add("decided");
+            }
+            if (callback != null) {
+                can.add("reseed");
+            }
+            send(frame.key("can").value(can).close());
             while (!gone && !broken) {
                 Map<?, ?> start = start();
                 if (start != null) {
@@ -208,6 +226,7 @@ public final class SimEnv {
 
     private synchronized void admit() {
         calls = 0;
+        due = 0;
         running = true;
     }
 
@@ -216,6 +235,9 @@ public final class SimEnv {
             fault = error;
             try {
                 if (error == null) {
+                    if (due != 0) {
+                        tellDecided(null);
+                    }
                     Object end = result instanceof End ? result : new End(result, false);
                     send(frame.begin().key("end").value(end).close());
                 }
@@ -253,35 +275,43 @@ public final class SimEnv {
      */
     public static <T> T decide(
             String point, String entity, Consumer<Arguments> arguments, Supplier<T> rule, Function<Object, T> taken) {
-        Object answer = ask(point, entity, arguments, Objects.requireNonNull(taken));
+        Objects.requireNonNull(taken);
         @SuppressWarnings("unchecked")
-        T decided = answer == RULE ? rule.get() : (T) answer;
+        T decided = WIRE == null ? rule.get() : (T) WIRE.ask(point, entity, arguments, rule, taken);
         return decided;
     }
 
     /** As {@link #decide}, for a double; integers become doubles. */
     public static double decideDouble(String point, String entity, Consumer<Arguments> arguments, DoubleSupplier rule) {
-        Object answer = ask(point, entity, arguments, value -> ((Number) value).doubleValue());
-        return answer == RULE ? rule.getAsDouble() : (Double) answer;
+        if (WIRE == null) {
+            return rule.getAsDouble();
+        }
+        return (Double) WIRE.ask(point, entity, arguments, rule::getAsDouble, value -> ((Number) value).doubleValue());
     }
 
     /** As {@link #decide}, for a long. */
     public static long decideLong(String point, String entity, Consumer<Arguments> arguments, LongSupplier rule) {
-        Object answer = ask(point, entity, arguments, value -> ((Long) value).longValue());
-        return answer == RULE ? rule.getAsLong() : (Long) answer;
+        if (WIRE == null) {
+            return rule.getAsLong();
+        }
+        return (Long) WIRE.ask(point, entity, arguments, rule::getAsLong, value -> ((Long) value).longValue());
     }
 
     /** As {@link #decide}, for an int. */
     public static int decideInt(String point, String entity, Consumer<Arguments> arguments, IntSupplier rule) {
-        Object answer = ask(point, entity, arguments, value -> Math.toIntExact((Long) value));
-        return answer == RULE ? rule.getAsInt() : (Integer) answer;
+        if (WIRE == null) {
+            return rule.getAsInt();
+        }
+        return (Integer) WIRE.ask(point, entity, arguments, rule::getAsInt, value -> Math.toIntExact((Long) value));
     }
 
     /** As {@link #decide}, for a boolean. */
     public static boolean decideBoolean(
             String point, String entity, Consumer<Arguments> arguments, BooleanSupplier rule) {
-        Object answer = ask(point, entity, arguments, value -> ((Boolean) value).booleanValue());
-        return answer == RULE ? rule.getAsBoolean() : (Boolean) answer;
+        if (WIRE == null) {
+            return rule.getAsBoolean();
+        }
+        return (Boolean) WIRE.ask(point, entity, arguments, rule::getAsBoolean, value -> ((Boolean) value).booleanValue());
     }
 
     /**
@@ -299,6 +329,20 @@ public final class SimEnv {
     }
 
     /**
+     * Reports that an entity is going to decide, with the arguments that it has now. So agents that are born together
+     * act in one round of the parallel view. Call it for all of them before the first of them decides.
+     *
+     * @param point the name of its decision point
+     * @param entity the name of the entity; null if there is only one
+     * @param arguments collects the arguments, as in a decision
+     */
+    public static void expect(String point, String entity, Consumer<Arguments> arguments) {
+        if (WIRE != null) {
+            WIRE.call("expect", point, entity, arguments, null);
+        }
+    }
+
+    /**
      * Reports that an entity is gone and makes no more decisions.
      *
      * @param point the name of its decision point
@@ -310,8 +354,45 @@ public final class SimEnv {
         }
     }
 
-    private static Object ask(String point, String entity, Consumer<Arguments> arguments, Function<Object, ?> taken) {
-        return WIRE == null ? RULE : WIRE.call("decide", point, entity, arguments, taken);
+    /** Gets a decision from the environment or the rule; if the latter is to be told, no other frame comes before. */
+    private Object ask(
+            String point, String entity, Consumer<Arguments> arguing, Supplier<?> rule, Function<Object, ?> taken) {
+        synchronized (this) {
+            Object answer = call("decide", point, entity, arguing, taken);
+            if (answer != RULE) {
+                return answer;
+            }
+            if (due != 0) {
+                ruling = point;
+                try {
+                    answer = rule.get();
+                } finally {
+                    ruling = null;
+                }
+                tellDecided(answer);
+                return answer;
+            }
+        }
+        return rule.get();
+    }
+
+    private void tellDecided(Object value) {
+        try {
+            send(frame.begin().key("decided").number(due).key("value").value(value).close());
+            due = 0;
+        } catch (IOException error) {
+            throw leave();
+        } catch (RuntimeException error) {
+            String text = "the rule's decision of call " + due + " cannot be sent: " + error.getMessage();
+            throw fail(new IllegalArgumentException(text + "; SimEnv.reportRules(false) spares that", error));
+        }
+    }
+
+    /** Unwinds the model because of an error that it cannot catch. */
+    private Stop fail(Throwable error) {
+        fault = error;
+        stopped = true;
+        return new Stop();
     }
 
     /** Sends a decision and waits for its answer, or sends a report about an entity, which has no answer. */
@@ -324,9 +405,20 @@ public final class SimEnv {
         if (stopped) {
             throw new Stop();
         }
+        if (ruling != null) {
+            throw fail(new IllegalStateException("the rule of " + ruling + " has asked for a decision, or reported on an"
+                    + " entity; it must only decide, or call SimEnv.reportRules(false) before"));
+        }
+        if (due != 0) { // the rule has thrown an exception, which the model has caught
+            tellDecided(null);
+        }
         busy = true;
         try {
             frame.begin().key(what);
+            boolean expects = what.equals("expect");
+            if (expects) {
+                frame.put('[').open().key("entity");
+            }
             if (!asks) {
                 frame.value(entity);
             } else if (entity == null) {
@@ -337,6 +429,9 @@ public final class SimEnv {
             frame.key("point").value(point);
             if (arguing != null) {
                 argue(arguing);
+            }
+            if (expects) {
+                frame.close().put(']');
             }
             send(frame.close());
             waiting = asks;
@@ -382,6 +477,7 @@ public final class SimEnv {
                 throw new WireError("call " + calls + " waits for its answer, and this came: " + json(told));
             }
             waiting = false;
+            due = rule && reports ? calls : 0;
             return rule ? RULE : told.get("value");
         }
     }

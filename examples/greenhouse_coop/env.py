@@ -146,6 +146,8 @@ WATERING: Final[dict[Any, Definition]] = {
         observation_labels=LABELS,
         action_labels=("water, in 1000 litres",),
         agent=WATERER,
+        action_labels=["share of 1000 litres of water"],
+        observation_labels=OBSERVED,
     )
 }
 """The waterer's decision point."""
@@ -161,6 +163,8 @@ VENTILATION: Final[dict[Any, Definition]] = {
         observation_labels=LABELS,
         action_labels=("share of the air",),
         agent=VENTILATOR,
+        action_labels=["share of the air that is exchanged"],
+        observation_labels=OBSERVED,
     )
 }
 """The ventilator's decision point."""

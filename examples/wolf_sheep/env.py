@@ -120,6 +120,11 @@ def sheep_moves(sight: int = SIGHT) -> Definition:
         apply=go,
         reward_mapping=turn,
         agent=name,
+        action_labels=["row - 1", "column + 1", "row + 1", "column - 1"],
+        observation_labels=[
+            "energy",
+            *(f"{what} at {cell}" for what in ("grass", "wolves", "other sheep") for cell in cells(sight)),
+        ],
         removed_by="mesa.agent.Agent.remove",  # called for sheep that starve or are eaten
     )
 

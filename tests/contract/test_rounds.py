@@ -95,6 +95,30 @@ def test_actions_of_a_round_are_replayed_as_they_were_given():
     assert branch(env, lambda twin, _: twin.simulation.log, 1, method="replay") == [[1.0]]
 
 
+def play_rounds(env, share, rounds=10):
+    """Play rounds with an action for the second agent in a share of them."""
+    env.reset(seed=0)
+    for number in range(rounds):
+        env.step({"ant_0": 1, "bee_0": 1} if number < share * rounds else {"ant_0": 1, "bee_0": RULE})
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
+    ant, bee = points()
+
+    def main(simulation):
+        for _ in range(10):
+            ant()
+            if not simulation.log:
+                simulation.log.append(bee())
+
+    env = parallel_env(script(main), [ant, bee], possible_agents=None)
+    play_rounds(env, 0.2)  # 11 of 12 were used
+    with pytest.warns(UserWarning, match=r"of 15 actions in this episode, 11 were used: .* aec_env loses none"):
+        play_rounds(env, 0.5)
+    play_rounds(env, 0.5)  # once for each environment
+
+
 # -- actions that are refused ---------------------------------------------------------------------
 
 

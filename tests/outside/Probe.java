@@ -21,6 +21,7 @@ public final class Probe {
             throw new IllegalStateException("it should know where it is");
         }
         System.out.println(SimEnv.decideInt("a", null, a -> {}, () -> 4)); // no episode yet: its rule
+        SimEnv.reportRules(System.getenv("NESTED") == null);
         SimEnv.run(List.of("a", "b"), Probe::episode, Probe::reseed);
         System.out.println(SimEnv.json(episode(7, Map.of("play", arguments[0]))));
     }
@@ -57,6 +58,8 @@ public final class Probe {
                 SimEnv.update("a", "y", a -> a.time(3).put("level", 0.5).put("full", true).put("mark", 'm'));
                 SimEnv.update("a", null, a -> {});
                 SimEnv.remove("a", "\"b\"");
+                SimEnv.expect("a", "y", a -> a.time(3).put("level", 0.5));
+                SimEnv.expect("b", null, a -> {});
                 return null;
             case "count":
                 return count(times);
@@ -72,6 +75,10 @@ public final class Probe {
                 return SimEnv.decideLong("a", "x", a -> {}, () -> seeded);
             case "nested":
                 return SimEnv.decideInt("a", "x", a -> {}, () -> 10 * SimEnv.decideInt("b", "y", b -> {}, () -> 1));
+            case "careless":
+                return careless();
+            case "bad rule":
+                return SimEnv.decide("a", "x", a -> {}, Object::new, Function.identity()).hashCode();
             case "bad arguments":
                 return guarded(new Object());
             case "bad result":
@@ -137,6 +144,18 @@ public final class Probe {
                 Thread.sleep(10);
             }
         }
+    }
+
+    /** A rule that fails, which the model survives. */
+    static Object careless() {
+        try {
+            SimEnv.decideInt("a", "x", a -> {}, () -> {
+                throw new IllegalStateException("no rule");
+            });
+        } catch (IllegalStateException error) {
+            System.err.println("swallowed");
+        }
+        return SimEnv.decideInt("a", "x", a -> {}, () -> 1);
     }
 
     static Object guarded(Object value) {

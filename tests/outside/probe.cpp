@@ -53,7 +53,9 @@ void reports(Client& client) {
     client.update("a", 12, {{"level", 0.5}}, 1.5);
     client.remove("a", 12);
     client.remove("a", "\"b\"");
-    client.update("a", nullptr, [] { return Json::Object{{"level", 1}}; });
+    client.update("a", nullptr, [] { return Json{{"level", 1}}; });
+    client.expect("a", 12, {{"level", 0.5}}, 1.5);
+    client.expect("b", nullptr, {});
 }
 
 int count(Client& client, const Episode& episode) {
@@ -78,6 +80,19 @@ int deaf(Client& client, const Episode& episode) {
     }
 }
 
+int nested(Client& client) {
+    return client.decide("a", "x", {}, [&] { return 10 * client.decide("b", "y", {}, [] { return 1; }); });
+}
+
+/// A rule that fails, which the model survives.
+int careless(Client& client) {
+    try {
+        client.decide("a", "x", {}, []() -> int { throw std::runtime_error("no rule"); });
+    } catch (const std::runtime_error&) {
+    }
+    return client.decide("a", "x", {}, [] { return 1; });
+}
+
 [[noreturn]] void fail() {
     try {
         throw std::out_of_range("the cause");
@@ -90,6 +105,7 @@ int deaf(Client& client, const Episode& episode) {
 
 int main(int argc, char** argv) {
     Client client({"a", "b"});
+    client.report_rules(!std::getenv("NESTED"));
     client.on_reseed([](std::uint64_t seed) { seeded = seed; });
     Json result;
     const auto model = [&](const Episode& episode) -> Json {
@@ -105,6 +121,10 @@ int main(int argc, char** argv) {
         if (play == "seed") return episode.seed;
         if (play == "reseed") return client.decide("a", "x", {}, [&] { return seeded; });
         if (play == "optional") return client.ask<double>("a", "x", {}).value_or(-1.0);
+        if (play == "reported") return client.ask<int>("a", "x", {}) ? 1 : (client.decided(7), 0);
+        if (play == "nested") return nested(client);
+        if (play == "careless") return careless(client);
+        if (play == "objects") return {{"a", 1}, {"b", Json{{"c", "d"}}}, {"e", Json::Array{1, "f"}}};
         if (play == "huge") return std::string(std::size_t{17} << 20, 'x');
         if (play == "text") client.decide("a", "\xff", {}, [] { return 0; });
         if (play == "name") client.remove("a", "\xc0\x80");

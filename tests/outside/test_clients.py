@@ -1,12 +1,15 @@
-"""The clients in C++ and Java: programs that play what they are told to, over pipes whose other side is the test's."""
+"""The clients in C++, Java and Python: programs that play what they are told to; the other side is the test's."""
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
 import signal
 import subprocess
+import sys
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -17,9 +20,11 @@ from tests.outside.wire import PATIENCE, VALUES, Child, exactly
 
 pytestmark = pytest.mark.greenlet("there is no environment")
 
-HELLO = {"hello": 1, "points": ["a", "b"], "can": ["reseed"]}
+HELLO = {"hello": 1, "points": ["a", "b"], "can": ["decided", "expect", "reseed"]}
 CPP = pytest.mark.parametrize("client", ["C++"], indirect=True)
 JAVA = pytest.mark.parametrize("client", ["Java"], indirect=True)
+PYTHON = pytest.mark.parametrize("client", ["Python"], indirect=True)
+TYPED = pytest.mark.parametrize("client", ["C++", "Java"], indirect=True)
 LONGEST = 16 << 20
 
 
@@ -49,8 +54,10 @@ def cpp_probe(tmp_path_factory):
     return [compiled(HERE / "probe.cpp", tmp_path_factory.mktemp("cpp"))]
 
 
-@pytest.fixture(params=["C++", "Java"])
+@pytest.fixture(params=["C++", "Java", "Python"])
 def client(request):
+    if request.param == "Python":
+        return Client("Python", [sys.executable, HERE / "probe.py"], "", "unwound by Stop\n")
     if request.param == "Java":
         command = request.getfixturevalue("java_probe")
         return Client("Java", command, "standard output is the model's\n4\n", "unwound by Stop\n")
@@ -60,7 +67,16 @@ def client(request):
 @pytest.fixture
 def child(client):
     with Child(*client.command) as child:
-        assert child.receive() == HELLO
+        hello = child.receive()
+        assert {**hello, "can": sorted(hello["can"])} == HELLO
+        yield child
+
+
+@pytest.fixture
+def silent(client):
+    """A child that does not tell what its rules decide, so that they may ask for decisions."""
+    with Child(*client.command, NESTED="1") as child:
+        assert sorted(child.receive()["can"]) == ["expect", "reseed"]
         yield child
 
 
@@ -90,7 +106,7 @@ def plain(client: Client, *arguments: str, descriptors: str | None = None) -> su
 
 @pytest.mark.parametrize("ascii_only", [True, False])
 def test_values_go_to_the_model_and_back_unchanged(child, client, ascii_only):
-    large = [-(2**70)] if client.name == "Java" else []
+    large = [] if client.name == "C++" else [-(2**70)]
     for value in [*VALUES, *large]:
         line = json.dumps({"start": {"seed": 1, "options": {"value": value}}}, ensure_ascii=ascii_only)
         child.send(line.replace("/", "\\/").encode() + b"\r\n")  # blanks and needless escapes are JSON, too
@@ -98,6 +114,9 @@ def test_values_go_to_the_model_and_back_unchanged(child, client, ascii_only):
         assert asked == {"decide": 1, "point": "a", "entity": "ä", "time": 0.25, "args": {"value": value}}
         assert exactly(asked["args"]["value"]) == exactly(value)
         assert exactly(child.act(1, value)) == exactly(ended(value))
+        child.begin(value=value)
+        assert exactly(child.rule(1)) == exactly(ended(value))
+        assert exactly(child.decided[-1]) == exactly(value), "the rule's decision goes back unchanged, too"
 
 
 BIG = 123456789012345678901234567890
@@ -106,6 +125,7 @@ ARGUMENTS = {
         {"x": 1.0, "y": 0.10000000149011612},
         {"flags": [True, False], "name": "b", "half": 0.5, "most": 2**64 - 1},
     ],
+    "Python": [{"value": [[1, 2], [1, 0.5, {"float": "nan"}], {"float": "inf"}, {"x": 0.5}]}],
     "Java": [{"value": [[1, 2], [0.5, {"float": "nan"}], [], "GLAD", "c", 1.5, 3, [{"1": "one"}], 7, 0.5, BIG, None]}],
 }
 
@@ -131,6 +151,7 @@ TYPES = {
 }
 
 
+@TYPED
 def test_the_model_has_the_types_that_it_asks_for(child, client):
     for decisions, found in TYPES[client.name]:
         left = iter(decisions or [])
@@ -151,6 +172,7 @@ WRONG_TYPES = {
 }
 
 
+@TYPED
 def test_a_decision_of_another_type_is_an_error_of_the_model(child, client):
     kind, text = {
         "C++": ("simenv::JsonError", r"decision {}, at a: .* is not of the type that the model takes"),
@@ -174,6 +196,20 @@ def test_a_model_may_ask_without_naming_its_rule(child):
     assert child.act(1, 2) == ended(2.0)
     child.begin(play="optional")
     assert child.rule(1) == ended(-1.0)
+    child.begin(play="reported")
+    assert child.rule(1) == ended(0)
+    assert child.decided == [None, 7]
+
+
+def test_the_decision_of_a_rule_that_fails_is_null(child):
+    child.begin(play="careless")
+    child.send(act=1, rule=True)
+    assert [child.receive() for _ in range(2)] == [
+        {"decided": 1, "value": None},
+        {"decide": 2, "point": "a", "entity": "x", "args": {}},
+    ]
+    assert child.rule(2) == ended(1)
+    assert child.decided == [1]
 
 
 def test_episodes_follow_each_other_and_calls_are_counted_anew(child):
@@ -182,6 +218,7 @@ def test_episodes_follow_each_other_and_calls_are_counted_anew(child):
         assert asked == {"decide": 1, "point": "a", "entity": "x", "args": {"sum": 0}}
         assert child.act(1, 5)["args"] == {"sum": 5}
         assert child.rule(2)["decide"] == 3, "the guard's, which asks at its end"
+        assert child.decided.pop() == 1
         assert child.act(3, 0) == {"update": "last", "point": "b", "args": {"i": 1}}
         assert child.receive() == {"remove": "last", "point": "b"}
         assert child.receive() == ended(6)
@@ -193,18 +230,23 @@ REPORTS = {
         {"remove": 12, "point": "a"},
         {"remove": '"b"', "point": "a"},
         {"update": None, "point": "a", "args": {"level": 1}},
+        {"expect": [{"entity": 12, "point": "a", "args": {"level": 0.5}, "time": 1.5}]},
+        {"expect": [{"entity": None, "point": "b", "args": {}}]},
     ],
     "Java": [
         {"remove": "x", "point": "a"},
         {"update": "y", "point": "a", "args": {"level": 0.5, "full": True, "mark": "m"}, "time": 3.0},
         {"update": None, "point": "a", "args": {}},
         {"remove": '"b"', "point": "a"},
+        {"expect": [{"entity": "y", "point": "a", "args": {"level": 0.5}, "time": 3.0}]},
+        {"expect": [{"entity": None, "point": "b", "args": {}}]},
     ],
 }
+REPORTS["Python"] = REPORTS["C++"]
 
 
-def test_clients_send_updates_and_removals(child, client):
-    told = [child.begin(play="reports"), *(child.receive() for _ in range(4))]
+def test_clients_send_what_entities_do_besides(child, client):
+    told = [child.begin(play="reports"), *(child.receive() for _ in range(6))]
     assert told == [*REPORTS[client.name], ended()]
 
 
@@ -213,11 +255,31 @@ def test_a_model_may_end_its_episode_truncated(child):
     assert child.begin(play="none") == ended()
 
 
-@JAVA
-def test_a_rule_may_decide(child):
-    frames = child.begin(play="nested"), child.rule(1)
+def test_a_rule_may_decide_if_it_is_not_reported(silent):
+    frames = silent.begin(play="nested"), silent.rule(1)
     assert [(call["decide"], call["point"], call["entity"]) for call in frames] == [(1, "a", "x"), (2, "b", "y")]
-    assert child.act(2, 6) == ended(60)
+    assert silent.act(2, 6) == ended(60)
+
+
+def test_a_rule_that_is_reported_and_decides_is_an_error(child):
+    child.begin(play="nested")
+    text = child.rule(1)["error"]["text"]
+    assert re.match("the rule of a has asked for a decision.*report_?[rR]ules", text)
+    assert plays_well(child)
+
+
+@CPP
+def test_pairs_in_braces_are_objects(child):
+    assert child.begin(play="objects") == ended({"a": 1, "b": {"c": "d"}, "e": [1, "f"]})
+
+
+@PYTHON
+def test_a_decorated_function_decides(child):
+    asked = child.begin(play="decorated")
+    assert asked == {"decide": 1, "point": "a", "entity": "x", "time": 2.0, "args": {"level": 3}}
+    assert child.rule(1) == ended(4)
+    child.begin(play="decorated")
+    assert child.act(1, "other") == ended("other")
 
 
 @JAVA
@@ -231,21 +293,21 @@ def test_threads_of_the_model_decide_one_at_a_time_and_are_all_stopped(child):
 
 
 def test_seeds_arrive_and_one_that_is_none_is_drawn(child, client):
-    for seed in {"C++": (0, 7, 2**64 - 1), "Java": (-5, 7, 2**63 - 1)}[client.name]:
+    for seed in {"C++": (0, 7, 2**64 - 1), "Java": (-5, 7, 2**63 - 1), "Python": (0, 7, 2**31 - 1)}[client.name]:
         assert child.begin(seed, play="seed") == ended(seed)
     drawn = []
     for start in ({"seed": None}, {}):
         child.send(start=start | {"options": {"play": "seed"}})
         drawn.append(child.receive()["end"]["result"])
     assert drawn[0] != drawn[1]
-    assert {"C++": 0, "Java": -(2**63)}[client.name] <= min(drawn) <= max(drawn) < 2**64
+    assert {"C++": 0, "Java": -(2**63), "Python": 0}[client.name] <= min(drawn) <= max(drawn) < 2**64
 
 
 def test_generators_are_seeded_anew_before_an_answer(child, client):
     child.begin(play="reseed")
     child.send(reseed=12)
     child.send(reseed=13)
-    own = {"C++": 0, "Java": 1000}[client.name]  # the callback's own decision, which is its rule's
+    own = 1000 if client.name == "Java" else 0  # the callback's own decision, which is its rule's
     assert child.rule(1) == ended(13 + own)
 
 
@@ -268,10 +330,18 @@ def test_a_model_that_ignores_a_stop_is_stopped_again(child):
     assert plays_well(child)
 
 
-DEAF = "simenv: the model catches simenv::Stop again and again, and does not unwind\n"
+DEAF = {
+    "C++": "simenv: the model catches simenv::Stop again and again, and does not unwind\n",
+    "Java": "",
+    "Python": "simenv_marl_client: the model catches Stop again and again, and does not unwind\n",
+}
 
 
-@pytest.mark.parametrize(("client", "gone"), [("C++", False), ("C++", True), ("Java", True)], indirect=["client"])
+@pytest.mark.parametrize(
+    ("client", "gone"),
+    [("C++", False), ("C++", True), ("Java", True), ("Python", False), ("Python", True)],
+    indirect=["client"],
+)
 def test_a_model_that_never_hears_is_ended(child, client, gone):
     child.begin(play="deaf", times=-1)
     if gone:
@@ -279,7 +349,7 @@ def test_a_model_that_never_hears_is_ended(child, client, gone):
     else:
         child.send(stop=True)
     assert child.receive() is None
-    assert child.ended() == (1, client.said, DEAF if client.name == "C++" else "")
+    assert child.ended() == (1, client.said, DEAF[client.name])
 
 
 @CPP
@@ -317,18 +387,29 @@ FAILURES = {
         "fail": ("java.io.IOException", "the mill \u2603 burnt down", "java.io.IOException"),
         "silent": ("java.lang.RuntimeException", "", "java.lang.RuntimeException"),
         "huge": (JAVA_REFUSES, "16777273 bytes are to be sent, and 16 MiB is the most", JAVA_REFUSES),
+        "bad rule": (JAVA_REFUSES, "the rule's decision of call 1 cannot be sent: a java.lang.Object.*", JAVA_REFUSES),
         **{f"bad {what}": CANNOT_BE_SENT for what in ("arguments", "result")},
+    },
+    "Python": {
+        "fail": ("RuntimeError", "the pump is broken", "KeyError: 'the cause'"),
+        "huge": ("ValueError", r"a line of 16\d* bytes cannot be sent; 16 MiB is the most", ""),
+        "reserved": ("ValueError", "'time' cannot be the name of an argument at a: .*", ""),
+        **{f"bad {what}": ("TypeError", "<object .*> cannot be sent: .*", "") for what in ("arguments", "result")},
     },
 }
 
 
 def test_an_error_is_sent_and_the_next_episode_works(child, client):
     for play, (kind, text, trace) in FAILURES[client.name].items():
-        error = child.begin(play=play)["error"]
+        error = child.begin(play=play)
+        error = (child.rule(1) if "decide" in error else error)["error"]
         assert re.fullmatch(kind, error["type"])
         assert re.fullmatch(text, error["text"])
         if client.name == "C++":
             assert error["trace"] == trace
+        elif client.name == "Python":
+            assert trace in error["trace"]
+            assert error["trace"].startswith("Traceback")
         else:
             assert error["trace"].startswith(trace)
             assert "\tat Probe." in error["trace"]
@@ -378,7 +459,9 @@ ANSWERS = {
 
 @pytest.mark.parametrize(
     ("client", "line"),
-    [("C++", line) for line in ANSWERS] + [("Java", line) for line, text in ANSWERS.items() if text is not None],
+    [("C++", line) for line in ANSWERS]
+    + [("Java", line) for line, text in ANSWERS.items() if text is not None]
+    + [("Python", line) for line in ANSWERS if not re.search(rb"184467|1e999|ud834", line)],
     indirect=["client"],
     ids=lambda value: repr(value[:40]),
 )
@@ -389,6 +472,8 @@ def test_an_invalid_answer_ends_the_child_with_an_error(child, client, line):
     assert error["text"]
     if client.name == "C++":
         assert error["type"] == "simenv::WireError"
+    elif client.name == "Python":
+        assert error["type"] == "simenv_marl_client.WireError"
     else:
         assert ANSWERS[line] in error["text"]
     assert child.receive() is None
@@ -398,7 +483,7 @@ def test_an_invalid_answer_ends_the_child_with_an_error(child, client, line):
 def test_a_line_without_an_end_is_given_up(child, client):
     child.begin(play="count")
     child.send(b" " * LONGEST)
-    text = {"C++": "a line of more than 16 MiB", "Java": "a line has more than 16 MiB"}[client.name]
+    text = "a line has more than 16 MiB" if client.name == "Java" else "a line of more than 16 MiB"
     assert child.receive()["error"]["text"] == text
     assert has_given_up(child)
 
@@ -407,17 +492,15 @@ def test_an_answer_between_episodes_is_an_error_and_the_end(child, client):
     child.begin(play="count")
     child.send(stop=True)
     error = child.rule(1)["error"]
-    assert client.name == "C++" or 'a start was expected, and this came: {"act":1,"rule":true}' in error["text"]
+    assert client.name != "Java" or 'a start was expected, and this came: {"act":1,"rule":true}' in error["text"]
     assert has_given_up(child)
 
 
-@CPP
-@pytest.mark.parametrize(
-    "frame", [{"stop": True}, {"start": {"seed": "x"}}, {"start": {"seed": -1}}, {"start": {"seed": 0.5}}, {"start": 1}]
-)
+@pytest.mark.parametrize("client", ["C++", "Python"], indirect=True)
+@pytest.mark.parametrize("frame", [{"stop": True}, {"start": {"seed": "x"}}, {"start": {"seed": 0.5}}, {"start": 1}])
 def test_an_invalid_start_ends_the_child_with_an_error(child, frame):
     child.send(**frame)
-    assert child.receive()["error"]["type"] == "simenv::WireError"
+    assert child.receive()["error"]["type"].endswith("WireError")
     assert has_given_up(child)
 
 
@@ -437,27 +520,31 @@ def test_a_model_may_exit(child):
     assert child.ended()[0] == 3
 
 
-@CPP
-def test_processes_of_the_model_inherit_nothing_of_the_wire(child):
+@pytest.mark.parametrize("client", ["C++", "Python"], indirect=True)
+def test_processes_of_the_model_inherit_nothing_of_the_wire(child, client):
     reading, writing = child.descriptors
     command = f'test -z "$SIMENV_MARL_FDS" && ! test -e /dev/fd/{reading} && ! test -e /dev/fd/{writing}'
     assert child.begin(play="shell", command=command) == ended(0)
-    assert child.begin(play="shell", command="kill -PIPE $$") == ended(signal.SIGPIPE), "as ever"
+    if client.name == "C++":
+        assert child.begin(play="shell", command="kill -PIPE $$") == ended(signal.SIGPIPE), "as ever"
 
 
 def test_outside_an_environment_the_model_runs_once_on_its_rule(client):
     done = plain(client, "count")
     assert (done.stdout, done.stderr) == (f"{client.said}5\n", "unwound by rule 7\n")
     failed = plain(client, "fail")
-    assert failed.returncode == {"C++": -signal.SIGABRT, "Java": 1}[client.name]
-    assert {"C++": "the pump is broken", "Java": "burnt down"}[client.name] in failed.stderr
+    assert failed.returncode == (-signal.SIGABRT if client.name == "C++" else 1)
+    assert ("burnt down" if client.name == "Java" else "the pump is broken") in failed.stderr
     assert client.name == "Java" or plain(client, "echo", '[1, 2.0, "ü"]').stdout == '[1,2.0,"ü"]\n'
+
+
+INVALID = ["", "3,", "a,b", "3,4,5", "998,999"]
 
 
 @pytest.mark.parametrize(
     ("client", "said", "text"),
     [
-        *(("C++", said, "SIMENV_MARL_FDS") for said in ["", "3,", "a,b", "3,4,5", "998,999"]),
+        *((name, said, "SIMENV_MARL_FDS") for name in ("C++", "Python") for said in INVALID),
         ("Java", "98,99", "/dev/fd/98"),
         ("Java", "7", "has to be two numbers"),
     ],
@@ -465,5 +552,32 @@ def test_outside_an_environment_the_model_runs_once_on_its_rule(client):
 )
 def test_descriptors_that_are_none_are_refused(client, said, text):
     done = plain(client, descriptors=said)
-    assert done.returncode == {"C++": -signal.SIGABRT, "Java": 1}[client.name]
+    assert done.returncode == (-signal.SIGABRT if client.name == "C++" else 1)
     assert text in done.stderr
+
+
+# -- other Pythons ----------------------------------------------------------------------------------------------------
+
+PYTHON_CLIENT = HERE.parents[1] / "clients" / "python" / "simenv_marl_client.py"
+
+
+def test_the_client_in_python_keeps_to_the_syntax_of_its_oldest_version():
+    ast.parse(PYTHON_CLIENT.read_text(encoding="utf-8"), feature_version=(3, 8))
+
+
+@pytest.mark.parametrize("version", ["3.8", "3.9", "3.10", "3.13"])
+def test_the_client_in_python_plays_with_other_pythons(version):
+    found = sorted((Path.home() / ".pyenv" / "versions").glob(f"{version}.*/bin/python"))
+    if not found:
+        pytest.skip(f"there is no Python {version}")
+    with Child(found[-1], HERE / "probe.py") as child:
+        assert sorted(child.receive()["can"]) == HELLO["can"]
+        for value in VALUES:
+            assert child.begin(value=value)["args"] == {"value": value}
+            assert exactly(child.act(1, value)) == exactly(ended(value))
+        child.begin(play="count", times=1)
+        child.send(stop=True)
+        assert child.begin(play="fail")["error"]["type"] == "RuntimeError"
+        assert child.begin(play="reports") == REPORTS["Python"][0]
+        child.close("out")
+        assert child.ended() == (0, "", "unwound by Stop\n")

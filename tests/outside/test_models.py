@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import closing
 from functools import cache
@@ -150,6 +151,19 @@ def test_the_code_of_the_page_on_java(model, here, capsys):
     earned = names["found"].values()
     assert (earned["by the granary"] > earned["rule"]).mean() > 0.8
     assert "by the granary" in capsys.readouterr().out
+
+
+@pytest.mark.greenlet("the page takes the driver as it is")
+def test_the_code_of_the_page_on_python(here, capsys):
+    model, environment = shown("clients-python.md", "python")
+    (here / "bay.py").write_text(model, encoding="utf-8")
+    shutil.copy(DOCS.parent / "clients" / "python" / "simenv_marl_client.py", here)
+    exec(environment.replace("old/bin/python", sys.executable), {"__name__": "__main__"})
+    plain = subprocess.run([sys.executable, "bay.py"], check=True, capture_output=True, text=True, timeout=20).stdout
+    assert capsys.readouterr().out == plain
+    assert int(plain) > 0
+    report = check_wire([sys.executable, "bay.py"])
+    assert {finding.verdict for finding in report.findings if finding.tried != "reseed"} == {"ok"}, str(report)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed")

@@ -330,7 +330,7 @@ def test_calls_can_be_copied():
     totals = set()
 
     def look(call):
-        with pytest.raises(KeyError):
+        with pytest.raises(KeyError, match=r"broker\.price has no argument 'rain'; it has total"):
             call["rain"]
         for copied in (copy.copy(call), copy.deepcopy(call), pickle.loads(pickle.dumps(call))):
             assert (copied.total, copied.time) == (call.total, call.time)

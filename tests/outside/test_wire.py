@@ -1,8 +1,10 @@
 """The wire: what is sent arrives, what is no frame is refused; and the check that authors of clients make of them."""
 
 import json
+import re
 import sys
 from math import inf, isnan, nan
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 from simenv_marl.__main__ import main
 from simenv_marl.errors import WireError
 from simenv_marl.remote.check import check_wire
-from simenv_marl.remote.wire import decode, encode
+from simenv_marl.remote.wire import KEYS, decode, encode
 from tests.outside.reservoirs import EXITS_AFTER_STOP, changed, command
 
 pytestmark = pytest.mark.greenlet("no environment is made")
@@ -85,6 +87,12 @@ def test_invalid_frames_are_refused(line):
         decode(line)
 
 
+def test_the_page_shows_frames_that_the_wire_has():
+    text = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    shown = [decode(line.encode()) for line in re.findall("^(?:->|<-)  (.*)$", text, re.MULTILINE)]
+    assert {next(iter(frame)) for frame in shown} == {*KEYS, "start", "act", "reseed", "stop"}
+
+
 def found(report):
     return {finding.tried: finding.verdict for finding in report.findings}
 
@@ -92,10 +100,17 @@ def found(report):
 def test_nothing_is_wrong_with_a_simulator_that_does_well():
     report = check_wire(command())
     assert report.ok
-    assert len(report.findings) == 15
+    assert len(report.findings) == 18
     assert found(report).pop("a run without an environment") == "note"  # it wants a seed then
     assert "nothing is wrong" in str(report)
-    assert check_wire(command("1"), timeout=10).ok  # one episode for each process
+
+
+def test_a_program_may_play_one_episode_and_be_started_again():
+    report = check_wire(command("1"), timeout=10)
+    assert report.ok, str(report)
+    (one,) = [finding for finding in report.findings if finding.tried == "two episodes in a row with the same seed"]
+    assert one.verdict == "note"
+    assert "exits with code 0 after an episode, and plays the same in a new process" in one.text
 
 
 def test_a_simulator_may_exit_after_a_stop(tmp_path):
@@ -142,6 +157,116 @@ def test_wire_check_finds_faults(tmp_path, change, tried):
     report = check_wire(changed(tmp_path, change), timeout=10.0)
     assert not report.ok
     assert found(report)[tried] == "wrong", str(report)
+
+
+SENDS = """
+send = outside.Wire.send
+def sends(self, frame):
+    {}
+    send(self, frame)
+outside.Wire.send = sends
+"""
+SEEDS = """
+init = outside.Reservoirs.__init__
+def begin(self, seed, options): init(self, {}, options)
+outside.Reservoirs.__init__ = begin
+"""
+DECIDES = """
+decide = outside.Wire.decide
+def decides(self, point, entity, time, arguments, rule):
+    value = decide(self, point, entity, time, arguments, rule)
+    {}
+outside.Wire.decide = decides
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "tried", "text"),
+    [
+        (
+            "def remove(self, point, entity):\n    for name in 'ab': self.send({'remove': name, 'point': point})\n"
+            "outside.Wire.remove = remove",
+            "an episode by its own rule",
+            r"call \d+ is of '[ab]' at reservoir\.inflow, which was removed before; an entity .* needs a name",
+        ),
+        (
+            DECIDES.format("return rule() if point == 'broker.price' else value"),
+            "other decisions at broker.price",
+            'the decisions 0, 1, 100 lead to the same episode: continue with the "value" of "act"',
+        ),
+        (
+            DECIDES.format("return rule()")  # its rule's decisions are strings, and are known to be legal
+            + SENDS.format("frame = {**frame, 'can': ['reseed', 'decided']} if 'hello' in frame else frame")
+            + "receive = outside.Wire.receive\n"
+            "def told(self):\n    answer = receive(self)\n"
+            "    if answer.get('rule'): send(self, {'decided': self.number, 'value': 'abc'[self.number % 3]})\n"
+            "    return answer\n"
+            "outside.Wire.receive = told",
+            "other decisions at reservoir.inflow",
+            "the decisions '[abc]', '[abc]' lead to the same episode",
+        ),
+        (SEEDS.format("seed % 2**16"), "other seeds", "1 to 4 lead to the same episodes as .*: keep all 31 bits"),
+        (
+            SEEDS.format("seed & ~127 if seed > 2**24 else seed"),
+            "other seeds",
+            "1073741825 to .* lead to the same episode:",
+        ),
+        (SEEDS.format("7"), "other seeds", 'though "reseed" changes it: seed the generators with the seed of "start"'),
+        (
+            "from time import time_ns\nsys.argv.append('1')\n" + SEEDS.format("time_ns()"),
+            "two episodes in a row with the same seed",
+            r"frame \d is .*, and in a new process it was .*; seed all generators",
+        ),
+        (
+            SENDS.format("frame = {**frame, 'argz': {}} if 'decide' in frame else frame"),
+            "an episode by its own rule",
+            "the key 'argz' of .* does not exist; did you mean args",
+        ),
+        (
+            SENDS.format("frame = {'end': {'score': 3}} if 'end' in frame else frame"),
+            "an episode by its own rule",
+            "the key 'score' of .* does not exist; an argument belongs into args, another result into result",
+        ),
+        (
+            SENDS.format("frame = {**frame, 'name': 'dam'} if 'hello' in frame else frame"),
+            "starts, and says hello",
+            "the key 'name' of .* does not exist",
+        ),
+        (
+            SENDS.format("frame = {**frame, 'can': ['reseeds']} if 'hello' in frame else frame"),
+            "starts, and says hello",
+            "the \"can\" of its hello lists 'reseeds', which does not exist; did you mean reseed",
+        ),
+        (
+            SENDS.format("frame = {'end': {'truncated': 'yes'}} if 'end' in frame else frame"),
+            "an episode by its own rule",
+            r"'truncated': 'yes'.*\"truncated\" \(true or false\)",
+        ),
+        (
+            SENDS.format("frame = {**frame, 'end': {}} if frame.get('decide') == 3 else frame"),
+            "an episode by its own rule",
+            "decide and end in one frame, .*; each needs a line of its own",
+        ),
+    ],
+    ids=range(13),
+)
+def test_wire_check_says_what_is_wrong_and_what_to_do(tmp_path, change, tried, text):
+    report = check_wire(changed(tmp_path, change), timeout=10.0)
+    (finding,) = [finding for finding in report.findings if finding.tried == tried]
+    assert finding.verdict == "wrong", str(report)
+    assert re.search(f"(?s){text}", finding.text), finding.text
+
+
+def test_seeds_that_change_nothing_are_noted_where_nothing_may_be_random(tmp_path):
+    report = check_wire(changed(tmp_path, SEEDS.format("7") + "outside.random.Random.seed = lambda *_: None"))
+    assert found(report)["other seeds"] == "note", str(report)
+
+
+def test_decisions_of_another_kind_are_noted(tmp_path):
+    report = check_wire(
+        changed(tmp_path, DECIDES.format("return value if value < 10 and value is not True else 1 // 0"))
+    )
+    assert found(report)["other decisions at reservoir.inflow"] == "note", str(report)
 
 
 def test_a_reseed_that_changes_nothing_is_noted(tmp_path):

@@ -27,14 +27,15 @@ VALUES = [None, True, *INTEGERS, *FLOATS, *TEXTS, *NAMED, *NESTED]
 class Child:
     """A process that speaks the wire, whose frames are written and read by hand."""
 
-    def __init__(self, *command: str | Path) -> None:
+    def __init__(self, *command: str | Path, **env: str) -> None:
         read_by_child, self.out = os.pipe()
         self.into, written_by_child = os.pipe()
         self.descriptors = (read_by_child, written_by_child)
         self._rest = b""
+        self.decided: list[Any] = []
         self.process = subprocess.Popen(
             [str(part) for part in command],
-            env=os.environ | {"SIMENV_MARL_FDS": "{},{}".format(*self.descriptors)},
+            env=os.environ | env | {"SIMENV_MARL_FDS": "{},{}".format(*self.descriptors)},
             pass_fds=self.descriptors,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -95,8 +96,13 @@ class Child:
         return self.receive()
 
     def rule(self, number: int) -> Any:
-        """Leave a call to the rule; return the next frame."""
+        """Leave a call to the rule; return the next frame. What the rule decides is added to ``decided``."""
         self.send(act=number, rule=True)
+        frame = self.receive()
+        if frame is None or "decided" not in frame:
+            return frame
+        assert frame["decided"] == number
+        self.decided.append(frame["value"])
         return self.receive()
 
     def play(self, choose: Callable[[Any], Any] | None = None, seed: Any = 7, **options: Any) -> tuple[list[Any], Any]:

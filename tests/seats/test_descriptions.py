@@ -8,6 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, clone, joint_env, make_step, parallel_env, simulate, single_env
+from simenv_marl.data import collect_episodes, plot_timeline
 from simenv_marl.errors import DefinitionError, InvalidActionError, NotResetError, SimEnvError, ViewError
 from simenv_marl.seats import describe, parse
 
@@ -188,6 +189,13 @@ def test_the_schema_of_numbers_has_their_bounds():
     assert schema["properties"]["c"] == {"type": "integer", "minimum": 1, "maximum": 3}
 
 
+def test_a_single_number_has_its_label():
+    env = env_of(of_space(spaces.Box(0, 2, (1,)), ["litres"]))
+    assert describe(env).endswith("\n- litres: a number from 0 to 2")
+    schema = {"type": "number", "minimum": 0.0, "maximum": 2.0, "description": "litres"}
+    assert describe(env, as_json=True)["actions"] == schema
+
+
 def test_actions_without_names_and_numbers_cannot_be_put_into_words():
     env = env_of(of_space(spaces.Box(0, 1, (2, 2)), None))
     with pytest.raises(ViewError, match="cannot be put into words"):
@@ -202,6 +210,12 @@ def test_parts_of_an_observation_have_their_labels():
         observation_labels={"level": "Level in m", "day": "Day"},
     )
     assert describe(env_of(definition), as_json=True)["observation"] == {"Day": 0, "Level in m": [5.0]}
+
+
+def test_timelines_name_actions_by_their_labels():
+    trajectories = collect_episodes(Tank, {"filler": RULE}, seeds=[1], points=POINTS)
+    axes = plot_timeline(trajectories).axes
+    assert "half" in {label.get_text() for one in axes for label in one.get_yticklabels()}
 
 
 @pytest.mark.parametrize("labels", [

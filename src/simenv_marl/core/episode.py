@@ -350,7 +350,7 @@ class Rounds(Episode):
 
     def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
         """Run the simulation to its first decision: see ``Episode``. The first round reports the ends until then."""
-        self.decide, self.actions, self.stalled = decide, {}, 0
+        self.decide, self.actions, self.stalled, self.given, self.unused = decide, {}, 0, 0, 0
         super().begin(at_first_event)
         self.unreported_end = self.over or bool(self.just_ended)
 
@@ -387,6 +387,7 @@ class Rounds(Episode):
             self.stalled = self.stalled + 1 if reply is WAIT else 0
             if reply is not WAIT:
                 self.advance(reply)
+            self.unused += sum(part is not RULE for part in actions.values())
             if not self.over and self.consulted is None:  # it is set where a replay ends
                 self.update_all(truncated=bool(action) and self.turns == self.most_steps)
         except BaseException as error:
@@ -419,6 +420,7 @@ class Rounds(Episode):
                 if legal is ILLEGAL or mask is not None:
                     legal = agent.point.checked(action, name, mask)
                 action = legal
+                self.given += 1
             checked[name] = action
         return checked
 

@@ -34,7 +34,7 @@ class Mirror(Episode):
         self.simulation = self.driver = self.latest = self.consulted = self.script = nothing
         self.clock = None if state.time is None else partial(getattr, remote, "time")
         self.agents, self.others, self.ended, self.entities = {}, {}, {}, {}
-        self.running, self.skips = True, False
+        self.running, self.skips, self.given, self.unused = True, False, 0, 0
         self.unreported_end, self.last_time = state.unreported_end, state.last_time
         self.load(state)
 

@@ -57,18 +57,21 @@ class Run:
         items: The items of a call that was split, until the rule has decided or another call is split.
         last_time: The time at the latest step of a joint view.
         actions: In rounds, the unused actions of the current round, by agent.
+        given, unused: The numbers of actions in rounds, other than ``RULE``, and of those that no decision has used.
         stalled: The number of rounds without an action for the pending agent since the simulation last moved.
     """
 
     __slots__ = (
         "_lock", "_rng", "actions", "agents", "clock", "consulted", "decide", "driver", "ended", "entities",
-        "failed_in_model", "items", "just_ended", "last_time", "latest", "most_steps", "others", "over", "pending",
-        "plan", "running", "script", "seed", "simulation", "skips", "stalled", "tape", "tape_size", "terminated",
-        "truncated", "turns", "unreported_end",
+        "failed_in_model", "given", "items", "just_ended", "last_time", "latest", "most_steps", "others", "over",
+        "pending", "plan", "running", "script", "seed", "simulation", "skips", "stalled", "tape", "tape_size",
+        "terminated", "truncated", "turns", "unreported_end", "unused",
     )  # fmt: skip
 
     in_rounds: ClassVar[bool] = False
     actions: dict[str, Any]
+    given: int
+    unused: int
     stalled: int
 
     def __init__(

@@ -9,6 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from ..errors import OptionValueError, UnknownAgentError, did_you_mean, short_repr
@@ -85,7 +86,8 @@ def plot_timeline(
         episode: The number of the episode, which is the index of its seed.
         agents: The names of the agents to draw. None: all agents that decided in this episode.
         action_names: The names of discrete actions: a sequence of names, or a dict from action to name; where policies
-            differ in them, a dict from their keys to these. None: the numbers of the actions.
+            differ in them, a dict from their keys to these. None: the ``action_labels`` of ``make_step``, else the
+            numbers of the actions.
         component: The component of the action by which rows are coloured, where actions have several components. The
             name of a component is its index: ``"[1]"`` in a vector, ``"litres"`` in a ``Dict``, ``"litres[1]"`` in a
             vector of the dict. None: the first component.
@@ -140,7 +142,10 @@ def _components(key: Any, found: Trajectories, action_names: Any) -> dict[str, _
         action_names = action_names[key]
     if isinstance(action_names, (str, bytes)) or not isinstance(action_names, (Mapping, Sequence, type(None))):
         raise OptionValueError(f"action_names must be a sequence or a dict of names, not {short_repr(action_names)}")
-    given = action_names if isinstance(action_names, Mapping) else dict(enumerate(action_names or ()))
+    if action_names is None and isinstance(found.action_space, Discrete):
+        action_names = found.action_labels
+    start = int(getattr(found.action_space, "start", 0)) if action_names is found.action_labels else 0
+    given = action_names if isinstance(action_names, Mapping) else dict(enumerate(action_names or (), start))
     components = {}
     for part, array in leaves(found.actions):
         names = given

@@ -66,6 +66,7 @@ class Trajectories:
         extras: A dict from name to array, ``(N, ...)``: what the policy returned besides the actions.
         observation_space, action_space: The spaces of the decision point. None where no agent decided and the decision
             point is not known.
+        action_labels: The ``action_labels`` of the decision point; None where it has none, or they vary with the call.
         collected: What ``collect`` returned for each episode's simulation, in the order of the seeds. None where there
             was no ``collect``.
     """
@@ -93,6 +94,7 @@ class Trajectories:
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     observation_space: spaces.Space[Any] | None = None
     action_space: spaces.Space[Any] | None = None
+    action_labels: Any = None
     collected: tuple[Any, ...] | None = None
 
     def __len__(self) -> int:
@@ -144,6 +146,7 @@ class Records:
     trajectories: Mapping[str, Any]  # the same with a row for each trajectory
     observation_space: spaces.Space[Any] | None
     action_space: spaces.Space[Any] | None
+    action_labels: Any
 
 
 def combine(parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[Any, ...] | None = None) -> Trajectories:
@@ -166,6 +169,7 @@ def combine(parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[A
         steps=np.arange(lengths.sum()) - np.repeat(starts, lengths),
         observation_space=filled[0].observation_space,
         action_space=filled[0].action_space,
+        action_labels=filled[0].action_labels,
         collected=collected,
     )
 
@@ -194,12 +198,13 @@ class _DecisionLog:
     """
 
     def __init__(self, point: Point | None) -> None:
-        self.observation_space = self.action_space = None
+        self.observation_space = self.action_space = self.action_labels = None
         self.stack_observations: Stacker = np.array
         self.stack_actions: Stacker = np.array
         if point is not None:
             self.name, definition = point.point.name, point.definition
             self.observation_space, self.action_space = definition.observation_space, definition.action_space
+            self.action_labels = None if callable(definition.action_labels) else definition.action_labels
             self.stack_observations, self.stack_actions = stacker(self.observation_space), stacker(self.action_space)
             self.unknown_action = blank(self.action_space)
         # One entry for each batch.
@@ -260,7 +265,7 @@ class _DecisionLog:
             "last_turns": np.array([log.last_turn for log in logs], np.int64),
             "last_observations": self.stack_observations([log.last_observation for log in logs]),
         }
-        return Records(decisions, trajectories, self.observation_space, self.action_space)
+        return Records(decisions, trajectories, self.observation_space, self.action_space, self.action_labels)
 
 
 class Recorder:

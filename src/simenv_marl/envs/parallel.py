@@ -1,17 +1,22 @@
 """The parallel view: rounds, in which every agent has at most one action."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from pettingzoo import ParallelEnv
 
 from ..core.episode import Episode
 from ..core.spaces import duplicate
+from ..errors import warn_user
 from ..simulation import Sentinel
 from .base import AgentsView
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
 """The results of a step: observations, rewards, terminations, truncations and infos, by agent."""
+
+
+LEAST_USED: Final = 0.9
+"""The share of the actions of an episode that must be used, or the user is warned."""
 
 
 class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
@@ -27,6 +32,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     """
 
     _in_rounds = True
+    _warned = False  # of actions that no decision used
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -74,6 +80,13 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 self.agents = []
             raise
         self.agents = [] if episode.over else list(episode.agents)
+        if episode.over and not self._warned and episode.unused > episode.given * (1 - LEAST_USED):
+            self._warned = True
+            warn_user(
+                f"of {episode.given} actions in this episode, {episode.given - episode.unused} were used: the agents do"
+                " not decide in each round, and the other actions are lost. aec_env loses none; joint_env gives one"
+                ' controller all of them; infos[agent]["acted"] tells which were used'
+            )
         results = self._begin(episode)
         if self._shows:
             self._show()

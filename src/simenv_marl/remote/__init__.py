@@ -8,7 +8,7 @@
     child      the process: starting it, its frames, waiting for it, ending it
     guardian   ends the processes of simulators when this process has ended
     callbacks  CallbackGuard: exceptions in callbacks of C code
-    wire       lines and their JSON
+    wire       lines, their JSON, and what frames may contain
 """
 
 from .callbacks import CallbackGuard

@@ -23,15 +23,21 @@ class RemoteCall:
         time: The process's time; None if it tells none.
     """
 
-    __slots__ = ("__dict__", "__weakref__", "entity", "point", "time")
+    __slots__ = ("__dict__", "__weakref__", "_rule", "entity", "point", "time")
 
     def __init__(self, point: str, entity: Any) -> None:
         self.point, self.entity = point, entity
         self.time: float | None = None
+        self._rule: Callable[[], Any] | None = None  # returns the rule's decision, while one is due and can be known
+
+    def __getstate__(self) -> Any:
+        return self.__dict__, {"point": self.point, "entity": self.entity, "time": self.time, "_rule": None}
 
     def __getitem__(self, name: str) -> Any:
-        if name in ("entity", "time") and name not in self.__dict__:
+        if name in ("entity", "time"):
             return getattr(self, name)
+        if name not in self.__dict__:
+            raise KeyError(self._missing(name))
         return self.__dict__[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -43,9 +49,10 @@ class RemoteCall:
     def __getattr__(self, name: str) -> Any:
         if name in RemoteCall.__slots__:  # a copy is being made
             raise AttributeError(name)
-        raise AttributeError(
-            f"the call of {self.point} has no argument {name!r}; it has {', '.join(self.__dict__) or 'none'}"
-        )
+        raise AttributeError(self._missing(name))
+
+    def _missing(self, name: str) -> str:
+        return f"the call of {self.point} has no argument {name!r}; it has {', '.join(self.__dict__) or 'none'}"
 
     def __repr__(self) -> str:
         arguments = "".join(f", {name}={value!r}" for name, value in self.__dict__.items())
@@ -56,7 +63,7 @@ class PointFunctions(NamedTuple):
     """The functions that represent a decision point of a simulator."""
 
     decide: Callable[[RemoteCall], Any]
-    """The decision function: it returns the decision, or ``RULE``."""
+    """The decision function. Its rule has the process decide, and returns what it decided; ``RULE`` if it tells not."""
 
     remove: Callable[[RemoteCall], None]
     """Ends the agent of an entity that is gone."""
@@ -65,7 +72,7 @@ class PointFunctions(NamedTuple):
 @cache
 def point_functions(name: str) -> PointFunctions:
     """Return the functions that represent decision points of that name, in all simulators."""
-    decide_hook = _named_hook(lambda call: RULE, name)
+    decide_hook = _named_hook(lambda call: RULE if call._rule is None else call._rule(), name)
     remove_hook = _named_hook(lambda call: None, f"{name} (removed)")
     functions = PointFunctions(decide_hook.make_wrapper(), remove_hook.make_wrapper())
     point_for(decide_hook).removed_by[functions.remove] = None

@@ -10,13 +10,14 @@ from functools import partial
 from itertools import zip_longest
 from math import inf
 from subprocess import DEVNULL, PIPE, TimeoutExpired, run
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from ..core.rng import is_seed
-from ..errors import OptionValueError, ProcessDiedError, ProcessError, short_repr
+from ..errors import OptionValueError, ProcessDiedError, ProcessError, WireError, did_you_mean, short_repr
 from ..simulation import RULE
 from .child import MOST_FRAMES, Child
-from .wire import DESCRIPTORS, encode, encode_answer
+from .wire import DESCRIPTORS, KEYS, decode, encode, encode_answer
 
 OK, NOTE, WRONG = "ok", "note", "wrong"
 
@@ -31,6 +32,15 @@ INVALID: Final = {
     "the end of its input in mid-episode": b"",
 }
 """What a simulator must refuse in place of an answer. Its input ends after a line without an end."""
+
+ABILITIES: Final = ("decided", "expect", "reseed")
+"""What the "can" of a hello may list."""
+
+GUESSES: Final = ((0, 1, 100), (False, True))
+"""Values that a decision may have, for simulators that do not tell what their rules decide."""
+
+HIGH: Final = 1 << 30
+"""The highest bit of a seed."""
 
 Outcome = tuple[str, str]
 """The verdict of a test, and what happened."""
@@ -76,7 +86,8 @@ def check_wire(
     """Run episodes of a simulator, and report its errors in the use of the protocol.
 
     The check runs episodes by the simulator's rule, in one process and in new ones; breaks episodes off; sends long
-    lines, ``reseed`` and invalid frames; closes the input; and runs the simulator without an environment.
+    lines, ``reseed``, other seeds, other decisions and invalid frames; closes the input; and runs the simulator without
+    an environment.
 
     Args:
         command: The program and its arguments.
@@ -105,6 +116,7 @@ class _Check:
         self._report = WireReport()
         self._first: list[dict[str, Any]] = []  # the frames of an episode by the rule, in a new process
         self._decisions = 0  # of that episode
+        self._draws = False  # whether other random numbers are known to change an episode
 
     def run(self) -> WireReport:
         """Run all tests; if a simulator fails one of the first two, only these."""
@@ -118,6 +130,9 @@ class _Check:
             self._try(f"stop in place of the answer to call {number}", partial(self._repeat, stop=number))
         self._try("a line of 1 MiB", self._long_line)
         self._try("reseed", self._reseed)
+        self._try("other seeds", self._seeds)
+        for point in dict.fromkeys(frame["point"] for frame in self._first if "decide" in frame):
+            self._try(f"other decisions at {point}", partial(self._values, point))
         for what, line in INVALID.items():
             self._try(what, partial(self._refusal, line))
         self._try("the end of its input between episodes", self._end_of_input)
@@ -135,29 +150,51 @@ class _Check:
         return closing(Child(self._command, self._timeout))
 
     def _play(
-        self, child: Child, *, start: bytes | None = None, stop: int = 0, reseed: tuple[int, int] = (0, 0)
+        self,
+        child: Child,
+        *,
+        start: bytes | None = None,
+        stop: int = 0,
+        reseed: tuple[int, int] = (0, 0),
+        decisions: Mapping[str, Any] = MappingProxyType({}),
     ) -> list[dict[str, Any]]:
         """Play an episode by the rule; return its frames.
 
         ``start`` replaces the usual line. ``stop`` is the call at which to break off, ``reseed`` a call and a seed.
+        ``decisions`` has a value for each point at which the rule does not decide.
         """
-        frames = [child.begin(start or self._start)]
-        while "end" not in frames[-1]:
-            if "decide" in frames[-1]:
+        frames, removed = [child.begin(start or self._start)], set[tuple[str, Any]]()
+        while True:
+            frame = frames[-1]
+            _check_keys(frame)
+            if "end" in frame:
+                return frames
+            who = frame.get("point", ""), frame.get("entity")
+            if "remove" in frame:
+                removed.add(who)
+            elif "decide" in frame:
                 number = child.number
+                if who in removed:
+                    raise WireError(
+                        f"call {number} is of {who[1]!r} at {who[0]}, which was removed before; an entity that comes"
+                        ' needs a name that none had in the episode, and "remove" comes after the last call'
+                    )
                 if number in (stop, self._most) or len(frames) > MOST_FRAMES:
                     child.break_off()
-                    break
-                before = encode({"reseed": reseed[1]}) if number == reseed[0] else b""
-                child.answer(before + encode_answer(number, RULE))
+                    return frames
+                if who[0] in decisions:
+                    child.answer(encode_answer(number, decisions[who[0]]))
+                else:
+                    value = child.leave_to_rule(encode({"reseed": reseed[1]}) if number == reseed[0] else b"")
+                    frames += [] if value is RULE else [{"decided": number, "value": value}]
             frames.append(child.next_frame())
-        return frames
 
     def _compare(self, frames: list[dict[str, Any]]) -> Outcome:
         """Compare an episode with the first one."""
         for number, (one, other) in enumerate(zip_longest(self._first, frames)):
             if one != other:
-                return WRONG, f"frame {number} is {short_repr(other)}, and in a new process it was {short_repr(one)}"
+                what = f"frame {number} is {short_repr(other)}, and in a new process it was {short_repr(one)}"
+                return WRONG, f'{what}; seed all generators by the seed of "start", and keep nothing of other episodes'
         return OK, "the same as in a new process"
 
     # -- tests ------------------------------------------------------------------------------------
@@ -166,6 +203,10 @@ class _Check:
         with self._child() as child:
             if not child.points:
                 return WRONG, "it has no points"
+            _check_keys(child.hello)
+            for name in child.can.difference(ABILITIES):
+                hint = did_you_mean(name, ABILITIES) or f"; it may list {', '.join(ABILITIES)}"
+                return WRONG, f'the "can" of its hello lists {name!r}, which does not exist{hint}'
             can = ", ".join(sorted(child.can)) or "nothing else"
             return OK, f"points {', '.join(sorted(child.points))}; can {can}"
 
@@ -188,8 +229,16 @@ class _Check:
                 return self._compare(self._play(child))
             except ProcessDiedError:
                 if child.number == 0 and child.exit_code() == 0:
-                    return NOTE, "it exits after an episode, and is started again for each"
+                    return self._restart()
                 raise
+
+    def _restart(self) -> Outcome:
+        """Compare an episode in another process, for a simulator that exits after each."""
+        with self._child() as child:
+            verdict, text = self._compare(self._play(child))
+        if verdict == OK:
+            return NOTE, "it exits with code 0 after an episode, and plays the same in a new process: one for each"
+        return verdict, text
 
     def _long_line(self) -> Outcome:
         with self._child() as child:
@@ -204,10 +253,56 @@ class _Check:
                 futures.append(self._play(child, reseed=(middle, seed)))
         one, again, other = futures
         if one != again:
-            return WRONG, "the same seed has led to two futures"
+            return WRONG, "the same seed has led to two futures; seed all generators by it"
         if one == other:
             return NOTE, "two seeds have led to the same future; is nothing in the model random?"
+        self._draws = True
         return OK, f"at call {middle}, two seeds lead to two futures, and the same seed to the same future"
+
+    def _seeds(self) -> Outcome:
+        """Play episodes with four low seeds, and with four that differ from them in the highest bit alone."""
+        low, high = ([self._seeded(base + number) for number in range(1, 5)] for base in (0, HIGH))
+        if all(one == low[0] for one in [*low, *high]):
+            text = "seeds 1 to 4 lead to the same episode"
+            if self._draws:
+                return WRONG, f'{text}, though "reseed" changes it: seed the generators with the seed of "start"'
+            return NOTE, f'{text}; is nothing in the model random, or does it ignore the seed of "start"?'
+        different = sum(one not in low[:number] for number, one in enumerate(low))
+        for same, what in (
+            (low == high, f"seeds 1 to 4 lead to the same episodes as {HIGH + 1} to {HIGH + 4}"),
+            (all(one == high[0] for one in high), f"seeds {HIGH + 1} to {HIGH + 4} lead to the same episode"),
+        ):
+            if same and different > 2:  # with fewer, it can be chance
+                return WRONG, f"{what}: keep all 31 bits of the seed, in an integer of 32 or 64 bits"
+        return OK, f"four seeds lead to {different} different episodes, and all their bits count"
+
+    def _seeded(self, seed: int) -> list[dict[str, Any]]:
+        """Play an episode with another seed, in a new process."""
+        start = encode({"start": {**decode(self._start)["start"], "seed": seed}})
+        with self._child() as child:
+            return self._play(child, start=start)
+
+    def _values(self, point: str) -> Outcome:
+        """Play episodes in which all decisions of a point have the same value."""
+        calls = {frame["decide"] for frame in self._first if frame.get("point") == point and "decide" in frame}
+        told = [frame["value"] for frame in self._first if frame.get("decided") in calls]
+        known = next(([told[0], value] for value in told if value != told[0]), None)
+        for values in GUESSES if known is None else [known]:
+            try:
+                episodes = [self._valued(point, value) for value in values]
+            except ProcessError as error:
+                if known is not None or isinstance(error, WireError):
+                    raise
+                continue  # it does not take such a value
+            shown = ", ".join(map(short_repr, values))
+            if all(episode == episodes[0] for episode in episodes):
+                return WRONG, f'the decisions {shown} lead to the same episode: continue with the "value" of "act"'
+            return OK, f"the decisions {shown} lead to different episodes"
+        return NOTE, "it takes neither numbers nor booleans here, so that other decisions were not tried"
+
+    def _valued(self, point: str, value: Any) -> list[dict[str, Any]]:
+        with self._child() as child:
+            return self._play(child, decisions={point: value})
 
     def _refusal(self, line: bytes) -> Outcome:
         with self._child() as child:
@@ -222,7 +317,7 @@ class _Check:
             return OK, "it ends"
         if "error" in last:
             return OK, f"it sends the error {short_repr(last['error'])}"
-        return WRONG, f"it continues with {short_repr(last)}"
+        return WRONG, f"it continues with {short_repr(last)}; it must end, or send an error"
 
     def _end_of_input(self) -> Outcome:
         with self._child() as child:
@@ -248,3 +343,20 @@ class _Check:
             last = done.stderr.decode(errors="replace").strip()[-300:]
             return NOTE, f"it has exited with code {done.returncode}: {last}"
         return OK, "it runs on its own rule, and exits with code 0"
+
+
+def _check_keys(frame: Mapping[str, Any]) -> None:
+    """Check that a frame has no keys that the wire does not know.
+
+    Raises:
+        WireError: It has one.
+    """
+    kind = next(kind for kind in KEYS if kind in frame)
+    parts = [(frame, {kind, *KEYS[kind]})]
+    if kind == "end":
+        parts.append((frame["end"], {"truncated", "result"}))
+    for part, keys in parts:
+        for key in part:
+            if key not in keys:
+                hint = did_you_mean(key, keys) or "; an argument belongs into args, another result into result"
+                raise WireError(f"the key {key!r} of {short_repr(frame)} does not exist{hint}")

@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
-from types import NoneType
 from typing import Any, Final, NoReturn
 from weakref import WeakSet, finalize
 
@@ -29,8 +28,9 @@ from ..errors import (
     short_repr,
     warn_user,
 )
+from ..simulation import RULE
 from . import guardian
-from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, decode
+from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, check_frame, decode, encode_answer
 
 CHUNK: Final = 1 << 16
 """The number of bytes to read at once; pipes hold no more."""
@@ -59,6 +59,7 @@ class Child:
 
     Attributes:
         pid: The id of the process.
+        hello: Its first frame.
         points: The names of its decision points.
         can: Its further abilities, such as "reseed".
         timeout: The time to wait for each line, in seconds.
@@ -100,6 +101,7 @@ class Child:
         except BaseException:  # an interrupt, too
             self.close(patience=0.0)
             raise
+        self.hello = hello
         version, points, can = hello.get("hello"), hello.get("points", ()), hello.get("can", [])
         if version is None:
             self.refuse(hello, f"began with {short_repr(hello)}, not with a hello")
@@ -159,9 +161,9 @@ class Child:
         return frame
 
     def next_frame(self) -> dict[str, Any]:
-        """Wait for the next frame of the episode, a "decide", "update", "remove" or "end", and check it.
+        """Wait for the next frame of the episode, a "decide", "expect", "update", "remove" or "end", and check it.
 
-        The first three always get an item "entity".
+        All but the last always get an item "entity"; of "expect", each item gets it.
 
         Raises:
             ProcessDiedError, ProcessTimeoutError: As ``receive``.
@@ -169,23 +171,23 @@ class Child:
             RemoteError: The model raised an error.
         """
         frame = self.receive()
+        try:
+            time = check_frame(frame, self.points)
+        except WireError as error:
+            self.fail(WireError(f"{self} has {error}"))
+        if time is not None:
+            self.time = time
         if "end" in frame:
-            if not isinstance(frame["end"], dict):
-                what = f'the end {short_repr(frame["end"])}; it must be an object with "truncated" and "result"'
-                self.fail(WireError(f"{self} has sent {what}"))
             self.state = "idle"
         elif "decide" in frame:
             number, due = frame["decide"], self.number + 1
             if type(number) is not int or number != due:
                 self.fail(WireError(f"{self} has made call {short_repr(number)} where call {due} was due"))
-            self._check_call(frame, frame.get("entity"))
             self.number, self.state, self._frames = number, "waiting", 0
-        elif "update" in frame:
-            self._check_call(frame, frame["update"])
-        elif "remove" in frame:
-            self._check_call(frame, frame["remove"])
-        else:
-            self.refuse(frame, f"has sent {short_repr(frame)}, which is not a frame of the wire")
+        elif not ("update" in frame or "remove" in frame or ("expect" in frame and "expect" in self.can)):
+            unasked = [name for name in ("decided", "expect") if name in frame]
+            why = 'is not due, or not in the "can" of its hello' if unasked else "is not a frame of the wire"
+            self.refuse(frame, f"has sent {short_repr(frame)}, which {why}")
         if self.state == "running":
             self._check_flood()
         return frame
@@ -202,23 +204,23 @@ class Child:
             what = f"has sent updates and removals for {MOST_WAITS * self.timeout:g} s, and neither a call nor an end"
             self.fail(ProcessTimeoutError(f"{self} {what}"))
 
-    def _check_call(self, frame: dict[str, Any], entity: Any) -> None:
-        """Check a frame's point, entity, arguments and time; note entity and time."""
-        name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
-        if not isinstance(name, str) or name not in self.points:
-            self.fail(WireError(f"{self} has named the point {short_repr(name)}, which is not in its hello"))
-        if type(entity) not in (str, int, NoneType):
-            what = f"the entity {short_repr(entity)} for {name}; an entity must be a string or an integer"
-            self.fail(WireError(f"{self} has sent {what}"))
-        if arguments is not None and not isinstance(arguments, dict):
-            self.fail(WireError(f"{self} has sent args for {name} that are not an object: {short_repr(arguments)}"))
-        if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
-            time = float(time)
-        if type(time) is float:
-            self.time = time
-        elif time is not None:
-            self.fail(WireError(f"{self} has sent the time {short_repr(time)} for {name}, which is not a number"))
-        frame["entity"] = entity
+    def leave_to_rule(self, before: bytes = b"") -> Any:
+        """Answer the call by the process's rule, after other lines.
+
+        Returns:
+            The rule's decision; ``RULE`` if the process does not tell it.
+
+        Raises:
+            WireError: The process tells another thing. Other errors are those of ``receive``.
+        """
+        self.answer(before + encode_answer(self.number, RULE))
+        if "decided" not in self.can:
+            return RULE
+        frame = self.receive()
+        if frame.get("decided") != self.number or type(frame["decided"]) is not int or "value" not in frame:
+            due = f'{{"decided": {self.number}, "value": ...}} was due: what its rule decided'
+            self.refuse(frame, f"has sent {short_repr(frame)} where {due}")
+        return frame["value"]
 
     def answer(self, lines: bytes) -> None:
         """Send the lines that answer the call for which it waits."""

@@ -89,12 +89,14 @@ class ProcessSimulation(SimulationInterface):
         """Forget the latest episode."""
         self._frame: dict[str, Any] | None = None  # the first frame of an episode that does not run yet
         self._calls: dict[tuple[str, Any], RemoteCall] = {}  # the latest call of each entity at each point
+        self._expected: dict[tuple[str, Any], RemoteCall] = {}  # those of entities that are going to decide
         self._time: float | None = None
         self._seed: int | None = None  # the seed to send with the next answer
 
     def __getstate__(self) -> dict[str, Any]:
         points = {getattr(function, BY_NAME): definition for function, definition in self.points.items()}
-        return {**vars(self), "points": points, "_child": None, "_finalizer": None, "_frame": None, "_calls": None}
+        of_this_process = dict.fromkeys(("_child", "_finalizer", "_frame", "_calls", "_expected"))
+        return {**vars(self), "points": points, **of_this_process}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, points=_by_function(state["points"]))
@@ -177,10 +179,11 @@ class ProcessSimulation(SimulationInterface):
         try:
             while "end" not in frame:
                 self._time = child.time
-                if frame["point"] in functions:
-                    self._handle(child, frame, functions[frame["point"]])
-                elif "decide" in frame:
-                    child.answer(encode_answer(child.number, RULE))
+                for item in frame.get("expect", [frame]):
+                    if item["point"] in functions:
+                        self._handle(child, item, functions[item["point"]])
+                    elif "decide" in item:
+                        child.leave_to_rule()
                 frame = child.next_frame()
         except BaseException:
             if self._child is child:  # otherwise it may serve another simulation already
@@ -209,6 +212,13 @@ class ProcessSimulation(SimulationInterface):
             raise AttributeError("the process has not sent a time")
         return lambda: self._time  # type: ignore[return-value]
 
+    @property
+    def expected_calls(self) -> Callable[[str], list[tuple[RemoteCall]]]:
+        """A method that returns the coming calls of a point. Missing if the process did not announce "expect"."""
+        if self._child is None or "expect" not in self._child.can:
+            raise AttributeError('the process has not announced "expect" in its hello')
+        return lambda point: [(call,) for (name, _), call in self._expected.items() if name == point]
+
     def reseed(self, seed: int) -> None:
         """Ask the process to reseed its generators, so that it draws new random numbers from here on.
 
@@ -223,34 +233,60 @@ class ProcessSimulation(SimulationInterface):
     # -- frames -----------------------------------------------------------------------------------
 
     def _handle(self, child: Child, frame: dict[str, Any], function: Callable[[RemoteCall], Any]) -> None:
-        """Handle a frame of an entity at a point, given the point's decision function."""
+        """Handle a frame of an entity at a point, or an item of an "expect", given the point's decision function."""
         key = frame["point"], frame["entity"]
         call = self._calls.get(key)
         if call is None:
-            if "decide" not in frame:
+            if "update" in frame or "remove" in frame:
                 return  # an entity without a call so far
             call = self._calls[key] = RemoteCall(*key)
-        if "decide" in frame:
-            call.__dict__, call.time = frame.get("args") or {}, child.time
-            child.answer(self._decide(child.number, call, function))
-        elif "update" in frame:
-            call.__dict__, call.time = frame.get("args") or {}, child.time
-        else:
+        if "remove" in frame:
+            self._expected.pop(key, None)
             del self._calls[key]
             point_functions(call.point).remove(call)
+            return
+        call.__dict__, call.time = frame.get("args") or {}, child.time
+        if "decide" in frame:
+            self._expected.pop(key, None)
+            self._decide(child, call, function)
+        elif "update" not in frame:
+            self._expected[key] = call
 
-    def _decide(self, number: int, call: RemoteCall, function: Callable[[RemoteCall], Any]) -> bytes:
-        """Get the decision of a call; return the lines that answer it."""
-        value = function(call)
+    def _decide(self, child: Child, call: RemoteCall, function: Callable[[RemoteCall], Any]) -> None:
+        """Get the decision of a call, and send it; if the rule is run, the process decides at once."""
+        ruled: list[Any] = []
+
+        def rule() -> Any:
+            if not ruled:
+                ruled.append(child.leave_to_rule(self._reseeding()))
+            return ruled[0]
+
+        call._rule = rule if "decided" in child.can else None
         try:
-            line = encode_answer(number, value)
-        except WireError as error:
-            annotate(error, f"simenv_marl: in the decision of {call.entity!r} at {call.point}")
-            raise
-        if self._seed is None:
-            return line
+            value = function(call)
+        finally:
+            call._rule = None
+        if ruled:
+            if value is not ruled[0] and value is not RULE:
+                raise SimulationError(
+                    f"the rule of {call.point} has decided {short_repr(ruled[0])} for {call.entity!r}, and the process"
+                    f" continues with that: {short_repr(value)} cannot replace it. A handler or apply that asks the"
+                    " rule must return what it decided; of a call that is split, answer all items by RULE, or none"
+                )
+        elif value is RULE:
+            rule()
+        else:
+            try:
+                line = encode_answer(child.number, value)
+            except WireError as error:
+                annotate(error, f"simenv_marl: in the decision of {call.entity!r} at {call.point}")
+                raise
+            child.answer(self._reseeding() + line)
+
+    def _reseeding(self) -> bytes:
+        """Return the line that reseeds the process, if one is due."""
         seed, self._seed = self._seed, None
-        return encode({"reseed": seed}) + line
+        return b"" if seed is None else encode({"reseed": seed})
 
     def _functions(self) -> dict[str, Any]:
         """Return the decision functions of the points, by name."""

@@ -175,7 +175,7 @@ def _parts(space: spaces.Space[Any], labels: Any) -> list[str]:
         return [f"- {labels[key] if labels else key}: {_limits(part)}" for key, part in space.spaces.items()]
     if isinstance(space, spaces.Tuple):
         return [f"- {place}: {_limits(part)}" for place, part in enumerate(space.spaces)]
-    if labels and isinstance(space, spaces.Box) and len(labels) > 1:
+    if labels and isinstance(space, spaces.Box) and labels != ("0",):
         limits = zip(labels, space.low.tolist(), space.high.tolist(), strict=True)
         return [f"- {label}: a number from {low:.6g} to {high:.6g}" for label, low, high in limits]
     if labels and isinstance(space, spaces.MultiDiscrete):
@@ -210,7 +210,7 @@ def _schema(space: spaces.Space[Any], labels: Any) -> dict[str, Any]:
         numbers = [_bounded(*bounds) for bounds in zip(*_bounds(space), strict=True)]
         names = labels or tuple(map(str, range(len(numbers))))
         if len(numbers) == 1 and isinstance(space, spaces.Box):
-            return numbers[0]
+            return numbers[0] if names == ("0",) else numbers[0] | {"description": names[0]}
         parts = dict(zip(names, numbers, strict=True))
     if parts is None:
         raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")

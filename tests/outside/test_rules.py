@@ -1,0 +1,187 @@
+"""What simulators in other processes tell besides their calls: the decisions of their rules, and births."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import RULE, aec_env, make_step, parallel_env, simulate
+from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
+from simenv_marl.errors import DefinitionError, SimulationError, WireError
+from simenv_marl.remote import ProcessSimulation
+from tests.outside.reservoirs import BOTH, BOTH_HERE, PRICE, Here, by_its_rule, reservoirs
+from tests.worlds import by_client
+from tests.worlds.models import play
+
+pytestmark = pytest.mark.greenlet("the rule's decision comes back within the simulation, whatever runs it")
+
+
+def with_actions(points):
+    """The definitions, in which the rule's decisions are actions."""
+    return {
+        name: replace(definition, rule_action_mapping=mapping)
+        for (name, definition), mapping in zip(
+            points.items(), [lambda decision: [decision], lambda decision: min(2, int(decision))], strict=True
+        )
+    }
+
+
+def telling(points=BOTH) -> ProcessSimulation:
+    """The reservoirs in a process that tells what its rules decide."""
+    return ProcessSimulation([sys.executable, by_client.__file__, "reservoirs"], points)
+
+
+def test_infos_have_the_action_of_the_rule(make_env):
+    told = make_env(aec_env, telling(with_actions(BOTH)))
+    here = make_env(aec_env, Here, with_actions(BOTH_HERE))
+    turns = [
+        [(turn.agent, turn.info.get("rule_action"), turn.reward) for turn in play(env, seed=1)] for env in (told, here)
+    ]
+    assert str(turns[0]) == str(turns[1])
+    assert any(action is not None for _, action, _ in turns[0])
+    assert told.unwrapped.simulation.result == by_its_rule(1)
+
+
+def _closes(observations):
+    return np.zeros((len(observations), 1))
+
+
+def test_the_rule_can_be_recorded_and_compared_with_policies():
+    here = type("There", (Here,), {"points": with_actions(BOTH_HERE)})
+    found = [
+        compare_with_rule(simulation, {name: _closes}, seeds=range(3), tolerance=0.5)[name]
+        for simulation, name in ((telling(with_actions(BOTH)), "reservoir.inflow"), (here, next(iter(BOTH_HERE))))
+    ]
+    assert 0 < found[0].agreement == found[1].agreement < 1
+    mixed = collect_episodes(telling(with_actions(BOTH)), {"reservoir.inflow": Mixture({RULE: 1.0})}, seeds=[1])
+    assert mixed["reservoir.inflow"].known.all()
+
+
+def test_actions_of_a_process_that_tells_nothing_stay_unknown():
+    policies = {"broker_0": lambda observations: np.zeros(len(observations), int)}
+    with pytest.raises(DefinitionError, match="the action of the rule is not known"):
+        compare_with_rule(reservoirs({"broker.price": replace(PRICE, agent="broker_0")}), policies, seeds=[1])
+
+
+def test_apply_may_ask_the_rule_and_leave_it_at_that():
+    asked = []
+
+    def apply(action, call, *, _rule):
+        asked.append(_rule(call))
+        return asked[-1]
+
+    definition = replace(PRICE, action_space_mapping=None, apply=apply)
+    assert simulate(telling({"broker.price": definition}), {"broker.price": lambda _: 0}, seed=1).result == by_its_rule(
+        1
+    )
+    assert asked[0] == pytest.approx(1.1)
+
+
+def test_what_the_rule_has_decided_cannot_be_replaced():
+    definition = replace(PRICE, action_space_mapping=None, apply=lambda action, call, *, _rule: 2 * _rule(call))
+    with pytest.raises(SimulationError, match=r"rule of broker\.price has decided 1\.1.* 2\.2.* cannot replace it"):
+        simulate(telling({"broker.price": definition}), {"broker.price": lambda _: 0}, seed=1)
+
+
+SPEAKS = """
+import os, sys
+reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
+lines = open(reading)
+for frame in sys.argv[1:]:
+    os.write(writing, frame.encode() + b"\\n")
+    if any(word in frame for word in ('"hello"', '"decide"', '"end"')):
+        lines.readline()
+"""
+HELLO = {"hello": 1, "points": ["sheep.graze"], "can": ["decided", "expect"]}
+CALL = {"decide": 1, "point": "sheep.graze", "entity": "a", "args": {"hunger": 1}}
+GRAZE = make_step(
+    observation_space=spaces.Box(0, 9, (1,), np.float32),
+    observation_space_mapping=lambda call: [call.hunger],
+    action_space=spaces.Discrete(5),
+    action_space_mapping=lambda action: int(action),
+    reward_mapping=lambda call: -float(call.hunger),
+    agent=lambda call: call.entity,
+)
+
+
+def speaking(*frames) -> ProcessSimulation:
+    """A simulator that sends some frames, whatever it receives."""
+    return ProcessSimulation([sys.executable, "-c", SPEAKS, *map(json.dumps, frames)], {"sheep.graze": GRAZE})
+
+
+@pytest.mark.parametrize(
+    ("frames", "text"),
+    [
+        ([{**CALL, "decide": 2}], r"has sent .*'decide': 2.* where \{\"decided\": 1, \"value\": \.\.\.\} was due"),
+        ([{"end": {}}], r"'end'.* where \{\"decided\": 1"),
+        ([{"decided": 2, "value": 3}], r"'decided': 2.* where \{\"decided\": 1"),
+        ([{"decided": True, "value": 3}], r"'decided': True.* where \{\"decided\": 1"),
+        ([{"decided": 1}], r"\{'decided': 1\} where \{\"decided\": 1"),
+        ([{"decided": 1, "value": 3}, {"decided": 1, "value": 3}], "'decided'.* which is not due"),
+        ([{"decided": 1, "value": 3}, {"expect": {"entity": "b"}}], '"expect" with .*must be a list of objects'),
+        ([{"decided": 1, "value": 3}, {"expect": [{**CALL}]}], '"expect" with .*must be a list of objects'),
+        ([{"decided": 1, "value": 3}, {"expect": [{"point": "moon", "entity": "b"}]}], "the point 'moon'"),
+        ([{"decided": 1, "value": 3}, {"end": {"truncated": "yes"}}], r"'yes'.*\"truncated\" \(true or false\)"),
+        ([{"decided": 1, "value": 3}, {**CALL, "end": {}}], "decide and end in one frame"),
+        (
+            [{"decided": 1, "value": 3}, {"update": "a", "point": "sheep.graze", "args": {"time": 3}}],
+            r"an argument 'time' for sheep\.graze",
+        ),
+        (
+            [{"decided": 1, "value": 3}, {"expect": [{"point": "sheep.graze", "args": {"entity": 3}}]}],
+            r"an argument 'entity' for sheep\.graze",
+        ),
+    ],
+    ids=str,
+)
+def test_frames_that_are_not_due_are_errors_that_name_them(frames, text):
+    with pytest.raises(WireError, match=f"(?s){text}"):
+        simulate(speaking(HELLO, CALL, *frames), seed=1)
+
+
+@pytest.mark.parametrize("frame", [{"decided": 1, "value": 3}, {"expect": []}])
+def test_frames_that_were_not_announced_are_errors(frame):
+    with pytest.raises(WireError, match=r"not in the \"can\" of its hello"):
+        simulate(speaking({**HELLO, "can": []}, CALL, frame), seed=1)
+
+
+def flock() -> ProcessSimulation:
+    return ProcessSimulation([sys.executable, by_client.__file__, "flock"], {"sheep.graze": GRAZE})
+
+
+def rounds(env, **options):
+    """Play an episode by its rule; return the number of agents after the reset, the number of rounds and the result."""
+    env.reset(seed=1, options=options)
+    born, number = len(env.agents), 0
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, RULE))
+        number += 1
+    return born, number, env.unwrapped.simulation.result
+
+
+def test_expected_calls_join_and_act_in_one_round(make_env):
+    env = make_env(parallel_env, flock())
+    born, number, eaten = rounds(env, sheep=1000, days=1)
+    assert (born, number) == (1, 1000)
+    assert rounds(env, sheep=1000, days=1, expects=True) == (1000, 1, eaten)
+    assert rounds(env, sheep=100, days=3, expects=True)[:2] == (100, 3), "also those that are born in mid-episode"
+
+
+def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
+    env = make_env(parallel_env, flock())
+    observations, _ = env.reset(seed=1, options={"sheep": 2, "expects": True, "culled": True})
+    assert list(observations) == ["0.0", "0.1"]
+    observations, _, terminations, *_ = env.step(dict.fromkeys(env.agents, 3))
+    assert terminations == {"0.0": True, "0.1": False, "1.0": False, "1.1": False}
+    calls = env.unwrapped.simulation.expected_calls("sheep.graze")
+    assert [(call.entity, call.time) for (call,) in calls] == [("1.0", 1.0), ("1.1", 1.0)], "one decides now"
+
+
+def test_a_process_that_does_not_expect_has_no_expected_calls(make_env):
+    env = make_env(aec_env, reservoirs())
+    assert not hasattr(env.unwrapped.simulation, "expected_calls")
+    env.reset(seed=1)
+    assert not hasattr(env.unwrapped.simulation, "expected_calls")

@@ -56,9 +56,6 @@ OBSERVED: Final = (
 )
 """The observation of both agents."""
 
-LABELS: Final = ("temperature", "humidity", "plants alive", "days gone", "water", "water of weak plants")
-"""The same for people."""
-
 
 # -- observations, actions, rewards ---------------------------------------------------------------
 
@@ -143,8 +140,6 @@ WATERING: Final[dict[Any, Definition]] = {
         action_space_mapping=to_litres,
         rule_action_mapping=from_litres,
         reward_mapping=reward,
-        observation_labels=LABELS,
-        action_labels=("water, in 1000 litres",),
         agent=WATERER,
         action_labels=["share of 1000 litres of water"],
         observation_labels=OBSERVED,
@@ -160,8 +155,6 @@ VENTILATION: Final[dict[Any, Definition]] = {
         apply=exchange_air,
         rule_action_mapping=usual_exchange,
         reward_mapping=reward,
-        observation_labels=LABELS,
-        action_labels=("share of the air",),
         agent=VENTILATOR,
         action_labels=["share of the air that is exchanged"],
         observation_labels=OBSERVED,

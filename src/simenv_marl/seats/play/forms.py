@@ -1,11 +1,15 @@
-"""What the page gets of a decision: observations, spaces, pictures, and actions to try out."""
+"""What goes between the game, the page and the recording: decisions, spaces, pictures and actions as JSON."""
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from base64 import b64encode
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from math import isfinite
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -15,9 +19,21 @@ from ...core.pending import decision_of
 from ...errors import describe_error, short_repr
 from ..descriptions import labelled
 from ..policies import digest_of
-from .recording import jsonable
 
 MOST: Final = 12  # candidates of a decision, and entries of its observation in the history
+
+
+def jsonable(value: Any) -> Any:
+    """Return a value as JSON has it: arrays as lists, numbers that are not finite and other things as text."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(part) for part in value]
+    if isinstance(value, float) and not isfinite(value):
+        return str(value)
+    return value if value is None or isinstance(value, (str, int, float)) else short_repr(value)
 
 
 def pending_decision(env: Any) -> dict[str, Any]:
@@ -89,3 +105,27 @@ def picture_of(env: Any) -> dict[str, Any] | None:
     chunks = [b"IHDR" + header, b"IDAT" + zlib.compress(lines.tobytes()), b"IEND"]
     parts = [struct.pack("!I", len(chunk) - 4) + chunk + struct.pack("!I", zlib.crc32(chunk)) for chunk in chunks]
     return {"png": b64encode(b"\x89PNG\r\n\x1a\n" + b"".join(parts)).decode()}
+
+
+def action_of(space: spaces.Space[Any], value: Any) -> Any:
+    """Return the action for its JSON; what does not fit stays as it is, and the environment refuses it."""
+    if isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)):
+        with suppress(ValueError, OverflowError):
+            array = np.asarray(value)
+            return array.astype(space.dtype) if array.dtype.kind == "i" else value
+    if isinstance(space, spaces.Dict) and isinstance(value, dict) and value.keys() == space.spaces.keys():
+        return {key: action_of(part, value[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple) and isinstance(value, list) and len(value) == len(space.spaces):
+        return tuple(map(action_of, space.spaces, value))
+    return value
+
+
+def write(path: Path | None, line: Mapping[str, Any]) -> str:
+    """Append a line, if there is a path; return what is wrong. It is open only meanwhile: clones need not copy it."""
+    try:
+        if path is not None:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(jsonable(line)) + "\n")
+    except OSError as error:
+        return f"The recording {path} cannot be written: {error}"
+    return ""

@@ -19,8 +19,7 @@ import numpy as np
 
 from ... import RULE, aec_env, clone
 from ...errors import InvalidActionError, OptionValueError, SimEnvError, describe_error, did_you_mean, short_repr
-from .forms import MOST, candidates_of, pending_decision, picture_of
-from .recording import action_of, jsonable, write
+from .forms import MOST, action_of, candidates_of, jsonable, pending_decision, picture_of, write
 
 FUTURES: Final = 16  # in which each candidate is tried out
 CHECKPOINTS: Final = 24  # at most: each is a process

@@ -1,58 +1,16 @@
-"""Recordings of what was decided on the page: lines of JSON, and the episode that they describe."""
+"""Recordings of what was decided on the page, and the episodes that they describe."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from contextlib import suppress
-from math import isfinite
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from gymnasium import spaces
 
 from ... import RULE, aec_env
 from ...data import collect_episodes
 from ...errors import InvalidActionError, OptionValueError, ResetNeededError, StoreError, short_repr
 from ..policies import digest_of
-
-
-def jsonable(value: Any) -> Any:
-    """Return a value as JSON has it: arrays as lists, numbers that are not finite and other things as text."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [jsonable(part) for part in value]
-    if isinstance(value, float) and not isfinite(value):
-        return str(value)
-    return value if value is None or isinstance(value, (str, int, float)) else short_repr(value)
-
-
-def action_of(space: spaces.Space[Any], value: Any) -> Any:
-    """Return the action for its JSON; what does not fit stays as it is, and the environment refuses it."""
-    if isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)):
-        with suppress(ValueError, OverflowError):
-            array = np.asarray(value)
-            return array.astype(space.dtype) if array.dtype.kind == "i" else value
-    if isinstance(space, spaces.Dict) and isinstance(value, dict) and value.keys() == space.spaces.keys():
-        return {key: action_of(part, value[key]) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple) and isinstance(value, list) and len(value) == len(space.spaces):
-        return tuple(map(action_of, space.spaces, value))
-    return value
-
-
-def write(path: Path | None, line: Mapping[str, Any]) -> str:
-    """Append a line, if there is a path; return what is wrong. It is open only meanwhile: clones need not copy it."""
-    try:
-        if path is not None:
-            with path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(jsonable(line)) + "\n")
-    except OSError as error:
-        return f"The recording {path} cannot be written: {error}"
-    return ""
+from .forms import action_of
 
 
 def read(path: Any) -> list[tuple[int, list[dict[str, Any]]]]:

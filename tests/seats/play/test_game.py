@@ -11,7 +11,7 @@ from simenv_marl import RULE, aec_env, simulate
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
 from simenv_marl.seats.play.game import Game
-from tests.seats.play.worlds import BreakingShop, BrokenShop, FixedShop, Shop
+from tests.seats.play.worlds import BreakingShop, BrokenShop, FixedShop, MislabelledShop, Shop
 
 
 @pytest.fixture
@@ -273,6 +273,15 @@ def test_an_error_of_the_model_ends_the_episode_and_can_be_undone(make_game):
     game.handle("buyer", {"do": "undo"})
     state = play(game, [2])
     assert (state["over"], state["turn"]) == ("", 2)
+
+
+def test_labels_are_shown_and_end_the_episode_if_they_fail(make_game):
+    game = make_game(MislabelledShop)
+    state = play(game, [1])
+    assert state["pending"]["labels"]["3"] == "order 3 of 2"
+    assert "ZeroDivisionError" in play(game, [1])["over"]
+    game.handle("buyer", {"do": "undo"})
+    assert settle(game)["turn"] == 1
 
 
 def test_a_simulation_that_does_not_begin_is_refused_with_its_error(make_game):

@@ -153,9 +153,13 @@ def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer
 def test_an_illegal_action_comes_back_as_text(buyer):
     buyer.send(do="act", turn=0, action=17)
     assert "17" in buyer.wait("error")["text"]
-    for action in ("<b>", float("nan"), [[1]], {"a": 1}, 1e400, 10**400):
+    for action in ("<b>", float("nan"), [[1]], {"a": 1}, 1e400, 10**400, json.loads("[" * 300 + "]" * 300)):
         buyer.send(do="act", turn=0, action=action)
         assert buyer.wait("error")["text"]
+    buyer.socket.send(
+        json.dumps({"seat": "buyer", "key": buyer.key, "action": "deep"}).replace('"deep"', "[" * 800 + "]" * 800)
+    )
+    assert buyer.wait("error")["text"]
     buyer.send(do="act", turn=0, action=1)
     buyer.wait_for_turn(1)
 

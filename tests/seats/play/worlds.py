@@ -1,11 +1,34 @@
 """Simulations that people play in these tests."""
 
 import random
+from dataclasses import replace
 
 import numpy as np
 from gymnasium import spaces
 
 from simenv_marl import SimulationInterface, difference, make_step, reseed_generators
+
+ORDER = make_step(
+    observation_space=spaces.Dict(
+        {"stock": spaces.Discrete(100), "mean": spaces.Box(-np.inf, np.inf, (1,), np.float32)}
+    ),
+    observation_space_mapping=lambda shop: {"stock": shop.stock, "mean": [shop.profit / (shop.day + 1)]},
+    action_space=spaces.Discrete(4),
+    action_space_mapping={0: 0, 1: 1, 2: 2, 3: 3},
+    rule_action_mapping=int,
+    action_mask_mapping=lambda shop: [shop.stock + amount < 7 for amount in range(4)],
+    reward_mapping=difference(lambda shop: shop.profit),
+    agent="buyer",
+)
+
+SWITCH = make_step(
+    observation_space=spaces.Box(0, 10, (2,)),
+    observation_space_mapping=lambda shop: [shop.day, shop.stock % 10],
+    action_space=spaces.MultiDiscrete([2, 3]),
+    action_space_mapping=tuple,
+    reward_mapping=lambda shop: float(shop.switches[0]),
+    agent="seller",
+)
 
 
 class Shop(SimulationInterface):
@@ -36,18 +59,6 @@ class Shop(SimulationInterface):
             self.profit += 4 * sold - self.stock - sum(self.switches)
             self.day += 1
 
-    @make_step(
-        observation_space=spaces.Dict(
-            {"stock": spaces.Discrete(100), "mean": spaces.Box(-np.inf, np.inf, (1,), np.float32)}
-        ),
-        observation_space_mapping=lambda shop: {"stock": shop.stock, "mean": [shop.profit / (shop.day + 1)]},
-        action_space=spaces.Discrete(4),
-        action_space_mapping={0: 0, 1: 1, 2: 2, 3: 3},
-        rule_action_mapping=int,
-        action_mask_mapping=lambda shop: [shop.stock + amount < 7 for amount in range(4)],
-        reward_mapping=difference(lambda shop: shop.profit),
-        agent="buyer",
-    )
     def order(self):
         """Order pieces.
 
@@ -55,20 +66,12 @@ class Shop(SimulationInterface):
         """
         return 2 if self.stock < 3 else 0
 
-    @make_step(
-        observation_space=spaces.Box(0, 10, (2,)),
-        observation_space_mapping=lambda shop: [shop.day, shop.stock % 10],
-        action_space=spaces.MultiDiscrete([2, 3]),
-        action_space_mapping=tuple,
-        reward_mapping=lambda shop: float(shop.switches[0]),
-        agent="seller",
-    )
     def switch(self):
         """Set the switches."""
         return (1, 0)
 
 
-Shop.points = [Shop.order, Shop.switch]
+Shop.points = {Shop.order: ORDER, Shop.switch: SWITCH}
 
 
 class FixedShop(Shop):
@@ -77,7 +80,7 @@ class FixedShop(Shop):
     reseed = None
 
 
-FixedShop.points = [Shop.order]
+FixedShop.points = {Shop.order: ORDER}
 
 
 class BrokenShop(Shop):
@@ -97,4 +100,15 @@ class BreakingShop(Shop):
             self.day += 1
 
 
-BreakingShop.points = [Shop.order]
+BreakingShop.points = {Shop.order: ORDER}
+
+
+def labels(shop):
+    """Name the actions, on the first two days."""
+    return [f"order {amount} of {2 // (2 - shop.day)}" for amount in range(4)]
+
+
+class MislabelledShop(Shop):
+    """Its labels fail on the third day."""
+
+    points = {Shop.order: replace(ORDER, action_labels=labels)}  # noqa: RUF012

@@ -104,9 +104,12 @@ class Game:
         return going | {agent: total for agent, (_, total) in self.ends.items()}
 
     def _step(self, agent: str, action: Any) -> None:
-        legal = RULE if action is None else action_of(self.env.action_space(agent), action)
+        self._attempt(self.env.step, RULE if action is None else action_of(self.env.action_space(agent), action))
+
+    def _attempt(self, function: Callable[..., Any], argument: Any) -> Any:
+        """Call a function of the environment. An error ends the episode, unless it refuses an action."""
         try:
-            self.env.step(legal)
+            return function(argument)
         except InvalidActionError:
             raise
         except Exception as error:
@@ -114,17 +117,12 @@ class Game:
 
     def _return_to(self, key: int | None) -> None:
         """Continue at a checkpoint, or at the beginning."""
-        old, self.failure = self.env, ""
+        old, self.env = self.env, self.root if key is None else clone(self.checkpoints[key])
         self.ends = {} if key is None else {agent: end for agent, end in self.ends.items() if end[0] <= key}
         self.latest: dict[str, int] = {row["agent"]: row["turn"] for row in self.line[: key or 0]}
-        if key is not None:
-            self.env = clone(self.checkpoints[key])
-        else:
-            self.env = self.root
-            try:
-                self.root.reset(seed=self.seed)
-            except Exception as error:
-                self.failure = describe_error(error)
+        self.failure = ""
+        if key is None:
+            self._attempt(self.root.reset, self.seed)
         if old is not self.root:
             old.close()
         self._arrive(key or 0)
@@ -142,8 +140,10 @@ class Game:
             _, reward, terminated, truncated, _ = env.last(observe=False)
             before = self._reward(agent, reward)
             if not (terminated or truncated):
-                self.now, self.over = env.unwrapped.call(pending_decision), ""
-                self._stand_at({"turn": turn, "agent": agent, "before": before}, self.now)
+                self.now = self._attempt(env.unwrapped.call, pending_decision)
+                self.over = self.failure
+                if self.now is not None:
+                    self._stand_at({"turn": turn, "agent": agent, "before": before}, self.now)
                 break
             self.ends[agent] = turn, before
             self.over = "truncated" if truncated else "terminated"

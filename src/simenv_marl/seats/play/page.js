@@ -104,6 +104,7 @@ function drawDecision() {
 function drawFans() {
   if (!fan || !mine() || fan.turn !== state.turn) return;
   $("note").textContent = fan.note;
+  if (document.activeElement !== $("horizon")) $("horizon").value = fan.horizon;
   const shown = fan.candidates.filter(({ bands }) => bands.length && bands[0].length), last = fan.horizon - 1;
   const y = scale(shown.flatMap(({ bands }) => bands.flat())), buttons = [...$("actions").children];
   for (const { action, bands: [below, middle, above], n } of shown) {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import json
+import pickle
 import secrets
 import select
 import socket
@@ -116,6 +117,7 @@ class Table:
         try:
             message = json.loads(text, parse_constant=str)
             seat, key = str(message.pop("seat")), str(message.pop("key"))
+            parcel = pickle.dumps((number, seat, message))  # not later, because it may be too deep
         except (ValueError, RecursionError, TypeError, LookupError, AttributeError):
             return "the message is not one of this page"
         if seat not in self.seats or not hmac.compare_digest(self.key(seat).encode(), key.encode(errors="replace")):
@@ -127,7 +129,7 @@ class Table:
             return "the game is busy; try again"
         else:
             link.open += 1
-            self.inbox.put_nowait((number, seat, message))
+            self.inbox.put_nowait(parcel)
         return ""
 
     def _tell_people(self) -> None:
@@ -135,7 +137,7 @@ class Table:
         taken = Counter(link.seat for link in self.links.values())
         self._send_all(json.dumps({"type": "people", "spectators": taken.pop("", 0), "taken": taken}), "people")
         if self.taken is None:
-            self.inbox.put_nowait((None, None, {}))
+            self.inbox.put_nowait(None)
         self.taken = list(taken)
 
     def _show(self, message: dict[str, Any]) -> None:
@@ -167,10 +169,10 @@ class Table:
         """Pass messages on to the game."""
         with suppress(OSError):
             while True:
-                number, seat, message = await self.inbox.get()
-                if seat is None:
-                    message, self.taken = {"taken": self.taken}, None
-                await asyncio.to_thread(self.connection.send, (number, seat, message))
+                parcel = await self.inbox.get()
+                if parcel is None:
+                    parcel, self.taken = pickle.dumps((None, None, {"taken": self.taken})), None
+                await asyncio.to_thread(self.connection.send_bytes, parcel)
 
 
 class _Protocol(H11Protocol):

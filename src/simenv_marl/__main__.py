@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     check("--episodes", type=int, default=10, metavar="N", help="random episodes (default: 10)")
     check("--max-steps", type=int, default=1000, metavar="N", help="the longest run, in decisions (default: 1000)")
     check("--time-limit", type=float, default=60.0, metavar="SECONDS", help="for the whole check (default: 60)")
-    play("--seat", action="append", default=[], metavar="AGENT", help="an agent that a person plays (default: all)")
+    play("--seat", action="extend", nargs="+", default=[], metavar="AGENT", help="agents for people (default: all)")
     play("--seed", type=int, metavar="N", help="the seed of the first episode (default: a random one)")
     play("--port", type=int, default=8000, metavar="P", help="where to serve it; 0: any free port (default: 8000)")
     play("--host", default="127.0.0.1", help="the address to listen on (default: 127.0.0.1, for this machine alone)")

@@ -47,7 +47,7 @@ def open_page(browser):
         page.set_default_timeout(60_000)
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
-        page.goto(f"{server.base}seat/{seat}?key={server.keys(seat)[0]}")
+        page.goto(f"{server.base}seat/{seat}?key={server.keys(seat)[0]}" if seat else server.base)
         return page
 
     yield make
@@ -142,4 +142,9 @@ def test_buttons_and_grids_are_played_by_keys_and_texts_of_the_game_are_no_marku
     buyer.keyboard.press("r")
     wait_for_turn(seller, 3)
     assert seller.evaluate("state.history[2].by") == "rule"
+    spectator = open_page(server, "")
+    spectator.get_by_text("Decide for seller").wait_for()  # and sees the futures, and has no controls
+    spectator.wait_for_selector("#actions polygon")
+    spectator.keyboard.press("r")
+    assert spectator.evaluate("document.querySelector('#decision').inert && document.querySelector('#controls').hidden")
     assert server.end()[0] == 0

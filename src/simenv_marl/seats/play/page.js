@@ -3,14 +3,14 @@
 const $ = (id) => document.getElementById(id);
 const seat = location.pathname.startsWith("/seat/") ? decodeURIComponent(location.pathname.slice(6)) : "";
 const key = new URLSearchParams(location.search).get("key") || "";
-const names = {}; // the entries of each agent's observation
-let socket, state = null, fan = null, people = { taken: {}, spectators: 0 }, widget = null, drawn = "", arrived = 0;
+let socket, state = null, fan = null, people = { taken: {}, spectators: 0 }, widget = null, drawn = "", arrived = 0, names = {};
 
 const show = (value) => typeof value === "number" ? (Number.isInteger(value) ? String(value) : String(+value.toPrecision(3)))
   : Array.isArray(value) ? value.map(show).join(", ") : typeof value === "string" ? value : JSON.stringify(value);
 const name = (action) => action === null ? "the rule"
   : (state.pending?.space.kind === "discrete" && state.pending.labels?.[action]) || show(action);
 const mine = () => Boolean(seat && state.pending && state.pending.agent === seat);
+const seen = () => mine() || Boolean(!seat && state.pending); // also by a spectator, who decides nothing
 const send = (message) => socket.readyState === 1 && socket.send(JSON.stringify({ ...message, seat, key }));
 const decide = (message) => mine() && send({ turn: state.turn, ...message });
 const act = (action) => decide(action === null ? { do: "rule" } : { do: "act", action });
@@ -95,14 +95,14 @@ function drawDecision() {
   if (widget) {
     const submit = (what) => { try { decide({ do: what, action: widget.get() }); } catch { problem("This is not JSON."); } };
     const go = make("button", { className: "go", onclick: () => submit("act") }, "Decide ", make("kbd", {}, "Enter"));
-    widget.element.onkeydown = (event) => { if (event.key === "Enter") { event.preventDefault(); submit("act"); } };
+    widget.element.onkeydown = (event) => { if (event.key === "Enter" && !event.repeat) { event.preventDefault(); submit("act"); } };
     $("inputs").append(widget.element, go, " ", make("button", { onclick: () => submit("try") }, "What then?"));
   }
   actionButton(null, "The rule", "r");
 }
 
 function drawFans() {
-  if (!fan || !mine() || fan.turn !== state.turn) return;
+  if (!fan || !seen() || fan.turn !== state.turn) return;
   $("note").textContent = fan.note;
   if (document.activeElement !== $("horizon")) $("horizon").value = fan.horizon;
   const shown = fan.candidates.filter(({ bands }) => bands.length && bands[0].length), last = fan.horizon - 1;
@@ -124,7 +124,7 @@ function drawFans() {
 
 function drawCharts() {
   const agent = seat || (state.pending || state.history.at(-1) || {}).agent, now = state.pending?.agent === agent;
-  if (state.pending) names[state.pending.agent] = state.pending.observation;
+  if (state.pending) names[state.pending.agent] = state.pending.observation; // the latest one of each agent
   const rows = state.history.filter((row) => row.agent === agent);
   $("seen").textContent = agent ? `What ${agent} ${now ? "sees" : "saw"}` : "";
   $("charts").replaceChildren(...(names[agent] || []).map(([label, value], i) => {
@@ -143,13 +143,12 @@ function drawWay() {
   $("rows").replaceChildren(...rows.map((row) => make("tr", {}, ...cells(row).map((cell) => make("td", {}, show(cell))))));
   Object.assign($("jump"), { max: state.length, value: state.turn });
   $("turn").textContent = `${state.turn} of ${state.length}`;
-  [$("undo").disabled, $("redo").disabled] = [state.turn === 0, state.turn >= state.length];
-  $("controls").hidden = !seat;
+  [$("undo").disabled, $("redo").disabled, $("controls").hidden] = [state.turn === 0, state.turn >= state.length, !seat];
 }
 
 function drawHead() {
   const { pending, over, seats, returns, seed, late } = state;
-  const status = over ? `The episode is over: ${over}.` : !pending ? "…" : mine() ? "Your decision" : `Waiting for ${pending.agent}`;
+  const status = over ? `The episode is over: ${over}.` : !pending ? "…" : mine() ? `Your decision no. ${pending.number}` : `Waiting for ${pending.agent}`;
   if ($("status").textContent !== status) $("status").textContent = status;
   document.title = `${mine() ? "● " : ""}${state.simulation}`;
   $("name").textContent = `${state.simulation} — ${seat || "spectator"}`;
@@ -162,9 +161,9 @@ function drawHead() {
 }
 
 function drawState() {
-  const current = mine() ? JSON.stringify([state.seed, state.turn, state.pending.seen]) : "", { picture } = state;
+  const current = seen() ? JSON.stringify([state.seed, state.turn, state.pending.seen]) : "", { picture } = state;
   problem(state.notice);
-  $("decision").hidden = !current;
+  [$("decision").hidden, $("decision").inert] = [!current, !mine()];
   if (current && current !== drawn) {
     drawDecision();
     const first = $("decision").querySelector("input:enabled, textarea, #actions button:enabled");
@@ -200,6 +199,7 @@ for (const id of ["horizon", "jump"]) $(id).onchange = () => send({ do: id, n: n
 $("stop").onclick = () => send({ do: "delegate", n: 0 });
 $("jump").oninput = () => { $("turn").textContent = `${$("jump").value} of ${state.length}`; };
 document.onkeydown = (event) => {
+  if (event.repeat && event.key === "Enter") event.preventDefault(); // each decision is one press
   if (!seat || !state || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, textarea")) return;
   if (event.key === "r") act(null);
   if (event.key === "u" || event.key === "y") $(event.key === "u" ? "undo" : "redo").click();

@@ -10,8 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import sync_playwright
-
 FOLDER = Path(__file__).parent
 FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
 COMMAND = [sys.executable, "-m", "simenv_marl", "play", "examples.greenhouse_coop.env:GreenhouseSim"]
@@ -26,6 +24,8 @@ def decide(page: Any, value: str) -> None:
 
 def main() -> None:
     """Play five days, and take a picture of each browser."""
+    from playwright.sync_api import sync_playwright
+
     server = subprocess.Popen([*COMMAND, "--port", "0", "--seed", "3"], stdout=subprocess.PIPE, text=True)
     assert server.stdout is not None
     lines = [server.stdout.readline() for _ in range(3)]

@@ -267,7 +267,7 @@ def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkey
         supports_return_generator = False
 
     sizes, work = [], parallel._work
-    monkeypatch.setattr(parallel, "_work", lambda parcel, seeds: (sizes.append(len(seeds)), work(parcel, seeds))[1])
+    monkeypatch.setattr(parallel, "_work", lambda *given: (sizes.append(len(given[-1])), work(*given))[1])
     monkeypatch.setitem(joblib.parallel.BACKENDS, "silent", Silent)
     with joblib.parallel_config(backend="silent"):
         assert traces(seeds=range(9), workers=2, batch_size=1) == traces(seeds=range(9))

@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, branch, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
-from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset
+from simenv_marl.data import collect_episodes, compare_with_rule, record_dataset
 from simenv_marl.errors import CopyError, InvalidActionError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
 from tests.conftest import DRIVERS
@@ -195,11 +195,6 @@ def test_planners_decide_in_vector_environments():
         envs.step(np.array([1, 1]))
     assert [env.unwrapped.simulation.turn for env in envs.envs] == [3, 3]
     envs.close()
-
-
-def test_a_mixture_cannot_ask_it():
-    with pytest.raises(OptionValueError, match="asks for the environment"):
-        Mixture({RULE: 1, planner(): 1})
 
 
 @pytest.mark.parametrize("many", [False, True])

@@ -17,6 +17,7 @@ from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
 from simenv_marl.errors import InvalidActionError, OptionValueError
 from simenv_marl.experiments import run_experiment
 from simenv_marl.planning import RolloutPolicy, action_values
+from simenv_marl.seats import FallbackPolicy
 
 from .tank import POINTS, Tank, level_of
 
@@ -239,9 +240,10 @@ def test_a_coroutine_cannot_get_the_environment():
         simulate(Tank, {"filler": planner}, points=POINTS, seed=0)
 
 
-def test_a_mixture_refuses_policies_that_are_asked_alone():
+@pytest.mark.parametrize("policy", [slow, RolloutPolicy(), FallbackPolicy(quick)])
+def test_a_mixture_refuses_policies_that_are_asked_alone(policy):
     with pytest.raises(OptionValueError, match="one decision at a time"):
-        Mixture({slow: 1.0})
+        Mixture({policy: 1.0})
 
 
 def test_an_illegal_answer_of_a_coroutine_is_an_error():

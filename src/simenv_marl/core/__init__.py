@@ -14,7 +14,9 @@ Each module imports only from those below it::
     greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
     driver                      the switch between a simulation's stack and its user's; what a simulation has opened
     context, points             the user's side, with its global generators; points, agents and policies by their names
-    actions, planner            checks of actions; policies that get the environment
+    policies                    policies that are asked one decision at a time
+    actions, pending            checks of actions; a pending decision, as policies and people get it
+    awaiting                    the thread in which coroutines of policies run
     spaces, stacking            casts and checks of single values; stacks of many
     rng, options, packing       seeds of generators; options; pickles for other processes
     forks, separation           forked processes, which end with the first one; what separates them from it

@@ -13,7 +13,7 @@ import simenv_marl
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "simenv_marl"
 BUDGETS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["simenv_marl"]["budgets"]
-ABOVE_THE_HEART = ("planning", "experiments", "data", "remote", "testing", "__main__")
+ABOVE_THE_HEART = ("planning", "experiments", "seats", "data", "remote", "testing", "__main__")
 
 
 def files_of(folder, suffix=""):

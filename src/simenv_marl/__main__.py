@@ -1,4 +1,4 @@
-"""The command line: ``python -m simenv_marl`` with ``new``, ``check``, ``inspect`` or ``wire-check``.
+"""The command line: ``python -m simenv_marl`` with ``new``, ``check``, ``inspect``, ``play`` or ``wire-check``.
 
 Exit codes: 0 for success; 1 if a check has found errors (or the model fails in ``inspect``); 2 if the arguments cannot
 be used, or nothing can be written.
@@ -14,6 +14,7 @@ import pkgutil
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    about = "Write a template to start from, check or inspect a simulation, or test a simulator in another process."
+    about = "Write a template to start from; check, inspect or play a simulation; test a simulator in another process."
     parser = argparse.ArgumentParser(prog="python -m simenv_marl", description=about)
-    commands = parser.add_subparsers(dest="command", required=True, metavar="new | check | inspect | wire-check")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="new | check | inspect | play | wire-check")
 
     def add(name: str, run: Callable[[argparse.Namespace], Any], text: str) -> Any:
         command = commands.add_parser(name, help=text, description=f"{text.capitalize()}.")
@@ -52,13 +53,21 @@ def _parser() -> argparse.ArgumentParser:
     new("--folder", type=Path, metavar="DIR", help="the folder for both files (default: a new folder NAME)")
     check = add("check", _check, "run a simulation alone and in environments, and report what is wrong")
     inspect = add("inspect", _inspect, "list the decision points of a simulation and the order of their calls")
-    for command in (check, inspect):
+    play = add("play", _play, "serve a page on which people take agents' seats in a running simulation")
+    for command in (check, inspect, play):
         command("simulation", metavar="module:Simulation", help="a class, an instance, or a factory without arguments")
+    for command in (check, inspect):
         command("--points", nargs="+", metavar="NAME", help="decision points (default: the simulation's own)")
         command("--seed", type=int, default=0, metavar="N", help="the first seed (default: 0)")
     check("--episodes", type=int, default=10, metavar="N", help="random episodes (default: 10)")
     check("--max-steps", type=int, default=1000, metavar="N", help="the longest run, in decisions (default: 1000)")
     check("--time-limit", type=float, default=60.0, metavar="SECONDS", help="for the whole check (default: 60)")
+    play("--seat", action="extend", nargs="+", default=[], metavar="AGENT", help="agents for people (default: all)")
+    play("--seed", type=int, metavar="N", help="the seed of the first episode (default: a random one)")
+    play("--port", type=int, default=8000, metavar="P", help="where to serve it; 0: any free port (default: 8000)")
+    play("--host", default="127.0.0.1", help="the address to listen on (default: 127.0.0.1, for this machine alone)")
+    play("--limit", type=float, metavar="SECONDS", help="the time after which the rule decides (default: none)")
+    play("--record", type=Path, metavar="FILE", help="append what is decided to a file of JSON lines")
     wire = add("wire-check", _wire_check, "test a simulator in another process, and report what it does wrong")
     wire("--seed", type=int, default=1, metavar="N", help="the seed of the episodes (default: 1)")
     wire("--options", type=_json, default={}, metavar="JSON", help="the options in the start message (default: {})")
@@ -110,6 +119,19 @@ def _inspect(options: argparse.Namespace) -> Any:
         raise
     except (Exception, SystemExit) as error:
         raise OptionValueError(f"{options.simulation} cannot be run: {describe_error(error)}") from error
+
+
+def _play(options: argparse.Namespace) -> str:
+    from .many.parallel import import_extra
+
+    for package in ("starlette", "uvicorn", "websockets"):
+        import_extra(package, "play")
+    from .seats.play.server import play
+
+    names = ("seed", "host", "port", "limit", "record")
+    arguments = {name: getattr(options, name) for name in names}
+    find = importlib.import_module(f"{__package__}.__main__")._find  # by a name that another process can import
+    return play(partial(find, options.simulation), name=options.simulation, seats=options.seat, **arguments)
 
 
 def _find(text: str) -> Any:

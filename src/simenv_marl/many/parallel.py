@@ -35,6 +35,9 @@ EXTRAS: Final = {
     "pyDOE": "design",
     "SALib": "design",
     "openai": "language",
+    "starlette": "play",
+    "uvicorn": "play",
+    "websockets": "play",
 }
 """The extra that installs a package. All other packages belong to ``experiments``."""
 

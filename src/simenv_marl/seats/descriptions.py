@@ -35,7 +35,7 @@ def describe(env_or_decision: Any, *, as_json: bool = False) -> Any:
     if not isinstance(env_or_decision, Decision):
         return pending_view(env_or_decision, "describe").call(_describe_pending, as_json)
     decision = env_or_decision
-    observation = _labelled(decision.observation, decision.observation_labels)
+    observation = labelled(decision.observation, decision.observation_labels)
     if as_json:
         return {
             "agent": decision.agent,
@@ -107,12 +107,12 @@ def _parse_pending(env: Any, text: str) -> Any:
 # -- what is observed -----------------------------------------------------------------------------
 
 
-def _labelled(value: Any, labels: Any) -> Any:
+def labelled(value: Any, labels: Any) -> Any:
     """Return an observation as values for JSON, by the labels of its parts."""
     if isinstance(value, Mapping):
-        return {str((labels or {}).get(key, key)): _labelled(part, None) for key, part in value.items()}
+        return {str((labels or {}).get(key, key)): labelled(part, None) for key, part in value.items()}
     if isinstance(value, tuple):
-        return [_labelled(part, None) for part in value]
+        return [labelled(part, None) for part in value]
     if isinstance(value, (np.ndarray, np.generic)):
         plain = [_plain(number) for number in value.tolist()] if np.ndim(value) == 1 else _plain(value.tolist())
         if isinstance(labels, Sequence) and labels and np.ndim(value) == 1:

@@ -150,7 +150,7 @@ class RecordedPolicy(PolicyWrapper):
     def __call__(self, observation: Any, info: Any = None, *, _decision: Decision, **asked: Any) -> Any:
         """Answer a decision. Return an awaitable if the answer is not known and the policy has to be awaited."""
         known = self._read() if self._known is None else self._known
-        key = _decision.seed, _decision.agent, _decision.number, _digest(observation)
+        key = _decision.seed, _decision.agent, _decision.number, digest_of(observation)
         if key in known:
             answer = known[key]
             return RULE if answer is None else _decision.action_space.from_jsonable(answer)[0]
@@ -210,7 +210,7 @@ def _in_form(space: spaces.Space[Any], action: Any) -> Any:
     return np.asarray(action, space.dtype).reshape(space.shape) if isinstance(space, spaces.Box) else action
 
 
-def _digest(observation: Any) -> str:
+def digest_of(observation: Any) -> str:
     """Return a digest of an observation: of the names, types, shapes and bytes of its parts."""
     digest = blake2b(digest_size=12)
 

@@ -1,0 +1,353 @@
+"""The game of the page: decisions, the way back, futures, limits, and recordings."""
+
+import json
+import struct
+import zlib
+from base64 import b64decode
+
+import pytest
+
+from simenv_marl import RULE, aec_env, simulate
+from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
+from simenv_marl.seats.play import replay
+from simenv_marl.seats.play.game import Game
+from tests.seats.play.worlds import BreakingShop, BrokenShop, FixedShop, MislabelledShop, Shop
+
+
+@pytest.fixture
+def make_game():
+    games = []
+
+    def make(simulation=Shop, *, seats=("buyer",), seed=5, limit=None, record=None):
+        game = Game(simulation, name="shop", seats=seats, seed=seed, limit=limit, record=record)
+        games.append(game)
+        return game
+
+    yield make
+    for game in games:
+        game.forget(-1)
+        game.env.close()
+        game.root.close()
+
+
+def settle(game):
+    """Let the rule decide where no person does; return what the page gets then."""
+    states = []
+    for update in game.work():
+        states += [update] if update else []
+        if game.now is not None and update and update["type"] == "state" and game.fan:
+            break
+    return states[-1]
+
+
+def think(game):
+    """Return the last message about the futures."""
+    return [update for update in game.work() if update][-1]
+
+
+def play(game, actions):
+    for action in actions:
+        settle(game)
+        game.decide(action, "person")
+    return settle(game)
+
+
+class Connection:
+    """Messages to come, then the end."""
+
+    def __init__(self, *messages):
+        self.messages, self.sent = [*messages, (None, None, None)], []
+
+    def poll(self, timeout=0):
+        return bool(self.messages)
+
+    def recv(self):
+        return self.messages.pop(0)
+
+    def send(self, message):
+        self.sent.append(message)
+
+    def errors(self):
+        return [reply["text"] for number, reply in self.sent if number is not None and reply]
+
+
+def as_by_hand(actions, seed=5):
+    env = aec_env(Shop)
+    env.reset(seed=seed)
+    found = []
+    for agent in env.agent_iter():
+        observation, reward, terminated, truncated, _ = env.last()
+        found.append((agent, str(observation), reward))
+        if terminated or truncated:
+            env.step(None)
+        else:
+            env.step(actions.pop(0) if agent == "buyer" else RULE)
+    return found, env.simulation.profit
+
+
+def test_the_rule_decides_for_agents_without_a_person(make_game):
+    game = make_game()
+    state = settle(game)
+    assert (state["turn"], state["pending"]["agent"], state["pending"]["doc"]) == (0, "buyer", "Order pieces.")
+    state = play(game, [3])
+    assert [(row["agent"], row["by"]) for row in state["history"][:2]] == [("buyer", "person"), ("seller", "rule")]
+    assert (state["turn"], state["pending"]["agent"], state["pending"]["time"]) == (2, "buyer", 1.0)
+    assert state["pending"]["mask"] == [int(game.env.simulation.stock + amount < 7) for amount in range(4)]
+
+
+def test_an_episode_equals_that_of_the_environment(make_game):
+    actions = [1, 3, 0, 2, 1, 1, 0, 2]
+    game = make_game()
+    state = play(game, actions)
+    by_hand, profit = as_by_hand(actions.copy())
+    assert state["over"] == "terminated"
+    assert state["returns"]["buyer"] == profit == sum(reward for agent, _, reward in by_hand if agent == "buyer")
+    assert state["returns"]["seller"] == sum(reward for agent, _, reward in by_hand if agent == "seller")
+    rewards = [row["reward"] for row in game.line if row["agent"] == "buyer"]
+    assert rewards == [reward for agent, _, reward in by_hand if agent == "buyer"][1:]
+
+
+@pytest.mark.parametrize("forks", [True, False])
+def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks):
+    game = make_game()
+    game.forks = forks
+    play(game, [1, 3, 0, 2])
+    before = json.dumps(game.line)
+    for turn in (4, 0, 8, 2, 6):
+        game.jump(turn)
+        assert game.turn == turn
+        assert settle(game)["length"] == 8
+    game.jump(7)  # of the seller: nobody plays it
+    assert game.turn == 6
+    for do, turn in (("undo", 4), ("redo", 6), ("redo", 8), ("redo", 8)):
+        game.handle("buyer", {"do": do})
+        assert game.turn == turn
+    assert json.dumps(game.line) == before
+    assert game.notice == ""
+    game.jump(4)
+    state = play(game, [0, 2, 1, 1, 0, 2])
+    assert state["returns"]["buyer"] == as_by_hand([1, 3, 0, 2, 1, 1, 0, 2])[1]
+    assert bool(game.checkpoints) == forks
+
+
+def test_the_end_can_be_undone(make_game):
+    game = make_game()
+    play(game, [2] * 8)
+    returns = game.returns()
+    game.handle("buyer", {"do": "undo"})
+    assert (game.turn, game.over, game.now["agent"]) == (14, "", "buyer")
+    game.handle("buyer", {"do": "redo"})
+    assert (game.turn, game.over, game.returns()) == (16, "terminated", returns)
+    game.handle("buyer", {"do": "undo"})
+    assert play(game, [2])["returns"] == returns
+
+
+def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(make_game):
+    game = make_game(seats=())
+    settle(game)
+    wrong = [
+        ("buyer", {"do": "act", "turn": 0, "action": 4}),
+        ("buyer", {"do": "act", "turn": 0, "action": [1]}),
+        ("buyer", {"do": "act", "turn": 0}),
+        ("buyer", {"do": "act", "turn": 1, "action": 1}),
+        ("seller", {"do": "act", "turn": 0, "action": [1, 1]}),
+        ("buyer", {"do": "delegate", "n": "all"}),
+        ("buyer", {"do": "restart", "n": -1}),
+        ("buyer", {"do": "fly"}),
+        ("buyer", {}),
+    ]
+    connection = Connection(*((number, *each) for number, each in enumerate(wrong)))
+    game.serve(connection)
+    assert [number for number, reply in connection.sent if reply and reply["type"] == "error"] == list(
+        range(len(wrong))
+    )
+    texts = connection.errors()
+    assert "4" in texts[0]
+    assert "another decision" in texts[3]
+    assert "buyer decides" in texts[4]
+    assert "'fly'" in texts[7]
+    assert len(game.line) == 1
+
+
+def test_a_masked_action_is_refused(make_game):
+    game = make_game(seed=1)
+    settle(game)
+    while game.now["mask"][3]:
+        play(game, [3])
+    with pytest.raises(InvalidActionError):
+        game.decide(3, "person")
+    assert settle(game)["pending"]["agent"] == "buyer"
+
+
+def test_actions_of_several_parts_reach_the_model_as_arrays(make_game):
+    game = make_game(seats=())
+    settle(game)
+    game.decide(1, "person")
+    state = settle(game)
+    assert state["pending"]["space"] == {"kind": "grid", "sizes": [2, 3], "starts": [0, 0]}
+    game.decide([1, 2], "person")
+    assert game.env.simulation.switches == (1, 2)
+
+
+def test_futures_are_tried_out_without_moving_the_game(make_game):
+    game = make_game()
+    settle(game)
+    fan = think(game)
+    assert [one["action"] for one in fan["candidates"]] == [None, 0, 1, 2, 3]
+    assert {one["n"] for one in fan["candidates"]} == {16}
+    assert fan["rule"] == 2
+    rule, two = (one["bands"] for one in fan["candidates"] if one["action"] in (None, 2))
+    assert rule == two  # the same futures for all candidates
+    below, middle, above = two
+    assert len(middle) == 8
+    assert all(low <= mid <= high for low, mid, high in zip(below, middle, above, strict=True))
+    assert above[0] > below[0]
+    assert (game.turn, game.env.simulation.day) == (0, 0)
+
+
+def test_without_reseed_there_is_one_future_and_a_note(make_game):
+    game = make_game(FixedShop)
+    settle(game)
+    fan = think(game)
+    assert {one["n"] for one in fan["candidates"]} == {1}
+    assert "reseed" in fan["note"]
+    play(game, [2] * 8)
+    assert game.returns()["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
+
+
+def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_game):
+    game = make_game(seats=("seller",))
+    settle(game)
+    assert [one["action"] for one in think(game)["candidates"]] == [None]
+    game.handle("seller", {"do": "try", "turn": 1, "action": [0, 2]})
+    assert [(one["action"], one["n"]) for one in think(game)["candidates"]] == [(None, 16), ([0, 2], 16)]
+    with pytest.raises(InvalidActionError):
+        game.handle("seller", {"do": "try", "turn": 1, "action": [2, 2]})
+    game.handle("seller", {"do": "horizon", "n": 2})
+    assert len(think(game)["candidates"][0]["bands"][1]) == 2
+
+
+def test_a_decision_ends_the_thinking(make_game):
+    game = make_game()
+    connection = Connection((1, "buyer", {"do": "act", "turn": 0, "action": 1}), (1, "buyer", {"do": "nothing"}))
+    game.serve(connection)
+    turns = [update["turn"] for number, update in connection.sent if number is None and update["type"] == "state"]
+    assert turns[0] == 0
+    assert len(game.line) > 1
+
+
+def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_game):
+    game = make_game(seats=())
+    settle(game)
+    game.handle("buyer", {"do": "delegate", "n": 2})
+    assert settle(game)["pending"]["agent"] == "seller"
+    game.handle("seller", {"do": "skip"})
+    state = settle(game)
+    assert (state["turn"], state["pending"]["agent"]) == (1, "seller")  # it is its turn
+    game.decide([0, 0], "person")
+    game.handle(None, {"taken": ["seller"]})
+    game.handle("seller", {"do": "skip"})
+    state = settle(game)
+    assert (state["turn"], state["pending"]["agent"]) == (3, "seller")
+    game.decide([0, 0], "person")
+    assert settle(game)["pending"]["agent"] == "buyer"  # the skip ended at the seller's turn
+
+
+def test_after_the_limit_the_rule_decides_and_is_counted(make_game, monkeypatch):
+    game = make_game(limit=30.0)
+    assert settle(game)["left"] is None  # nobody is there
+    game.handle(None, {"taken": ["buyer"]})
+    assert 0 < game.snapshot()["left"] <= 30
+    times = iter(range(0, 10**9, 10))
+    monkeypatch.setattr("simenv_marl.seats.play.game.monotonic", lambda: next(times))
+    game.deadline = 0.0
+    game.serve(Connection())
+    assert game.late["buyer"] >= 1
+    assert (game.line[0]["action"], game.line[0]["by"]) == (None, "limit")
+
+
+def test_an_error_of_the_model_ends_the_episode_and_can_be_undone(make_game):
+    game = make_game(BreakingShop)
+    state = play(game, [1, 3])
+    assert "the till is broken" in state["over"]
+    game.handle("buyer", {"do": "undo"})
+    state = play(game, [2])
+    assert (state["over"], state["turn"]) == ("", 2)
+
+
+def test_labels_are_shown_and_end_the_episode_if_they_fail(make_game):
+    game = make_game(MislabelledShop)
+    state = play(game, [1])
+    assert state["pending"]["labels"]["3"] == "order 3 of 2"
+    assert "ZeroDivisionError" in play(game, [1])["over"]
+    game.handle("buyer", {"do": "undo"})
+    assert settle(game)["turn"] == 1
+
+
+def test_a_simulation_that_does_not_begin_is_refused_with_its_error(make_game):
+    with pytest.raises(OptionValueError, match="the door is locked"):
+        make_game(BrokenShop)
+    with pytest.raises(OptionValueError, match="did you mean buyer"):
+        make_game(seats=("buier",))
+
+
+def test_pictures_are_sent_as_png(make_game):
+    game = make_game()
+    play(game, [1])
+    data = b64decode(settle(game)["picture"]["png"])
+    assert data.startswith(b"\x89PNG\r\n\x1a\n")
+    assert struct.unpack("!II", data[16:24]) == (3, 2)
+    begin = data.index(b"IDAT")
+    length = struct.unpack("!I", data[begin - 4 : begin])[0]
+    assert zlib.decompress(data[begin + 4 : begin + 4 + length]) == (b"\0" + b"\1" * 9) * 2
+
+
+def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_game, tmp_path):
+    game = make_game(seats=(), record=tmp_path / "game.jsonl")
+    for _ in range(3):
+        settle(game)
+        game.decide(3 if game.now["agent"] == "buyer" else [0, 2], "person")
+    game.handle("buyer", {"do": "undo"})
+    for seat in ("buyer", "seller"):
+        game.delegated[seat] = 100
+    settle(game)
+    game.decide(0, "person") if game.now and game.now["agent"] == "buyer" else None
+    state = settle(game)
+    assert state["over"]
+    found = replay(tmp_path / "game.jsonl", Shop)
+    assert {agent: float(trajectories.returns[0]) for agent, trajectories in found.items()} == state["returns"]
+    rows = [row for row in game.line if row["agent"] == "buyer"]
+    assert found["buyer"].rewards.tolist() == [row["reward"] for row in rows]
+    assert found["buyer"].by_rule.tolist() == [row["action"] is None for row in rows]
+    assert found["seller"].actions[0].tolist() == [0, 2]
+    assert found["buyer"].observations["stock"].tolist() == [row["values"][1] for row in rows]
+    assert found["buyer"].terminations[-1]
+
+
+def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_game, tmp_path):
+    path = tmp_path / "game.jsonl"
+    game = make_game(record=path)
+    play(game, [2] * 8)
+    game.restart(6)
+    play(game, [1])
+    assert replay(path, Shop)["buyer"].seeds == (6,)
+    assert replay(path, Shop)["buyer"].truncations.tolist() == [True]
+    assert len(replay(path, Shop, episode=0)["buyer"]) == 8
+    with pytest.raises(OptionValueError, match="episode 2"):
+        replay(path, Shop, episode=2)
+    with pytest.raises(OptionValueError, match="does not repeat"):
+        replay(path, FixedShop, episode=0)
+    path.write_text("{")
+    with pytest.raises(StoreError, match="cannot be read"):
+        replay(path, Shop)
+
+
+def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_game, tmp_path):
+    game = make_game(record=tmp_path / "game.jsonl")
+    (tmp_path / "game.jsonl").unlink()
+    (tmp_path / "game.jsonl").mkdir()
+    state = play(game, [1])
+    assert "cannot be written" in state["notice"]
+    assert state["turn"] == 2
+    with pytest.raises(OptionValueError, match="cannot be written"):
+        make_game(record=tmp_path / "missing" / "game.jsonl")

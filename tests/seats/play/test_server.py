@@ -1,0 +1,268 @@
+"""The command and its server: links, keys, hosts, limits of messages and connections, and the end."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import pytest
+
+from simenv_marl.__main__ import main
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+client = pytest.importorskip("websockets.sync.client")
+from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+
+ROOT = Path(__file__).parents[3]
+SHOP = "tests.seats.play.worlds:Shop"
+
+
+class Server:
+    """The command, and the links that it prints."""
+
+    def __init__(self, *arguments, simulation=SHOP):
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
+        command = [sys.executable, "-m", "simenv_marl", "play", simulation, "--port", "0", *arguments]
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT,
+            start_new_session=True,
+        )  # fmt: skip
+        self.base = re.search(r"http://\S+", self.process.stdout.readline())[0]
+        self.host = self.base.split("/")[2]
+        self.links = {}
+
+    def keys(self, *seats):
+        while not self.links.keys() >= set(seats):
+            link = self.process.stdout.readline().strip()
+            seat, key = re.search(r"/seat/(\w+)\?key=(\w+)$", link).groups()
+            self.links[seat] = key
+        return [self.links[seat] for seat in seats]
+
+    def page(self, seat="", key="", **options):
+        return Page(self, seat, key or (self.keys(seat)[0] if seat else ""), options)
+
+    def children(self):
+        path = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return [int(number) for number in path.read_text().split()]
+
+    def end(self):
+        os.killpg(self.process.pid, signal.SIGINT)  # as Ctrl-C does
+        out, err = self.process.communicate(timeout=60)
+        return self.process.returncode, out, err
+
+
+def is_alive(process):
+    with suppress(FileNotFoundError, ProcessLookupError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+class Page:
+    """A page without a browser."""
+
+    def __init__(self, server, seat, key, options):
+        self.seat, self.key = seat, key
+        settings = {"open_timeout": 60, "close_timeout": 1, "max_queue": None, **options}
+        self.socket = client.connect(f"ws://{server.host}/ws", **settings).__enter__()
+        if seat:
+            self.send(do="take")
+
+    def send(self, **message):
+        self.socket.send(json.dumps({"seat": self.seat, "key": self.key, **message}))
+
+    def wait(self, kind, condition=lambda message: True):
+        while True:
+            message = json.loads(self.socket.recv(timeout=60))
+            if message["type"] == kind and condition(message):
+                return message
+
+    def wait_for_the_end(self):
+        with pytest.raises(ConnectionClosed):
+            self.wait("nothing")
+
+    def wait_for_turn(self, turn):
+        return self.wait("state", lambda state: state["turn"] == turn)
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = Server("--seed", "5")
+    yield server
+    assert server.end()[0] == 0
+
+
+@pytest.fixture
+def page(server):
+    pages = []
+
+    def make(*arguments, **options):
+        pages.append(server.page(*arguments, **options))
+        return pages[-1]
+
+    yield make
+    for one in pages:
+        one.socket.close()
+
+
+@pytest.fixture
+def buyer(page):
+    buyer = page("buyer")
+    buyer.send(do="restart", n=5)
+    buyer.wait_for_turn(0)
+    return buyer
+
+
+def test_two_people_play_and_a_spectator_sees_it(page, buyer):
+    seller, spectator = page("seller"), page()
+    everybody = {"type": "people", "taken": {"buyer": 1, "seller": 1}, "spectators": 1}
+    spectator.wait("people", lambda people: people == everybody)
+    buyer.send(do="act", turn=0, action=2)
+    assert seller.wait_for_turn(1)["pending"]["agent"] == "seller"
+    seller.send(do="act", turn=1, action=[1, 1])
+    buyer.wait_for_turn(2)
+    state = spectator.wait_for_turn(2)
+    assert [(row["agent"], row["action"]) for row in state["history"][:2]] == [("buyer", 2), ("seller", [1, 1])]
+    fan = buyer.wait("fan", lambda fan: fan["turn"] == 2 and fan["candidates"][-1]["n"] > 1)
+    assert fan["candidates"][0]["action"] is None
+    again = page("buyer")  # as after a reload
+    assert again.wait("state")["turn"] == 2
+
+
+def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer):
+    (key,) = server.keys("seller")
+    for stranger in (page("buyer", key), page("buyer", "0" * 32), page("nobody", key), page("", "")):
+        stranger.send(do="act", turn=0, action=1)
+        assert "key" in stranger.wait("error")["text"]
+    for text in ("{", "[]", "[" * 60_000, "1", '{"seat": "buyer"}', json.dumps({"seat": "büyer", "key": "\ud800"})):
+        stranger.socket.send(text)
+        assert stranger.wait("error")
+    stranger.socket.send(b"\xff\xfe")
+    assert stranger.wait("error")
+    assert page().wait("state")["turn"] == 0
+
+
+def test_an_illegal_action_comes_back_as_text(buyer):
+    buyer.send(do="act", turn=0, action=17)
+    assert "17" in buyer.wait("error")["text"]
+    for action in ("<b>", float("nan"), [[1]], {"a": 1}, 1e400, 10**400, json.loads("[" * 300 + "]" * 300)):
+        buyer.send(do="act", turn=0, action=action)
+        assert buyer.wait("error")["text"]
+    buyer.socket.send(
+        json.dumps({"seat": "buyer", "key": buyer.key, "action": "deep"}).replace('"deep"', "[" * 800 + "]" * 800)
+    )
+    assert buyer.wait("error")["text"]
+    buyer.send(do="act", turn=0, action=1)
+    buyer.wait_for_turn(1)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"Host": "evil.example"}, {"Host": "evil.example:80", "Origin": "http://evil.example:80"}, {"Host": "[::1"}],
+)
+def test_another_host_is_refused(server, headers):
+    with pytest.raises(HTTPError) as caught:
+        urlopen(Request(f"{server.base}", headers=headers), timeout=60)
+    with caught.value as answer:
+        assert answer.code == 403
+
+
+def test_a_page_of_another_site_is_refused_and_all_pages_are_served_here(server):
+    with pytest.raises(InvalidStatus):
+        server.page(additional_headers={"Origin": "http://evil.example"})
+    for path in ("", "seat/buyer?key=x", "page.js", "page.css"):
+        with urlopen(f"{server.base}{path}", timeout=60) as answer:
+            text = answer.read().decode()
+            assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+        assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text)
+
+
+def test_a_flood_from_one_page_does_not_keep_another_from_playing(page, buyer):
+    flood = page("seller")
+    flood.socket.socket.settimeout(0.2)
+    with suppress(TimeoutError, ConnectionClosed):  # nobody reads so fast
+        for _ in range(200_000):
+            flood.send(do="horizon", n=1000, more="x" * 1000)
+    buyer.send(do="act", turn=0, action=1)
+    buyer.wait_for_turn(1)
+
+
+def test_a_message_that_is_too_long_ends_only_its_connection(page, buyer):
+    other = page()
+    other.socket.send("x" * 100_000)
+    other.wait_for_the_end()
+    buyer.send(do="act", turn=0, action=1)
+    buyer.wait_for_turn(1)
+
+
+def test_many_connections_end_old_spectators_and_no_player(server, page, buyer):
+    idle = [socket.create_connection(server.host.split(":"), timeout=60) for _ in range(60)]
+    spectators = [page() for _ in range(70)]
+    spectators[0].wait_for_the_end()
+    for one in idle:
+        one.close()
+    buyer.send(do="act", turn=0, action=1)
+    buyer.wait_for_turn(1)
+
+
+def test_the_end_leaves_no_process(tmp_path):
+    server = Server("--seat", "buyer", "--record", str(tmp_path / "game.jsonl"))
+    buyer = server.page("buyer")
+    buyer.wait("fan")
+    children = server.children()
+    assert children
+    code, out, err = server.end()
+    assert (code, err) == (0, "")
+    assert out.startswith("The returns: buyer")
+    buyer.wait_for_the_end()
+    deadline = time.monotonic() + 30
+    while living := [child for child in children if is_alive(child)]:
+        assert time.monotonic() < deadline, living
+        time.sleep(0.05)
+    assert (tmp_path / "game.jsonl").read_text().count("\n") == 1
+
+
+def test_the_end_of_the_game_ends_the_server():
+    server = Server()
+    (game,) = [child for child in server.children() if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+    os.kill(game, signal.SIGKILL)
+    _, err = server.process.communicate(timeout=60)
+    assert server.process.returncode == 2
+    assert "exit code -9" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([SHOP, "--seat", "buier"], "did you mean buyer"),
+        ([SHOP, "--limit", "nan"], "limit"),
+        ([SHOP, "--port", "99999"], "port 99999"),
+        ([SHOP, "--host", "192.0.2.1"], "192.0.2.1"),
+        (["tests.seats.play.worlds:Shopp"], "did you mean"),
+        (["tests.seats.play.worlds:BrokenShop"], "the door is locked"),
+    ],
+)
+def test_what_cannot_be_played_is_told(arguments, told, capsys):
+    assert main(["play", *arguments]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_told(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    assert main(["play", SHOP]) == 2
+    assert "play needs uvicorn: install simenv-marl[play]" in capsys.readouterr().err
+
+
+def test_the_command_line_imports_the_server_only_to_play():
+    names = ("starlette", "uvicorn", "websockets")
+    code = f"import simenv_marl.__main__, sys; print([name for name in {names} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "src")
+    assert done.stdout.strip() == "[]"

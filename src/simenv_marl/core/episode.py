@@ -29,14 +29,14 @@ episode is RESETTING or MOVING on the user's side, decision functions run their 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from math import inf
 from threading import current_thread
 from typing import TYPE_CHECKING, Any, Final
 
 from greenlet import getcurrent
 
-from ..errors import AgentError, InvalidActionError, NoDecisionError, UnknownAgentError, short_repr, warn_user
+from ..errors import AgentError, InvalidActionError, NoDecisionError, UnknownAgentError, listed, short_repr, warn_user
 from ..hooks.hook import Hook
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
@@ -447,9 +447,3 @@ def decide(agent: Agent, episode: Rounds, args: tuple[Any, ...], kwargs: dict[st
     if agent.clock is not None:
         agent.read_clock(agent)
     return episode.use_action(agent)
-
-
-def listed(names: Collection[str]) -> str:
-    """List the first ten of some names, and the number of the others, for messages."""
-    first = ", ".join(list(names)[:10])
-    return f"{first} and {len(names) - 10} more" if len(names) > 10 else first

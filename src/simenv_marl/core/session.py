@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextvars import Context, copy_context
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +20,7 @@ from gymnasium.utils import seeding
 from ..errors import BranchError, OptionValueError, ReentrancyError, annotate, short_repr, warn_user
 from ..hooks.handlers import Installation
 from ..simulation import closer, make_simulation, resetter
-from .context import ExclusiveLock, GlobalRandom, environment_context
+from .context import ExclusiveLock, GlobalRandom, environment_context, reuse_resources
 from .driver import Driver
 from .episode import Episode, Rounds
 from .plan import DRIVERS, Plan
@@ -341,3 +341,21 @@ def checked_seed(seed: Any) -> int | None:
     if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
     return int(seed)
+
+
+def close_all(sessions: Iterable[tuple[str, Session]], error: BaseException | None = None) -> BaseException | None:
+    """Close all sessions, given with their names. Return the first error, with notes of all others; None without any.
+
+    ``error`` is an error before.
+    """
+    with reuse_resources():  # it waits for all processes of simulations together
+        for name, session in sessions:
+            try:
+                session.close()
+            except BaseException as problem:
+                if error is None:
+                    error = problem
+                    annotate(error, f"simenv_marl: in {name}")
+                else:
+                    annotate(error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well")
+    return error

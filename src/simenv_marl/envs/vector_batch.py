@@ -13,11 +13,11 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from ..core.plan import Plan
-from ..core.session import Session
+from ..core.session import Session, close_all
 from ..core.stacking import stacker
 from ..decision import decision_points
 from ..errors import InvalidActionError, OptionValueError, annotate, short_repr
-from ..many.batch import close_all, step_all
+from ..many.batch import step_all
 from .base import OneAgentView
 from .joint import Joint, SimulationJointEnv
 from .single import SimulationEnv

@@ -13,9 +13,10 @@ decisions are asked in ``Group``s; all decisions of a group have the same spaces
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any, Final, Protocol
 
@@ -29,7 +30,7 @@ from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import Point
 from ..core.policies import AskingPolicy, DeferredPolicy, is_asked_alone, two_arguments, waits
-from ..core.session import Session
+from ..core.session import Session, close_all
 from ..core.spaces import duplicate
 from ..core.stacking import rows, stacker
 from ..decision import DecisionPoint
@@ -260,17 +261,18 @@ class _Simulations:
         """Have decisions answered, and run their simulations to their next decisions."""
         while self.backlog and len(self.awaited) < self.concurrency:
             place, episode = self.backlog.popleft()
-            with _noted(episode):
+            try:
                 self.awaited.add((place, episode), _ask_alone(episode, AskingPolicy.begin))
+            except BaseException as error:
+                episode.annotate(error)
+                raise
         # Waiting for large groups saves calls of policies.
         group = max(self.groups, key=lambda group: len(group.waiting), default=None)
         if group is not None and group.waiting and not self.awaited.ready:
             self.answer(group)
         elif self.awaited:
             (place, episode), answer = self.awaited.take()
-            with _noted(episode):
-                answered = answer.result()
-            self.step(place, episode, answered)
+            self.step(place, episode, answer.result)
             self._queue(place, episode)
         self.refill()
 
@@ -292,23 +294,15 @@ class _Simulations:
         if 2 * number > self.crowd < self.size and asked - start > perf_counter() - asked:
             self.crowd = min(self.size, 2 * self.crowd)
 
-    def answer_alone(self, place: int, episode: Episode) -> None:
-        """Have a decision answered at once, by a policy that answers one at a time."""
+    def step(self, place: int, episode: Episode, ask: Callable[[], Any]) -> None:
+        """Have one decision answered, and run its simulation to the next one."""
+        agent: Any = episode.pending
+        extras: Mapping[str, Any] = {}
         try:
-            if episode.plan.options.global_rng:
-                with episode.context():
-                    answer = _ask_alone(episode, _call)
-            else:
-                answer = _ask_alone(episode, _call)
+            answer = ask()
         except BaseException as error:
             episode.annotate(error)
             raise
-        self.step(place, episode, answer)
-
-    def step(self, place: int, episode: Episode, answer: Any) -> None:
-        """Take the answer to one decision, and run its simulation to the next one."""
-        agent: Any = episode.pending
-        extras: Mapping[str, Any] = {}
         if type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping):
             answer, extras = answer
         action = _checked(episode, answer)
@@ -337,7 +331,7 @@ class _Simulations:
             self.watcher.pay(episode)
         agent = episode.pending
         while agent is not None and agent.policy.asked.alone and not agent.policy.waits:
-            self.answer_alone(place, episode)
+            self.step(place, episode, partial(_ask_now, episode))
             if self.watcher is not None:
                 self.watcher.pay(episode)
             agent = episode.pending
@@ -390,18 +384,10 @@ def _ask_alone(episode: Episode, ask: Callable[[Any, Any, Any], Any]) -> Any:
     return ask(agent.policy, duplicate(agent.observation), info)
 
 
-def _call(policy: Any, observation: Any, info: Any) -> Any:
-    return policy(observation, info)
-
-
-@contextmanager
-def _noted(episode: Episode) -> Iterator[None]:
-    """Note in errors at which decision they arose."""
-    try:
-        yield
-    except BaseException as error:
-        episode.annotate(error)
-        raise
+def _ask_now(episode: Episode) -> Any:
+    """Ask this policy, and wait for its answer."""
+    with episode.context() if episode.plan.options.global_rng else nullcontext():
+        return _ask_alone(episode, lambda policy, observation, info: policy(observation, info))
 
 
 # -- many episodes and sessions -------------------------------------------------------------------
@@ -457,21 +443,3 @@ def step_all(
             culprit.annotate(error)
         blame(number, error)
         raise
-
-
-def close_all(sessions: Iterable[tuple[str, Session]], error: BaseException | None = None) -> BaseException | None:
-    """Close all sessions, given with their names. Return the first error, with notes of all others; None without any.
-
-    ``error`` is an error before.
-    """
-    with reuse_resources():  # it waits for all processes of simulations together
-        for name, session in sessions:
-            try:
-                session.close()
-            except BaseException as problem:
-                if error is None:
-                    error = problem
-                    annotate(error, f"simenv_marl: in {name}")
-                else:
-                    annotate(error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well")
-    return error

@@ -10,6 +10,7 @@ import pickle
 import random
 import socket
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
@@ -21,6 +22,7 @@ from examples.greenhouse_coop.env import env as make_greenhouse
 from benchmarks.measure import Contender, Group, Row, timer, two_cores
 from benchmarks.noop import Alone, Busy, Model, steps
 from simenv_marl import branch, clone, reseed_generators, single_env
+from simenv_marl.planning import TreeSearchPolicy
 
 BRANCHES, STEPS = 20, 10
 MANY = 64
@@ -87,6 +89,27 @@ def groups(number: int) -> Iterator[Group]:
         row = Row("branches of 10 ms: two cores beside one", two, one, 1.7, 1.9, faster=True, unit="ms")
         yield Group([row], most=9)
     env.close()
+    kept, replayed = (search(policy, 8 if number < 400 else 64) for policy in (TreeSearchPolicy, Forgetful))
+    what = "a tree search with states kept / replayed, steps of 5 ms, depth 8"
+    yield Group([Row(what, kept, replayed, 0.6, 0.4, unit="ms")], most=3)
+
+
+class Forgetful(TreeSearchPolicy):
+    """A tree search that begins each branch at the pending decision."""
+
+    def _states_of(self, rollouts: Any) -> None:
+        return None
+
+
+def search(kind: type[TreeSearchPolicy], budget: int) -> Contender:
+    """Make a contender of a search for one decision, in one exact future."""
+    simulation = Busy()
+    simulation.seconds = 5e-3
+    env = single_env(simulation, Model.left)
+    env.reset(seed=0)
+    policy = kind([0, 1], depth=8, horizon=8, budget=budget)
+    warnings.filterwarnings("ignore", ".*foresees")  # with one future, it does
+    return milliseconds(lambda: policy.choose(env), 1)
 
 
 def some_steps(env: Any, number: int) -> float:

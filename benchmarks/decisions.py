@@ -8,9 +8,9 @@ from typing import Any
 from greenlet import getcurrent, greenlet
 from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, OrderEnforcingWrapper
 
-from benchmarks.hand_written import BareEnv, EventLock, GeneratorEnv, TemplateAECEnv, TemplateEnv, ThreadEnv, busy_lock
+from benchmarks.hand_written import BareEnv, TemplateAECEnv, TemplateEnv, ThreadEnv
 from benchmarks.measure import Contender, Group, Row, both, calls, timer
-from benchmarks.noop import Alone, AloneBy, Crowd, CrowdBy, Entity, Model, Turns, TurnsBy, aec, single
+from benchmarks.noop import Alone, AloneBy, Crowd, CrowdBy, Dispatched, Entity, Model, Turns, TurnsBy, aec, single
 from simenv_marl import aec_env, single_env
 
 MANY = 10_000
@@ -33,15 +33,16 @@ def groups(number: int) -> Iterator[Group]:
     template_aec = aec(TemplateAECEnv(), number)
     wrapped = aec(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(TemplateAECEnv())), number)
     least, least_aec = both(template, greenlets), both(template_aec, greenlets)
-    bare, generator = both(single(BareEnv(), number), greenlets), single(GeneratorEnv(), number)
-    threads = [ThreadEnv(busy_lock), ThreadEnv(EventLock)]
-    by_lock, by_event = (single(thread, number // 10) for thread in threads)
+    bare, thread = both(single(BareEnv(), number), greenlets), ThreadEnv()
+    by_lock = single(thread, number // 10)
 
     turns = aec(aec_env(Turns, [Model.left, Model.right]), number)
     turns_by = aec(aec_env(TurnsBy, [Model.left_by, Model.right_by]), number)
     entities = aec(aec_env(Crowd(2), Entity.decide), number)
     entities_by = aec(aec_env(CrowdBy(2), Entity.decide_by), number)
     many = min(MANY, number)
+    items = aec(aec_env(Dispatched(100), Dispatched.dispatch), number)
+    hundred = aec(aec_env(CrowdBy(100), Entity.decide_by), number)
     of_many = aec(aec_env(Crowd(many), Entity.decide), number)
     alone = single(single_env(Alone, Model.left), number)
     alone_by = single(single_env(AloneBy, Model.left_by), number)
@@ -54,18 +55,16 @@ def groups(number: int) -> Iterator[Group]:
             Row("AEC / template", turns, template_aec),
             Row("AEC / template in two wrappers", turns, wrapped),
             Row("AEC / one greenlet round trip", turns, greenlets),
+            Row("AEC, an item of a call for 100 / a decision with a call of its own", items, hundred, 1.0),
             Row(f"AEC, entities: {MANY:,} / 2", of_many, entities, 1.2, 1.1),
             Row(f"single / {crossing}", alone, least, 2.6, 2.3),
             Row(f"single, another argument / {crossing}", alone_by, least, 2.7, 2.3),
             Row("single / bare + one greenlet round trip", alone, bare),
             Row("single / template", alone, template),
-            Row("single / generator", alone, generator),
             Row("single beside thread and Lock", alone, by_lock, faster=True),
-            Row("single beside thread and Event", alone, by_event, faster=True),
         ]
     )
-    for thread in threads:
-        thread.close()
+    thread.close()
 
     few = min(100, many // 2)
     dead_many = dead_steps(aec_env(Crowd(many, rounds=1), Entity.decide), many)

@@ -8,7 +8,6 @@ without an end, with an observation of four float32 and a reward of 1.0.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -133,27 +132,14 @@ class BareEnv(TemplateEnv):
 # -- other ways to let a simulation keep its own loop ----------------------------------------------
 
 
-class GeneratorEnv(TemplateEnv):
-    """The simulation is a generator that yields at its decisions: fast, but all its callers must be generators, too."""
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self.simulation = self._run()
-        return next(self.simulation), {}
-
-    def _run(self) -> Iterator[Any]:
-        while True:
-            yield self.model.observe()
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        return self.simulation.send(action), 1.0, False, False, {}  # type: ignore[attr-defined]
-
-
 class ThreadEnv(TemplateEnv):
     """The simulation runs in a thread and alternates with its user, by two locks."""
 
-    def __init__(self, lock: Callable[[], Any]) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.action_arrives, self.observation_arrives = lock(), lock()
+        self.action_arrives, self.observation_arrives = threading.Lock(), threading.Lock()
+        self.action_arrives.acquire()
+        self.observation_arrives.acquire()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.over = False
@@ -178,20 +164,3 @@ class ThreadEnv(TemplateEnv):
         self.over = True
         self.action_arrives.release()
         self.thread.join()
-
-
-def busy_lock() -> threading.Lock:
-    """Make a lock that its next user has to wait for."""
-    lock = threading.Lock()
-    lock.acquire()
-    return lock
-
-
-class EventLock(threading.Event):
-    """An event that is used like such a lock, as in the original Sim-Env."""
-
-    release = threading.Event.set
-
-    def acquire(self) -> None:
-        self.wait()
-        self.clear()

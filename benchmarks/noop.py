@@ -145,6 +145,18 @@ class Crowd:
             done += 1
 
 
+class Dispatched(Crowd):
+    """The same without an end, in one call for all of them."""
+
+    @make_step(**BY, agent=lambda entity, crowd: entity.name, split=lambda crowd: crowd.entities)
+    def dispatch(self) -> list[int]:
+        return [0] * self.size
+
+    def run(self) -> None:
+        while True:
+            self.dispatch()
+
+
 class CrowdBy(Crowd):
     """The same without an end, and with an argument."""
 

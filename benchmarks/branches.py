@@ -89,25 +89,20 @@ def groups(number: int) -> Iterator[Group]:
         row = Row("branches of 10 ms: two cores beside one", two, one, 1.7, 1.9, faster=True, unit="ms")
         yield Group([row], most=9)
     env.close()
-    kept, replayed = (search(policy, 8 if number < 400 else 64) for policy in (TreeSearchPolicy, Forgetful))
+    kept, replayed = (search(8 if number < 400 else 64, keeps=keeps) for keeps in (True, False))
     what = "a tree search with states kept / replayed, steps of 5 ms, depth 8"
     yield Group([Row(what, kept, replayed, 0.6, 0.4, unit="ms")], most=3)
 
 
-class Forgetful(TreeSearchPolicy):
-    """A tree search that begins each branch at the pending decision."""
-
-    def _states_of(self, rollouts: Any) -> None:
-        return None
-
-
-def search(kind: type[TreeSearchPolicy], budget: int) -> Contender:
-    """Make a contender of a search for one decision, in one exact future."""
+def search(budget: int, *, keeps: bool) -> Contender:
+    """Make a contender of a search for one decision, in one exact future, which may keep states."""
     simulation = Busy()
     simulation.seconds = 5e-3
     env = single_env(simulation, Model.left)
     env.reset(seed=0)
-    policy = kind([0, 1], depth=8, horizon=8, budget=budget)
+    policy = TreeSearchPolicy([0, 1], depth=8, horizon=8, budget=budget)
+    if not keeps:
+        vars(policy)["_states_of"] = lambda rollouts: None
     warnings.filterwarnings("ignore", ".*foresees")  # with one future, it does
     return milliseconds(lambda: policy.choose(env), 1)
 

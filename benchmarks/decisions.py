@@ -8,7 +8,7 @@ from typing import Any
 from greenlet import getcurrent, greenlet
 from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, OrderEnforcingWrapper
 
-from benchmarks.hand_written import BareEnv, TemplateAECEnv, TemplateEnv, ThreadEnv
+from benchmarks.hand_written import TemplateAECEnv, TemplateEnv, ThreadEnv
 from benchmarks.measure import Contender, Group, Row, both, calls, timer
 from benchmarks.noop import Alone, AloneBy, Crowd, CrowdBy, Dispatched, Entity, Model, Turns, TurnsBy, aec, single
 from simenv_marl import aec_env, single_env
@@ -33,7 +33,7 @@ def groups(number: int) -> Iterator[Group]:
     template_aec = aec(TemplateAECEnv(), number)
     wrapped = aec(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(TemplateAECEnv())), number)
     least, least_aec = both(template, greenlets), both(template_aec, greenlets)
-    bare, thread = both(single(BareEnv(), number), greenlets), ThreadEnv()
+    thread = ThreadEnv()
     by_lock = single(thread, number // 10)
 
     turns = aec(aec_env(Turns, [Model.left, Model.right]), number)
@@ -59,7 +59,6 @@ def groups(number: int) -> Iterator[Group]:
             Row(f"AEC, entities: {MANY:,} / 2", of_many, entities, 1.2, 1.1),
             Row(f"single / {crossing}", alone, least, 2.6, 2.3),
             Row(f"single, another argument / {crossing}", alone_by, least, 2.7, 2.3),
-            Row("single / bare + one greenlet round trip", alone, bare),
             Row("single / template", alone, template),
             Row("single beside thread and Lock", alone, by_lock, faster=True),
         ]

@@ -1,8 +1,8 @@
 """Environments written by hand, with which the benchmarks compare the environments of this library.
 
 The AEC environment has the bookkeeping of PettingZoo's documented template, the single one the parts of
-Gymnasium's (``_get_obs``, ``_get_info``); ``BareEnv`` does not even have these. All of them are no-op simulations
-without an end, with an observation of four float32 and a reward of 1.0.
+Gymnasium's (``_get_obs``, ``_get_info``). All of them are no-op simulations without an
+end, with an observation of four float32 and a reward of 1.0.
 """
 
 from __future__ import annotations
@@ -120,13 +120,6 @@ class TemplateEnv(gym.Env[Any, Any]):
         observation = self._get_obs()
         info = self._get_info()
         return observation, reward, terminated, False, info
-
-
-class BareEnv(TemplateEnv):
-    """The minimal Gymnasium environment."""
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        return np.array(self.model.values), 1.0, False, False, {}
 
 
 # -- other ways to let a simulation keep its own loop ----------------------------------------------

@@ -37,14 +37,6 @@ class Slow(Turns):
             work(100e-6)
 
 
-class Few(Turns):
-    """Twenty decisions."""
-
-    def run(self) -> None:
-        for _ in range(20):
-            self.model.left()
-
-
 async def wait(observation: Any) -> int:
     """Answer like a service that takes its time."""
     await asyncio.sleep(0.05)
@@ -55,7 +47,7 @@ def groups(number: int) -> Iterator[Group]:
     """Yield the rows: as many simulations as there are decisions in a round, divided by 20, and at most a thousand."""
     number = min(SIMULATIONS, number // 20)
     network = {Model.left: network_policy()}
-    waiting = at_once(Few, {Model.left: wait}, min(200, number), 20, time.perf_counter, concurrency=50)
+    waiting = at_once(Slow, {Model.left: wait}, min(200, number), DECISIONS // 10, time.perf_counter, concurrency=50)
     least = 50e3 / 50  # microseconds for each decision
     yield Group([Row("coroutines of 50 ms, 50 at once / their time", waiting, lambda: least, 1.3, 1.2)], most=1)
 

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from pettingzoo.test import api_test, parallel_api_test
 
 from simenv_marl import aec_env, branch, clone, parallel_env, single_env
+from simenv_marl.core.forks import Fork
 from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError, ReentrancyError, WrongThreadError
 from tests.contract.test_conformance import SHAPES, made
 from tests.core.test_global_rng import world
@@ -214,6 +215,24 @@ USES = [
     (lambda twin: twin.call(lambda env: env.reset(seed=9)), TWO[3:]),
     (lambda twin: [twin.reset(seed=8), twin.reset(seed=9)], TWO),
 ]
+
+
+@FORKS
+def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
+    before = children()
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    handler = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 0.1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            Fork.begin(lambda connection: None, lambda: time.sleep(60), wait=True)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+    assert children() == before
 
 
 @pytest.mark.parametrize("end", [lambda twins: twins[0].close(), list.clear])

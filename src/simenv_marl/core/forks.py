@@ -258,9 +258,16 @@ def start(
                 there.sendall(b".")
         except BaseException:
             os._exit(1)
-    elif wait and not here.recv(1):
-        os.waitpid(process, 0)
-        raise BranchError("the forked process died before it was separated from this one")
+    elif wait:
+        separated = b""
+        try:
+            separated = here.recv(1)
+        finally:
+            if not separated:  # it has died, or an interrupt has ended the wait
+                os.kill(process, _signal.SIGKILL)
+                os.waitpid(process, 0)
+        if not separated:
+            raise BranchError("the forked process died before it was separated from this one")
     return process
 
 

@@ -45,12 +45,17 @@ def pending_decision(env: Any) -> dict[str, Any]:
         "time": jsonable(decision.time),
         "doc": (decision.doc or "").strip().partition("\n")[0],
         "reward": decision.reward,
-        "observation": [*_entries(labelled(decision.observation, decision.observation_labels))][:64],
+        "observation": entries_of(decision.observation, decision.observation_labels),
         "space": describe_space(decision.action_space),
         "mask": jsonable(decision.mask),
         "labels": jsonable(decision.action_labels),
         "seen": digest_of(decision.observation),
     }
+
+
+def entries_of(observation: Any, labels: Any = None) -> list[tuple[str, Any]]:
+    """Return the first entries of an observation: name, and number or text."""
+    return [*_entries(labelled(observation, labels))][:64]
 
 
 def _entries(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

@@ -11,6 +11,7 @@ import signal
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
+from itertools import islice
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final
@@ -19,7 +20,7 @@ import numpy as np
 
 from ... import RULE, aec_env, clone
 from ...errors import InvalidActionError, OptionValueError, SimEnvError, describe_error, did_you_mean, short_repr
-from .forms import MOST, action_of, candidates_of, jsonable, pending_decision, picture_of, write
+from .forms import MOST, action_of, candidates_of, entries_of, jsonable, pending_decision, picture_of, write
 
 FUTURES: Final = 16  # in which each candidate is tried out
 CHECKPOINTS: Final = 24  # at most: each is a process
@@ -302,24 +303,28 @@ class Game:
             self.told["note"], seeds = f"One future, in which chance is known: {error!s}", [None]
         for place, seed in enumerate(seeds):
             for candidate in [one for one in self.fan if len(one["courses"]) <= place]:
-                course: list[float] = []
+                course: list[list[float]] = []
                 try:
                     yield from self._play_future(agent, candidate["action"], seed, course)
                 except Exception as error:
                     self.told["note"] = f"A future has failed: {describe_error(error)[:300]}"
-                candidate["courses"].append(course or [0.0])
+                candidate["courses"].append(course or [[0.0, *self._measured(self.env.observe(agent))]])
             yield self._fans()
 
-    def _play_future(self, agent: str, action: Any, seed: int | None, course: list[float]) -> Iterator[None]:
-        """Play a future. Add the agent's return after each of its decisions to the course; yield after each step."""
+    def _play_future(self, agent: str, action: Any, seed: int | None, course: list[list[float]]) -> Iterator[None]:
+        """Play a future; yield after each step. Add to the course, after each decision of the agent, what is measured.
+
+        This is the agent's return, and the numbers that it observes.
+        """
         with closing(clone(self.env, seed=seed, time_limit=30.0)) as twin:
             twin.step(RULE if action is None else action_of(twin.action_space(agent), action))
             while twin.agents:
                 name = twin.agent_selection
-                _, reward, terminated, truncated, info = twin.last(observe=False)
+                observation, reward, terminated, truncated, info = twin.last(observe=name == agent)
                 ended = terminated or truncated
                 if name == agent:
-                    course.append(reward + sum(course[-1:]))
+                    before = course[-1][0] if course else 0.0
+                    course.append([before + reward, *self._measured(observation)])
                     if action is None and "rule_action" in info:
                         self.told.setdefault("rule", jsonable(info["rule_action"]))
                     if ended or len(course) >= self.horizon:
@@ -327,14 +332,28 @@ class Game:
                 yield
                 twin.step(None if ended else RULE)
 
+    def _measures(self) -> dict[int, str]:
+        """Return the names of the numbers in the pending decision's observation, by their places in it."""
+        entries = enumerate(self.now["observation"] if self.now else ())
+        numbers = ((place, name) for place, (name, value) in entries if type(value) in (int, float))
+        return dict(islice(numbers, MOST))
+
+    def _measured(self, observation: Any) -> list[float]:
+        values = entries_of(observation)
+        return [float(values[place][1]) for place in self._measures()]
+
     def _fans(self) -> dict[str, Any]:
-        """Return the median and the 80 % band of each candidate's return after each decision."""
+        """Return the median and the 80 % band of each candidate after each decision, for all that is measured."""
         fans = []
         for candidate in self.fan:
             courses = [course + course[-1:] * (self.horizon - len(course)) for course in candidate["courses"]]
-            bands = np.quantile(courses, (0.1, 0.5, 0.9), axis=0).round(6).tolist() if courses else []
+            numbers = np.nan_to_num(np.array(courses, np.float64))
+            bands = (
+                np.quantile(numbers, (0.1, 0.5, 0.9), axis=0).transpose(2, 0, 1).round(6).tolist() if courses else []
+            )
             fans.append({"action": candidate["action"], "n": len(courses), "bands": bands})
-        return {"type": "fan", "turn": self.turn, "horizon": self.horizon, "candidates": fans} | self.told
+        shown = {"measures": ["return", *self._measures().values()], "candidates": fans}
+        return {"type": "fan", "turn": self.turn, "horizon": self.horizon} | shown | self.told
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the page shows but the futures, as JSON."""

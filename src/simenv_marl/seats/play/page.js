@@ -105,13 +105,18 @@ function drawFans() {
   if (!fan || !seen() || fan.turn !== state.turn) return;
   $("note").textContent = fan.note;
   if (document.activeElement !== $("horizon")) $("horizon").value = fan.horizon;
-  const shown = fan.candidates.filter(({ bands }) => bands.length && bands[0].length), last = fan.horizon - 1;
+  const last = fan.horizon - 1, of = Math.max(0, fan.measures.indexOf($("of").value));
+  if ($("of").children.length !== fan.measures.length || $("of").dataset.agent !== state.pending.agent) {
+    $("of").replaceChildren(...fan.measures.map((one) => make("option", {}, one)));
+    $("of").dataset.agent = state.pending.agent;
+  }
+  const shown = fan.candidates.filter(({ bands }) => bands.length).map((one) => ({ ...one, bands: one.bands[of] }));
   const y = scale(shown.flatMap(({ bands }) => bands.flat())), buttons = [...$("actions").children];
   for (const { action, bands: [below, middle, above], n } of shown) {
     const button = buttons.find((one) => one.dataset.action === JSON.stringify(action)) || actionButton(action, name(action), "");
     const text = `${show(middle[last])} (${show(below[last])} to ${show(above[last])})`;
     const line = (band) => (last ? band : [band[0], band[0]]).map((value, i) => [100 * i / (last || 1), y(value)]);
-    const label = `return after ${fan.horizon} decisions: median ${text}, ${n} futures`;
+    const label = `${fan.measures[of]} after ${fan.horizon} decisions: median ${text}, ${n} futures`;
     button.lastChild.replaceChildren(
       draw(label, ["polygon", [...line(below), ...line(above).reverse()]], ["polyline", line(middle)]), make("span", { className: "dim" }, text));
   }
@@ -195,6 +200,7 @@ function connect() {
 const number = (id) => Number.parseInt($(id).value, 10);
 for (const id of ["undo", "redo", "skip"]) $(id).onclick = () => send({ do: id });
 for (const [id, input] of [["delegate", "many"], ["restart", "seed"]]) $(id).onclick = () => send({ do: id, n: number(input) });
+$("of").onchange = drawFans;
 for (const id of ["horizon", "jump"]) $(id).onchange = () => send({ do: id, n: number(id) });
 $("stop").onclick = () => send({ do: "delegate", n: 0 });
 $("jump").oninput = () => { $("turn").textContent = `${$("jump").value} of ${state.length}`; };

@@ -1,0 +1,1 @@
+"""Planning in models that are driven by events, beside their rules."""

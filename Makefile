@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix pension check test test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -21,7 +21,7 @@ test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random
 
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
-test-all: test test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-clusters test-outside
+test-all: test test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside
 
 # The quickest of them, for each commit: some 40 seconds on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
@@ -60,7 +60,12 @@ test-rllib: .venv-rllib/.rllib
 test-wrappers: .venv-wrappers/.wrappers
 	OMP_NUM_THREADS=1 .venv-wrappers/bin/python -m pytest tests/clients/test_supersuit.py tests/envs/test_wrappers.py
 
-.venv-clients/.clients .venv-rllib/.rllib .venv-wrappers/.wrappers: pyproject.toml
+# The page of `play` in headless Chromium, which is installed where it is missing.
+test-browser: .venv-browser/.browser
+	test -x /usr/bin/chromium || (apt-get update --quiet && apt-get install --yes --quiet chromium)
+	.venv-browser/bin/python -m pytest -rs tests/seats/play/test_browser.py
+
+.venv-clients/.clients .venv-rllib/.rllib .venv-wrappers/.wrappers .venv-browser/.browser: pyproject.toml
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
 	touch $@

@@ -9,6 +9,7 @@ is paid back to all traders, in equal parts. With a levy of 20 each does best wi
 
 from __future__ import annotations
 
+from math import ceil
 from random import Random
 from typing import Final
 
@@ -47,10 +48,13 @@ class Trader:
         return sum(trader.crates for trader in self.market.traders if trader is not self)
 
     def choose_crates(self) -> int:
-        """Choose how many crates to bring. The rule takes what earns most if no other trader changes anything more."""
+        """Choose how many crates to bring to the market.
+
+        The rule takes the number that earns most beside the crates of the others, as they are now.
+        """
         own_levy = self.market.levy * (1 - 1 / TRADERS)  # as a part of it comes back
         best = (DEMAND - COST - own_levy - self.crates_of_others()) / 2
-        return min(max(round(best), 0), MOST)
+        return min(max(ceil(best - 0.5), 0), MOST)  # the lower of two that earn as much
 
 
 class Market:
@@ -73,8 +77,9 @@ class Market:
     def play_round(self) -> None:
         """Let all traders decide, each round another one first, and sell."""
         first = self.round % TRADERS
-        for self.decided, trader in enumerate(self.traders[first:] + self.traders[:first]):
+        for trader in self.traders[first:] + self.traders[:first]:
             trader.crates = trader.choose_crates()
+            self.decided += 1
         brought = sum(trader.crates for trader in self.traders)
         self.price = float(max(0, DEMAND + self.random.randint(-SPREAD, SPREAD) - brought))
         for trader in self.traders:

@@ -58,7 +58,8 @@ async def illegal_later(observation):
     (illegal_later, "illegal"),
 ])  # fmt: skip
 def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, retries):
-    guarded = FallbackPolicy(policy, lambda observation: 1, timeout=0.002, retries=retries)
+    timeout = 0.002 if kind == "late" else None  # others may be late, too, on a busy machine
+    guarded = FallbackPolicy(policy, lambda observation: 1, timeout=timeout, retries=retries)
     assert played(guarded) == played(lambda observation: 1)
     tries = Tank.days * (1 + retries)
     assert guarded.counts == counted(asked=5, fallbacks=5, retried=tries - 5, **{kind: tries})

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -100,8 +100,9 @@ def server():
     assert server.end()[0] == 0
 
 
-@pytest.fixture
-def page(server):
+@contextmanager
+def pages_of(server):
+    """Make pages that are closed in the end."""
     pages = []
 
     def make(*arguments, **options):
@@ -114,6 +115,12 @@ def page(server):
 
 
 @pytest.fixture
+def page(server):
+    with pages_of(server) as make:
+        yield make
+
+
+@pytest.fixture
 def buyer(page):
     buyer = page("buyer")
     buyer.send(do="restart", n=5)
@@ -121,8 +128,18 @@ def buyer(page):
     return buyer
 
 
-def test_two_people_play_and_a_spectator_sees_it(page, buyer):
-    seller, spectator = page("seller"), page()
+@pytest.fixture
+def new_page():
+    """Pages of a server that nobody else has used."""
+    server = Server("--seed", "5")
+    with pages_of(server) as make:
+        yield make
+    assert server.end()[0] == 0
+
+
+def test_two_people_play_and_a_spectator_sees_it(new_page):
+    page = new_page
+    buyer, seller, spectator = page("buyer"), page("seller"), page()
     everybody = {"type": "people", "taken": {"buyer": 1, "seller": 1}, "spectators": 1}
     spectator.wait("people", lambda people: people == everybody)
     buyer.send(do="act", turn=0, action=2)

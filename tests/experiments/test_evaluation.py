@@ -115,7 +115,7 @@ def test_the_same_comes_of_all_ways_to_run_it(arguments):
 
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
 def test_planners_decide_as_they_do_in_simulate(arguments):
-    planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1)
+    planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1, method="replay")
     contenders = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
     found = evaluate(Shop, contenders, seeds=range(2), points=NEAR, metric=level, **arguments).values("metric")
     for name, policies in contenders.items():

@@ -59,7 +59,7 @@ def nothing_was_warned_of(monkeypatch):
 def share_of_rule(kind, model, margin, decisions):
     env, answers = made(model), []
     for _ in range(decisions):
-        answers.append(kind(actions=[1, 2, 3], futures=4, horizon=1, margin=margin).choose(env).best)
+        answers.append(kind(actions=[1, 2, 3], futures=4, horizon=1, margin=margin, method="replay").choose(env).best)
         env.step(0)
     return sum(answer is RULE for answer in answers) / decisions
 

@@ -144,7 +144,7 @@ def test_planners_decide_in_environments_as_by_hand(make, method):
 @pytest.mark.parametrize("policies", [{}, {"right": lambda observations: np.ones(len(observations), int)}])
 def test_many_episodes_ask_row_by_row(batch_size, policies):
     given = {"points": tame(), "seeds": [5, 6], "batch_size": batch_size, "collect": lambda duel: duel.value}
-    policies = {"left": planner(), **policies}
+    policies = {"left": planner(method="replay"), **policies}
     found = collect_episodes(Duel, policies, **given)
     assert simulate_many(Duel, policies, **given) == list(found["left"].collected)
     for place, seed in enumerate([5, 6]):
@@ -170,12 +170,12 @@ def test_batch_policies_of_others_go_on_in_branches(method):
 
 def test_planners_can_be_compared_with_the_rule():
     given = {"points": tame(), "seeds": [5, 6]}
-    told = compare_with_rule(Duel, {"left": planner()}, **given)["left"]
+    told = compare_with_rule(Duel, {"left": planner(method="replay")}, **given)["left"]
     env, wanted = single_env(Duel, given["points"], agent="left"), []
     for seed in (5, 6):
         env.reset(seed=seed)
         for _ in range(6):
-            wanted.append(planner().choose(env).best)
+            wanted.append(planner(method="replay").choose(env).best)
             env.step(RULE)
     assert told.policy_actions.tolist() == known(wanted)
     assert told.trajectories.actions.tolist() == [1] * 12
@@ -388,6 +388,6 @@ def share(policy, seeds):
 
 def test_plans_are_better_than_a_poor_rule():
     """Beside the optimum of a model that can be solved."""
-    planner = RolloutPolicy(futures=16, horizon=3)
+    planner = RolloutPolicy(futures=16, horizon=3, method="replay")
     assert share(lambda env: 1, range(40)) < 0.75
     assert share(lambda env: planner.choose(env).best, [1, 2]) >= 0.95

@@ -112,7 +112,7 @@ test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[experiments]' '$(CLUSTER)'
 	touch $@
 
-# Simulators outside Python: in C++, Java, ns-3, Enki, EnergyPlus, FMI. Reports and skips what cannot be installed here.
+# Simulators outside Python: in C++, Java, ns-3, Enki, ROS, EnergyPlus, FMI. Reports and skips what cannot be installed here.
 test-outside: .venv/.test
 	sh tools/outside.sh
 	for extra in energyplus fmi; do \

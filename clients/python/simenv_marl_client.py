@@ -73,7 +73,7 @@ class Client:
         self._running = self.stopped = False
         self._gone = self._failed = False  # the environment is gone, or was not understood
         self._number = self._stops = 0
-        self._thread = (0, "")  # the id and the name of the thread that runs the model; gevent does not replace these ids
+        self._thread = (0, "")  # the thread that runs the model: its name, and an id that gevent does not replace
         self._rule_of = ""  # the point whose rule is running, if its decision is to be reported
         self._due = 0  # the number of the call whose rule has not told its decision
         descriptors = os.environ.pop("SIMENV_MARL_FDS", None)  # child processes are not connected

@@ -117,11 +117,13 @@ test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[experiments]' '$(CLUSTER)'
 	touch $@
 
-# Simulators outside Python: in C++, ns-3, Java and EnergyPlus. Reports and skips what cannot be installed here.
+# Simulators outside Python: in C++, Java, ns-3, Enki, ROS, EnergyPlus, FMI. Reports and skips what cannot be installed here.
 test-outside: .venv/.test
 	sh tools/outside.sh
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[energyplus]' || \
-	    echo "EnergyPlus cannot be installed; its tests are skipped" >&2
+	for extra in energyplus fmi; do \
+	    $(BIN)/pip install --quiet --disable-pip-version-check --editable ".[$$extra]" || \
+	        echo "the extra $$extra cannot be installed; its tests are skipped" >&2; \
+	done
 	$(BIN)/python -m pytest -n 2 -rs tests/outside
 
 # The built wheel, on the newest Python that is there: templates from an empty folder, and the newest Mesa.

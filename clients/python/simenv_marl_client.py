@@ -26,6 +26,7 @@ import json
 import math
 import os
 import random
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, NoReturn
@@ -50,7 +51,7 @@ class Episode(NamedTuple):
 
 
 class Client:
-    """The model's side of the wire. A process has one client, which one thread uses.
+    """The model's side of the wire. A process has one client. The thread that calls ``run`` makes all decisions.
 
     Attributes:
         connected: Whether there is an environment.
@@ -72,6 +73,7 @@ class Client:
         self._running = self.stopped = False
         self._gone = self._failed = False  # the environment is gone, or was not understood
         self._number = self._stops = 0
+        self._thread = (0, "")  # the thread that runs the model: its name, and an id that gevent does not replace
         self._rule_of = ""  # the point whose rule is running, if its decision is to be reported
         self._due = 0  # the number of the call whose rule has not told its decision
         descriptors = os.environ.pop("SIMENV_MARL_FDS", None)  # child processes are not connected
@@ -107,6 +109,7 @@ class Client:
         """
         if not self.connected:
             return model(Episode(seed, options or {}))
+        self._thread = threading.get_native_id(), threading.current_thread().name
         able = {"decided": self._reports, "expect": True, "reseed": self._reseed is not None}
         self._send({"hello": 1, "points": self._points, "can": [name for name in able if able[name]]})
         while not self._gone:
@@ -157,6 +160,16 @@ class Client:
             self._send({"end": {"truncated": bool(truncated), "result": result}})
             self._running = False
             self._flush()
+
+    def _refuse_thread(self, about: str) -> NoReturn:
+        """Report the use in another thread to the environment, too: libraries often catch errors of callbacks."""
+        text = (
+            f"{about} in the thread {threading.current_thread().name!r}, but the model runs in the thread"
+            f" {self._thread[1]!r}; pass what the decision needs to that thread, by a queue.Queue, and decide there"
+        )
+        self._error("RuntimeError", text, "".join(traceback.format_stack()))
+        self._running = False
+        raise RuntimeError(text)
 
     def _error(self, kind: str, text: str, trace: str) -> None:
         most, self._due = 1 << 16, 0
@@ -250,6 +263,8 @@ class Client:
         return self.connected and self._running and not self.stopped
 
     def _decide(self, point: str, entity: Any, time: Any, arguments: dict[str, Any], rule: Callable[[], Any]) -> Any:
+        if threading.get_native_id() != self._thread[0] and self._running:
+            self._refuse_thread(f"a decision at {point}")
         if self.stopped:
             self._unwind()
         if not self._running:

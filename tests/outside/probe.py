@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import threading
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "clients" / "python"))
@@ -82,6 +83,22 @@ def fail():
         raise RuntimeError("the pump is broken") from cause
 
 
+def threaded():
+    """Decide in a thread whose errors nobody sees, as in callbacks that a library catches; never end by itself."""
+
+    def callback():
+        try:
+            client.decide("a", "x", rule=lambda: 1)
+        except RuntimeError:
+            done.set()
+
+    done = threading.Event()
+    threading.Thread(target=callback, name="callbacks").start()
+    done.wait()
+    client.update("a", "x", level=1)
+    return "nobody hears of that"
+
+
 def reports():
     client.update("a", 12, time=1.5, level=0.5)
     client.remove("a", 12)
@@ -118,7 +135,7 @@ def model(episode):
     if play == "shell":
         return os.system(options["command"])
     plays = {"types": types, "careless": careless, "fail": fail, "reports": reports, "seed": lambda: episode.seed}
-    plays.update(count=lambda: count(times), deaf=lambda: deaf(times))
+    plays.update(count=lambda: count(times), deaf=lambda: deaf(times), threaded=threaded)
     return plays.get(play, lambda: None)()
 
 

@@ -282,6 +282,16 @@ def test_a_decorated_function_decides(child):
     assert child.act(1, "other") == ended("other")
 
 
+@PYTHON
+def test_a_decision_in_another_thread_is_an_error_that_names_both(child):
+    error = child.begin(play="threaded")["error"]
+    assert error["type"] == "RuntimeError"
+    assert "thread 'callbacks'" in error["text"]
+    assert "thread 'MainThread'" in error["text"]
+    assert "in callback" in error["trace"]
+    assert plays_well(child)
+
+
 @JAVA
 def test_threads_of_the_model_decide_one_at_a_time_and_are_all_stopped(child):
     calls, last = child.play(lambda call: call["args"]["n"] + 1, play="threads")

@@ -1,0 +1,1 @@
+"""E-pucks in Enki that sweep an arena in pairs."""

@@ -1,0 +1,1 @@
+"""A robot in ROS 1 that follows a leader."""

@@ -1,0 +1,169 @@
+"""Co-simulation units (FMI 2 and 3): the master decides in this process, and the units run below it."""
+
+import random
+import shutil
+from functools import cache
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import RULE, clone, evaluate, single_env
+
+pytest.importorskip("fmpy", reason="FMPy is not there: pip install 'simenv-marl[fmi]'")
+
+from examples.heated_room.env import BOUNDS, OBSERVED, RoomSim
+from examples.heated_room.master import Master, labels_of, spaces_of
+from examples.heated_room.train import Linear, learn
+from examples.heated_room.units import UNITS, unit
+from fmpy import read_model_description
+from fmpy.model_description import Dimension, Item, ModelDescription, ModelVariable, SimpleType
+
+NEEDS_C = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
+KINDS = pytest.mark.parametrize("kind", [pytest.param(kind, marks=[NEEDS_C] if kind == "c" else []) for kind in UNITS])
+
+
+@cache
+def plain(kind, seed):
+    """The cost and the temperature at the end of the model's own run."""
+    simulation = RoomSim(kind)
+    simulation.reset(seed)
+    simulation.run()
+    found = outcome(simulation)
+    simulation.close()
+    return found
+
+
+def outcome(simulation):
+    return simulation.room.cost, simulation.room.read("temperature")
+
+
+def by_the_rule(env, seed):
+    """Play an episode, which a time limit ends; return the sum of the rewards."""
+    env.reset(seed=seed)
+    total, terminated, truncated = 0.0, False, False
+    while not truncated:
+        _, reward, terminated, truncated, _ = env.step(RULE)
+        total += reward
+    assert not terminated
+    return total
+
+
+def heat(power):
+    return {"power": np.array([power])}
+
+
+@KINDS
+def test_by_the_rule_it_is_the_plain_run(make_env, kind):
+    env = make_env(single_env, RoomSim(kind))
+    for seed in (3, 4):
+        total = by_the_rule(env, seed)
+        assert outcome(env.simulation) == plain(kind, seed)
+        assert total == pytest.approx(-plain(kind, seed)[0])
+
+
+@NEEDS_C
+def test_all_units_are_the_same_room():
+    assert plain("fmi2", 3) == plain("fmi3", 3) == pytest.approx(plain("c", 3), rel=1e-12)
+
+
+@KINDS
+def test_interleaved_units_are_what_they_are_alone(make_env, kind):
+    order, envs = random.Random(0), [make_env(single_env, RoomSim(kind)) for _ in range(3)]
+    for env, seed in zip(envs, (3, 4, 3), strict=True):
+        env.reset(seed=seed)
+    for env in order.sample(envs * 192, 3 * 192):
+        env.step(RULE)
+    assert [outcome(env.simulation) for env in envs] == [plain(kind, seed) for seed in (3, 4, 3)]
+
+
+@KINDS
+def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(make_env, kind):
+    env = make_env(single_env, RoomSim(kind))
+    env.reset(seed=9)
+    for _ in range(50):
+        env.step(heat(2.0))
+    by_the_rule(env, seed=3)
+    assert outcome(env.simulation) == plain(kind, 3)
+
+
+@pytest.mark.greenlet("with threads there is no fork")
+@KINDS
+@pytest.mark.parametrize("method", ["fork", "replay"])
+def test_a_clone_goes_on_exactly_without_the_units_own_states(make_env, kind, method):
+    env = make_env(single_env, RoomSim(kind))
+    env.reset(seed=5)
+    powers = np.random.default_rng(0).uniform(0.0, 2.0, 192)
+    for power in powers[:60]:
+        env.step(heat(power))
+    copies = [make_env(clone, env, method=method, seed=seed) for seed in (None, 7)]
+
+    def rest(env):
+        return [str(env.step(heat(power))) for power in powers[60:]]
+
+    found = rest(env)
+    assert rest(copies[0]) == found
+    assert rest(copies[1]) != found, "another weather"
+
+
+@pytest.mark.greenlet("the driver makes no difference to the spaces")
+@KINDS
+def test_bounds_and_units_come_from_the_variable_or_its_type_or_from_the_user(kind):
+    description = read_model_description(unit(kind))
+    names = ("power", *OBSERVED)
+    if kind == "fmi2":
+        with pytest.raises(ValueError, match=r"power has no bounds; give them: bounds=\{'power': \(low, high\)\}"):
+            spaces_of(description, names)
+        found = spaces_of(description, names, BOUNDS)
+        assert labels_of(description, names)["power"] == "power"
+    else:
+        found = spaces_of(description, names)
+        assert labels_of(description, names) == {
+            "power": "power (kW)", "temperature": "temperature (degC)", "outside": "outside (degC)"
+        }  # fmt: skip
+    assert found["power"] == spaces.Box(0.0, 2.0, (1,), np.float64)
+    assert found["outside"] == spaces.Box(-40.0, 60.0, (1,), np.float64)
+    assert spaces_of(description, ["power"], {"power": (0.5, 1.5)})["power"].low == 0.5
+    with pytest.raises(ValueError, match=r"no variable heat, but .*power"):
+        spaces_of(description, ["heat"])
+
+
+@pytest.mark.greenlet("the driver makes no difference to the spaces")
+def test_variables_that_are_not_real_have_discrete_spaces():
+    level = SimpleType(name="Level", type="Enumeration", items=[Item(name="low", value="1"), Item("high", "2")])
+    variables = [
+        ModelVariable(name="open", valueReference=0, type="Boolean"),
+        ModelVariable(name="level", valueReference=1, type="Enumeration", declaredType=level),
+        ModelVariable(name="count", valueReference=2, type="Int32", min="-1", max="3"),
+        ModelVariable(name="text", valueReference=3, type="String"),
+        ModelVariable(name="row", valueReference=4, type="Float64", min="0", max="1", dimensions=[Dimension("2", 0)]),
+    ]
+    description = ModelDescription(modelVariables=variables)
+    found = spaces_of(description, ["open", "level", "count"])
+    assert dict(found) == {
+        "open": spaces.Discrete(2), "level": spaces.Discrete(2, start=1), "count": spaces.Discrete(5, start=-1)
+    }  # fmt: skip
+    for name in ("text", "row"):
+        with pytest.raises(ValueError, match=f"{name} is not a scalar number"):
+            spaces_of(description, [name], {name: (0, 1)})
+
+
+@pytest.mark.greenlet("the driver makes no difference to learning")
+@NEEDS_C
+def test_the_heater_learns_to_beat_the_thermostat():
+    contenders = {
+        "rule": {},
+        "trained": {"heater_0": learn(generations=8, episodes=1)},
+        "untrained": {"heater_0": Linear([0.0] * 6)},
+    }
+    values = evaluate(RoomSim, contenders, seeds=range(10**6, 10**6 + 8)).values()
+    assert (values["untrained"] < values["rule"]).all()
+    assert (values["trained"] > values["rule"]).all()
+
+
+@pytest.mark.greenlet("the driver makes no difference without an environment")
+def test_a_master_needs_decisions():
+    master = Master(unit("fmi2"), read_model_description(unit("fmi2")), 900.0, 900.0)
+    with pytest.raises(NotImplementedError):
+        master.run()
+    master.close()

@@ -53,7 +53,7 @@ def turns(env, seed):
 
 
 def test_a_hand_written_environment_and_its_successor_tell_the_same(run):
-    before, after = map(run, page.blocks("coming-from-pettingzoo.md"))
+    before, after = map(run, page.blocks("coming-from.md", "PettingZoo"))
     told = [turns(before["StallEnv"](), seed) for seed in range(20)]
     assert told == [turns(after["env"], seed) for seed in range(20)]
     assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
@@ -61,7 +61,7 @@ def test_a_hand_written_environment_and_its_successor_tell_the_same(run):
 
 def test_the_environment_of_the_paper_in_todays_words(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "model", model)
-    _, after = page.blocks("coming-from-sim-env.md")
+    _, after = page.blocks("coming-from.md", "Sim-Env")
     names = run(after)
     assert names["terminated"]
     assert names["alive"](names["env"].simulation.greenhouse) == 0
@@ -81,7 +81,7 @@ def messages():
 
 
 def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are():
-    text = (page.DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    text = (page.DOCS / "problems.md").read_text(encoding="utf-8")
     quoted = re.findall(r"^### (.+)$", text, re.MULTILINE)  # the headings
     assert len(quoted) >= 20
     said = messages()

@@ -23,7 +23,7 @@ test: lint docs
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
 test-all: test test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside
 
-# The quickest of them, for each commit: some 40 seconds on two cores, once the environment is there.
+# The quickest of them, for each commit: about a minute on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
 	$(addprefix tests/contract/test_,$(addsuffix .py,conformance environments episodes errors identity joint many_agents \
 	messages one_agent rounds simulate)) \

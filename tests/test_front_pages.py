@@ -41,6 +41,19 @@ def test_the_code_of_the_front_page_has_the_rewards_that_it_shows(run):
     assert rewards == [-1.0, -2.0, -1.0, -2.0, -3.0]
 
 
+def test_the_readme_shows_and_names_only_what_there_is():
+    """Its pictures and links lead to files, so that no badge stands for a service that does not exist."""
+    root = page.DOCS.parent
+    text = (root / "README.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", text)
+    links = [link for link in re.findall(r"\]\(([^)]*)\)", text) if not link.startswith("https://")]
+    assert pictures
+    assert [path for path in (*pictures, *links) if not (root / path).is_file()] == []
+    targets = re.findall(r"^make (\w+)", text, re.MULTILINE)
+    makefile = (root / "Makefile").read_text(encoding="utf-8")
+    assert [target for target in targets if f"\n{target}: " not in makefile] == []
+
+
 def turns(env, seed):
     """What is told in an episode of random actions, turn by turn."""
     actions, told = random.Random(seed), []
@@ -53,7 +66,7 @@ def turns(env, seed):
 
 
 def test_a_hand_written_environment_and_its_successor_tell_the_same(run):
-    before, after = map(run, page.blocks("coming-from-pettingzoo.md"))
+    before, after = map(run, page.blocks("coming-from.md", "PettingZoo"))
     told = [turns(before["StallEnv"](), seed) for seed in range(20)]
     assert told == [turns(after["env"], seed) for seed in range(20)]
     assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
@@ -61,7 +74,7 @@ def test_a_hand_written_environment_and_its_successor_tell_the_same(run):
 
 def test_the_environment_of_the_paper_in_todays_words(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "model", model)
-    _, after = page.blocks("coming-from-sim-env.md")
+    _, after = page.blocks("coming-from.md", "Sim-Env")
     names = run(after)
     assert names["terminated"]
     assert names["alive"](names["env"].simulation.greenhouse) == 0
@@ -81,7 +94,7 @@ def messages():
 
 
 def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are():
-    text = (page.DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    text = (page.DOCS / "problems.md").read_text(encoding="utf-8")
     quoted = re.findall(r"^### (.+)$", text, re.MULTILINE)  # the headings
     assert len(quoted) >= 20
     said = messages()

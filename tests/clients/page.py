@@ -14,9 +14,12 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def blocks(name: str, section: str | None = None) -> list[CodeType]:
-    """Compile all python blocks of a file in ``docs``, or of a section of it, in their order."""
+    """Compile all python blocks of a file in ``docs``, or of a section or a tab of it, in their order."""
     text = (DOCS / name).read_text(encoding="utf-8")
-    if section is not None:
+    tab = f"{{tab-item}} {section}\n"
+    if tab in text:
+        text = text.partition(tab)[2].partition("{tab-item}")[0]
+    elif section is not None:
         level, _, rest = text.partition(f"# {section}\n")
         level = level.rpartition("\n")[2] + "#"  # up to the next heading that is as high
         text = re.split(rf"^#{{2,{len(level)}}} ", rest, maxsplit=1, flags=re.MULTILINE)[0]

@@ -172,7 +172,7 @@ class Stopped(Exception):
 
 def test_an_external_env_and_its_successor_tell_the_same(monkeypatch):
     before, after = {}, {}
-    for names, code in zip((before, after), blocks("coming-from-external-env.md"), strict=True):
+    for names, code in zip((before, after), blocks("coming-from.md", "ExternalEnv"), strict=True):
         exec(code, names)
     drawn = random.Random(1)
     actions = [drawn.randrange(3) for _ in range(20)]

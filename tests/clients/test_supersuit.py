@@ -6,10 +6,11 @@ import importlib
 import numpy as np
 import pettingzoo
 import pytest
+from gymnasium.spaces import Box
 from pettingzoo.test import api_test, seed_test
 from stable_baselines3 import PPO
 
-from simenv_marl import TRUNCATED, aec_env, parallel_env
+from simenv_marl import TRUNCATED, SimulationInterface, aec_env, difference, make_step, parallel_env
 from tests.worlds.counters import alike
 from tests.worlds.dials import ACTIONS, SEEN, Dial, points, turned_by
 
@@ -157,12 +158,42 @@ def test_one_policy_of_stable_baselines3_for_all_agents():
     assert after > parallel_return(tested, lambda agent, seen, info: 1) + 5
 
 
+class Boat:
+    def __init__(self, name):
+        self.name, self.cash = name, 2.0
+
+    def choose_effort(self):
+        return 0.5
+
+
+class Harbour(SimulationInterface):
+    def reset(self):
+        self.boats = [Boat("boat_0"), Boat("boat_1")]
+
+    def run(self):
+        for _ in range(8):
+            for boat in list(self.boats):
+                boat.cash += 2 * boat.choose_effort() - 1
+                if boat.cash <= 0:
+                    self.boats.remove(boat)
+                    self.end_agent(boat.name)
+
+    def expected_calls(self, point):
+        return [(boat,) for boat in self.boats]
+
+
 def test_options_replace_wrappers():
-    common, before, after = page.blocks("coming-from-supersuit.md")
     told = []
-    for code in (before, after):
-        names = {}
-        exec(common, names)
+    for code in page.blocks("coming-from.md", "SuperSuit"):
+        names = {
+            "Boat": Boat, "Harbour": Harbour, "Box": Box, "difference": difference, "make_step": make_step,
+            "parallel_env": parallel_env, "names": ["boat_0", "boat_1"],
+            "effort": {
+                "action_space": Box(0, 1, (1,)),
+                "action_space_mapping": lambda action: float(action[0]),
+                "agent": lambda boat: boat.name,
+            },
+        }  # fmt: skip
         exec(code, names)
         env, drawn = names["env"], np.random.default_rng(3)
         told.append([env.reset(seed=1)[0]])

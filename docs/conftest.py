@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from tests.worlds.undone import models_of_pages_forgotten, registries_put_back
 
-# A model that is only found from a page, one that is a process, and one that needs a learner.
-collect_ignore = ["bakery_env.py", "dam.py", "quickstart.py"]
+# A model that is only found from a page, one that is a process, and three that need a learner.
+collect_ignore = ["bakery_env.py", "dam.py", "hive_torchrl.py", "one_file.py", "quickstart.py"]
 
 
 @pytest.fixture(autouse=True)

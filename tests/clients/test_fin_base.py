@@ -1,9 +1,10 @@
-"""Stable-Baselines3 and TorchRL on the pension fund, by the code of its page: both gain over the rule."""
+"""Stable-Baselines3 and TorchRL on the pension fund, as its page shows them: both gain over the rule."""
 
 from types import SimpleNamespace
 
 import torch
 from examples.fin_base.env import FundSim
+from studies.pension import torchrl as together
 
 from simenv_marl import evaluate
 
@@ -21,11 +22,6 @@ def welfare_gained(learner, agents):
     return found.summary("metric").loc["learner", ["difference", "difference_low", "difference_high"]]
 
 
-def read(section):
-    """The blocks of a section of the page, and the names that they share."""
-    return blocks("_clients_pension.md", section), {"__name__": "__main__"}
-
-
 def check(found, before):
     """A trained learner does better than the rule, seed by seed with the interval above 0, and than before training."""
     trained = found.summary("metric").loc["trained"]
@@ -34,7 +30,8 @@ def check(found, before):
 
 
 def test_stable_baselines3_gains_over_the_rule():
-    (define, learn), names = read("Train it with Stable-Baselines3")
+    define, learn = blocks("_clients_pension.md", "Train it with Stable-Baselines3")
+    names = {"__name__": "__main__"}
     exec(define, names)
     before = welfare_gained(SimpleNamespace(**names), ["indexer_0"])
     exec(learn, names)
@@ -42,14 +39,9 @@ def test_stable_baselines3_gains_over_the_rule():
 
 
 def test_torchrl_gains_over_the_rule():
-    (define, learn, compare), names = read("Train it with TorchRL")
-    exec(define, names)
-    exec(learn, names)
-    trained = names["policy"]
+    policy, loss = together.learner()
+    together.train(policy, loss)
+    trained = together.compare(policy)
     torch.manual_seed(0)
-    names["policy"], _ = names["learner"]()
-    exec(compare, names)
-    before = names["found"].summary("metric").loc["trained"]
-    names["policy"] = trained
-    exec(compare, names)
-    check(names["found"], before)
+    untrained, _ = together.learner()
+    check(trained, together.compare(untrained).summary("metric").loc["trained"])

@@ -1,27 +1,30 @@
 """Scripts in one file, as CleanRL has them: the vector view."""
 
+from importlib import import_module
+
 import numpy as np
 import torch
 
 from simenv_marl import single_env
+from tests.worlds.undone import models_of_pages_forgotten
 
-from . import page
+from .page import DOCS
 from .returns import single_return
 
 
-def test_the_code_of_the_page_runs(monkeypatch):
-    steps = page.steps("Scripts in one file", monkeypatch)
-    names = next(steps)
-    env = single_env(names["FourWeeks"], {"bakery.Bakery.choose_batch": names["batch"]})
+def test_the_script_of_the_page_learns(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS)
+    with models_of_pages_forgotten():
+        script = import_module("one_file")
+        env = single_env(script.FourWeeks, script.points)
 
-    def act(observation, info):
-        with torch.no_grad():
-            return names["Categorical"](logits=names["actor"](names["seen"](observation))).sample().item()
+        def act(observation, info):
+            with torch.no_grad():
+                return script.Categorical(logits=script.actor(script.seen(observation))).sample().item()
 
-    before = single_return(env, act)
-    names = next(steps)
-    assert single_return(env, act) > before + 100
-    assert names["best"] in env.action_space
-    assert len(names["envs"].return_queue) == 100
-    assert np.mean(names["envs"].length_queue) == 28
-    names["envs"].close()
+        before = single_return(env, act)
+        script.train(21)
+        assert single_return(env, act) > before + 100
+        assert len(script.envs.return_queue) == 100
+        assert np.mean(script.envs.length_queue) == 28
+        script.envs.close()

@@ -41,7 +41,7 @@ def test_learner_sweep_has_the_table_of_its_page(tmp_path, monkeypatch):
 
     monkeypatch.setattr(sweep, "LEVELS", {"learning_rate": [1e-3, 3e-3], "gamma": [0.8, 0.9]})
     names = {"table": sweep.sweep(tmp_path, 250, range(2))}
-    (code,) = page.blocks("sweeps.md", "The table elsewhere")
+    (code,) = page.blocks("experiments.md", "The table elsewhere")
     exec(code, names)
     assert names["mean"].shape == (2, 2)
     assert names["shares"]["C(learning_rate)"] == names["shares"].max()

@@ -1,5 +1,6 @@
 """TorchRL: its wrappers, its checker, and a policy that all agents of one kind share."""
 
+import hive_torchrl
 import numpy as np
 import pytest
 import torch
@@ -81,20 +82,14 @@ def worth(env, policy):
 
 @EVERY_VIEW
 def test_one_policy_for_all_who_are_born(view):
-    _, define, _, take_out = blocks("_clients_torchrl.md")
-    names = {"__name__": "__main__"}
-    exec(define, names)
-    env = names["make"](view)
-    policy, loss = names["learner"](env)
+    env = hive_torchrl.make(view)
+    policy, loss = hive_torchrl.learner(env)
     before = worth(env, policy)
-    names["train"](env, policy, loss)
+    hive_torchrl.train(env, policy, loss)
     after = worth(env, policy)
     assert after > before + 4
-    names["policy"] = policy
-    exec(take_out, names)
-    assert names["hive"].day > 0
     learnt, rule = (
         np.mean([simulate(HiveSim, {Bee.choose_meadow: own}, points=points(), seed=seed).hive.day for seed in HELD_OUT])
-        for own in (names["decide"], RULE)
+        for own in (hive_torchrl.single(policy), RULE)
     )
     assert learnt >= rule

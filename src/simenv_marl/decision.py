@@ -249,6 +249,13 @@ def fit_labels(space: Any, labels: Any) -> bool:
         parts = space.spaces
     elif space is not None and space.shape is not None and len(space.shape) == 1:
         parts = range(space.shape[0])
+    texts = labels.values() if isinstance(labels, Mapping) else labels
+    if (
+        not isinstance(space, spaces.Discrete)
+        and isinstance(texts, Iterable)
+        and len(set(map(str, texts))) < len(parts)
+    ):
+        return False  # the parts of arrays and dicts are told apart by their labels
     if isinstance(labels, Mapping):
         return set(labels) == set(parts) and all(isinstance(text, str) for text in labels.values())
     listed = isinstance(labels, Sequence) and not isinstance(labels, str) and not isinstance(space, spaces.Dict)

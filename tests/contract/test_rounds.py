@@ -114,6 +114,8 @@ def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
 
     env = parallel_env(script(main), [ant, bee], possible_agents=None)
     play_rounds(env, 0.2)  # 11 of 12 were used
+    nine = parallel_env(script(lambda simulation: [bee(), *(ant() for _ in range(8))]), [ant, bee])
+    play_rounds(nine, 0.2, 8)  # 9 of 10
     with pytest.warns(UserWarning, match=r"of 15 actions in this episode, 11 were used: .* aec_env loses none"):
         play_rounds(env, 0.5)
     play_rounds(env, 0.5)  # once for each environment

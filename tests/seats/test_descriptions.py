@@ -46,7 +46,7 @@ def test_it_is_described_as_json():
         "number": 1,
         "time": 0.0,
         "observation": {"level": 5.0},
-        "actions": {"enum": ["closed", "half", "open"]},
+        "actions": {"type": "string", "enum": ["closed", "half", "open"]},
         "reward": 0.0,
     }
 
@@ -97,7 +97,7 @@ def test_what_names_no_legal_action_is_an_error_that_lists_them(text):
 def test_masked_actions_are_neither_listed_nor_taken():
     env = env_of(replace(FILL, action_mask_mapping=lambda tank: [1, 0, 1]))
     assert "half" not in describe(env)
-    assert describe(env, as_json=True)["actions"] == {"enum": ["closed", "open"]}
+    assert describe(env, as_json=True)["actions"] == {"type": "string", "enum": ["closed", "open"]}
     for text in ("half", "1"):
         with pytest.raises(InvalidActionError, match=r"legal:\n- closed\n- open$"):
             parse(env, text)
@@ -105,16 +105,45 @@ def test_masked_actions_are_neither_listed_nor_taken():
 
 def test_choices_and_decisions_are_labels_where_none_are_given():
     decisions = replace(FILL, action_labels=None)
-    assert describe(env_of(decisions), as_json=True)["actions"] == {"enum": ["0.0", "1.0", "2.0"]}
+    assert describe(env_of(decisions), as_json=True)["actions"] == {"type": "string", "enum": ["0.0", "1.0", "2.0"]}
     moves = replace(decisions, action_space_mapping=None, choices=lambda tank: [3.0, 4.0, 4.0][: 3 - tank.day])
     env = env_of(moves)
-    assert describe(env, as_json=True)["actions"] == {"enum": ["3.0", "4.0 (1)", "4.0 (2)"]}
+    assert describe(env, as_json=True)["actions"] == {"type": "string", "enum": ["3.0", "4.0 (1)", "4.0 (2)"]}
     assert (parse(env, "3.0"), parse(env, "4.0 (2)")) == (0, 2)
 
 
 def test_a_label_that_looks_like_another_action_is_the_label():
     env = env_of(replace(FILL, action_labels={0: "1", 1: "2", 2: "3"}))
     assert [parse(env, text) for text in ("1", "2", '{"action": "3"}')] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("labels", "said", "action"), [
+    (["R", "R'", "U"], "R'", 1),
+    (["bxc3", "Bxc3", "a"], "bxc3", 0),
+    (["bxc3", "Bxc3", "a"], "Bxc3", 1),
+    ([" open", "shut", "ajar"], " open", 0),
+    (["1.5", "2", "3"], "1.50", 0),
+    (["1", "2", "3"], '{"action": 2.0}', 1),
+    (["open", "half open", "shut"], "I choose half open, to be safe.", 1),
+    (["open", "half open", "shut"], "<think>shut or open?</think> open", None),
+    (["open", "half open", "shut"], '```json\n{"action": "shut"}\n```', 2),
+    (["open", "half open", "shut"], 'Perhaps {"action": "open"}, or rather {"action": "shut"}.', 2),
+    (["1", "2", "3"], "0", None),
+    (["OPEN", "open", "shut"], "Open", None),
+])  # fmt: skip
+def test_labels_are_found_exactly_or_not_at_all(labels, said, action):
+    env = env_of(replace(FILL, action_labels=labels))
+    if action is None:
+        with pytest.raises(InvalidActionError):
+            parse(env, said)
+    else:
+        assert parse(env, said) == action
+
+
+def test_the_label_of_a_masked_action_is_not_taken_for_another_one():
+    env = env_of(replace(FILL, action_labels=["1", "2", "3"], action_mask_mapping=lambda tank: [1, 0, 1]))
+    with pytest.raises(InvalidActionError):
+        parse(env, "2")
 
 
 def test_labels_may_be_made_for_each_call():
@@ -222,9 +251,11 @@ def test_timelines_name_actions_by_their_labels():
     {"action_labels": ["a", "b"]},
     {"action_labels": {0: "a", 1: "b"}},
     {"action_labels": "abc"},
+    {"action_labels": [1, 2, 3]},
     {"action_labels": ["a", "b", 3]},
     {"observation_labels": ["a", "b"]},
     {"observation_labels": {"level": "a"}},
+    {"observation_labels": ["a", "a"], "observation_space": spaces.Box(0, 1, (2,))},
 ])  # fmt: skip
 def test_labels_that_do_not_fit_their_space_are_refused(labels):
     with pytest.raises(SimEnvError, match=f"{next(iter(labels))} must be texts for the parts"):

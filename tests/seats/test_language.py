@@ -44,7 +44,7 @@ def test_a_language_model_decides_by_labels():
     assert "Choose how much water flows in." in system["content"]
     assert "level: 5" in question["content"]
     schema = requests[0]["response_format"]["json_schema"]["schema"]
-    assert schema["properties"]["action"] == {"enum": ["closed", "half", "open"]}
+    assert schema["properties"]["action"] == {"type": "string", "enum": ["closed", "half", "open"]}
     assert json.dumps(schema) in system["content"]  # for endpoints that do not enforce it
     assert policy.usage["requests"] == 5
     assert policy.usage["prompt_tokens"] == 50
@@ -145,6 +145,12 @@ def test_requests_contain_the_latest_decisions_of_the_agent():
     assert [message["content"] for message in requests[3]["messages"] if message["role"] == "assistant"] == [
         "half", "closed"
     ]  # fmt: skip
+
+
+def test_episodes_of_one_seed_have_a_history_each():
+    with endpoint([OPEN]) as (address, requests):
+        simulate_many(Tank, {"filler": model(address, history=9)}, seeds=[7, 7], points=POINTS)
+    assert sorted(len(request["messages"]) for request in requests) == [2, 2, 4, 4, 6, 6, 8, 8, 10, 10]
 
 
 def test_many_simulations_are_decided_at_once():

@@ -7,6 +7,8 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
+from functools import partial
 
 import greenlet
 import numpy as np
@@ -14,7 +16,7 @@ import pytest
 
 from simenv_marl import RULE, aec_env, branch, clone, evaluate, simulate, simulate_many, single_env
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
-from simenv_marl.errors import InvalidActionError, OptionValueError
+from simenv_marl.errors import InvalidActionError, OptionValueError, ReentrancyError
 from simenv_marl.experiments import run_experiment
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.seats import FallbackPolicy
@@ -246,6 +248,46 @@ def test_a_mixture_refuses_policies_that_are_asked_alone(policy):
         Mixture({policy: 1.0})
 
 
+def test_labels_for_each_call_reach_coroutines_in_many_simulations():
+    points = {Tank.fill: replace(POINTS[Tank.fill], action_labels=lambda tank: [f"{tank.level}", "b", "c"])}
+    labels = []
+
+    async def noting(observation, *, _decision):
+        labels.append(_decision.action_labels[0])
+        return 0
+
+    simulate_many(Tank, {"filler": noting}, points=points, seeds=[1])
+    assert labels[0] == "5.0"
+
+
+def test_a_coroutine_that_waits_for_others_is_told_of_threads():
+    async def nested(observation):
+        return len(simulate(Tank, {"filler": slow}, points=POINTS, seed=1).log)
+
+    async def threaded(observation):
+        await asyncio.to_thread(simulate, Tank, {"filler": slow}, points=POINTS, seed=1)
+        return 0
+
+    with pytest.raises(ReentrancyError, match="to_thread"):
+        simulate(Tank, {"filler": nested}, points=POINTS, seed=0)
+    assert len(simulate(Tank, {"filler": threaded}, points=POINTS, seed=0).log) == Tank.days
+
+
+def test_partial_coroutine_functions_and_objects_are_awaited():
+    class Asked:
+        async def __call__(self, more, observation):
+            return 2
+
+    plain = simulate(Tank, {"filler": lambda observation: 2}, points=POINTS, seed=0).log
+    assert simulate(Tank, {"filler": partial(Asked(), "more")}, points=POINTS, seed=0).log == plain
+
+
+@pytest.mark.parametrize("wrap", [lambda policy: policy, FallbackPolicy])
+def test_a_function_that_returns_an_awaitable_is_told_what_to_do(wrap):
+    with pytest.raises(OptionValueError, match="async def"):
+        simulate(Tank, {"filler": wrap(lambda observation: slow(observation))}, points=POINTS, seed=0)
+
+
 def test_an_illegal_answer_of_a_coroutine_is_an_error():
     async def illegal(observation):
         return 9
@@ -300,18 +342,16 @@ def test_rewards_of_forced_moves_add_up_in_the_pending_decision():
         return 0
 
     def forced(tank):
-        return [1, 1, 1] if tank.day % 2 == 0 else [1, 0, 0]
+        return [1, 0, 0] if tank.day % 2 == 0 else [1, 1, 1]
 
-    points = {Tank.fill: make_masked(forced)}
+    points = {Tank.fill: replace(POINTS[Tank.fill], action_mask_mapping=forced)}
     tank = simulate(Tank, {"filler": plain}, points=points, seed=0, skip_forced=True)
-    assert [number for number, _ in rewards] == [1, 3, 5]
-    assert rewards[1][1] == pytest.approx(tank.log[0] + tank.log[1])
-
-
-def make_masked(mask):
-    from dataclasses import replace
-
-    return replace(POINTS[Tank.fill], action_mask_mapping=mask)
+    assert [number for number, _ in rewards] == [2, 4]
+    assert rewards[0][1] == 0.0  # nothing was asked before; that reward adds to the next one
+    assert rewards[1][1] == pytest.approx(sum(tank.log[:3]))
+    seen = [*rewards]
+    evaluate(Tank, {"it": {"filler": plain}}, points=points, seeds=[0], skip_forced=True)
+    assert rewards[2:] == seen
 
 
 # -- in clones ------------------------------------------------------------------------------------

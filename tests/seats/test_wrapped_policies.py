@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, clone, evaluate, make_step, simulate, simulate_many, single_env
-from simenv_marl.errors import InvalidActionError, OptionValueError
+from simenv_marl.errors import DefinitionError, InvalidActionError, OptionValueError
 from simenv_marl.experiments import run_experiment
 from simenv_marl.seats import FallbackPolicy, RecordedPolicy
 
@@ -112,6 +112,21 @@ def test_a_planner_can_be_guarded():
     guarded = FallbackPolicy(planner)
     assert played(guarded) == played(lambda observation: int(observation[0] < 5) * 2)
     assert guarded.counts == counted(asked=5)
+
+
+def test_the_fallback_may_be_a_planner():
+    guarded = FallbackPolicy(illegal, lambda observation, *, _environment: 1)
+    assert played(guarded) == played(lambda observation: 1)
+
+
+def test_a_decision_that_cannot_be_passed_is_refused_at_once():
+    with pytest.raises(DefinitionError, match="keyword-only"):
+        FallbackPolicy(lambda observation, _decision: 1)
+
+
+def test_a_recording_without_its_folder_is_refused_at_once(tmp_path):
+    with pytest.raises(OptionValueError, match="no folder"):
+        RecordedPolicy(raises, tmp_path / "missing" / "answers")
 
 
 def test_an_illegal_answer_of_the_fallback_is_an_error():

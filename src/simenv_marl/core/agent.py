@@ -132,15 +132,16 @@ class Agent:
         self.point.updates[0](self, args, kwargs, reward=rewarded)
         forced = self.only_action() if episode.skips else None
         if rewarded and episode.skips:
-            self.add_carried_reward(carry_on=forced is not None)
+            self.add_carried_reward(carry_on=forced is not None or not self.asked)
         if forced is not None:
             return self.answer_forced(episode, forced)
+        self.asked = True
+        if alone:
+            self.keep(episode, args, kwargs)
         deferred = isinstance(policy, DeferredPolicy)
         if deferred and not episode.plan.solo:
             episode.pending = self
             return WAIT
-        if alone:
-            self.keep(episode, args, kwargs)
         if episode.script:
             action = episode.script.popleft()
         else:

@@ -14,7 +14,7 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Any, Final
 
-from ..errors import short_repr, warn_user
+from ..errors import ReentrancyError, short_repr, warn_user
 
 SECONDS_TO_CANCEL: Final = 10.0
 """The seconds that coroutines may take to end after they were cancelled."""
@@ -99,7 +99,17 @@ class Answers:
         return not self._ended.empty()
 
     def add(self, key: Any, value: Any) -> None:
-        """Await something. What is not awaitable is an answer."""
+        """Await something. What is not awaitable is an answer.
+
+        Raises:
+            ReentrancyError: This is a coroutine of a policy itself: it would wait for its own thread.
+        """
+        if inspect.isawaitable(value) and asyncio._get_running_loop() is _loops.get(os.getpid()) is not None:
+            getattr(value, "close", int)()
+            raise ReentrancyError(
+                "a coroutine of a policy runs simulations whose policies are coroutines; run them in another thread:"
+                " await asyncio.to_thread(simulate, ...)"
+            )
         self._keys[Answer(value, self._ended.put)] = key
 
     def take(self) -> tuple[Any, Answer]:

@@ -387,7 +387,8 @@ class Rounds(Episode):
             self.stalled = self.stalled + 1 if reply is WAIT else 0
             if reply is not WAIT:
                 self.advance(reply)
-            self.unused += sum(part is not RULE for part in actions.values())
+            if not self.skips:  # else forced moves are not asked for
+                self.unused += sum(part is not RULE for part in actions.values())
             if not self.over and self.consulted is None:  # it is set where a replay ends
                 self.update_all(truncated=bool(action) and self.turns == self.most_steps)
         except BaseException as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,7 @@ class Decision:
         reward: The reward of the agent's previous action; 0.0 at its first decision.
         doc: The docstring of the model's function; None if it has none.
         in_clone: Whether the environment is a clone or a branch, in which policies count nothing.
+        memory: A dict for what policies remember of this agent in this episode.
     """
 
     agent: str
@@ -54,20 +55,22 @@ class Decision:
     reward: float
     doc: str | None
     in_clone: bool
-    checked: Callable[[Any], Any] = field(repr=False)
-    """Returns an action in the form that the model's mapping gets, or raises an ``InvalidActionError``."""
-    count_fallback: Callable[[], None] = field(repr=False)
-    """Notes that a fallback answers: evaluations count these for each agent and seed."""
+    memory: dict[Any, Any] = field(repr=False)
+    _agent: Agent = field(repr=False)
+
+    def checked(self, action: Any) -> Any:
+        """Return an action in the form that the model's mapping gets, or raise an ``InvalidActionError``."""
+        return self._agent.point.checked(action, self.agent, self._agent.mask)
+
+    def count_fallback(self) -> None:
+        """Note that a fallback answers: evaluations count these for each agent and seed."""
+        self._agent.fallbacks += 1
 
 
 def decision_of(episode: Episode, agent: Agent, *, in_clone: bool = False) -> Decision:
     """Describe the decision of an agent that is pending, or is put to a policy."""
     point, choices = agent.point, agent.choices
     call = agent.arguments() or (), agent.kwargs
-
-    def count_fallback() -> None:
-        agent.fallbacks += 1
-
     return Decision(
         agent=agent.name,
         point=point.point.name,
@@ -83,6 +86,6 @@ def decision_of(episode: Episode, agent: Agent, *, in_clone: bool = False) -> De
         reward=agent.reward,
         doc=point.point.function.__doc__,
         in_clone=in_clone or episode.plan.solo,
-        checked=lambda action: point.checked(action, agent.name, agent.mask),
-        count_fallback=count_fallback,
+        memory=agent.memory,
+        _agent=agent,
     )

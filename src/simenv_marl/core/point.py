@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, fit_labels, inverse
-from ..errors import DefinitionError, InvalidActionError, MaskError, short_repr, warn_user
+from ..errors import DefinitionError, InvalidActionError, MaskError, OptionValueError, short_repr, warn_user
 from ..hooks.hook import BOUND
 from ..simulation import RULE, asks_for, positional
 from . import actions, spaces
@@ -169,6 +169,12 @@ class Point:
     def checked(self, action: Any, agent: str, mask: Any) -> Any:
         """Return an action of an agent in the form that ``convert`` takes, or raise an ``InvalidActionError``."""
         legal, space = self.check(action), self.definition.action_space
+        if legal is ILLEGAL and inspect.isawaitable(action):
+            getattr(action, "close", int)()
+            raise OptionValueError(
+                f"the policy of {agent!r} has returned an awaitable; make it a coroutine function by async def, or give"
+                " it an attribute waits = True"
+            )
         if legal is ILLEGAL:
             raise InvalidActionError(
                 f"the action {short_repr(action)} of {agent!r} is not in its action space {short_repr(space)}"

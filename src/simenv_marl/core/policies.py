@@ -14,6 +14,7 @@ import copy
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from contextvars import ContextVar
+from functools import partial
 from importlib import import_module
 from typing import Any, Final
 from weakref import ref
@@ -43,6 +44,8 @@ def is_planner(policy: Any) -> bool:
 
 def waits(policy: Any) -> bool:
     """Return whether a policy is a coroutine function, or returns coroutines and says so by an attribute ``waits``."""
+    while isinstance(policy, partial):
+        policy = policy.func
     call = getattr(type(policy), "__call__", None)  # noqa: B004 - the function itself is needed
     is_coroutine = inspect.iscoroutinefunction(policy) or inspect.iscoroutinefunction(call)
     return is_coroutine or getattr(policy, "waits", False) is True
@@ -130,7 +133,7 @@ class PolicyWrapper:
             raise OptionValueError(f"the policy must be a callable, not {short_repr(policy)}")
         self.policy, self.waits = policy, waits(policy)
         self.records: bool = getattr(policy, "records", False) is True
-        names = [name for name in ASKED if name in asks or asks_for(policy, name)]
+        names = [name for name in ASKED if asks_for(policy, name) or name in asks]
         seen = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("observation", "info")]
         asked = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY) for name in names]
         self.__signature__ = inspect.Signature(seen + asked)

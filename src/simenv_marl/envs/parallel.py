@@ -1,7 +1,7 @@
 """The parallel view: rounds, in which every agent has at most one action."""
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 from pettingzoo import ParallelEnv
 
@@ -13,10 +13,6 @@ from .base import AgentsView
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
 """The results of a step: observations, rewards, terminations, truncations and infos, by agent."""
-
-
-LEAST_USED: Final = 0.9
-"""The share of the actions of an episode that must be used, or the user is warned."""
 
 
 class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
@@ -80,7 +76,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 self.agents = []
             raise
         self.agents = [] if episode.over else list(episode.agents)
-        if episode.over and not self._warned and episode.unused > episode.given * (1 - LEAST_USED):
+        if episode.over and not self._warned and 10 * episode.unused > episode.given:
             self._warned = True
             warn_user(
                 f"of {episode.given} actions in this episode, {episode.given - episode.unused} were used: the agents do"

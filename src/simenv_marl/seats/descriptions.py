@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -56,7 +58,9 @@ def describe(env_or_decision: Any, *, as_json: bool = False) -> Any:
 def parse(env_or_decision: Any, text: str) -> Any:
     """Return the action that a text names: by its label, by its value, or as JSON such as ``{"action": "open"}``.
 
-    Components of arrays and dicts are a JSON list, or a JSON object with their labels or keys.
+    Components of arrays and dicts are a JSON list, or a JSON object with their labels or keys. Other text may stand
+    around a JSON object, and around the only label that it names. The action is one of the agent whose decision is
+    pending, for ``env.unwrapped``: wrappers may take other actions.
 
     Raises:
         InvalidActionError: The text names no legal action. The error says which are legal.
@@ -64,30 +68,60 @@ def parse(env_or_decision: Any, text: str) -> Any:
     """
     if not isinstance(env_or_decision, Decision):
         return pending_view(env_or_decision, "parse").call(_parse_pending, text)
-    decision, said = env_or_decision, text.strip()
-    try:
-        value = json.loads(said)
-    except ValueError:
-        value = said
-    is_wrapped = isinstance(value, Mapping) and set(value) == {"action"}
-    if is_wrapped and not (isinstance(decision.action_space, spaces.Dict) and "action" in decision.action_space.spaces):
-        value = value["action"]
-    elif isinstance(decision.action_space, spaces.Discrete) and not isinstance(value, str):
-        value = said  # a label may look like a number
-    try:
-        action = _action(decision.action_space, decision.action_labels, value, legal_labels(decision))
-        return _checked(decision, action)
-    except (InvalidActionError, ValueError, TypeError, LookupError, OverflowError):
-        legal = "\n".join(_legal_lines(decision))
-        raise InvalidActionError(
-            f"{short_repr(text)} names no legal action of {decision.agent!r}; these are legal:\n{legal}"
-        ) from None
+    decision, space = env_or_decision, env_or_decision.action_space
+    legal = legal_labels(decision)
+    for value in _values(text, unwrap=not (isinstance(space, spaces.Dict) and "action" in space.spaces)):
+        with suppress(InvalidActionError, ValueError, TypeError, LookupError, OverflowError):
+            action = _choice(decision, legal, value) if legal else _action(space, decision.action_labels, value)
+            decision.checked(action)
+            return action
+    words = "|".join(re.escape(label) for label in sorted(legal, key=len, reverse=True))
+    named = set(re.findall(rf"(?<![\w.-])(?:{words})(?!\w|\.\d)", text)) if words else set()
+    if len(named) == 1:
+        return legal[named.pop()]
+    listed = "\n".join(_legal_lines(decision))
+    raise InvalidActionError(
+        f"{short_repr(text)} names no legal action of {decision.agent!r}; these are legal:\n{listed}"
+    )
 
 
-def _checked(decision: Decision, action: Any) -> Any:
-    """Check an action, and return it as a member of the action space."""
-    decision.checked(action)
+def _values(text: str, *, unwrap: bool) -> Iterator[Any]:
+    """Yield what a text may mean: itself, as JSON if it is that, and the last JSON object in it."""
+    found: list[Any] = [text]
+    decoder = json.JSONDecoder()
+    starts = [place for place, letter in enumerate(text) if letter == "{"]
+    for start in reversed(starts[-MOST:]):
+        with suppress(ValueError):
+            value, end = decoder.raw_decode(text, start)
+            found += [value] if "}" not in text[end:] else []
+    with suppress(ValueError):
+        found.insert(0, json.loads(text))
+    for value in found:
+        yield value["action"] if unwrap and isinstance(value, Mapping) and set(value) == {"action"} else value
+
+
+def _choice(decision: Decision, legal: Mapping[str, int], value: Any) -> int:
+    """Return the action of a ``Discrete`` that a text or number means, by its label or else by its value."""
+    said = value if isinstance(value, str) else json.dumps(value)
+    if said in legal:
+        return legal[said]
+    meant = {action for label, action in legal.items() if _normal(label) == _normal(said)}
+    labels: Any = decision.action_labels
+    if not meant and not any(isinstance(_normal(label), float) for label in labels.values()):
+        return int(said)
+    (action,) = meant
     return action
+
+
+def _normal(text: str) -> str | float:
+    """Return what is compared: a number, or the text without quotes around it and in lower case."""
+    text = text.strip()
+    if len(text) > 1 and text[0] == text[-1] and text[0] in "\"'":
+        text = text[1:-1]
+    try:
+        return float(text)
+    except ValueError:
+        return text.casefold()
 
 
 def _pending(env: Any) -> Decision:
@@ -195,7 +229,9 @@ def _limits(space: spaces.Space[Any]) -> str:
 def action_schema(decision: Decision) -> dict[str, Any]:
     """Return the JSON schema of the actions that ``parse`` takes."""
     labels = legal_labels(decision)
-    return {"enum": list(labels)} if labels else _schema(decision.action_space, decision.action_labels)
+    return (
+        {"type": "string", "enum": list(labels)} if labels else _schema(decision.action_space, decision.action_labels)
+    )
 
 
 def _schema(space: spaces.Space[Any], labels: Any) -> dict[str, Any]:
@@ -234,19 +270,17 @@ def _bounded(low: Any, high: Any) -> dict[str, Any]:
 # -- what is said ---------------------------------------------------------------------------------
 
 
-def _action(space: spaces.Space[Any], labels: Any, value: Any, legal: Mapping[str, int]) -> Any:
+def _action(space: spaces.Space[Any], labels: Any, value: Any) -> Any:
     """Return the action that a value of JSON means, which may be illegal; raise a builtin error if it means none."""
     if isinstance(space, spaces.Discrete):
-        named = {label.casefold(): action for label, action in legal.items()}
-        said = str(value).strip().strip("\"'").casefold()
-        return named[said] if said in named else int(said)
+        return int(value)
     if isinstance(space, spaces.Dict):
         keys = {(labels or {}).get(key, key): key for key in space.spaces}
         given = {keys.get(name, name): part for name, part in dict(value).items()}
-        return {key: _action(part, None, given[key], {}) for key, part in space.spaces.items()}
+        return {key: _action(part, None, given[key]) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
         listed = [value[str(place)] for place in range(len(value))] if isinstance(value, Mapping) else value
-        return tuple(_action(part, None, listed[place], {}) for place, part in enumerate(space.spaces))
+        return tuple(_action(part, None, listed[place]) for place, part in enumerate(space.spaces))
     if isinstance(value, Mapping):
         names = labels or tuple(map(str, range(len(value))))
         if set(value) != set(names):

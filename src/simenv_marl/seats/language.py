@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable
 from inspect import cleandoc
 from itertools import chain
@@ -20,9 +20,6 @@ from ..core.policies import COUNTS
 from ..errors import InvalidActionError, LanguageModelError, OptionValueError, describe_error, short_repr
 from ..many.parallel import import_extra
 from .descriptions import _pending, action_schema, describe, parse
-
-MOST_HISTORIES: Final = 4096
-"""For so many agents of episodes the latest decisions are kept."""
 
 LONGEST_WAIT: Final = 30.0
 """The longest time before a request is repeated, in seconds."""
@@ -86,7 +83,6 @@ class LanguageModelPolicy:
         self._describe, self._most_turns, self._retries = describe, history, retries
         self._request = {"timeout": timeout, **request}
         self._client, self._own_client = client, None
-        self._histories: OrderedDict[tuple[int, str], deque[list[dict[str, str]]]] = OrderedDict()
         self._token = uuid4().hex
 
     def __getstate__(self) -> dict[str, Any]:
@@ -162,12 +158,8 @@ class LanguageModelPolicy:
 
     def _history(self, decision: Decision) -> deque[list[dict[str, str]]]:
         """Return the latest decisions of an agent in an episode, each as a question and an answer."""
-        key = decision.seed, decision.agent
-        if decision.number == 1 or key not in self._histories:
-            self._histories[key] = deque(maxlen=self._most_turns)
-            while len(self._histories) > MOST_HISTORIES:
-                self._histories.popitem(last=False)
-        return self._histories[key]
+        history: deque[list[dict[str, str]]] = decision.memory.setdefault(self._token, deque(maxlen=self._most_turns))
+        return history
 
     # -- requests ---------------------------------------------------------------------------------
 

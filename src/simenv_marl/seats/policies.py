@@ -17,9 +17,9 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.pending import Decision
-from ..core.policies import COUNTS, PolicyWrapper, waits
+from ..core.policies import ASKED, COUNTS, PolicyWrapper, waits
 from ..errors import InvalidActionError, OptionValueError, describe_error, short_repr, warn_user
-from ..simulation import RULE
+from ..simulation import RULE, asks_for
 
 KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
 """What a ``FallbackPolicy`` counts."""
@@ -51,7 +51,8 @@ class FallbackPolicy(PolicyWrapper):
         Raises:
             OptionValueError: An argument has an invalid value.
         """
-        super().__init__(policy, asks=("_decision",))
+        more = [name for name in ASKED if fallback is not RULE and asks_for(fallback, name)]
+        super().__init__(policy, asks=("_decision", *more))
         if fallback is not RULE and not callable(fallback):
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
         if timeout is not None and not (isinstance(timeout, (int, float)) and timeout > 0):
@@ -86,15 +87,18 @@ class FallbackPolicy(PolicyWrapper):
             began = monotonic()
             try:
                 answer = self.ask(self.policy, observation, info, asked)
-                if isawaitable(answer):
+                if isawaitable(answer) and self.waits:
                     answer = await asyncio.wait_for(answer, self.timeout)
                 if self.timeout is not None and monotonic() - began > self.timeout:
-                    raise TimeoutError(f"the answer took longer than {self.timeout} s")
+                    raise TimeoutError
                 if answer is not RULE:
                     decision.checked(answer)
                 return answer
+            except OptionValueError:  # the policy was not written or set up well
+                raise
             except TimeoutError as error:
-                self._note(decision, "late", error)
+                late = TimeoutError(f"the answer took longer than {self.timeout} s")
+                self._note(decision, "late", error if str(error) else late)
             except InvalidActionError as error:
                 self._note(decision, "illegal", error)
             except Exception as error:
@@ -141,6 +145,8 @@ class RecordedPolicy(PolicyWrapper):
         """Wrap a policy, as ``simulate`` takes them; it may be a coroutine function. The file is created if needed."""
         super().__init__(policy, asks=("_decision",))
         self.path, self.records = Path(path), True
+        if not self.path.parent.is_dir():
+            raise OptionValueError(f"{self.path} cannot be written: {self.path.parent} is no folder")
         self.fallback: Any = getattr(policy, "fallback", RULE)
         self._known: dict[tuple[Any, ...], Any] | None = None
 

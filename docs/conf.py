@@ -15,12 +15,14 @@ from tools.notebooks import write_notebooks  # noqa: E402
 project = "simenv_marl"
 release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "sphinx_design"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions += ["sphinx_copybutton", "sphinx_design"]
 exclude_patterns = ["_build", "figures", "_clients_*"]  # figures and clients are parts of pages
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 
 add_module_names = False
+autosummary_generate = False  # tables of names alone; the pages of rooms have the rest
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
@@ -83,7 +85,7 @@ def _enlarge(app, doctree):
 
 def _shorten(app, what, name, obj, options, lines):
     """Link the page on options, where docstrings for editors list all of them."""
-    text = re.sub(r"(\*\*options: )Any of these:\n\n(?: {8}.*\n)+", r"\1See :doc:`options`.\n", "\n".join(lines))
+    text = re.sub(r"(\*\*options: )Any of these:\n\n(?: {8}.*\n)+", r"\1See :doc:`/options`.\n", "\n".join(lines))
     lines[:] = text.split("\n")
 
 

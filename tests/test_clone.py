@@ -142,6 +142,14 @@ def test_functions_are_called_where_the_clone_is():
         twin.call(lambda env: env.simulation.held)
 
 
+@pytest.mark.parametrize("view", VIEWS)
+def test_functions_in_a_clone_that_was_reset_meet_its_new_episode(view):
+    twin = clone(trip(view), method="fork")
+    twin.reset(seed=9)
+    (branched,) = branch(twin, lambda env, number: move(env))
+    assert branched == move(twin)
+
+
 @METHODS
 @pytest.mark.parametrize("view", VIEWS)
 def test_errors_surface_as_themselves(view, method):

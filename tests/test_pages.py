@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 
+import simenv_marl
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md"))
+ROOMS = {page.stem: page for page in (DOCS / "reference").glob("*.md")}
+PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md")) + sorted(f"reference/{room}" for room in ROOMS)
 BESIDE = {"dask", "gym", "gym_fin", "tensordict"}
 """Packages that other packages bring, or that a reader who comes from them has."""
 
@@ -42,23 +45,23 @@ def sources(text):
         yield from [path for path in paths if path.exists()][:1]
 
 
-def linked(text):
+def linked(page, text):
     """The files that a page lets its reader save or read."""
     links = re.findall(r"\{download\}`(?:[^`<]*<)?([^`>]+)>?`|\{literalinclude\} (\S+)", text)
-    return {(DOCS / "".join(link)).resolve() for link in links}
+    return {(DOCS / page).parent.joinpath("".join(link)).resolve() for link in links}
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_the_code_of_a_page_imports_what_can_be_installed_or_saved(page):
     text, code = code_of(page)
-    saved = {path.stem for path in linked(text)}
+    saved = {path.stem for path in linked(page, text)}
     assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {"examples", "studies"}
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_links_each_example_that_it_imports_or_runs(page):
     text, _ = code_of(page)
-    assert set(sources(text)) <= linked(text)
+    assert set(sources(text)) <= linked(page, text)
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -75,3 +78,16 @@ def test_the_code_of_a_page_fits_on_it(page):
     text, _ = code_of(page)
     code = re.findall(r"^```(?:python|console|sh)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert [line for line in "".join(code).splitlines() if len(line) > 100] == []
+
+
+@pytest.mark.parametrize("room", ["simenv_marl", *simenv_marl.ROOMS])
+def test_the_page_of_a_room_lists_the_names_that_it_has(room):
+    text = ROOMS[room].read_text(encoding="utf-8")
+    names = set(getattr(simenv_marl, room, simenv_marl).__all__)
+    described = re.findall(r"^\.\. (auto\w+|data):: (\w+)$|^\.\. \w+:: (\w+)\(\)$", text, re.MULTILINE)
+    constants = {name for kind, name, _ in described if kind == "data"}
+    table = re.search(r"autosummary::\n   :nosignatures:\n\n((?:   \S+\n)+)", text)[1].split()
+    assert {name for name in table if "." not in name} | constants == names
+    if f"automodule:: simenv_marl.{room}\n   :members:" not in text:
+        elsewhere = {"evaluate", "SimEnvError"} if room == "simenv_marl" else set()
+        assert {name or made for _, name, made in described} == names - elsewhere

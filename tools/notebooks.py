@@ -21,7 +21,7 @@ PAGES = ("tutorial", "many-agents", "branches")
 """The pages that have a notebook."""
 
 FENCE = re.compile(r"^```(\S+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-LINK = re.compile(r"\[([^]]*)\]\(([\w-]+\.md)?(?:#[\w-]+)?\)")
+LINK = re.compile(r"\[([^]]*)\]\(([\w/-]+\.md)?(?:#[\w-]+)?\)")
 DOWNLOAD = re.compile(r"\{download\}`([\w.]+)`")
 NOTEBOOK = re.compile(r"\n[^\n]*\{download\}`[^`]*\.ipynb>`[^\n]*\n")
 

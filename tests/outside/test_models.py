@@ -136,18 +136,45 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
+PAGE = "clients-outside.md"
+
+
+def environment(command: list[str]) -> dict[str, Any]:
+    """Runs the page's environment with a command, and returns its names."""
+    names = {"__name__": "page"}
+    shown_code = shown(PAGE, "python")[1]
+    assert 'command = ["./ferries"]' in shown_code
+    exec(shown_code.replace('["./ferries"]', json.dumps(command), 1), names)
+    return names
+
+
+def printed_by(command: list[str]) -> str:
+    """What a model prints without an environment: the page says that it is the same with one."""
+    plain = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20).stdout
+    assert int(plain) > 0
+    return plain
+
+
+@pytest.mark.greenlet("the page takes the driver as it is")
+@pytest.mark.skipif(bool(no_java()), reason="no JDK")
+def test_the_code_of_the_page_on_java(here, capsys):
+    (here / "Ferries.java").write_text(shown(PAGE, "java")[0])
+    shutil.copy(building.CLIENT, here)
+    commands = shown(PAGE, "sh")[1]
+    plain = subprocess.run(["sh", "-e"], input=commands, capture_output=True, text=True, timeout=120)
+    assert plain.stderr == ""
+    command = ["java", "-cp", "out", "Ferries"]
+    assert f"Java: {json.dumps(command)}" in shown(PAGE, "python")[1]
+    environment(command)
+    assert capsys.readouterr().out == plain.stdout == printed_by([*command, "7"])
+    assert check_wire(command).ok
+
+
 @pytest.mark.greenlet("the page takes the driver as it is")
 @of_the_town
-def test_the_code_of_the_page_on_java(model, here, capsys):
-    page = "clients-java.md"
-    (here / "Reservoir.java").write_text(shown(page, "java")[0])
-    shutil.copy(building.CLIENT, here)
-    plain = subprocess.run(["sh", "-e"], input=shown(page, "sh")[0], capture_output=True, text=True, timeout=120)
-    assert plain.stderr == ""
-    exec(blocks(page, "A model and its environment")[0], {"__name__": "__main__"})
-    assert capsys.readouterr().out == plain.stdout != ""
+def test_the_code_of_the_page_on_the_town(model, capsys):
     names = {"__name__": "__main__"}
-    exec(blocks(page, "A town of farms and shops")[0], names)
+    exec(blocks(PAGE, "Larger models")[0], names)
     earned = names["found"].values()
     assert (earned["by the granary"] > earned["rule"]).mean() > 0.8
     assert "by the granary" in capsys.readouterr().out
@@ -155,27 +182,22 @@ def test_the_code_of_the_page_on_java(model, here, capsys):
 
 @pytest.mark.greenlet("the page takes the driver as it is")
 def test_the_code_of_the_page_on_python(here, capsys):
-    model, environment = shown("clients-python.md", "python")
-    (here / "bay.py").write_text(model, encoding="utf-8")
+    (here / "ferries.py").write_text(shown(PAGE, "python")[0], encoding="utf-8")
     shutil.copy(DOCS.parent / "clients" / "python" / "simenv_marl_client.py", here)
-    exec(environment.replace("old/bin/python", sys.executable), {"__name__": "__main__"})
-    plain = subprocess.run([sys.executable, "bay.py"], check=True, capture_output=True, text=True, timeout=20).stdout
-    assert capsys.readouterr().out == plain
-    assert int(plain) > 0
-    report = check_wire([sys.executable, "bay.py"])
+    command = [sys.executable, "ferries.py"]
+    environment(command)
+    assert capsys.readouterr().out == printed_by([*command, "7"])
+    report = check_wire(command)
     assert {finding.verdict for finding in report.findings if finding.tried != "reseed"} == {"ok"}, str(report)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed")
 def test_the_code_of_the_page_on_cpp(here, capsys):
-    whole, own_loop, *_ = shown("clients-cpp.md", "cpp")
+    whole, own_loop, *_ = shown(PAGE, "cpp")
     (here / "ferries.cpp").write_text(whole, encoding="utf-8")
     program = str(compiled(here / "ferries.cpp", here))
-    names = {"__name__": "page"}
-    exec(blocks("clients-cpp.md")[0], names)
-    plain = subprocess.run([program, "7"], check=True, capture_output=True, text=True, timeout=20).stdout
-    assert capsys.readouterr().out == plain
-    assert int(plain) > 0
+    names = environment([program])
+    assert capsys.readouterr().out == printed_by([program, "7"])
     gone = set()
     with closing(parallel_env(names["ferries"])) as env:
         env.reset(seed=7)

@@ -128,7 +128,8 @@ def test_a_label_that_looks_like_another_action_is_the_label():
     (["open", "half open", "shut"], "<think>shut or open?</think> open", None),
     (["open", "half open", "shut"], '```json\n{"action": "shut"}\n```', 2),
     (["open", "half open", "shut"], 'Perhaps {"action": "open"}, or rather {"action": "shut"}.', 2),
-    (["1", "2", "3"], "0", None),
+    (["1", "2", "3"], "0", 0),
+    (["1", "2", "3"], "4", None),
     (["OPEN", "open", "shut"], "Open", None),
 ])  # fmt: skip
 def test_labels_are_found_exactly_or_not_at_all(labels, said, action):

@@ -104,6 +104,7 @@ class Host:
     def start(self, seed: int, options: Any, in_rounds: bool) -> None:
         """Begin another episode."""
         self._session.start(seed, options, in_rounds=in_rounds)
+        self._view._set_up()  # branches of the clone have it, and it may hold agents of the episode before
 
     def reseed(self, seed: int) -> None:
         """Draw what lies ahead anew."""

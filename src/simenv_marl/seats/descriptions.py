@@ -105,10 +105,12 @@ def _choice(decision: Decision, legal: Mapping[str, int], value: Any) -> int:
     said = value if isinstance(value, str) else json.dumps(value)
     if said in legal:
         return legal[said]
-    meant = {action for label, action in legal.items() if _normal(label) == _normal(said)}
     labels: Any = decision.action_labels
-    if not meant and not any(isinstance(_normal(label), float) for label in labels.values()):
-        return int(said)
+    every = [*legal.items(), *((label, action) for action, label in labels.items())]  # those of masked actions, too
+    meant = {action for label, action in every if _normal(label) == _normal(said)}
+    if not meant:
+        number = float(said)
+        return int(number) if number.is_integer() else int(said)
     (action,) = meant
     return action
 

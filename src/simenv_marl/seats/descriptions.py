@@ -111,6 +111,7 @@ def _choice(decision: Decision, legal: Mapping[str, int], value: Any) -> int:
     if not meant:
         number = float(said)
         return int(number) if number.is_integer() else int(said)
+    action: int
     (action,) = meant
     return action
 

@@ -7,6 +7,8 @@ from examples.greenhouse_coop.env import DAYS, GreenhouseSim
 from examples.queue_admission.model import Queue
 from studies.debt_collection import study as debts
 from studies.demo import picture
+from studies.event_planning import measure as events
+from studies.event_planning import model as event_models
 from studies.greenhouse_matrix import matrix, variants
 from studies.greenhouse_plans import figures as plans
 from studies.pension import study as pension
@@ -73,6 +75,14 @@ def test_credit_compares_estimators_with_the_truth(capsys):
     assert paired.deviation < apart.deviation
     assert paired.days == 2 * returns.days
     assert all(way.title in estimators.table(world, ways, truth) for way in ways)
+
+
+def test_event_planning_compares_planners_with_the_rule(monkeypatch):
+    monkeypatch.setattr(event_models, "JOBS", 3)
+    rows = events.main(["--quick", "--horizon", "2"])
+    settings = [(name, unit) for name in events.MODELS for unit in ("decision", "time")]
+    assert [row.setting[::2] for row in rows] == settings
+    assert all(0 <= row.share <= 1 and row.error >= 0 for row in rows)
 
 
 def test_wolf_sheep_plan_lets_one_sheep_plan(capsys):

@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix pension check test test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -97,6 +97,10 @@ test-wheel:
 	.venv-wheel/bin/python -m pytest --quiet tests/distribution
 	mkdir -p build/sdist && tar -xzf dist/*.tar.gz --strip-components 1 -C build/sdist && rm -r build/sdist/src
 	cd build/sdist && ../../.venv-wheel/bin/python -m pytest --quiet -n 2 --driver greenlet $(WHEEL_TESTS)
+
+# Builds and tests what is published, and checks that changelog and citation have its version. Upload it by hand.
+release: test-wheel
+	.venv-wheel/bin/python -m tools.release
 
 # Each supported Python, but for the one of .venv. What is not found is told of.
 PYTHONS := 3.11 3.12 3.13

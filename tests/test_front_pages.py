@@ -74,8 +74,8 @@ def test_a_hand_written_environment_and_its_successor_tell_the_same(run):
 
 def test_the_environment_of_the_paper_in_todays_words(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "model", model)
-    _, after = page.blocks("coming-from.md", "Sim-Env")
-    names = run(after)
+    (code,) = page.blocks("coming-from.md", "Sim-Env")
+    names = run(code)
     assert names["terminated"]
     assert names["alive"](names["env"].simulation.greenhouse) == 0
     assert -1 <= names["reward"] <= 1

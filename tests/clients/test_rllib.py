@@ -164,35 +164,3 @@ def test_masks_are_read_from_observations():
     algorithm = config.rl_module(rl_module_spec=masking).build_algo()
     algorithm.train()  # an illegal action of the one who decides would be an error
     algorithm.stop()
-
-
-class Stopped(Exception):
-    pass
-
-
-def test_an_external_env_and_its_successor_tell_the_same(monkeypatch):
-    before, after = {}, {}
-    for names, code in zip((before, after), blocks("coming-from.md", "ExternalEnv"), strict=True):
-        exec(code, names)
-    drawn = random.Random(1)
-    actions = [drawn.randrange(3) for _ in range(20)]
-    external = before["TankEnv"]()
-    seen, rewards, left = [], [], iter(actions)
-
-    def end(episode, observation):
-        seen.append(observation.tolist())
-        raise Stopped  # its loop has no end
-
-    monkeypatch.setattr(external, "get_action", lambda episode, observed: seen.append(observed.tolist()) or next(left))
-    monkeypatch.setattr(external, "log_returns", lambda episode, reward: rewards.append(reward))
-    monkeypatch.setattr(external, "end_episode", end)
-    with pytest.raises(Stopped):
-        external.run()
-
-    env = after["make"]()
-    observation, _ = env.reset(seed=1)
-    assert observation.tolist() == seen[0]
-    for action, then, earned in zip(actions, seen[1:], rewards, strict=True):
-        observation, reward, terminated, *_ = env.step(action)
-        assert (observation.tolist(), reward) == (then, earned)
-    assert terminated

@@ -11,6 +11,7 @@ from pettingzoo.test import api_test, seed_test
 from stable_baselines3 import PPO
 
 from simenv_marl import TRUNCATED, SimulationInterface, aec_env, difference, make_step, parallel_env
+from simenv_marl.envs import pad_agents
 from tests.worlds.counters import alike
 from tests.worlds.dials import ACTIONS, SEEN, Dial, points, turned_by
 
@@ -182,23 +183,41 @@ class Harbour(SimulationInterface):
         return [(boat,) for boat in self.boats]
 
 
+BOATS = ["boat_0", "boat_1"]
+
+
+def harbour(bounds, cash, reward, **options):
+    definition = make_step(
+        observation_space=Box(-bounds, bounds, (1,)),
+        observation_space_mapping=cash,
+        action_space=Box(0, 1, (1,)),
+        action_space_mapping=lambda action: float(action[0]),
+        reward_mapping=reward,
+        agent=lambda boat: boat.name,
+    )
+    return parallel_env(Harbour, {Boat.choose_effort: definition}, possible_agents=BOATS, **options)
+
+
+def with_wrappers():
+    env = suit["clip_actions_v0"](harbour(20, lambda boat: [boat.cash], difference(lambda boat: boat.cash)))
+    env = suit["clip_reward_v0"](env, -0.5, 0.5)
+    env = suit["observation_lambda_v0"](env, lambda seen, space: seen / 20, lambda space: Box(-1, 1, (1,)))
+    return suit["black_death_v3"](env)
+
+
+def with_options():
+    earned = difference(lambda boat: boat.cash)
+    env = harbour(1, lambda boat: [boat.cash / 20], lambda boat: max(-0.5, min(0.5, earned(boat))), clip_actions=True)
+    return pad_agents(env)
+
+
 def test_options_replace_wrappers():
     told = []
-    for code in page.blocks("coming-from.md", "SuperSuit"):
-        names = {
-            "Boat": Boat, "Harbour": Harbour, "Box": Box, "difference": difference, "make_step": make_step,
-            "parallel_env": parallel_env, "names": ["boat_0", "boat_1"],
-            "effort": {
-                "action_space": Box(0, 1, (1,)),
-                "action_space_mapping": lambda action: float(action[0]),
-                "agent": lambda boat: boat.name,
-            },
-        }  # fmt: skip
-        exec(code, names)
-        env, drawn = names["env"], np.random.default_rng(3)
+    for env in (with_wrappers(), with_options()):
+        drawn = np.random.default_rng(3)
         told.append([env.reset(seed=1)[0]])
         while env.agents:
-            actions = {name: drawn.uniform(-0.5, 1.0, 1).astype(np.float32) for name in names["names"]}
+            actions = {name: drawn.uniform(-0.5, 1.0, 1).astype(np.float32) for name in BOATS}
             observations, rewards, *_ = env.step({agent: actions[agent] for agent in env.agents})
             alive = {boat.name for boat in env.unwrapped.simulation.boats}
             told[-1].append(({name: observations[name] for name in sorted(alive)}, rewards))

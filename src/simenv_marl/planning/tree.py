@@ -71,7 +71,7 @@ class TreeSearchPolicy(RolloutPolicy):
         return [tree.best() if rollouts.reseeds else max(rollouts.outcomes, key=rollouts.certain)]
 
     def _states_of(self, rollouts: Rollouts) -> States | None:
-        """Begin to keep states, if there is one exact future and a step takes longer than a fork; else return None."""
+        """Begin to keep states, if there is one exact future and this saves more steps than a fork costs."""
         if rollouts.reseeds or self.method == "replay" or self.depth == 1:
             return None
         began = perf_counter()
@@ -79,7 +79,7 @@ class TreeSearchPolicy(RolloutPolicy):
             root = clone(rollouts.env, method="fork", time_limit=self.time_limit)
         except (BranchError, OptionValueError):  # only a replay is possible
             return None
-        if rollouts.seconds > perf_counter() - began:
+        if rollouts.seconds * self.depth / 2 > perf_counter() - began:  # a try repeats half of the depth in the mean
             return States(root, self, rollouts.actions)
         root.close()
         return None

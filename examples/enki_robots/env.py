@@ -15,7 +15,6 @@ nearest dirty cell that no other robot is nearer to, and the charge of its batte
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 from operator import attrgetter
@@ -32,6 +31,8 @@ from simenv_marl import parallel_env as parallel
 from simenv_marl.envs import SimulationAECEnv, SimulationParallelEnv
 from simenv_marl.remote import ProcessSimulation
 
+from ..compiling import compiled
+
 HERE: Final = Path(__file__).parent
 SOURCES: Final = (HERE / "robots.cpp", HERE.parents[1] / "clients" / "cpp" / "simenv.hpp")
 COMMAND: Final = ("g++", "-std=c++17", "-O2", f"-I{SOURCES[1].parent}", "-x", "c++")
@@ -47,29 +48,8 @@ def missing() -> str:
 
 
 def program(folder: Path = HERE / "out") -> Path:
-    """Compile the model, unless the program is up to date.
-
-    Args:
-        folder: The folder of the program.
-
-    Returns:
-        The path of the program.
-
-    Raises:
-        RuntimeError: A tool or library is missing, or the model does not compile.
-    """
-    target = folder / "robots"
-    if target.exists() and all(source.stat().st_mtime < target.stat().st_mtime for source in SOURCES):
-        return target
-    if lacking := missing():
-        raise RuntimeError(f"the model of the robots cannot be compiled without {lacking}")
-    folder.mkdir(parents=True, exist_ok=True)
-    made = folder / f"robots.{os.getpid()}"  # takes its place once it is complete
-    command = [*COMMAND, str(SOURCES[0]), "-lenki", "-o", str(made)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=600)
-    if done.returncode:
-        raise RuntimeError(f"the model of the robots does not compile:\n{done.stderr[:4000]}")
-    return made.replace(target)
+    """Compile the model, unless the program is up to date: see ``compiled``. ``folder`` is that of the program."""
+    return compiled(folder / "robots", SOURCES, missing, lambda: [*COMMAND, str(SOURCES[0]), "-lenki"])
 
 
 def observe(call: Any) -> NDArray[np.float32]:

@@ -3,7 +3,7 @@
 ``python -m simenv_marl play examples.market_seats.env:Free --seat trader_0 trader_1 trader_2 trader_3`` serves a page
 with a seat for each trader.
 
-**Observations.** What a trader knows when it decides, as ``OBSERVED`` lists it. Everybody may see everything, as on the
+**Observations.** What a trader knows when it decides, as ``OBSERVED`` lists it. All traders see everything, as on the
 page, so the conditions differ in a rule of the market, and not in what is known.
 
 **Rewards.** The trader's profit of the round.

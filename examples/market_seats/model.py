@@ -22,7 +22,7 @@ COST: Final = 10
 """What a crate costs a trader."""
 
 DEMAND: Final = 50
-"""The mean of the price at which nobody buys; each crate lowers the price by 1."""
+"""The mean of the price at which no crate is bought; each crate lowers the price by 1."""
 
 SPREAD: Final = 4
 """How much demand can differ from its mean. It is known when all have decided."""

@@ -20,7 +20,6 @@ slow one is a gain. Each 0.1 s of queueing delay costs as much as half the throu
 from __future__ import annotations
 
 import math
-import os
 import shlex
 import shutil
 import subprocess
@@ -37,6 +36,8 @@ from simenv_marl import aec_env as aec
 from simenv_marl import parallel_env as parallel
 from simenv_marl.envs import SimulationAECEnv, SimulationParallelEnv
 from simenv_marl.remote import ProcessSimulation
+
+from ..compiling import compiled
 
 HERE: Final = Path(__file__).parent
 SOURCES: Final = (HERE / "senders.cpp", HERE.parents[1] / "clients" / "cpp" / "simenv.hpp")
@@ -55,31 +56,15 @@ def missing() -> str:
 
 
 def program(folder: Path = HERE / "out") -> Path:
-    """Compile the model, unless the program is up to date.
+    """Compile the model, unless the program is up to date: see ``compiled``. ``folder`` is that of the program."""
+    return compiled(folder / "senders", SOURCES, missing, command)
 
-    Args:
-        folder: The folder of the program.
 
-    Returns:
-        The path of the program.
-
-    Raises:
-        RuntimeError: A tool or library is missing, or the model does not compile.
-    """
-    target = folder / "senders"
-    if target.exists() and all(source.stat().st_mtime < target.stat().st_mtime for source in SOURCES):
-        return target
-    if lacking := missing():
-        raise RuntimeError(f"the model of the senders cannot be compiled without {lacking}")
-    folder.mkdir(parents=True, exist_ok=True)
-    command = ["pkg-config", "--cflags", "--libs", *MODULES]
-    flags = shlex.split(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
-    made = folder / f"senders.{os.getpid()}"  # takes its place once it is complete
-    command = ["g++", "-std=c++17", "-O2", f"-I{SOURCES[1].parent}", str(SOURCES[0]), *flags, "-o", str(made)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=600)
-    if done.returncode:
-        raise RuntimeError(f"the model of the senders does not compile:\n{done.stderr[:4000]}")
-    return made.replace(target)
+def command() -> list[str]:
+    """Return the command of the compiler, with the flags of ns-3."""
+    asked = ["pkg-config", "--cflags", "--libs", *MODULES]
+    flags = shlex.split(subprocess.run(asked, check=True, capture_output=True, text=True, timeout=60).stdout)
+    return ["g++", "-std=c++17", "-O2", f"-I{SOURCES[1].parent}", str(SOURCES[0]), *flags]
 
 
 # -- observations, actions, rewards ---------------------------------------------------------------

@@ -1,6 +1,6 @@
 """The queue as an environment: who admits a job decides at irregular times, and discounts by time.
 
-The agent ``admission_0`` decides whether an arriving job comes in. Nobody is asked if the queue is full.
+The agent ``admission_0`` decides whether an arriving job comes in. It is not asked if the queue is full.
 
 **Observations.** The kind of the job and the kind in service, each as two indicators, and the numbers of waiting jobs.
 All times are exponential, so nothing else helps to foresee the future.
@@ -13,7 +13,7 @@ within that interval, and holding costs run all along. The discount of the inter
 from __future__ import annotations
 
 from math import exp
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -65,11 +65,11 @@ admission = make_step(
 class QueueSimulation(SimulationInterface):
     """The queue for a limited time."""
 
-    points: Final = {Queue.admit: admission}
+    points: ClassVar[Any] = {Queue.admit: admission}
 
     def reset(self, seed: int | None = None) -> None:
         """Begin with an empty queue."""
-        self.model = Queue(seed)
+        self.model: Any = Queue(seed)
 
     def run(self) -> Any:
         """Run SimPy's loop. The queue has no end, so the limit truncates."""

@@ -78,7 +78,7 @@ class Queue:
             self.clock.process(self._serve(kind, work))
 
     def _arrive(self, kind: int, generator: Any) -> Generator[Any, Any, Any]:
-        """Let jobs of a kind arrive. A job has the same work in each run of a seed, whoever is admitted."""
+        """Let jobs of a kind arrive. A job has the same work in each run of a seed, whichever jobs are admitted."""
         for _ in count():
             yield self.clock.timeout(generator.exponential(1 / KINDS[kind].arrivals))
             work = generator.exponential(1 / KINDS[kind].services)

@@ -1,6 +1,6 @@
 """A ROS node that simulates a leader and the robot that follows it: it publishes what the robot sees, and the clock.
 
-It waits for a command on ``cmd_vel`` before each step, so that the run does not depend on how fast anybody is.
+It waits for a command on ``cmd_vel`` before each step, so that the run does not depend on the speed of the nodes.
 """
 
 from __future__ import annotations

@@ -13,15 +13,15 @@ import argparse
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import simpy
-from examples.queue_admission.env import HORIZON, admission, observation
+from examples.queue_admission.env import QueueSimulation, admission, observation
 from examples.queue_admission.exact import ADMIT_ALL, DECISIONS, Table, best_table, worth
 from examples.queue_admission.model import INTEREST, KINDS, Queue
 
-from simenv_marl import TRUNCATED, SimulationInterface, aec_env, evaluate, reseed_generators
+from simenv_marl import aec_env, evaluate
 
 # -- the model ------------------------------------------------------------------------------------
 
@@ -66,27 +66,14 @@ class Network:
 AGENTS: Final = ("first", "second")
 
 
-class NetworkSimulation(SimulationInterface):
+class NetworkSimulation(QueueSimulation):
     """The network for a limited time. An agent for each queue decides at the times of its own arrivals."""
 
-    points: Final = {Queue.admit: replace(admission, agent=lambda station, kind: station.name)}
+    points: ClassVar[Any] = {Queue.admit: replace(admission, agent=lambda station, kind: station.name)}
 
     def reset(self, seed: int | None = None) -> None:
         """Begin with empty queues."""
         self.model = Network(seed)
-
-    def run(self) -> Any:
-        """Run SimPy's loop."""
-        self.model.clock.run(until=HORIZON)
-        return TRUNCATED
-
-    def time(self) -> float:
-        """Return SimPy's clock."""
-        return float(self.model.clock.now)
-
-    def reseed(self, seed: int) -> None:
-        """Draw another future."""
-        reseed_generators(self, seed)
 
 
 # -- learning -------------------------------------------------------------------------------------

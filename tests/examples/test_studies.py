@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from examples.greenhouse_coop import plan, train
 from examples.greenhouse_coop.env import DAYS, GreenhouseSim
+from examples.queue_admission.env import HORIZON
 from examples.queue_admission.model import Queue
 from studies.debt_collection import study as debts
 from studies.demo import picture
@@ -125,7 +126,7 @@ def test_queue_network_compares_two_learners_with_their_rules(capsys):
     shown = capsys.readouterr().out
     assert shown.count("both learned") == 3
     alone = Queue(np.random.SeedSequence(3).generate_state(2).tolist()[0])
-    alone.clock.run(until=network.HORIZON)
+    alone.clock.run(until=HORIZON)
     both = simulate(network.NetworkSimulation, seed=3).model
     assert both.first.present_value() == alone.present_value()  # what comes after it does not change it
     first = network.train(150)["first"].table()

@@ -11,13 +11,16 @@ import inspect
 import os
 from collections.abc import Awaitable, Callable
 from queue import Empty, SimpleQueue
-from threading import Thread
+from threading import Thread, current_thread
 from typing import Any, Final
 
 from ..errors import ReentrancyError, short_repr, warn_user
 
 SECONDS_TO_CANCEL: Final = 10.0
 """The seconds that coroutines may take to end after they were cancelled."""
+
+THREAD: Final = "simenv_marl policies"
+"""The name of the thread."""
 
 _loops: Final[dict[int, asyncio.AbstractEventLoop]] = {}
 """The loop, by the process that it belongs to."""
@@ -30,7 +33,7 @@ def _loop() -> asyncio.AbstractEventLoop:
         made = asyncio.new_event_loop()
         loop = _loops.setdefault(os.getpid(), made)
         if loop is made:
-            Thread(target=loop.run_forever, name="simenv_marl policies", daemon=True).start()
+            Thread(target=loop.run_forever, name=THREAD, daemon=True).start()
         else:  # another thread was faster
             made.close()
     return loop
@@ -104,7 +107,7 @@ class Answers:
         Raises:
             ReentrancyError: This is a coroutine of a policy itself: it would wait for its own thread.
         """
-        if inspect.isawaitable(value) and asyncio._get_running_loop() is _loops.get(os.getpid()) is not None:
+        if inspect.isawaitable(value) and current_thread().name == THREAD:
             getattr(value, "close", int)()
             raise ReentrancyError(
                 "a coroutine of a policy runs simulations whose policies are coroutines; run them in another thread:"

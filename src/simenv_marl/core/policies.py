@@ -87,12 +87,11 @@ COUNTS: Final[dict[str, dict[str, float]]] = {}
 """What policies have counted in this process, by a token that their copies share. Workers send it back."""
 
 
-def add_counts(counts: Mapping[str, Mapping[str, float]]) -> None:
-    """Add what copies of policies have counted in another process."""
-    for token, numbers in counts.items():
-        own = COUNTS.setdefault(token, {})
-        for name, number in numbers.items():
-            own[name] = own.get(name, 0) + number
+def count(token: str, **numbers: float) -> None:
+    """Add numbers to what the policies with a token have counted."""
+    counts = COUNTS.setdefault(token, {})
+    for name, number in numbers.items():
+        counts[name] = counts.get(name, 0) + number
 
 
 def has_fallback(policy: Any) -> bool:
@@ -115,11 +114,41 @@ def policy_in_branch(policy: Any, agent: str, episode: Any) -> Callable[[Any, An
     )
 
 
+class Caller:
+    """A policy with what it takes, which is found out once: that takes longer than most decisions.
+
+    Attributes:
+        policy: The policy.
+        names: Which of ``ASKED`` it asks for.
+    """
+
+    def __init__(self, policy: Callable[..., Any]) -> None:
+        self.policy, self._takes_info = policy, takes_info(policy)
+        self.names = tuple(name for name in ASKED if asks_for(policy, name))
+
+    def __call__(self, observation: Any, info: Any, asked: Mapping[str, Any]) -> Any:
+        """Ask the policy, with what it asks for. Return its answer, or an awaitable."""
+        seen = (observation, info) if self._takes_info else (observation,)
+        return self.policy(*seen, **{name: asked[name] for name in self.names})
+
+
+def when_answered(answer: Any, conclude: Callable[[Any], Any]) -> Any:
+    """Return what a function makes of an answer; if that has to be awaited, an awaitable."""
+    if not inspect.isawaitable(answer):
+        return conclude(answer)
+
+    async def wait() -> Any:
+        return conclude(await answer)
+
+    return wait()
+
+
 class PolicyWrapper:
     """A policy that asks another policy, and itself asks for what that one asks for.
 
     Attributes:
         policy: The other policy, a callable.
+        ask: Asks it: takes the observation, the info, and a dict of what may be asked for.
         waits: Whether that one has to be awaited.
         records: Whether that one records its answers.
         counts_fallbacks: Whether evaluations show how many of its answers come from a fallback.
@@ -131,17 +160,12 @@ class PolicyWrapper:
         """Wrap a policy. ``asks``: what this one asks for besides."""
         if not callable(policy):
             raise OptionValueError(f"the policy must be a callable, not {short_repr(policy)}")
-        self.policy, self.waits = policy, waits(policy)
+        self.policy, self.waits, self.ask = policy, waits(policy), Caller(policy)
         self.records: bool = getattr(policy, "records", False) is True
-        names = [name for name in ASKED if asks_for(policy, name) or name in asks]
+        names = [name for name in ASKED if name in (*self.ask.names, *asks)]
         seen = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("observation", "info")]
         asked = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY) for name in names]
         self.__signature__ = inspect.Signature(seen + asked)
-
-    def ask(self, policy: Callable[..., Any], observation: Any, info: Any, asked: Mapping[str, Any]) -> Any:
-        """Ask a policy, with what it asks for. Return its answer, or an awaitable."""
-        seen = (observation, info) if takes_info(policy) else (observation,)
-        return policy(*seen, **{name: value for name, value in asked.items() if asks_for(policy, name)})
 
 
 class DeferredPolicy:
@@ -160,9 +184,9 @@ class AskingPolicy:
     """
 
     def __init__(self, policy: Callable[..., Any]) -> None:
-        self.policy = policy
-        self.plans, self.asks, self.waits = is_planner(policy), asks_for(policy, "_decision"), waits(policy)
-        self._takes_info = takes_info(policy)
+        self.policy, self._call = policy, Caller(policy)
+        self.plans, self.asks = (name in self._call.names for name in ASKED)
+        self.waits = waits(policy)
         self._session: ref[Any] | None = None
         if self.plans and self.waits:
             raise OptionValueError(
@@ -213,11 +237,10 @@ class AskingPolicy:
         self, observation: Any, info: Any, episode: Any, agent: Any, environment: Any, *, in_clone: bool = False
     ) -> Any:
         """Ask the policy itself about the pending decision of an agent. Return its answer, or an awaitable."""
-        seen = (observation, info) if self._takes_info else (observation,)
-        more: dict[str, Any] = {"_environment": environment} if self.plans else {}
+        asked: dict[str, Any] = {"_environment": environment}
         if self.asks:
-            more["_decision"] = decision_of(episode, agent, in_clone=in_clone)
-        return self.policy(*seen, **more)
+            asked["_decision"] = decision_of(episode, agent, in_clone=in_clone)
+        return self._call(observation, info, asked)
 
 
 def bind_session(policy: Any, session: Any) -> Any:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from inspect import isawaitable
 from math import isfinite
 from typing import Any, Final, Unpack
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
-from ..core.policies import PolicyWrapper, is_asked_alone
+from ..core.policies import PolicyWrapper, is_asked_alone, when_answered
 from ..core.spaces import same
 from ..core.stacking import stacker, taken
 from ..errors import DefinitionError, OptionValueError, short_repr
@@ -322,11 +321,7 @@ class _Shadow(PolicyWrapper):
     """The same for a policy that answers one decision at a time."""
 
     def __call__(self, observation: Any, info: Any, **asked: Any) -> Any:
-        answer = self.ask(self.policy, observation, info, asked)
-        return self._await(answer) if isawaitable(answer) else self._record(answer)
-
-    async def _await(self, answer: Any) -> Any:
-        return self._record(await answer)
+        return when_answered(self.ask(observation, info, asked), self._record)
 
     def _record(self, action: Any) -> Any:
         recorded = np.empty((), object)

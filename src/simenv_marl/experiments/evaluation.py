@@ -176,11 +176,9 @@ class Evaluation:
             for row in values.to_numpy()[:LINES]:
                 axes[0].plot(range(len(names)), row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
             _draw_dots(axes[0], values, names, summary[["mean", "low", "high"]], 0.0)
-            shares = self._fallback_shares()
-            marked = {
-                name: f"{name}\n{share:.0%} fallbacks" for name, share in shares.items() if share > FALLBACK_LIMIT
-            }
-            label_below(axes[0], [marked.get(name, name) for name in names])
+            shares = summary[FALLBACKS] if FALLBACKS in summary else dict.fromkeys(names, 0.0)
+            marks = [f"\n{shares[name]:.0%} fallbacks" if shares[name] > FALLBACK_LIMIT else "" for name in names]
+            label_below(axes[0], [name + mark for name, mark in zip(names, marks, strict=True)])
             axes[0].set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
             each = "each a line" if len(values) <= LINES else f"lines for {LINES} of them"
             each = "each a dot" if len(names) == 1 else each
@@ -188,8 +186,9 @@ class Evaluation:
             if others:
                 axes[1].axhline(0.0, color=INK, linewidth=0.8, zorder=1)
                 differences = values.sub(values[baseline], axis=0)[others]
-                marks = summary.loc[others, ["difference", "difference_low", "difference_high"]]
-                _draw_dots(axes[1], differences, names, marks, 0.24)
+                bounds = summary.loc[others, ["difference", "difference_low", "difference_high"]]
+                _draw_dots(axes[1], differences, names, bounds, 0.24)
+                label_below(axes[1], others)
                 axes[1].set_ylabel(f"difference from {baseline}, same seed")
                 axes[1].set_title("differences")
         return figure
@@ -229,7 +228,6 @@ def _draw_dots(axes: Any, values: "DataFrame", names: list[str], marks: "DataFra
         axes.errorbar([place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5)
         axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), textcoords="offset points", va="center", fontsize=8.5)
     axes.set_xlim(-0.5, len(values.columns) - 0.5)
-    label_below(axes, list(values.columns))
 
 
 def label_below(axes: Any, names: list[str]) -> None:

@@ -25,7 +25,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
-from ..core.policies import COUNTS, add_counts
+from ..core.policies import COUNTS, count
 from ..errors import MissingExtraError, OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 
 EXTRAS: Final = {
@@ -101,7 +101,8 @@ def spread(
             if error is not None:
                 raise error
             result, counts = result
-            add_counts(counts)
+            for token, numbers in counts.items():
+                count(token, **numbers)
             bar.update(len(part))
             yield result
     finally:

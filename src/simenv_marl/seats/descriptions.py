@@ -127,18 +127,18 @@ def _normal(text: str) -> str | float:
         return text.casefold()
 
 
-def _pending(env: Any) -> Decision:
+def pending(env: Any) -> Decision:
     """Return the pending decision of an environment of this process."""
     episode = env.unwrapped.episode
     return decision_of(episode, episode.pending or episode.consulted)
 
 
 def _describe_pending(env: Any, as_json: bool) -> Any:
-    return describe(_pending(env), as_json=as_json)
+    return describe(pending(env), as_json=as_json)
 
 
 def _parse_pending(env: Any, text: str) -> Any:
-    return parse(_pending(env), text)
+    return parse(pending(env), text)
 
 
 # -- what is observed -----------------------------------------------------------------------------

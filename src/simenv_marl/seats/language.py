@@ -16,10 +16,10 @@ from weakref import finalize
 
 from ..core.awaiting import Answer
 from ..core.pending import Decision
-from ..core.policies import COUNTS
+from ..core.policies import COUNTS, count
 from ..errors import InvalidActionError, LanguageModelError, OptionValueError, describe_error, short_repr
 from ..many.parallel import import_extra
-from .descriptions import _pending, action_schema, describe, parse
+from .descriptions import action_schema, describe, parse, pending
 
 LONGEST_WAIT: Final = 30.0
 """The longest time before a request is repeated, in seconds."""
@@ -101,7 +101,7 @@ class LanguageModelPolicy:
             ResetNeededError: No decision is pending.
         """
         is_decision = isinstance(env_or_decision, Decision)
-        decision = env_or_decision if is_decision else env_or_decision.unwrapped.call(_pending)
+        decision = env_or_decision if is_decision else env_or_decision.unwrapped.call(pending)
         return f"{self._system(decision)}\n\n{self._words(decision)}"
 
     async def __call__(self, observation: Any, info: Any = None, *, _decision: Decision) -> Any:
@@ -189,9 +189,10 @@ class LanguageModelPolicy:
                 ) from error
             raise _PassingError(describe_error(error), _seconds_to_wait(error)) from error
         finally:
-            self._count(requests=1, seconds=perf_counter() - began)
+            count(self._token, requests=1, seconds=perf_counter() - began)
         usage = getattr(response, "usage", None)
-        self._count(
+        count(
+            self._token,
             prompt_tokens=getattr(usage, "prompt_tokens", 0) or 0,
             completion_tokens=getattr(usage, "completion_tokens", 0) or 0,
         )
@@ -209,11 +210,6 @@ class LanguageModelPolicy:
             self._own_client = made
             finalize(self, _close, made, os.getpid()).atexit = False
         return self._own_client
-
-    def _count(self, **numbers: float) -> None:
-        counts = COUNTS.setdefault(self._token, {})
-        for name, number in numbers.items():
-            counts[name] = counts.get(name, 0) + number
 
 
 class _PassingError(Exception):

@@ -17,9 +17,9 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.pending import Decision
-from ..core.policies import ASKED, COUNTS, PolicyWrapper, waits
+from ..core.policies import COUNTS, Caller, PolicyWrapper, count, waits, when_answered
 from ..errors import InvalidActionError, OptionValueError, describe_error, short_repr, warn_user
-from ..simulation import RULE, asks_for
+from ..simulation import RULE
 
 KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
 """What a ``FallbackPolicy`` counts."""
@@ -51,10 +51,10 @@ class FallbackPolicy(PolicyWrapper):
         Raises:
             OptionValueError: An argument has an invalid value.
         """
-        more = [name for name in ASKED if fallback is not RULE and asks_for(fallback, name)]
-        super().__init__(policy, asks=("_decision", *more))
         if fallback is not RULE and not callable(fallback):
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
+        self._ask_fallback = None if fallback is RULE else Caller(fallback)
+        super().__init__(policy, asks=("_decision", *(self._ask_fallback.names if self._ask_fallback else ())))
         if timeout is not None and not (isinstance(timeout, (int, float)) and timeout > 0):
             raise OptionValueError(f"timeout must be a number of seconds or None, not {short_repr(timeout)}")
         if isinstance(retries, bool) or not isinstance(retries, int) or retries < 0:
@@ -86,7 +86,7 @@ class FallbackPolicy(PolicyWrapper):
                 self._count(decision, "retried")
             began = monotonic()
             try:
-                answer = self.ask(self.policy, observation, info, asked)
+                answer = self.ask(observation, info, asked)
                 if isawaitable(answer) and self.waits:
                     answer = await asyncio.wait_for(answer, self.timeout)
                 if self.timeout is not None and monotonic() - began > self.timeout:
@@ -105,9 +105,9 @@ class FallbackPolicy(PolicyWrapper):
                 self._note(decision, "failed", error)
         self._count(decision, "fallbacks")
         decision.count_fallback()
-        if self.fallback is RULE:
+        if self._ask_fallback is None:
             return RULE
-        answer = self.ask(self.fallback, observation, info, asked)
+        answer = self._ask_fallback(observation, info, asked)
         return await answer if isawaitable(answer) else answer
 
     def _note(self, decision: Decision, kind: str, error: Exception) -> None:
@@ -116,8 +116,7 @@ class FallbackPolicy(PolicyWrapper):
 
     def _count(self, decision: Decision, kind: str) -> None:
         if not decision.in_clone:
-            counts = COUNTS.setdefault(self._token, {})
-            counts[kind] = counts.get(kind, 0) + 1
+            count(self._token, **{kind: 1})
 
 
 def _finished(coroutine: Coroutine[Any, Any, Any]) -> Any:
@@ -161,11 +160,8 @@ class RecordedPolicy(PolicyWrapper):
             answer = known[key]
             return RULE if answer is None else _decision.action_space.from_jsonable(answer)[0]
         asked["_decision"] = _decision
-        answer = self.ask(self.policy, observation, info, asked)
-        return self._await(key, answer, _decision) if isawaitable(answer) else self._record(key, answer, _decision)
-
-    async def _await(self, key: tuple[Any, ...], answer: Any, decision: Decision) -> Any:
-        return self._record(key, await answer, decision)
+        answer = self.ask(observation, info, asked)
+        return when_answered(answer, lambda known: self._record(key, known, _decision))
 
     def _read(self) -> dict[tuple[Any, ...], Any]:
         """Read the file. A line that is not finished is ended, so that the next one can be read."""

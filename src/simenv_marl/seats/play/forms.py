@@ -15,9 +15,8 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from ...core.pending import decision_of
 from ...errors import describe_error, short_repr
-from ..descriptions import labelled
+from ..descriptions import labelled, pending
 from ..policies import digest_of
 
 MOST: Final = 12  # candidates of a decision, and entries of its observation in the history
@@ -38,7 +37,7 @@ def jsonable(value: Any) -> Any:
 
 def pending_decision(env: Any) -> dict[str, Any]:
     """Return the pending decision of an AEC environment as JSON; called in the process where it lives."""
-    decision = decision_of(env.episode, env.episode.pending)
+    decision = pending(env)
     return {
         "agent": decision.agent,
         "number": decision.number,

@@ -46,7 +46,7 @@ class Game:
             raise OptionValueError(f"there is no agent {seat!r}; the agents are {known}{did_you_mean(seat, known)}")
         self.name, self.given, self.limit, self.record = name, list(seats), limit, record
         self.known = dict.fromkeys(self.given or known)
-        self.taken: set[str] = set()  # the seats that somebody has
+        self.taken: set[str] = set()  # the seats that people have
         self.late: Counter[str] = Counter()  # decisions that the rule took because of the limit
         self.checkpoints: dict[int, Any] = {}
         self.ends: dict[str, tuple[int, float]] = {}  # of agents: when, and their returns
@@ -248,7 +248,7 @@ class Game:
             self.fan.append({"action": action, "courses": []})
 
     def _set_deadline(self) -> None:
-        """Give the person whose decision is pending the time of the limit, which begins when somebody is there."""
+        """Give the person whose decision is pending the time of the limit, which begins when a person is there."""
         if self.limit and self.now is not None and self.deadline is None and self.taken:
             self.deadline = monotonic() + self.limit
 

@@ -40,8 +40,8 @@ from .mutants_draw import Mutant, candidates
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path("src/simenv_marl")
 LEFT_OUT = ("testing/", "data/plots.py", "data/timeline.py")
-FILES = ("README.md", "CHANGELOG.md", "pyproject.toml")
-COPIED = ("src", "tests", "tools", "examples", "studies", "benchmarks", "docs", *FILES)
+FILES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "Makefile", "pyproject.toml")
+COPIED = ("src", "tests", "tools", "examples", "studies", "benchmarks", "clients", "docs", *FILES)
 TEST_LIMIT = 20.0
 """The time limit of a test in seconds, in addition to ten times its normal duration."""
 FIRST = 6

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from textwrap import dedent
@@ -150,6 +151,27 @@ def test_decisions_in_threads_of_the_model_are_refused_and_the_step_says_so(driv
     assert "refuse" in culprits(caught.value.__cause__)  # which leads to the thread
     env.reset()
     env.close()
+
+
+@DRIVERS
+@pytest.mark.parametrize("way", WAYS, ids=["thread", "grandchild", "pool", "asyncio"])
+def test_a_refusal_that_is_kept_does_not_keep_the_root_of_its_thread(driver, way):
+    """Else greenlet frees that root too early, if the collector runs while the thread ends, and the process crashes."""
+
+    def main(simulation):
+        decide()
+        with suppress(WrongThreadError):
+            way(lambda: (roots.append(weakref.ref(greenlet.getcurrent())), decide()))
+
+    roots, decide = [], decision()
+    env = single_env(script(main), decide, driver=driver)
+    env.reset()
+    with pytest.raises(WrongThreadError) as caught:
+        env.step(1)
+    env.close()
+    assert caught.value.__cause__.__traceback__
+    (root,) = roots
+    assert root() is None or not gc.get_referrers(root())
 
 
 @DRIVERS

@@ -406,9 +406,9 @@ def _noting(method: Any) -> Any:
 
 def _run_registered(driver: Driver, run: Callable[[], None]) -> None:
     """Run a thread that a simulation has started, as a stack of that simulation's driver."""
-    here = getcurrent()
-    STACKS[here] = driver
+    # Not in a variable: tracebacks keep variables, and a root that outlives its thread makes greenlets crash.
+    STACKS[getcurrent()] = driver
     try:
         run()
     finally:
-        STACKS.pop(here, None)
+        STACKS.pop(getcurrent(), None)

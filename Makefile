@@ -17,8 +17,11 @@ plan: .venv/.demo
 matrix: .venv/.matrix
 	$(BIN)/python -m studies.greenhouse_matrix.matrix $(MATRIX)
 
+# These fork all the time, and forks take four times as long in a process in which all the other tests run.
+FORKING := tests/planning tests/test_branch.py tests/test_clone.py docs/branches.md docs/seats.md docs/reference/planning.md
 test: lint docs
-	$(BIN)/python -m pytest -n 2 --order random
+	$(BIN)/python -m pytest -n 2 --order random $(FORKING)
+	$(BIN)/python -m pytest -n 2 --order random $(addprefix --ignore=,$(FORKING))
 
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
 test-all: test test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside
@@ -140,8 +143,11 @@ lint: .venv/.test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Links, the map, words, names in the reference, and whether tests run the commands that pages show.
+PAGE_TESTS := tests/test_pages.py tests/test_front_pages.py
 docs: .venv/.test
 	$(BIN)/sphinx-build --fail-on-warning --quiet docs docs/_build
+	$(BIN)/python -m pytest --quiet $(PAGE_TESTS)
 
 benchmark: .venv/.test
 	$(BIN)/python -m benchmarks.core

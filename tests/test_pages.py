@@ -1,8 +1,11 @@
 """A page's code needs only what can be installed or what the page links; the page says how to get anything else."""
 
 import re
+import subprocess
 import sys
 import tomllib
+from fnmatch import fnmatch
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -12,8 +15,12 @@ import simenv_marl
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+BUDGETS = CONFIG["tool"]["simenv_marl"]["budgets"]
+EXTRAS = set(CONFIG["project"]["optional-dependencies"])
 ROOMS = {page.stem: page for page in (DOCS / "reference").glob("*.md")}
 PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md")) + sorted(f"reference/{room}" for room in ROOMS)
+FRONT = ["README.md", "CONTRIBUTING.md", *(f"docs/{page}.md" for page in PAGES)]
 BESIDE = {"dask", "gym", "gym_fin", "tensordict"}
 """Packages that other packages bring, or that a reader who comes from them has."""
 
@@ -32,7 +39,7 @@ def imported(code):
 
 def can_be_installed():
     """The packages that the project requires, with any of its extras."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = CONFIG["project"]
     required = chain(project["dependencies"], *project["optional-dependencies"].values())
     return {re.match(r"[\w-]+", requirement)[0].lower().replace("-", "_") for requirement in required}
 
@@ -80,6 +87,22 @@ def test_the_code_of_a_page_fits_on_it(page):
     assert [line for line in "".join(code).splitlines() if len(line) > 100] == []
 
 
+def words_of(page):
+    return len((DOCS / f"{page}.md").read_text(encoding="utf-8").split())
+
+
+def test_the_map_has_few_pages_and_each_is_short():
+    captions = re.findall(r":caption: (.+)\n\n((?:[\w-]+\n)+)", (DOCS / "index.md").read_text(encoding="utf-8"))
+    pages = {caption: names.split() for caption, names in captions}
+    studies = {page: words_of(page) for page in pages.pop("Studies")}
+    others = {page: words_of(page) for page in {"index", *chain(*pages.values())} - {"changelog", "reference"}}
+    assert len(pages) <= 7
+    assert len(others) <= BUDGETS["pages"]
+    assert sum(others.values()) <= BUDGETS["words_of_pages"], others
+    assert {page: words for page, words in others.items() if words > BUDGETS["words_of_a_page"]} == {}
+    assert {page: words for page, words in studies.items() if words > BUDGETS["words_of_a_study"]} == {}
+
+
 @pytest.mark.parametrize("room", ["simenv_marl", *simenv_marl.ROOMS])
 def test_the_page_of_a_room_lists_the_names_that_it_has(room):
     text = ROOMS[room].read_text(encoding="utf-8")
@@ -91,3 +114,58 @@ def test_the_page_of_a_room_lists_the_names_that_it_has(room):
     if f"automodule:: simenv_marl.{room}\n   :members:" not in text:
         elsewhere = {"evaluate", "SimEnvError"} if room == "simenv_marl" else set()
         assert {name or made for _, name, made in described} == names - elsewhere
+
+
+@cache
+def texts():
+    """The text of all tests, and of the examples and the script that they use."""
+    paths = [*ROOT.glob("tests/**/*.py"), *ROOT.glob("examples/**/*.py"), ROOT / "tools/outside.sh"]
+    return {path: path.read_text(encoding="utf-8") for path in paths}
+
+
+@cache
+def programs_of_tests():
+    """The modules that tests run as programs, and our commands; a star stands for what a test fills in."""
+    found = set()
+    for path in ROOT.glob("tests/**/*.py"):
+        text = re.sub(r"\{.+?\}", "*", texts()[path])
+        found.update(re.findall(r'"-m", f?"([^"]+)"', text))
+        found.update(f"simenv_marl {name}" for name in re.findall(r'(?:main\(\[|"simenv_marl", )"([\w-]+)"', text))
+        for package, names in re.findall(r"^ *from ((?:examples|studies)\.\S+) import (.+)$", text, re.MULTILINE):
+            aliases = (name.partition(" as ") for name in names.split(", "))
+            found.update(f"{package}.{name}" for name, _, alias in aliases if f" {alias or name}.main(" in text)
+    return found
+
+
+def commands_of(text):
+    """The commands of a page, without the blocks that it marks as not run."""
+    blocks = re.findall(
+        r"^(<!-- not run: .+ -->\n\n?)?( *)```(sh|console)\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE
+    )
+    for mark, _, language, block in blocks:
+        lines = [line.partition(" #")[0].strip() for line in block.replace("\\\n", "").splitlines()]
+        if not mark:
+            yield from (line.removeprefix("$ ") for line in lines if language == "sh" or line.startswith("$ "))
+
+
+def untested(command, written):
+    """What a command runs or installs, and no test; ``written`` are the modules that a command before it writes."""
+    if command.startswith("make "):
+        command = subprocess.run([*command.split(), "--dry-run"], cwd=ROOT, capture_output=True, text=True).stdout
+    extras = re.findall(r"pip install .*\[(.+)\]", command)
+    programs = [name.replace("$script", "*") for name in re.findall(r"-m (simenv_marl \S+|[\w.$]+)", command)]
+    if programs or "pip install" in command:
+        known = {"pytest", "venv", *written, *programs_of_tests()}
+        unknown = {name for name in programs if not any(fnmatch(name, pattern) for pattern in known)}
+        return unknown | set(chain(*(names.split(",") for names in extras))) - EXTRAS
+    name = [word for word in command.split() if not word.isdigit()][-1].rpartition("/")[2]  # a file, a class, a package
+    named = re.compile(rf'["/ ]{re.escape(name)}\b')
+    return set() if name in written or any(map(named.search, texts().values())) else {name}
+
+
+@pytest.mark.parametrize("page", FRONT)
+def test_a_command_of_a_page_is_run_by_tests_or_marked_as_not_run(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    written = re.findall(r"-m simenv_marl new \w+ (\w+)", text)
+    found = {command: missing for command in commands_of(text) if (missing := untested(command, written))}
+    assert found == {}

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Sequence
 from math import atan2, pi
 from typing import Any, Final
 
@@ -39,5 +41,12 @@ def compare(seeds: range, workers: int = 0) -> Evaluation:
     return evaluate(BuildingSim, contenders, seeds=seeds, baseline="time switch", workers=workers)
 
 
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the comparison."""
+    parser = argparse.ArgumentParser(description="Compare two policies for thermostats.")
+    parser.add_argument("--seeds", type=int, default=20, help="number of days (default: %(default)s)")
+    print(compare(range(parser.parse_args(arguments).seeds)).summary().round(2).to_string())
+
+
 if __name__ == "__main__":
-    print(compare(range(20)).summary().round(2).to_string())
+    main()

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, pi, sin, tanh
@@ -35,7 +36,7 @@ class Linear:
         return {"power": np.array([1 + tanh(np.dot(self.weights, features))])}
 
 
-def learn(generations: int = 25, episodes: int = 4) -> Linear:
+def learn(generations: int, episodes: int = 4) -> Linear:
     """Train a policy."""
     rng = np.random.default_rng(0)
 
@@ -47,6 +48,15 @@ def learn(generations: int = 25, episodes: int = 4) -> Linear:
     return Linear(evolve(rate, np.zeros(6), generations, rng, population=10).tolist())
 
 
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train a policy, and print the comparison."""
+    parser = argparse.ArgumentParser(description="Train the heater of a room, and compare it with the thermostat.")
+    parser.add_argument("--generations", type=int, default=25, help="generations of training (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=50, help="seeds for the comparison (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    contenders = {"rule": {}, "trained": {"heater_0": learn(options.generations)}}
+    print(evaluate(RoomSim, contenders, seeds=range(HELD_OUT, HELD_OUT + options.seeds), baseline="rule"))
+
+
 if __name__ == "__main__":
-    seeds = range(HELD_OUT, HELD_OUT + 50)
-    print(evaluate(RoomSim, {"rule": {}, "trained": {"heater_0": learn()}}, seeds=seeds, baseline="rule"))
+    main()

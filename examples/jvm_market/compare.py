@@ -57,11 +57,11 @@ def compare(seeds: Sequence[int], weeks: int = WEEKS) -> Evaluation:
     return evaluate(market(weeks), CONTENDERS, seeds=seeds, baseline="rule", metric=METRICS)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Compare the policies, and print the results."""
     parser = argparse.ArgumentParser(description="Compare the farms' rule with two simple policies.")
     parser.add_argument("--seeds", type=int, default=20, help="number of seeds (default: 20)")
-    found = compare(range(parser.parse_args().seeds))
+    found = compare(range(parser.parse_args(arguments).seeds))
     print("total earnings of farms and shops:", found.summary().round(1).to_string(), sep="\n")
     print("means:", *(f"{metric}: {found.values(metric).mean().round(2).to_dict()}" for metric in METRICS), sep="\n")
 

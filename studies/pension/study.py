@@ -209,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     size: dict[str, Any] = {}
     if parser.parse_args(arguments).quick:
         parser.set_defaults(seeds=2, generations=1, out=OUT / "quick")
-        size = {"clients": 30, "years": 4}
+        size = {"clients": 30, "years": 2}
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     found = learned(options.out, size, options.generations, min(options.seeds, 12), options.workers)

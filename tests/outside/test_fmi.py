@@ -12,9 +12,9 @@ from simenv_marl import RULE, clone, evaluate, single_env
 
 pytest.importorskip("fmpy", reason="FMPy is not there: pip install 'simenv-marl[fmi]'")
 
+from examples.heated_room import train
 from examples.heated_room.env import BOUNDS, OBSERVED, RoomSim
 from examples.heated_room.master import Master, labels_of, spaces_of
-from examples.heated_room.train import Linear, learn
 from examples.heated_room.units import UNITS, unit
 from fmpy import read_model_description
 from fmpy.model_description import Dimension, Item, ModelDescription, ModelVariable, SimpleType
@@ -150,11 +150,13 @@ def test_variables_that_are_not_real_have_discrete_spaces():
 
 @pytest.mark.greenlet("the driver makes no difference to learning")
 @NEEDS_C
-def test_the_heater_learns_to_beat_the_thermostat():
+def test_the_heater_learns_to_beat_the_thermostat(capsys):
+    train.main(["--generations", "1", "--seeds", "2"])
+    assert "Evaluation: rule, trained on 2 seeds" in capsys.readouterr().out
     contenders = {
         "rule": {},
-        "trained": {"heater_0": learn(generations=8, episodes=1)},
-        "untrained": {"heater_0": Linear([0.0] * 6)},
+        "trained": {"heater_0": train.learn(generations=8, episodes=1)},
+        "untrained": {"heater_0": train.Linear([0.0] * 6)},
     }
     values = evaluate(RoomSim, contenders, seeds=range(10**6, 10**6 + 8)).values()
     assert (values["untrained"] < values["rule"]).all()

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from examples.jvm_market import build as building
+from examples.jvm_market import compare as town_policies
 from examples.jvm_market import env as town
 from examples.ns3_senders import env as network
 
@@ -177,6 +178,8 @@ def test_the_code_of_the_page_on_the_town(model, capsys):
     exec(blocks(PAGE, "Larger models")[0], names)
     earned = names["found"].values()
     assert (earned["by the granary"] > earned["rule"]).mean() > 0.8
+    assert "by the granary" in capsys.readouterr().out
+    town_policies.main(["--seeds", "2"])
     assert "by the granary" in capsys.readouterr().out
 
 

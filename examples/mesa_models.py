@@ -10,13 +10,14 @@ From Mesa 3.5 on, some of these models take a scenario. ``stepped`` handles both
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import math
 import platform
 import random
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final
@@ -210,6 +211,9 @@ def alliance_formation() -> Example:
     return MultiLevelAllianceModel, {name: join}, {}
 
 
+NEEDS_SIMULATOR: Final = "simulator" in inspect.signature(WolfSheep).parameters
+"""Whether a simulator runs ``WolfSheep``, as before Mesa 3.5. Then only ``examples.wolf_sheep`` runs it."""
+
 EXAMPLES: Final = (
     boltzmann_wealth, schelling, boid_flockers, conways_game_of_life, virus_on_network, epstein_civil_violence, pd_grid,
     sugarscape, wolf_sheep, alliance_formation,
@@ -348,9 +352,12 @@ def table(outcomes: Iterable[Outcome]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Run all examples, and print the table."""
-    outcomes = [outcome(function) for function in EXAMPLES]
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the examples, and print the table."""
+    parser = argparse.ArgumentParser(description="Run Mesa's example models as environments, and by themselves.")
+    names = [function.__name__ for function in EXAMPLES if function is not wolf_sheep or not NEEDS_SIMULATOR]
+    parser.add_argument("names", nargs="*", default=names, help="which examples to run (default: all)")
+    outcomes = [outcome(globals()[name]) for name in parser.parse_args(arguments).names]
     print(f"Mesa {mesa.__version__}, Python {platform.python_version()}, {STEPS} steps")
     print(table(outcomes))
     if not all(one.same and one.moved for one in outcomes):

@@ -131,14 +131,15 @@ def programs_of_tests():
         text = re.sub(r"\{.+?\}", "*", texts()[path])
         found.update(re.findall(r'"-m", f?"([^"]+)"', text))
         found.update(f"simenv_marl {name}" for name in re.findall(r'(?:main\(\[|"simenv_marl", )"([\w-]+)"', text))
-        for package, names in re.findall(r"^ *from ((?:examples|studies)\.\S+) import (.+)$", text, re.MULTILINE):
+        for package, names in re.findall(r"^ *from ((?:examples|studies)\S*) import (.+)$", text, re.MULTILINE):
             aliases = (name.partition(" as ") for name in names.split(", "))
             found.update(f"{package}.{name}" for name, _, alias in aliases if f" {alias or name}.main(" in text)
     return found
 
 
 def commands_of(text):
-    """The commands of a page, without the blocks that it marks as not run."""
+    """The commands of a page, in its blocks and lines, without the blocks that it marks as not run."""
+    yield from re.findall(r"`((?:make|python -m) [^`<]+)`", text)
     blocks = re.findall(
         r"^(<!-- not run: .+ -->\n\n?)?( *)```(sh|console)\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE
     )
@@ -151,7 +152,8 @@ def commands_of(text):
 def untested(command, written):
     """What a command runs or installs, and no test; ``written`` are the modules that a command before it writes."""
     if command.startswith("make "):
-        command = subprocess.run([*command.split(), "--dry-run"], cwd=ROOT, capture_output=True, text=True).stdout
+        recipe = subprocess.run([*command.split(), "--dry-run"], cwd=ROOT, capture_output=True, text=True).stdout
+        command = "; ".join(re.findall(r"-m (?:examples|studies)\S+", recipe)) or "-m pytest"
     extras = re.findall(r"pip install .*\[(.+)\]", command)
     programs = [name.replace("$script", "*") for name in re.findall(r"-m (simenv_marl \S+|[\w.$]+)", command)]
     if programs or "pip install" in command:

@@ -4,9 +4,8 @@ import pickle
 
 import numpy as np
 import pytest
-from examples.fin_base import train
+from examples.fin_base import pension, train
 from examples.fin_base.env import PREMIUMS, TEAM, FundSim, premium_env, team_env
-from examples.fin_base.pension import Parameters
 from examples.fin_base.people import Client, clients_of
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
@@ -16,7 +15,7 @@ from simenv_marl.errors import InvalidActionError
 from simenv_marl.testing import check_simulation
 from tests.worlds.models import follow_the_rule
 
-SMALL = Parameters(clients=60, coverage=1.0)  # poor enough for plans, cuts and demands
+SMALL = pension.Parameters(clients=60, coverage=1.0)  # poor enough for plans, cuts and demands
 MANAGER = {point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"}
 
 
@@ -98,7 +97,7 @@ def test_rewards_of_the_team_sum_up_to_the_welfare_gained_since_the_first_decisi
 
 @pytest.mark.parametrize(("coverage", "ends"), [(0.02, (True, False)), (1.5, (False, True))])
 def test_an_episode_is_terminated_when_pensions_cannot_be_paid_and_truncated_at_its_last_year(coverage, ends):
-    environment = single_env(FundSim(4, Parameters(clients=60, coverage=coverage)), MANAGER)
+    environment = single_env(FundSim(4, pension.Parameters(clients=60, coverage=coverage)), MANAGER)
     environment.reset(seed=1)
     over = (False, False)
     while not any(over):
@@ -113,7 +112,7 @@ def test_pettingzoo_and_gymnasium_accept_the_environments():
     with pytest.warns(UserWarning, match="possible_agents"):  # which clients there will be is not known beforehand
         api_test(premium_env(small(3)), num_cycles=30)
     seed_test(lambda: premium_env(small(3)), num_cycles=10)
-    rich = FundSim(3, Parameters(clients=60, coverage=5.0))
+    rich = FundSim(3, pension.Parameters(clients=60, coverage=5.0))
     unmasked = {point: definition for point, definition in TEAM.items() if definition.agent != "indexer_0"}
     parallel_api_test(parallel_env(rich, unmasked), num_cycles=30)  # which knows no masks
     parallel_seed_test(lambda: parallel_env(rich, unmasked), num_cycles=10)
@@ -124,6 +123,11 @@ def test_pettingzoo_and_gymnasium_accept_the_environments():
 def test_the_librarys_check_finds_nothing(points):
     report = check_simulation(lambda: small(3), points, episodes=2)
     assert not [finding for finding in report.findings if finding.severity != "note"], report
+
+
+def test_the_model_prints_its_years(capsys):
+    pension.main(["--clients", "30", "--years", "2"])
+    assert "years a second" in capsys.readouterr().out
 
 
 def test_training_is_determined_by_its_seed(capsys):

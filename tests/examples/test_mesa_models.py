@@ -1,20 +1,16 @@
 """Mesa's example models as environments: with RULE throughout the plain run, with actions another one."""
 
-import inspect
 import re
 from pathlib import Path
 
 import mesa
 import pytest
-from mesa.examples import WolfSheep
 
 from examples import mesa_models
 
 pytestmark = pytest.mark.filterwarnings("ignore:Random number generator not specified")  # Mesa's own, before 3.5
 
 PAGE = Path(__file__).parents[2] / "docs" / "mesa.md"
-NEW = "simulator" not in inspect.signature(WolfSheep).parameters
-"""Whether models keep their own time, as from Mesa 3.5 on. Before, one of them was run by a simulator."""
 
 
 def told_of(model):
@@ -25,7 +21,7 @@ def told_of(model):
 
 @pytest.mark.parametrize("example", mesa_models.EXAMPLES, ids=lambda example: example.__name__)
 def test_rules_are_the_plain_run_and_actions_are_carried_out(example):
-    if example is mesa_models.wolf_sheep and not NEW:
+    if example is mesa_models.wolf_sheep and mesa_models.NEEDS_SIMULATOR:
         pytest.skip("this Mesa runs it by a simulator: tests/contract/test_mesa.py")
     outcome = mesa_models.outcome(example)
     assert outcome.same
@@ -36,6 +32,11 @@ def test_rules_are_the_plain_run_and_actions_are_carried_out(example):
         assert printed == told_of(outcome.model)
     else:  # chance is drawn in another order
         assert printed[:3] == told_of(outcome.model)[:3]
+
+
+def test_the_program_prints_a_table(capsys):
+    mesa_models.main(["boltzmann_wealth"])
+    assert "| `BoltzmannWealth` | `MoneyAgent.move` |" in capsys.readouterr().out
 
 
 def test_every_model_of_mesa_is_there():

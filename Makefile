@@ -17,8 +17,8 @@ plan: .venv/.demo
 matrix: .venv/.matrix
 	$(BIN)/python -m studies.greenhouse_matrix.matrix $(MATRIX)
 
-# These fork all the time, and forks take four times as long in a process in which all the other tests run.
-FORKING := tests/planning tests/test_branch.py tests/test_clone.py docs/branches.md docs/seats.md docs/reference/planning.md
+# These fork all the time, and a fork takes four times as long in a process in which all the other tests run.
+FORKING := tests/planning tests/seats tests/test_branch.py tests/test_clone.py docs/branches.md docs/seats.md docs/reference/planning.md
 test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random $(FORKING)
 	$(BIN)/python -m pytest -n 2 --order random $(addprefix --ignore=,$(FORKING))

@@ -8,6 +8,9 @@ Before the first mutant, it runs all tests once and measures which tests execute
 tests that execute a mutant's function run for it: first those that execute its line, some quick ones of each file
 before the others.
 
+A mutant that survives can cost half an hour, because nearly all tests execute some functions of the core. ``--most``
+limits the tests for each mutant to the first ones; the report says how many of them ran.
+
 Some changes are no mistakes (equivalent mutants): ``mutants_known.toml`` lists each with the reason.
 """
 
@@ -17,6 +20,7 @@ import argparse
 import difflib
 import hashlib
 import json
+import math
 import os
 import random
 import shutil
@@ -31,6 +35,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -110,6 +115,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="number of parallel jobs (2)")
     parser.add_argument("--out", type=Path, default=ROOT / ".mutants", help="folder for the results")
     parser.add_argument("--only", default="", metavar="PATH", help="only modules whose path begins with PATH")
+    parser.add_argument("--most", type=float, default=math.inf, help="seconds of tests for each mutant (all tests)")
     parser.add_argument("--again", action="store_true", help="retry the survivors")
     parser.add_argument("--report", action="store_true", help="only show the results so far")
     given = parser.parse_args()
@@ -123,7 +129,7 @@ def main() -> None:
     if missing and not given.report:
         measured = measure(given.out / "measured.json")
         with results.open("a", encoding="utf-8") as file:
-            for number, result in enumerate(tried(missing, measured, given.jobs), 1):
+            for number, result in enumerate(tried(missing, measured, given.jobs, given.most), 1):
                 done[result["mutant"]] = result
                 file.write(json.dumps(result) + "\n")
                 file.flush()
@@ -250,7 +256,7 @@ def read(path: Path) -> list[Any]:
 # -- trying mutants -------------------------------------------------------------------------------
 
 
-def tried(mutants: list[Mutant], measured: Measured, jobs: int) -> Iterator[dict[str, Any]]:
+def tried(mutants: list[Mutant], measured: Measured, jobs: int, most: float) -> Iterator[dict[str, Any]]:
     """Run the tests for each mutant, several mutants in parallel, each in its own copy."""
     with tempfile.TemporaryDirectory(prefix="mutants-") as temporary, ThreadPoolExecutor(jobs) as threads:
         free: SimpleQueue[Path] = SimpleQueue()
@@ -261,7 +267,7 @@ def tried(mutants: list[Mutant], measured: Measured, jobs: int) -> Iterator[dict
         def try_one(mutant: Mutant) -> dict[str, Any]:
             folder = free.get()
             try:
-                return outcome(mutant, folder, measured)
+                return outcome(mutant, folder, measured, most)
             finally:
                 free.put(folder)
 
@@ -269,12 +275,14 @@ def tried(mutants: list[Mutant], measured: Measured, jobs: int) -> Iterator[dict
             yield future.result()
 
 
-def outcome(mutant: Mutant, folder: Path, measured: Measured) -> dict[str, Any]:
+def outcome(mutant: Mutant, folder: Path, measured: Measured, most: float) -> dict[str, Any]:
     """Find out whether a test finds a mutant, and which."""
     path = folder / PACKAGE / mutant.module
     original, begun = path.read_text(encoding="utf-8"), time.monotonic()
     changed = mutant.applied(original)
-    tests, notes = measured.tests(mutant), folder / "notes.jsonl"
+    found_by, notes = measured.tests(mutant), folder / "notes.jsonl"
+    spent = accumulate(measured.seconds[test] for test in found_by)
+    tests = [test for test, seconds in zip(found_by, spent, strict=True) if seconds <= most] or found_by[:1]
     notes.unlink(missing_ok=True)
     chosen = folder / "chosen.json"
     chosen.write_text(json.dumps({test: TEST_LIMIT + 10 * measured.seconds[test] for test in tests}), encoding="utf-8")
@@ -301,7 +309,7 @@ def outcome(mutant: Mutant, folder: Path, measured: Measured) -> dict[str, Any]:
         "exit": found,
         "by": killers[0] if killers else None,
         "tests": len(ran),
-        "of": len(tests),
+        "of": len(found_by),
         "seconds": round(time.monotonic() - begun, 1),
         "diff": "".join(
             difflib.unified_diff(
@@ -347,7 +355,7 @@ def report(results: list[dict[str, Any]]) -> None:
         for result in survivors
     ]
     for result, why in sorted(told, key=lambda pair: pair[1] is None):
-        print(f"\nsurvived {result['of']} tests: {result['mutant']}\n{why or result['diff']}")
+        print(f"\nsurvived {result['tests']} of {result['of']} tests: {result['mutant']}\n{why or result['diff']}")
     seconds = sum(result["seconds"] for result in results) / max(1, len(results))
     number, listed = len(results) - len(survivors), sum(why is not None for _, why in told)
     print(f"\n{len(results)} mutants, {number / max(1, len(results)):.0%} killed, {seconds:.0f} s each")

@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, aec_env, branch, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl import (
+    RULE,
+    aec_env,
+    branch,
+    evaluate,
+    joint_env,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
 from simenv_marl.data import collect_episodes, compare_with_rule, record_dataset
 from simenv_marl.errors import CopyError, InvalidActionError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
@@ -195,6 +206,27 @@ def test_planners_decide_in_vector_environments():
         envs.step(np.array([1, 1]))
     assert [env.unwrapped.simulation.turn for env in envs.envs] == [3, 3]
     envs.close()
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_max_steps_ends_the_branch_of_an_agent_only_if_no_other_takes_steps(alone):
+    def to_the_end(twin, number):
+        taken = 1
+        while not any(over := twin.step(1)[2:4]):
+            taken += 1
+        return taken, over
+
+    def left(observation, info, *, _environment):
+        seen.append(branch(_environment, to_the_end, 1, method="replay")[0])
+        return 1
+
+    seen, named = [], points()
+    if alone:
+        named = {name: point for name, point in named.items() if "left" in str(name)}
+    evaluate(Duel, {"planner": {"left": left}}, points=named, seeds=[5], max_steps=4)
+    assert seen == (
+        [(taken, (False, True)) for taken in (4, 3, 2, 1)] if alone else [(6, (True, False)), (5, (True, False))]
+    )
 
 
 @pytest.mark.parametrize("many", [False, True])

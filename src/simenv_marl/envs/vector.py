@@ -88,7 +88,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         if workers:
             self._simulations = WorkerPool(SimulationBatch, batch.arguments, self.num_envs, workers, context)
             self._observations = create_empty_array(self.single_observation_space, self.num_envs)
-        self._finalizer = weakref.finalize(self, self._simulations.abandon)
+        weakref.finalize(self, self._simulations.abandon)
         self._guard = _Guard()
         self.closed = False
 
@@ -315,8 +315,6 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 self._simulations.close()
             finally:
                 self.closed = self._guard.closed = self._simulations.idle
-                if self.closed:
-                    self._finalizer.detach()
 
     def __del__(self) -> None:  # that of Gymnasium before 1.3 closes and raises; the finalizer warns
         """Leave the end to the finalizer."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -49,25 +50,24 @@ def replay(path: Any, simulation: Any, points: Any = None, *, episode: int = -1,
     if not -len(episodes) <= episode < len(episodes) or not episodes[episode][1]:
         raise OptionValueError(f"nothing was decided in episode {episode} of the {len(episodes)} of {path}")
     seed, decisions = episodes[episode]
-    env, actions = aec_env(simulation, points, **options), list[Any]()
-    env.reset(seed=seed)
+    actions = list[Any]()
     try:
-        for turn, line in enumerate(decisions):
-            while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
-                env.step(None)
-            agent = env.agent_selection if env.agents else ""
-            if agent != line["agent"] or digest_of(env.observe(agent)) != line["seen"]:
-                raise OptionValueError(
-                    f"{short_repr(simulation)} does not repeat {path}: decision {turn} was one of {line['agent']!r},"
-                    f" and is now one of {agent!r}, or with another observation"
-                )
-            action = line["action"]
-            actions.append(RULE if action is None else action_of(env.action_space(agent), action))
-            env.step(actions[-1])
+        with closing(aec_env(simulation, points, **options)) as env:
+            env.reset(seed=seed)
+            for turn, line in enumerate(decisions):
+                while env.agents and (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
+                    env.step(None)
+                agent = env.agent_selection if env.agents else ""
+                if agent != line["agent"] or digest_of(env.observe(agent)) != line["seen"]:
+                    raise OptionValueError(
+                        f"{short_repr(simulation)} does not repeat {path}: decision {turn} was one of"
+                        f" {line['agent']!r}, and is now one of {agent!r}, or with another observation"
+                    )
+                action = line["action"]
+                actions.append(RULE if action is None else action_of(env.action_space(agent), action))
+                env.step(actions[-1])
     except (InvalidActionError, ResetNeededError) as error:
         raise OptionValueError(f"{short_repr(simulation)} does not repeat {path}: {error}") from error
-    finally:
-        env.close()
 
     def policy(observations: Any, infos: Any, identities: Any) -> list[Any]:
         return [actions[turn] for _, turn in identities]

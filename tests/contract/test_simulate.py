@@ -1,6 +1,7 @@
 """Policies back in the model: ``simulate``."""
 
 import weakref
+from functools import partial
 
 import numpy as np
 import pytest
@@ -121,6 +122,13 @@ def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent,
     env.reset()
     env.step(1)
     assert env.simulation.log == [expected[1], 1]
+
+
+def test_runs_to_their_own_end_refuse_max_steps():
+    decide = decision()
+    for run in (simulate, partial(simulate_many, policies={}, seeds=[1])):
+        with pytest.raises(OptionValueError, match=r"max_steps has no effect .* evaluate"):
+            run(calling(decide), points=decide, max_steps=3)
 
 
 @pytest.mark.parametrize("action", [1, RULE])

@@ -127,6 +127,7 @@ SOUND = [
     (world(**MOVING), {}, {"horizon": 5.0, "horizon_by": "time"}),
     (world(**MOVING), {}, {"horizon": None}),
     (world(shared=True), {}, {"futures": 15}),  # too few to know
+    (world(turns=1, noise=0.0), {}, {}),  # the last decision, after which nothing is drawn
     (world(gain=1.0, reseed=None), {}, {"actions": [0], "method": "replay"}),
 ]
 DOUBTFUL = [

@@ -545,6 +545,7 @@ def test_inspection_shows_points_calls_and_the_end():
     assert "truncated" in seen.ended
     assert sum(seen.counts.values()) > 50
     assert any("removed_by" in point["uses"] for point in seen.points)
+    assert "Possible views: aec, parallel, single with agent=, joint with possible_agents=" in str(seen)
 
 
 class Broken(Walk):

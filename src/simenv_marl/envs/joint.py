@@ -45,7 +45,8 @@ class Joint:
         elif self._flatten:
             if not isinstance(action, np.ndarray) or action.shape != self.action_space.shape:
                 raise InvalidActionError(
-                    f"the joint action {short_repr(action)} is not in {short_repr(self.action_space)}"
+                    f"the joint action {short_repr(action)} is not in {short_repr(self.action_space)}; with"
+                    " flatten=True, it is a NumPy array"
                 )
             actions = {name: action[place] for name, place in self._places.items()}
         elif not isinstance(action, Mapping) or set(action) != set(self.roster):

@@ -33,7 +33,7 @@ def simulate(
         points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor ``policies``, there are
             no decision points and the plain model runs.
         seed: The seed for the simulation's ``reset``, where ``reset`` takes one. None: a seed is drawn.
-        **options: The options of ``aec_env``.
+        **options: The options of ``aec_env``, without ``max_steps``.
 
     Returns:
         The simulation, after its ``run``.
@@ -42,7 +42,7 @@ def simulate(
         SimEnvError: Something cannot work. The subclass tells what.
         BaseException: Any exception of the model, a mapping or a policy.
     """
-    plan = Plan(simulation, points, {**options, "policies": policies or {}}, unattended=True)
+    plan = _draw_up(simulation, policies or {}, points, options)
     with reuse_resources():  # policies may branch
         session = Session(plan)
         try:
@@ -112,14 +112,23 @@ def simulate_many(
     """
     checked, episodes = checked_seeds(seeds), (simulation, checked_policies(policies), points, options)
     check_options(batch_size, workers, collect, concurrency)
-    plan = _draw_up(*episodes)  # errors show up before any work starts
+    plan = _draw_up_keyed(*episodes)  # errors show up before any work starts
     arguments = episodes, None if workers else plan, collect, batch_size, concurrency
     with progress_bar(len(checked), progress) as bar:
         return list(chain.from_iterable(spread(_simulate, arguments, checked, workers, batch_size, bar)))
 
 
 def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
-    return Plan(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
+    if options.get("max_steps") is not None:
+        raise OptionValueError(
+            "max_steps has no effect where simulations run to their own end; evaluate, collect_episodes and"
+            " environments truncate episodes"
+        )
+    return Plan(simulation, points, {**options, "policies": policies}, unattended=True)
+
+
+def _draw_up_keyed(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
+    return _draw_up(simulation, policy_keys(policies), points, options)
 
 
 def _simulate(
@@ -138,7 +147,7 @@ def _simulate(
         results[place] = ended if collect is None else collect(ended)
         bar.update()
 
-    run(plan or _draw_up(*episodes), seeds, batch_size, finish, concurrency=concurrency)
+    run(plan or _draw_up_keyed(*episodes), seeds, batch_size, finish, concurrency=concurrency)
     return results
 
 

@@ -72,11 +72,13 @@ def warn_of_futures(name: str, outcomes: Sequence[list[Any]], returns: NDArray[n
 
     Args:
         name: The name of the simulation.
-        outcomes: For each plan, what was seen in its futures.
+        outcomes: For each plan, of each of its futures the rewards, what was seen at its end, and whether the episode
+            ended there. A plan with which the episode ends at once does not count, as little chance lies ahead.
         returns: As in ``ActionValues``.
     """
-    several = [seen for seen in outcomes if len(seen) >= _SEVERAL]
-    if several and all(seen.count(seen[0]) == len(seen) for seen in several):
+    several = [futures for futures in outcomes if len(futures) >= _SEVERAL]
+    several = [futures for futures in several if not all(over and len(rewards) == 1 for rewards, _, over in futures)]
+    if several and all(futures.count(futures[0]) == len(futures) for futures in several):
         _warn_once(
             name,
             "same futures",

@@ -96,8 +96,9 @@ If the model draws random numbers, reset() does not seed them. If it draws none,
         "same_rewards": """Rewards at {point} are always the same
 All random actions earned the same. Check the reward_mapping, unless only the length of the episode should count.""",
         "few_generators": """Entities that decide share random generators
-What one of them draws changes what all others draw afterwards, so that actions are hard to compare on the same seeds
-and futures. Give each a generator of its own: see Streams, and "One stream for each entity" (docs/branches.md).""",
+If one of them draws, the others draw something else afterwards, so that actions are hard to compare on the same seeds
+and futures. If several draw, give each a generator of its own: see Streams, and "One stream for each entity" in the
+documentation. If only the model draws, there is nothing to do.""",
         "never_legal": """Some actions at {point} were never legal
 Either there were too few episodes for them to be legal, or the action space is larger than necessary.""",
     },
@@ -207,7 +208,9 @@ class Inspection:
         episode = f"calls    {counts or 'none'}\norder    {self.calls or '-'}"
         parts = [f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}"]
         parts += ["\n  ".join(f"{key:<13} {text}" for key, text in point.items()) for point in self.points]
-        parts.append(f"Possible views: {', '.join(self.views)}")
+        options = {"single": "single with agent=", "joint": "joint with possible_agents="}
+        views = [*self.views, *(text for view, text in options.items() if view not in self.views)]
+        parts.append(f"Possible views: {', '.join(views)}")
         parts.append(f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}")
         return "\n\n".join(parts)
 

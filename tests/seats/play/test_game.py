@@ -4,6 +4,7 @@ import json
 import struct
 import zlib
 from base64 import b64decode
+from dataclasses import replace
 
 import pytest
 
@@ -11,7 +12,7 @@ from simenv_marl import RULE, aec_env, simulate
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
 from simenv_marl.seats.play.game import Game
-from tests.seats.play.worlds import BreakingShop, BrokenShop, FixedShop, MislabelledShop, Shop
+from tests.seats.play.worlds import ORDER, BreakingShop, BrokenShop, FixedShop, MislabelledShop, Shop
 
 
 @pytest.fixture
@@ -128,6 +129,18 @@ def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks):
     state = play(game, [0, 2, 1, 1, 0, 2])
     assert state["returns"]["buyer"] == as_by_hand([1, 3, 0, 2, 1, 1, 0, 2])[1]
     assert bool(game.checkpoints) == forks
+
+
+def test_a_seat_whose_agent_never_decides_is_told_at_the_end(make_game):
+    class Open(Shop):
+        """Its agents are known when they decide."""
+
+        points = {Shop.order: replace(ORDER, agent=lambda shop: "buyer")}  # noqa: RUF012
+
+    game = make_game(Open, seats=["buier"])
+    while not game.over:
+        settle(game)
+    assert game.notice == "No decision was one of buier; buyer decided."
 
 
 def test_the_end_can_be_undone(make_game):

@@ -76,6 +76,9 @@ class Game:
         kept = {key: row[key] for key in ("turn", "agent", "action", "by", "seen", "time")}
         self._arrive(self.turn + 1)
         end = {"end": self.over, "returns": self.returns()} if self.over else {}
+        absent = [seat for seat in self.given if seat not in self.latest]
+        if self.over and absent:
+            self.notice = f"No decision was one of {', '.join(absent)}; {', '.join(self.latest)} decided."
         self.notice = write(self.record, kept | end) or self.notice
 
     def jump(self, turn: int) -> None:

@@ -273,7 +273,8 @@ class Slow(Rendering):
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 def test_metadata_say_what_clients_ask_for(make):
-    assert make(Rendering, PUMP).metadata["render_fps"] == 4
+    metadata = make(Rendering, PUMP).metadata
+    assert (metadata["render_fps"], metadata["render_modes"]) == (4, ["ansi", "rgb_array"])
     metadata = make(Slow, PUMP, max_steps=3).metadata
     assert metadata["render_fps"] == 0.5
     assert metadata.get("is_parallelizable") == {aec_env: False, parallel_env: True}.get(make)

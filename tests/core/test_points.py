@@ -4,13 +4,18 @@ import gc
 import sys
 import weakref
 
-from simenv_marl.core import packing
+import numpy as np
+import pytest
+
+from simenv_marl import single_env
+from simenv_marl.core import agent, packing
 from simenv_marl.core.packing import pack, pack_plainly, unpack
 from simenv_marl.core.points import find_point, locate, portable
 from simenv_marl.decision import point_of, registered
+from simenv_marl.errors import RewardError
 from simenv_marl.hooks.hook import hook_of, unwrap
 from simenv_marl.plugins import handlers
-from tests.worlds.models import define
+from tests.worlds.models import calling, decision, define
 
 HERE = __name__
 
@@ -31,6 +36,25 @@ class Base:
 
 class Sub(Base):
     pass
+
+
+@pytest.mark.parametrize("others", [[], ["a difference that was made elsewhere"]])
+@pytest.mark.parametrize(
+    ("value", "told"), [(2, 2.0), (np.float32(0.5), 0.5), (float("nan"), RewardError), ("2", RewardError)]
+)
+def test_each_reward_is_checked(value, told, others, monkeypatch):
+    monkeypatch.setattr(agent, "DIFFERENCES", others)
+    rewards = iter([0.0, 0.0, value])
+    decide = decision(reward_mapping=lambda: next(rewards))
+    env = single_env(calling(decide, decide, decide), decide)
+    env.reset()
+    env.step(1)
+    if told is RewardError:
+        with pytest.raises(RewardError):
+            env.step(1)
+    else:
+        reward = env.step(1)[1]
+        assert (reward, type(reward)) == (told, float)
 
 
 def test_a_decorated_function_is_found_under_its_name_and_as_itself():

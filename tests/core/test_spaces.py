@@ -29,6 +29,7 @@ WORDS = spaces.Text(5)
         (DIAL, 6.0, np.int64(6)),
         (DIAL, np.array(7), np.int64(7)),
         (DIALS, [1, 5], np.array([1, 5], np.int64)),
+        (BYTES, np.array([0, 255]), np.array([0, 255], np.uint8)),
         (BITS, [True, False, True], np.array([1, 0, 1], np.int8)),
         (WORDS, "word", "word"),
     ],

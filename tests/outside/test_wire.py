@@ -274,6 +274,12 @@ def test_a_reseed_that_changes_nothing_is_noted(tmp_path):
     assert found(report)["reseed"] == "note"
 
 
+def test_the_run_without_an_environment_has_the_variables_of_this_process(tmp_path, monkeypatch):
+    monkeypatch.setenv("NEEDED", "3")
+    report = check_wire(changed(tmp_path, "import os; print(os.environ['NEEDED'], file=sys.stderr)"))
+    assert "KeyError" not in report.findings[-1].text
+
+
 def test_the_command_wire_check_reports_and_exits(capsys):
     assert main(["wire-check", "--seed", "3", "--", *command()]) == 0
     assert "nothing is wrong" in capsys.readouterr().out

@@ -1,5 +1,6 @@
 """What candidate actions are worth: the same as by a reference that goes through the model by itself."""
 
+import copy
 import os
 import random
 import time
@@ -304,7 +305,9 @@ def test_wrappers_of_single_views_take_part():
     assert action_values(limited, futures=3, terminal_value=lambda env: 1e6).returns == pytest.approx(table)
     wrapped = TransformReward(TransformAction(env, lambda action: 2 - action, spaces.Discrete(3)), lambda r: 10 * r)
     wrapped.reset(seed=5)
-    told = action_values(wrapped, futures=3, horizon=3)  # with RULE as base, which no wrapper is to meet
+    drawn = copy.deepcopy(wrapped.action_space.np_random)
+    told = action_values(wrapped, futures=3, horizon=3, method="replay")  # with RULE, which no wrapper is to meet
+    assert wrapped.action_space.np_random.random() == drawn.random()
     assert told.returns == pytest.approx(10 * table[::-1])
     assert told.best == 0
     told = action_values(wrapped, futures=3, horizon=3, base=lambda observation: 2)

@@ -1,5 +1,6 @@
 """A language model decides: over an endpoint that answers right, wrong, late, with garbage, or not at all."""
 
+import asyncio
 import json
 import sys
 
@@ -85,10 +86,13 @@ def test_a_wrong_answer_is_corrected_in_the_conversation():
     [{"object": "something else"}, OPEN],
     [2.0, OPEN],
 ], ids=["500", "503", "429", "HTML", "refusal", "nothing", "garbage", "late"])  # fmt: skip
-def test_what_may_pass_is_tried_again(answers):
+def test_what_may_pass_is_tried_again(answers, monkeypatch):
+    waited, sleep = [], asyncio.sleep
+    monkeypatch.setattr(asyncio, "sleep", lambda seconds: (waited.append(seconds), sleep(0))[1])
     with endpoint(answers) as (address, requests):
         assert played(model(address, timeout=1.0))[0] == played(lambda observation: 2)[0]
     assert len(requests) == 6
+    assert waited == [0.01]  # LONGEST_WAIT in these tests
 
 
 @pytest.mark.parametrize("answer", [fails(500), "<html>down</html>", says(None, refusal="no")])

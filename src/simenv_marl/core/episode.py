@@ -265,13 +265,13 @@ class Episode(Run):
 
     def single_out(self, agent: Agent) -> None:
         """In a branch, wait for one agent's decision alone. For all others answer their policies, else the rule."""
-        if list(self.agents.values()) != [agent]:
+        others = {name: other for name, other in self.agents.items() if other is not agent}
+        if others:
             self.most_steps = inf  # ``max_steps`` counts the steps of other agents
         self.plan = self.plan.for_one(agent.name)
-        for name, other in self.agents.items():
+        for name, other in others.items():
             other.policy, other.delegated = self.plan.policy_of(name, other.point), True
-        self.others |= self.agents
-        self.others.pop(agent.name)
+        self.others |= others
         self.agents, self.just_ended = {agent.name: agent}, []
         agent.policy, agent.delegated, agent.asked = None, False, True
         self.__class__ = Episode  # it is played in turns from now on

@@ -197,7 +197,7 @@ def pack_reply(value: bytes | None, error: bytes | None, state: State | None) ->
         kept = {key: part for key, part in fields["info"].items() if _can_be_pickled(part)}
         left_out |= {repr(key): None for key in fields["info"].keys() - kept.keys()}
         agents.append((name, point, (*(fields | {"info": kept}).values(),)))
-    return pickle.dumps((value, error, state._replace(agents=agents), list(left_out)), 5)
+    return pickle.dumps((value, error, state._replace(agents=agents), left_out), 5)
 
 
 def _can_be_pickled(value: Any) -> bool:

@@ -149,6 +149,7 @@ def test_the_end_can_be_undone(make_game):
     returns = game.returns()
     game.handle("buyer", {"do": "undo"})
     assert (game.turn, game.over, game.now["agent"]) == (14, "", "buyer")
+    assert settle(game)["seats"] == ["buyer"]
     game.handle("buyer", {"do": "redo"})
     assert (game.turn, game.over, game.returns()) == (16, "terminated", returns)
     game.handle("buyer", {"do": "undo"})

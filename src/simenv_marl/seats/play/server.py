@@ -79,7 +79,7 @@ class Table:
         self.latest: dict[str, str] = {}  # by type of message, for those who come
         self.seats: set[str] = set()
         self.inbox: asyncio.Queue[Any] = asyncio.Queue()  # of the game; each link has few messages in it
-        self.taken: list[str] | None = None  # seats of which the game is to be told
+        self.taken: Counter[str] | None = None  # seats of which the game is to be told
         self._show(state)
 
     def key(self, seat: str) -> str:
@@ -138,7 +138,7 @@ class Table:
         self._send_all(json.dumps({"type": "people", "spectators": taken.pop("", 0), "taken": taken}), "people")
         if self.taken is None:
             self.inbox.put_nowait(None)
-        self.taken = list(taken)
+        self.taken = taken
 
     def _show(self, message: dict[str, Any]) -> None:
         for seat in message.get("seats", ()):

@@ -298,6 +298,14 @@ class Doubled(BaseParallelWrapper):
         return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
 
 
+def test_samples_that_wrappers_get_for_the_rule_are_not_drawn_from_the_environment():
+    space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(3)})
+    env = begun(TransformAction(made("joint"), lambda action: action, space))
+    drawn = copy.deepcopy(env.action_space["right"].np_random)
+    action_values(env, [{"left": 0, "right": RULE}], futures=1, horizon=1)
+    assert env.action_space["right"].np_random.random() == drawn.random()
+
+
 def test_wrappers_of_single_views_take_part():
     env = made("single")
     table = expected(env, "left", horizon=3)
@@ -305,9 +313,7 @@ def test_wrappers_of_single_views_take_part():
     assert action_values(limited, futures=3, terminal_value=lambda env: 1e6).returns == pytest.approx(table)
     wrapped = TransformReward(TransformAction(env, lambda action: 2 - action, spaces.Discrete(3)), lambda r: 10 * r)
     wrapped.reset(seed=5)
-    drawn = copy.deepcopy(wrapped.action_space.np_random)
-    told = action_values(wrapped, futures=3, horizon=3, method="replay")  # with RULE, which no wrapper is to meet
-    assert wrapped.action_space.np_random.random() == drawn.random()
+    told = action_values(wrapped, futures=3, horizon=3)  # with RULE as base, which no wrapper is to meet
     assert told.returns == pytest.approx(10 * table[::-1])
     assert told.best == 0
     told = action_values(wrapped, futures=3, horizon=3, base=lambda observation: 2)

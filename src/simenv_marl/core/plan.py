@@ -132,7 +132,7 @@ class Plan:
         kind = inspected if isinstance(inspected, type) else type(inspected)
         self._ends_agents = issubclass(kind, SimulationInterface)
         modes = getattr(inspected, "render_modes", ("ansi", "human", "rgb_array"))
-        self.render_modes = list(modes) if hasattr(inspected, "render") else []
+        self.render_modes = modes if hasattr(inspected, "render") else []
         self.render_fps = getattr(inspected, "render_fps", 4)
         self._own = own_points(inspected)
         if points is None:

@@ -562,6 +562,20 @@ def test_a_value_sent_before_the_first_item_is_not_passed_on():
     assert generator.send(5) == 0
 
 
+def test_an_error_of_a_handler_closes_the_generator_although_the_error_is_kept():
+    def ticking():
+        try:
+            yield from range(3)
+        finally:
+            closed.append(True)
+
+    closed, ticks = [], expose_to_plugins(ticking)
+    with handlers((failing, ticks, "after_next")), pytest.raises(ZeroDivisionError) as caught:
+        next(ticks())
+    assert caught.value.__traceback__
+    assert closed == [True]
+
+
 @EVERYWHERE
 def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited(with_handlers):
     name, log = f"{MARKET}.Trader.wire", []

@@ -70,10 +70,8 @@ class ThreadDriver(Driver):
         """Resume the simulation with a reply; return its next event."""
         self._replies.put(reply if self._job is None else _JOB)
         while True:
-            try:
+            with suppress(Empty):
                 return self._arrived.get(True, _LONGEST_WAIT)
-            except Empty:
-                continue
 
     def throw(self) -> Event | None:
         """Raise ``SimulationExit`` in the simulation, at its next decision if it still runs; return its next event."""

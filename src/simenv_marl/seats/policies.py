@@ -196,11 +196,8 @@ class RecordedPolicy(PolicyWrapper):
         return answer
 
     def _write(self, line: bytes) -> None:
-        file = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-        try:
-            os.write(file, line)  # as a whole, so that processes can share the file
-        finally:
-            os.close(file)
+        with open(self.path, "ab", buffering=0) as file:
+            file.write(line)  # as a whole, so that processes can share the file
 
 
 def _in_form(space: spaces.Space[Any], action: Any) -> Any:

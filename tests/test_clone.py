@@ -21,7 +21,14 @@ from pettingzoo.test import api_test, parallel_api_test
 
 from simenv_marl import aec_env, branch, clone, parallel_env, single_env
 from simenv_marl.core.forks import Fork
-from simenv_marl.errors import BranchError, InvalidActionError, OptionValueError, ReentrancyError, WrongThreadError
+from simenv_marl.errors import (
+    BranchError,
+    EpisodeOverError,
+    InvalidActionError,
+    OptionValueError,
+    ReentrancyError,
+    WrongThreadError,
+)
 from tests.contract.test_conformance import SHAPES, made
 from tests.core.test_global_rng import world
 from tests.processes import ROOT, alone, descriptors, runs
@@ -165,6 +172,14 @@ def test_errors_surface_as_themselves(view, method):
     assert method == "replay" or "in <lambda>\n" in notes(caught.value)
     twin.reset(seed=3)
     assert twin.unwrapped.call(outcome) == before
+
+
+def test_a_clone_whose_episode_is_over_says_so():
+    twin = clone(trip("single"), method="fork")
+    while not twin.step(twin.action_space.sample())[2]:
+        pass
+    with pytest.raises(EpisodeOverError):
+        twin.unwrapped.step(0)
 
 
 def test_infos_lose_what_cannot_be_pickled():

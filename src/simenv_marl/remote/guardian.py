@@ -47,9 +47,10 @@ def release(group: int) -> None:
     """Leave a process group alone, because it has ended. After the last one, the shell ends."""
     global _shell
     with _lock:
-        if _shell is None or group not in _groups:
+        if group not in _groups:
             return
-        _groups.discard(group)
+        assert _shell is not None  # as long as there are groups
+        _groups.remove(group)
         if _groups:
             _tell(_shell, f"- {group}\n")
         else:

@@ -1,6 +1,7 @@
 """Many simulations at once: ``simulate_many``, in this process."""
 
 import gc
+import inspect
 import sys
 import weakref
 from typing import ClassVar
@@ -11,7 +12,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import RULE, simulate, simulate_many
+from simenv_marl import RULE, evaluate, simulate, simulate_many
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import (
     InvalidActionError,
@@ -20,6 +21,7 @@ from simenv_marl.errors import (
     UnknownOptionError,
     UnknownPointError,
 )
+from simenv_marl.experiments import run_experiment
 from tests.worlds import worlds
 from tests.worlds.counters import same
 from tests.worlds.models import calling, decision, define, notes, plainly, script, stacks
@@ -415,3 +417,13 @@ def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch
 
     assert (crowd(0.0), crowd(1.0, batch_size=6), crowd(1.0, batch_size=3)) == (4, 6, 3)
     assert crowd(1.0) > 8
+
+
+def test_functions_that_run_many_simulations_have_the_same_defaults():
+    expected = {"batch_size": 1024, "concurrency": 64, "workers": 0, "progress": False}
+    for function in (simulate_many, collect_episodes, evaluate, run_experiment):
+        parameters = inspect.signature(function).parameters
+        assert {name: parameters[name].default for name in expected if name in parameters} == {
+            name: default for name, default in expected.items() if name in parameters
+        }
+        assert {"workers", "concurrency"} <= parameters.keys()

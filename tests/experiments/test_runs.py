@@ -589,8 +589,9 @@ HUGE = 10**5000
 
 def test_integers_of_too_many_digits_are_errors_of_their_run(tmp_path):
     given = {"seeds": [1], "points": POINTS, "metric": lambda shop: HUGE}
-    with pytest.raises(OptionValueError, match="'metric' must be a number of no more than 4,200 digits"):
-        evaluate(Shop, {"rule": {}}, **given)
+    for huge in (HUGE, 2**13_999):
+        with pytest.raises(OptionValueError, match="'metric' must be a number of no more than 4,200 digits"):
+            evaluate(Shop, {"rule": {}}, **given | {"metric": lambda shop, huge=huge: huge})
     frame = run_experiment(Shop, {"days": [1]}, store=tmp_path, **given)
     assert frame["error"].str.contains("4,200 digits").all()
     policy = partial(lambda observation, number: 5, number=HUGE)

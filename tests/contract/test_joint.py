@@ -177,7 +177,7 @@ def test_the_dead_are_observed_as_they_ended_and_neither_act_nor_are_paid():
 @pytest.mark.parametrize("make", [joint_env, partial(vector_env, num_envs=2)], ids=["one", "vector"])
 def test_a_roster_that_is_not_known_is_refused(make):
     for program in ("0 whole 1", PACK):
-        with pytest.raises(ViewError, match=r"known when the environment is made.*possible_agents=.*expected_calls"):
+        with pytest.raises(ViewError, match=r"known when .* those of tests\S+act; .*possible_agents=.*expected_calls"):
             make(life(program), beings())
     with pytest.raises(NoDecisionError, match="without a decision"):
         joint_env(life("0 whole 1", announced=[]), beings())

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import pickle
 import sys
 
 import pytest
@@ -164,6 +165,12 @@ def test_many_simulations_are_decided_at_once():
         )
     assert found == [tuple(played(lambda observation: 2, seed)) for seed in range(6)]
     assert len(requests) == 30
+
+
+def test_a_policy_that_is_sent_to_another_process_decides_there():
+    with endpoint([OPEN]) as (address, _):
+        policy = model(address)
+        assert played(policy) == played(pickle.loads(pickle.dumps(policy)))
 
 
 def test_a_client_of_the_user_and_own_words_are_taken():

@@ -323,7 +323,7 @@ def test_pictures_show_each_seed_and_can_be_read():
     values, differences = drawn(CONTENDERS, SEEDS, baseline="rule").plot("metric").axes
     assert sum(len(line.get_xdata()) == 2 for line in values.lines) == len(SEEDS)
     assert len(differences.collections[0].get_offsets()) == len(SEEDS)
-    assert values.get_axisbelow()
+    assert values.get_axisbelow() is True  # the grid
     figure = drawn({f"the contender of number {number}": {} for number in range(20)}, [1]).plot()
     assert figure.get_figwidth() <= 14
     assert {label.get_rotation() for label in figure.axes[0].get_xticklabels()} == {30}

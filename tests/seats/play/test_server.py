@@ -265,6 +265,7 @@ def test_the_end_of_the_game_ends_the_server():
         ([SHOP, "--host", "192.0.2.1"], "192.0.2.1"),
         (["tests.seats.play.worlds:Shopp"], "did you mean"),
         (["tests.seats.play.worlds:BrokenShop"], "the door is locked"),
+        (["tests.seats.play.worlds:LeavingShop"], "has ended, with exit code 3"),
     ],
 )
 def test_what_cannot_be_played_is_told(arguments, told, capsys):

@@ -1,5 +1,6 @@
 """Simulations that people play in these tests."""
 
+import os
 import random
 from dataclasses import replace
 
@@ -88,6 +89,13 @@ class BrokenShop(Shop):
 
     def reset(self, seed=None):
         raise OSError("the door is locked")
+
+
+class LeavingShop(Shop):
+    """It ends its process."""
+
+    def reset(self, seed=None):
+        os._exit(3)
 
 
 class BreakingShop(Shop):

@@ -169,6 +169,7 @@ def test_errors_surface_as_themselves(view, method):
     with pytest.raises(ZeroDivisionError) as caught:
         [move(twin) for _ in range(10)]
     assert "seed 3" in notes(caught.value)
+    assert caught.value.__cause__ is None
     assert method == "replay" or "in <lambda>\n" in notes(caught.value)
     twin.reset(seed=3)
     assert twin.unwrapped.call(outcome) == before
@@ -347,6 +348,21 @@ def test_a_clone_that_dies_says_so_and_others_go_on():
         late.call(lambda env: time.sleep(600))
     assert ended(number)
     assert future(other) == future(env)
+
+
+def test_the_number_of_a_clones_clone_that_has_ended_is_not_killed(monkeypatch):
+    """The system may have given the number to another process."""
+    twin = clone(trip(), method="fork")
+    deeper = clone(twin, method="fork")
+    number, killed = number_of(deeper), []
+    os.kill(number, signal.SIGKILL)
+    assert ended(number)
+    monkeypatch.setattr(os, "kill", lambda *given: killed.append(given[0]))
+    with pytest.raises(BranchError):
+        deeper.step(None)
+    monkeypatch.undo()
+    assert number not in killed
+    twin.close()
 
 
 def test_threads_use_a_clone_one_at_a_time(tmp_path):

@@ -7,10 +7,12 @@ from base64 import b64decode
 from dataclasses import replace
 
 import pytest
+from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, simulate
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
+from simenv_marl.seats.play.forms import action_of
 from simenv_marl.seats.play.game import Game
 from tests.seats.play.worlds import ORDER, BreakingShop, BrokenShop, FixedShop, MislabelledShop, Shop
 
@@ -229,6 +231,14 @@ def test_without_reseed_there_is_one_future_and_a_note(make_game):
     assert "reseed" in fan["note"]
     play(game, [2] * 8)
     assert game.returns()["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
+
+
+def test_actions_of_all_spaces_have_a_form_in_json():
+    pair = spaces.Tuple([spaces.Discrete(3), spaces.MultiDiscrete([2, 2])])
+    space = spaces.Dict({"amount": spaces.Discrete(4), "pair": pair})
+    action = action_of(space, {"amount": 2, "pair": [1, [0, 1]]})
+    assert action in space
+    assert action_of(pair, [1]) == [1]  # which the environment refuses
 
 
 def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_game):

@@ -53,7 +53,7 @@ def made(model, **options):
 
 @pytest.fixture(autouse=True)
 def nothing_was_warned_of(monkeypatch):
-    monkeypatch.setattr(values, "_WARNED", set())
+    monkeypatch.setattr(values, "_SETTLED", set())
 
 
 def share_of_rule(kind, model, margin, decisions):
@@ -117,7 +117,24 @@ def test_returns_correlate_as_far_as_candidates_share_chance():
     assert correlation(world(), futures=3) == pytest.approx(1.0)
     assert np.isnan([correlation(world(), futures=2), correlation(world(), actions=[1])]).all()
     with pytest.warns(UserWarning, match="are the same"):
-        assert np.isnan(correlation(world(noise=0.0)))
+        assert np.isnan(correlation(type("Quiet", (World,), {"noise": 0.0})))
+
+
+class Fading(World):
+    """Draws nothing after its first turn."""
+
+    turns = 2
+
+    @property
+    def noise(self):
+        return float(not self.paid)
+
+
+def test_futures_that_are_the_same_later_are_not_warned_of():
+    env = made(Fading)
+    for _ in range(2):
+        action_values(env, futures=16, horizon=1)
+        env.step(0)
 
 
 OWN = {"reseed": lambda world, seed: world.other.seed(seed)}
@@ -127,7 +144,6 @@ SOUND = [
     (world(**MOVING), {}, {"horizon": 5.0, "horizon_by": "time"}),
     (world(**MOVING), {}, {"horizon": None}),
     (world(shared=True), {}, {"futures": 15}),  # too few to know
-    (world(turns=1, noise=0.0), {}, {}),  # the last decision, after which nothing is drawn
     (world(gain=1.0, reseed=None), {}, {"actions": [0], "method": "replay"}),
 ]
 DOUBTFUL = [

@@ -311,14 +311,12 @@ class Outcome(NamedTuple):
         seen: A digest of what the agent saw at its end.
         times: The simulation's times between decisions.
         seconds: The real seconds for each decision.
-        over: Whether the agent's episode has ended.
     """
 
     rewards: list[float]
     seen: int
     times: list[float]
     seconds: float
-    over: bool
 
 
 def try_out(env: Any, number: int, tries: Sequence[tuple[list[Any], int]], policy: Any) -> Outcome:
@@ -344,8 +342,7 @@ def rollout_from(
         made.seen, made.over = player.seen, player.over
         made.seconds += perf_counter() - began
         digest = _digest((player.record.observation, player.record.info))
-        seconds = made.seconds / max(1, len(made.rewards))
-        return made, Outcome(made.rewards, digest, made.times, seconds, made.over)
+        return made, Outcome(made.rewards, digest, made.times, made.seconds / max(1, len(made.rewards)))
     except BaseException as error:
         tried = ", ".join(map(short_repr, actions))
         annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")

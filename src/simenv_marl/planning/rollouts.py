@@ -162,7 +162,7 @@ class Rollouts:
         outcomes = self._outcomes_of(rollouts)
         for (plan, _), outcome in zip(rollouts, outcomes, strict=True):
             self.returns[plan[0]].append(sum(outcome.rewards))
-            self.outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen, outcome.over))
+            self.outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen))
             self._times.append(outcome.times)
             self.seconds = max(self.seconds, outcome.seconds)
         return [outcome.rewards for outcome in outcomes]

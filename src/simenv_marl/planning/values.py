@@ -24,8 +24,8 @@ _UNRELATED: Final = (-0.5, 0.1)
 _VARIATION: Final = 0.1
 """The coefficient of variation of times above which the user is warned."""
 
-_WARNED: Final[set[tuple[str, str]]] = set()
-"""The simulations of which the user was warned, and of what."""
+_SETTLED: Final[set[tuple[str, str]]] = set()
+"""The simulations of which the user was warned, or need not be, and of what."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +72,13 @@ def warn_of_futures(name: str, outcomes: Sequence[list[Any]], returns: NDArray[n
 
     Args:
         name: The name of the simulation.
-        outcomes: For each plan, of each of its futures the rewards, what was seen at its end, and whether the episode
-            ended there. A plan with which the episode ends at once does not count, as little chance lies ahead.
+        outcomes: For each plan, what was seen in its futures.
         returns: As in ``ActionValues``.
     """
-    several = [futures for futures in outcomes if len(futures) >= _SEVERAL]
-    several = [futures for futures in several if not all(over and len(rewards) == 1 for rewards, _, over in futures)]
-    if several and all(futures.count(futures[0]) == len(futures) for futures in several):
+    several = [seen for seen in outcomes if len(seen) >= _SEVERAL]
+    if any(seen.count(seen[0]) != len(seen) for seen in several):
+        _SETTLED.add((name, "same futures"))  # it draws; by chance, or near the end, futures can be the same later
+    elif several:
         _warn_once(
             name,
             "same futures",
@@ -120,6 +120,6 @@ def warn_of_times(name: str, rollouts: Sequence[list[float]]) -> None:
 
 def _warn_once(name: str, kind: str, message: str) -> None:
     """Warn of a simulation, once for each kind of warning."""
-    if (name, kind) not in _WARNED:
-        _WARNED.add((name, kind))
+    if (name, kind) not in _SETTLED:
+        _SETTLED.add((name, kind))
         warn_user(message)

@@ -45,8 +45,6 @@ from .mutants_draw import Mutant, candidates
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path("src/simenv_marl")
 LEFT_OUT = ("testing/", "data/plots.py", "data/timeline.py")
-FILES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "Makefile", "pyproject.toml")
-COPIED = ("src", "tests", "tools", "examples", "studies", "benchmarks", "clients", "docs", *FILES)
 TEST_LIMIT = 20.0
 """The time limit of a test in seconds, in addition to ten times its normal duration."""
 FIRST = 6
@@ -173,14 +171,13 @@ def draw(number: int, seed: int, only: str) -> list[Mutant]:
 
 
 def copied(folder: Path) -> Path:
-    """Copy everything that the tests need to a folder."""
-    for name in COPIED:
-        source = ROOT / name
-        if source.is_dir():
-            ignored = shutil.ignore_patterns("__pycache__", "_build", "out")
-            shutil.copytree(source, folder / name, ignore=ignored)
-        elif source.exists():
-            shutil.copy(source, folder / name)
+    """Copy all files of the repository to a folder, but for those that Git ignores."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0")
+    for name in names:
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / name)
     return folder
 
 

@@ -45,21 +45,27 @@ def observed(env: Any, policy: Any, seed: int) -> np.ndarray:
     return np.array(flat)
 
 
+def over_time(curves: dict[str, np.ndarray], step: float, xlabel: str, ylabel: str, target: float) -> Any:
+    """Draw curves over time, and the value that is best."""
+    figure, axes = plt.subplots(figsize=(6.4, 4.8))
+    for label, values in curves.items():
+        axes.plot(step * np.arange(len(values)), values, label=label)
+    axes.axhline(target, color="grey", linestyle=":")
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.legend()
+    return figure
+
+
 def room() -> Any:
     """Draw the temperature of the room by its thermostat, and by the trained heater."""
     from examples.heated_room.env import COMFORT, RoomSim
     from examples.heated_room.train import HELD_OUT, learn
 
-    figure, axes = plt.subplots(figsize=(6.4, 4.8))
-    for label, policy in {"thermostat": lambda _: RULE, "trained": learn(25)}.items():
-        env = single_env(RoomSim)
-        column = list(env.observation_space).index("temperature")
-        temperatures = observed(env, policy, HELD_OUT)[:, column]
-        axes.plot(np.arange(len(temperatures)) / 4, temperatures, label=label)
-    axes.axhline(COMFORT, color="grey", linestyle=":")
-    axes.set(xlabel="hours", ylabel="temperature of the room, °C")
-    axes.legend()
-    return figure
+    env = single_env(RoomSim)
+    column = list(env.observation_space).index("temperature")
+    policies = {"thermostat": lambda _: RULE, "trained": learn(25)}
+    temperatures = {label: observed(env, policy, HELD_OUT)[:, column] for label, policy in policies.items()}
+    return over_time(temperatures, 1 / 4, "hours", "temperature of the room, °C", COMFORT)
 
 
 def follower() -> Any:
@@ -69,14 +75,9 @@ def follower() -> Any:
     def slower(observation: np.ndarray) -> list[float]:
         return [min(1.0, max(0.0, 0.5 * observation[0])), float(np.clip(observation[1], -1, 1))]
 
-    figure, axes = plt.subplots(figsize=(6.4, 4.8))
-    for label, policy in {"rule": lambda _: RULE, "another policy": slower}.items():
-        distances = np.hypot(*observed(ros.env(), policy, 7).T)
-        axes.plot(np.arange(len(distances)) / 10, distances, label=label)
-    axes.axhline(1.0, color="grey", linestyle=":")
-    axes.set(xlabel="seconds", ylabel="distance to the leader, m")
-    axes.legend()
-    return figure
+    policies = {"rule": lambda _: RULE, "another policy": slower}
+    distances = {label: np.hypot(*observed(ros.env(), policy, 7).T) for label, policy in policies.items()}
+    return over_time(distances, 1 / 10, "seconds", "distance to the leader, m", 1.0)
 
 
 def robots() -> Any:

@@ -113,13 +113,14 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2, help="number of parallel jobs (2)")
     parser.add_argument("--out", type=Path, default=ROOT / ".mutants", help="folder for the results")
     parser.add_argument("--only", default="", metavar="PATH", help="only modules whose path begins with PATH")
+    parser.add_argument("--kind", default="", help="only mistakes of this kind, such as copy or clean-up")
     parser.add_argument("--most", type=float, default=math.inf, help="seconds of tests for each mutant (all tests)")
     parser.add_argument("--again", action="store_true", help="retry the survivors")
     parser.add_argument("--report", action="store_true", help="only show the results so far")
     given = parser.parse_args()
     given.out.mkdir(exist_ok=True)
     results = given.out / f"seed-{given.seed}.jsonl"
-    drawn = draw(given.number, given.seed, given.only)
+    drawn = draw(given.number, given.seed, given.only, given.kind)
     done = {result["mutant"]: result for result in read(results)}
     if given.again:
         done = {name: result for name, result in done.items() if result["outcome"] != "survived"}
@@ -144,9 +145,10 @@ def modules() -> list[str]:
     return [path for path in paths if not path.startswith(LEFT_OUT)]
 
 
-def draw(number: int, seed: int, only: str) -> list[Mutant]:
+def draw(number: int, seed: int, only: str = "", kind: str = "") -> list[Mutant]:
     """Draw mutants: from each module in proportion to its candidates, at least one, and evenly from all kinds."""
     found = {path: candidates(path, (ROOT / PACKAGE / path).read_text(encoding="utf-8")) for path in modules()}
+    found = {path: [mutant for mutant in mutants if kind in ("", mutant.kind)] for path, mutants in found.items()}
     found = {path: mutants for path, mutants in found.items() if mutants and path.startswith(only)}
     total = sum(map(len, found.values()))
     exact = {path: number * len(mutants) / total for path, mutants in found.items()}

@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix pension check test test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-studies test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -19,12 +19,18 @@ matrix: .venv/.matrix
 
 # These fork all the time, and a fork takes four times as long in a process in which all the other tests run.
 FORKING := tests/planning tests/seats tests/test_branch.py tests/test_clone.py docs/branches.md docs/seats.md docs/reference/planning.md
+# What test-studies runs, and what test-outside runs because it needs more than a compiler.
+ELSEWHERE := tests/studies $(addprefix tests/outside/test_,$(addsuffix .py,energyplus enki fmi ros))
 test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random $(FORKING)
-	$(BIN)/python -m pytest -n 2 --order random $(addprefix --ignore=,$(FORKING))
+	$(BIN)/python -m pytest -n 2 --order random $(addprefix --ignore=,$(FORKING) $(ELSEWHERE))
+
+# One quick run of each study, from its command line to its figures.
+test-studies: .venv/.test
+	$(BIN)/python -m pytest -n 2 tests/studies
 
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
-test-all: test test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside
+test-all: test test-studies test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside
 
 # The quickest of them, for each commit: about a minute on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \

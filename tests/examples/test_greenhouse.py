@@ -132,7 +132,7 @@ def test_trains_end_to_end(tmp_path, capsys):
 
 
 def test_training_is_worth_it():
-    generations, seeds = 8, range(train.HELD_OUT, train.HELD_OUT + 8)
+    generations, seeds = 3, range(train.HELD_OUT, train.HELD_OUT + 8)
     pair = {"waterer_0": train.Constant(0.084), "ventilator_0": train.Constant(1.0)}  # what searching finds
     trained = train.learn(train.rate, pair, generations, np.random.default_rng(0))
     rule, constant, learnt = train.rate([{}, pair, trained], seeds)

@@ -2,7 +2,7 @@
 
 Run it with ``python -m tools.mutants``, or ``make mutants``. It writes each result to a file at once, one JSON object
 per line. A second call resumes where the first stopped; with ``--again`` it retries the survivors, for example after
-tests were added. It draws mutants from all modules except ``testing`` and the plots of ``data``.
+tests were added. It draws mutants from all modules except ``testing`` and those that draw plots.
 
 Before the first mutant, it runs all tests once and measures which tests execute which lines, and their durations. Only
 tests that execute a mutant's function run for it: first those that execute its line, some quick ones of each file
@@ -44,7 +44,7 @@ from .mutants_draw import Mutant, candidates
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path("src/simenv_marl")
-LEFT_OUT = ("testing/", "data/plots.py", "data/timeline.py")
+LEFT_OUT = ("testing/", "data/plots.py", "data/timeline.py", "experiments/plots.py")
 TEST_LIMIT = 20.0
 """The time limit of a test in seconds, in addition to ten times its normal duration."""
 FIRST = 6

@@ -2,16 +2,17 @@
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from math import ceil, nan
+from math import nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.plots import COLOURS, interval, is_proportion, style
+from ..data.plots import interval, is_proportion
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
-from .evaluation import check_metric, check_probability, label_below, numbers
+from .evaluation import check_metric, check_probability, numbers
+from .plots import plot_factors
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -56,50 +57,7 @@ class Effects:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        factors = self.levels
-        pairs = [pair for pair, strength in self.interactions["strength"].items() if strength > 0][:4]
-        columns = min(max(len(factors), len(pairs)), 5)  # more would be too small to read
-        above = ceil(len(factors) / columns)
-        with style("plot") as new_figure:
-            if figure is None:
-                figure = new_figure(max(3.2, 2.3 * columns), 2.8 * (above + bool(pairs)))
-            rows = figure.subplots(above + bool(pairs), columns, squeeze=False)
-            main = rows[:above].ravel()
-            for axes, factor in zip(main, factors, strict=False):
-                if axes is not main[0]:
-                    axes.sharey(main[0])
-                own = self.main.loc[factor]
-                bars = [(own["mean"] - own["low"]).clip(lower=0), (own["high"] - own["mean"]).clip(lower=0)]
-                axes.errorbar(
-                    range(len(own)), own["mean"], yerr=bars, fmt="o-", color=COLOURS[0], linewidth=1, markersize=4
-                )
-                _label_levels(axes, self.levels[factor], factor)
-            for axes in rows[:above, 0]:
-                axes.set_ylabel(f"{self.metric}, mean")
-            for axes, (one, other) in zip(rows[-1], pairs, strict=False):
-                table = self.cells(one, other)
-                for place, level in enumerate(self.levels[other]):
-                    colour = COLOURS[place % len(COLOURS)]
-                    axes.plot(
-                        range(len(table)), table.iloc[:, place], "o-", color=colour, markersize=4, label=_short(level)
-                    )
-                _label_levels(axes, self.levels[one], one)
-                axes.legend(title=other, fontsize=7, title_fontsize=8, frameon=True, framealpha=0.8, edgecolor="none")
-            for axes in [*main[len(factors) :], *(rows[-1][len(pairs) :] if pairs else ())]:
-                axes.set_visible(False)
-        return figure
-
-
-def _label_levels(axes: Any, levels: list[Any], factor: str) -> None:
-    axes.set_xlim(-0.4, len(levels) - 0.6)
-    axes.set_xlabel(factor)
-    label_below(axes, [_short(level) for level in levels])
-
-
-def _short(level: Any) -> str:
-    if hasattr(level, "left"):
-        return f"{level.left:.3g} to {level.right:.3g}"
-    return f"{level:.4g}" if isinstance(level, float) else str(level)
+        return plot_factors(self.main, self.interactions, self._cells, self.levels, self.metric, figure)
 
 
 def effects(

@@ -17,9 +17,10 @@ from ..core.options import EpisodeOptions
 from ..core.packing import pack
 from ..core.plan import Plan
 from ..core.points import Points
-from ..data.plots import ABSENT, COLOURS, INK, PALE, interval, is_proportion, style
+from ..data.plots import interval, is_proportion
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
+from .plots import plot_contenders
 from .runner import (
     FALLBACKS,
     RUN_COLUMNS,
@@ -45,9 +46,6 @@ MOST_SEEDS: Final = 10_000_000
 
 FALLBACK_LIMIT: Final = 0.05
 """A contender with a larger share of decisions by fallbacks is marked."""
-
-LINES: Final = 200
-"""The largest number of seeds that are drawn as lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,33 +163,10 @@ class Evaluation:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        values, summary, baseline = numbers(self.values(metric), metric), self.summary(metric), self.baseline
-        names = list(values.columns)
-        others = [] if baseline is None else [name for name in names if name != baseline]
-        sizes = [len(names), len(others)] if others else [len(names)]
-        with style("plot") as new_figure:
-            if figure is None:
-                figure = new_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, 14.0), 4.2)
-            axes = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)[0]
-            for row in values.to_numpy()[:LINES]:
-                axes[0].plot(range(len(names)), row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
-            _draw_dots(axes[0], values, names, summary[["mean", "low", "high"]], 0.0)
-            shares = summary[FALLBACKS] if FALLBACKS in summary else dict.fromkeys(names, 0.0)
-            marks = [f"\n{shares[name]:.0%} fallbacks" if shares[name] > FALLBACK_LIMIT else "" for name in names]
-            label_below(axes[0], [name + mark for name, mark in zip(names, marks, strict=True)])
-            axes[0].set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
-            each = "each a line" if len(values) <= LINES else f"lines for {LINES} of them"
-            each = "each a dot" if len(names) == 1 else each
-            axes[0].set_title(f"{len(values)} seeds, {each}" if len(values) > 1 else "1 seed")
-            if others:
-                axes[1].axhline(0.0, color=INK, linewidth=0.8, zorder=1)
-                differences = values.sub(values[baseline], axis=0)[others]
-                bounds = summary.loc[others, ["difference", "difference_low", "difference_high"]]
-                _draw_dots(axes[1], differences, names, bounds, 0.24)
-                label_below(axes[1], others)
-                axes[1].set_ylabel(f"difference from {baseline}, same seed")
-                axes[1].set_title("differences")
-        return figure
+        values, summary = numbers(self.values(metric), metric), self.summary(metric)
+        shares = summary[FALLBACKS] if FALLBACKS in summary else dict.fromkeys(values.columns, 0.0)
+        marks = [f"\n{shares[name]:.0%} fallbacks" if shares[name] > FALLBACK_LIMIT else "" for name in values.columns]
+        return plot_contenders(values, summary, metric, self.baseline, marks, figure)
 
     def _fallback_shares(self) -> dict[str, float]:
         """Return the share of decisions that a fallback answered, by contender; empty if they are not counted."""
@@ -212,33 +187,6 @@ class Evaluation:
         """Return the width of the widest interval of a difference or, without a baseline, of a mean; nan if unknown."""
         summary, prefix = self.summary(), "" if self.baseline is None else "difference_"
         return float((summary[f"{prefix}high"] - summary[f"{prefix}low"]).max(skipna=False))
-
-
-def _draw_dots(axes: Any, values: "DataFrame", names: list[str], marks: "DataFrame", spread: float) -> None:
-    """Draw a column of dots for each contender, one for each seed, and the mean with its interval from ``marks``.
-
-    The dots are at most ``spread`` from the middle of their column. All ``names`` together determine the colours.
-    """
-    for place, name in enumerate(values.columns):
-        across = place + spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)  # even, in irregular order
-        colour = COLOURS[names.index(name) % len(COLOURS)]
-        axes.scatter(across, values[name], 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
-        mean, low, high = marks.loc[name]
-        bars = None if np.isnan(low) else [[max(0.0, mean - low)], [max(0.0, high - mean)]]
-        axes.errorbar([place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5)
-        axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), textcoords="offset points", va="center", fontsize=8.5)
-    axes.set_xlim(-0.5, len(values.columns) - 0.5)
-
-
-def label_below(axes: Any, names: list[str]) -> None:
-    """Write names below the axes, slanted if they would overlap, and draw a grid."""
-    axes.grid(axis="y", color=ABSENT, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.set_xticks(range(len(names)), names)
-    inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
-    if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter
-        for label in axes.get_xticklabels():
-            label.set(rotation=30, ha="right", rotation_mode="anchor")
 
 
 def _by_contender(rows: Mapping[str, Iterable[float]], columns: list[str]) -> "DataFrame":

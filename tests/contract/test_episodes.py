@@ -195,6 +195,7 @@ def test_an_observation_is_computed_when_its_decision_arises():
         ("b_0", [22, 1], 12, 22),
     ]
     # At the end it is computed anew.
+    env.observe("a_0")[:] = 0  # a copy
     assert env.observe("a_0").tolist() == [122, 0]
     assert env.observe("b_0").tolist() == [122, 1]
 

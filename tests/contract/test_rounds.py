@@ -258,7 +258,7 @@ def test_with_announced_calls_each_tick_is_one_round():
 
 
 def test_the_dead_are_dropped_from_agents_in_the_same_step():
-    program = "0 acts, 1 health 3, 1 leaves, 0 health 6, 0 leaves, 2 acts, 2 acts"
+    program = "0 acts, 1 health 3, 1 leaves, 0 health 6, 0 leaves, 2 acts, 2 acts, 2 forgotten"
     env = parallel_env(life(program, announced=[0, 1, 2]), beings())
     env.reset()
     results = env.step({"being_0": 1, "being_1": 2, "being_2": 3})
@@ -275,8 +275,11 @@ def test_the_dead_are_dropped_from_agents_in_the_same_step():
     with pytest.raises(UnknownAgentError, match="being_0"):
         env.step({"being_0": 1, "being_2": 1})
     # Whoever is announced after its end is not revived.
-    results = env.step({"being_2": 1})
-    assert [set(part) for part in results] == [{"being_2"}] * 5
+    last = env.step({"being_2": 1})
+    assert [set(part) for part in last] == [{"being_2"}] * 5
+    # Whoever the model has let go cannot be observed anew.
+    assert last[0]["being_2"].tolist() == [2, 0]
+    assert last[0]["being_2"] is not results[0]["being_2"]
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,7 @@ def test_rounds_have_everybody_and_are_those_of_the_living(world):
     chance = random.Random(seed)
     while env.agents:
         assert env.agents == everybody
+        env.agents.clear()  # a list for the caller
         present = {agent for agent in everybody if infos[agent]["present"]}
         for agent in everybody:
             if agent in present:

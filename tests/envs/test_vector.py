@@ -357,7 +357,7 @@ def test_call_get_attr_and_set_attr_reach_the_sub_environments(processes):
             envs.envs  # noqa: B018
     else:
         assert [env.simulation for env in envs.envs] == list(envs.get_attr("simulation"))
-    for value, told in (("same", ("same",) * 3), ([1, 2, 3], (1, 2, 3))):
+    for value, told in (("same", ("same",) * 3), ((1, 2, 3), (1, 2, 3))):
         envs.set_attr("tag", value)
         assert envs.get_attr("tag") == told
     with pytest.raises(OptionValueError):

@@ -1,6 +1,6 @@
 """The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from copy import deepcopy
 from math import exp
 from typing import Any
@@ -28,8 +28,8 @@ class Joint:
         self.observation_space: spaces.Space[Any] = spaces.Dict(observations)
         self.action_space: spaces.Space[Any] = spaces.Dict(actions)
         if flatten:
-            self.observation_space = _concatenate(list(observations.values()))
-            self.action_space = _concatenate(list(actions.values()), discrete=True)
+            self.observation_space = _concatenate(observations.values())
+            self.action_space = _concatenate(actions.values(), discrete=True)
             self._places: dict[str, int | slice] = {}  # of each agent's action in the flattened one
             begin = 0
             for name, space in actions.items():
@@ -172,7 +172,7 @@ class SimulationJointEnv(OneAgentView):
         return self.joint.observe(episode), self.joint.inform(episode)
 
 
-def _concatenate(parts: list[Any], *, discrete: bool = False) -> spaces.Space[Any]:
+def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> spaces.Space[Any]:
     """Return the space of concatenated vectors. ``discrete``: they may all be discrete, too."""
     kinds = (spaces.Discrete, spaces.MultiDiscrete)
     if discrete and all(isinstance(space, kinds) and np.ndim(space.start) < 2 for space in parts):

@@ -60,9 +60,8 @@ class SimulationBatch:
         self.view: type[OneAgentView] = SimulationJointEnv
         if view == "single":
             self.view, self.view_plan, self.plan = SimulationEnv, plan, SimulationEnv._adapt(plan)
-            definition = self.plan.active[0].definition
-            self.observation_space = deepcopy(definition.observation_space)
-            self.action_space = deepcopy(definition.action_space)
+            own = self.plan.active[0].definition
+            self.observation_space, self.action_space = deepcopy((own.observation_space, own.action_space))
         elif view == "joint":
             first = SimulationJointEnv(plan)
             first.close()

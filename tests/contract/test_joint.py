@@ -35,11 +35,12 @@ BOX = {"action_space": spaces.Box(0, 1, (1,), np.float32), "action_space_mapping
 
 
 def test_spaces_are_dicts_keyed_by_agent():
-    ant, bee, cat = points(3)
+    ant, bee, cat = points(3, action_space=spaces.Discrete(10), observation_space=spaces.Box(-9, 9, (2,)))
     env = joint_env(calling(ant, cat, bee), [ant, bee, cat], policies={"cat_0": lambda observation: 7})
     assert env.action_space == spaces.Dict({"ant_0": spaces.Discrete(10), "bee_0": spaces.Discrete(10)})
     assert list(env.observation_space.spaces) == ["ant_0", "bee_0"]
-    assert env.observation_space["ant_0"] is not env.observation_space["bee_0"]  # each has its own generator
+    for space in (env.observation_space, env.action_space):
+        assert space["ant_0"] is not space["bee_0"]  # each has its own generator
     observation, info = env.reset(seed=1)
     assert observation in env.observation_space
     assert observation["ant_0"].tolist() == [1, 2]

@@ -227,13 +227,14 @@ def test_the_action_of_one_that_is_reset_is_not_looked_at():
 
 
 def test_boxes_take_actions_in_other_dtypes():
-    dtypes, box = [], VARIETY["box"][1].action_space
-    mapping = {"action_space_mapping": lambda action: dtypes.append(action.dtype) or 3}
+    taken, box = [], VARIETY["box"][1].action_space
+    mapping = {"action_space_mapping": lambda action: taken.append(action) or 3}
     envs = begun(vector_env(Counter, {POINT: definition(action_space=box, **mapping)}, num_envs=2))
-    for batch in (np.ones((2, 2)), np.ones((2, 2), int), np.ones((2, 2), np.float16), [[1.0, 1.0], [1, 1]]):
+    for batch in ([[1.0, 1.0], [1, 1]], *(np.ones((2, 2), dtype) for dtype in (float, int, np.float16, np.float32))):
         envs.reset(seed=0)
         envs.step(batch)
-    assert dtypes == [np.float32] * 8
+    batch[:] = 0  # the caller's own
+    assert [(action.dtype, *action) for action in taken] == [(np.float32, 1, 1)] * 10
     assert envs.single_action_space is not box
     with pytest.raises(InvalidActionError, match="sub-environment 1"):
         envs.step(np.array([[0, 0], [0, 3.5]], np.float32))

@@ -23,7 +23,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.data import collect_episodes, compare_with_rule, record_dataset
-from simenv_marl.errors import CopyError, InvalidActionError, OptionValueError, ReentrancyError
+from simenv_marl.errors import ClosedError, CopyError, InvalidActionError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
 from tests.conftest import DRIVERS
 from tests.planning.test_action_values import GRAZING, METHODS, Herd, begun, greedy, made
@@ -239,6 +239,13 @@ def test_max_steps_ends_the_branch_of_an_agent_only_if_no_other_takes_steps(alon
 def test_a_policy_gets_the_environment_with_its_decision_pending(many):
     seen = []
 
+    def tried(twin, action):
+        told = twin.step(action)[:4], twin.simulation.turn
+        twin.close()
+        with pytest.raises(ClosedError):
+            twin.step(action)
+        return told
+
     def left(observation, info, *, _environment):
         assert _environment.unwrapped is _environment
         assert _environment.action_space == spaces.Discrete(3)
@@ -253,8 +260,7 @@ def test_a_policy_gets_the_environment_with_its_decision_pending(many):
             with pytest.raises(CopyError):
                 copied(_environment)
         for method in ("fork", "replay"):
-            told = branch(_environment, lambda twin, i: (twin.step(i)[:4], twin.simulation.turn), 3, method=method)
-            seen.append(told)
+            seen.append(branch(_environment, tried, 3, method=method))
         return 1
 
     if many:

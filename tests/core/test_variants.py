@@ -110,6 +110,8 @@ def test_variants_are_frozen_and_can_be_pickled():
     assert (again.name, again.simulation, dict(again.parameters), again.plugins, list(again.points)) == (
         ("small", Farm, {"fields": 1}, ((dearer, HARVEST, "after"),), [SOW])
     )
+    plain = pickle.loads(pickle.dumps(replace(DEAR, points=None)))  # also without cloudpickle
+    assert plain.parameters == LARGE.parameters
     for each in (variant, again):
         assert simulate(each, points=POINTS).log == [("wheat", 10)]
 

@@ -96,7 +96,7 @@ def test_invalid_arguments_are_refused(tmp_path):
         (both, [frame], {"metric": "y", "confidence": 95}, "confidence must lie between 0 and 1"),
         (both, [whole], {"metric": "text"}, "'text' is not a column of numbers"),
         ([effects], [frame], {"metric": "a"}, "not a column of numbers"),
-        ([effects], [frame], {"metric": "y", "contender": "x"}, "no contender 'x'"),
+        ([effects], [frame], {"metric": "y", "contender": "x"}, r"no contender 'x'; there are \['rule'\]"),
         ([sobol_indices], [frame], {"metric": "y"}, "saltelli"),
         ([sobol_indices], [whole], {"metric": "some"}, "'some' is missing or not finite"),
         ([sobol_indices], [whole], {"metric": "return"}, "no variance"),

@@ -344,12 +344,12 @@ def _compare(found: Trajectories, tolerance: float) -> Comparison:
     return Comparison(found, policy_actions, np.all(agreements, axis=0))
 
 
-def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> Any:
     """Return in which rows two arrays agree."""
     if one.dtype == object:
-        return np.array([same(*pair) for pair in zip(one, other, strict=True)], np.bool_)
+        return [same(*pair) for pair in zip(one, other, strict=True)]
     equal = np.abs(one - other) <= tolerance if one.dtype.kind == "f" else one == other
-    return np.asarray(equal.reshape(len(one), -1).all(axis=1), np.bool_)
+    return equal.reshape(len(one), -1).all(axis=1)
 
 
 # -- policies and their answers -------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """Designs of experiments: which combinations of factors to run."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -62,13 +62,13 @@ class Factor:
         values = [float(min(max(value, self.low), self.high)) for value in values]
         return [round(value) for value in values] if self.is_whole else values
 
-    def steps(self, number: int | None) -> Sequence[Any]:
+    def steps(self, number: int | None) -> Collection[Any]:
         """Return ``number`` values (default 2) of a range from bound to bound, or all levels of a list."""
         if number == 1:
             raise OptionValueError("this method takes n values of each range; n must be at least 2")
         if self.levels is not None:
             return self.levels
-        return list(dict.fromkeys(self.scale(np.linspace(0.0, 1.0, _rows(number or 2)))))
+        return dict.fromkeys(self.scale(np.linspace(0.0, 1.0, _rows(number or 2))))
 
     def ends(self) -> tuple[Any, ...]:
         """Return the two values for a two-level design."""
@@ -185,7 +185,7 @@ def _is_same(one: Any, other: Any) -> bool:
 
 # -- methods: the columns of a design -------------------------------------------------------------
 
-Columns = Sequence[Sequence[Any]]
+Columns = Iterable[Sequence[Any]]
 
 
 def _pydoe() -> Any:
@@ -196,7 +196,7 @@ def _pydoe() -> Any:
 def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     steps = [factor.steps(n) for factor in factors]
     _rows(prod(map(len, steps)))
-    return list(zip(*product(*steps), strict=True))
+    return zip(*product(*steps), strict=True)
 
 
 def _of_two_levels(factors: Sequence[Factor], matrix: Any) -> Columns:
@@ -303,7 +303,7 @@ def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Colum
         for value in factor.steps(n):
             if not _is_same(value, middle[place]):
                 rows.append([*middle[:place], value, *middle[place + 1 :]])
-    return list(zip(*rows, strict=True))
+    return zip(*rows, strict=True)
 
 
 def _rows(number: int | None) -> int:

@@ -110,7 +110,7 @@ def effects(
             main[name, labels[name][code]] = [sample.mean(), low, high, sample.mean() - whole, len(here)]
     index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
     columns = ["mean", "low", "high", "effect", "count"]
-    rows = pandas.DataFrame(list(main.values()), index, columns).astype({"count": int})
+    rows = pandas.DataFrame(main.values(), index, columns).astype({"count": int})
     cells: dict[tuple[str, str], DataFrame] = {}
     strengths = []
     for one, other in combinations(levels, 2):

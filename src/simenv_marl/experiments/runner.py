@@ -105,7 +105,7 @@ class Runner:
 
     def __init__(
         self, contenders: Any, points: Any, options: Mapping[str, Any], metric: Any, team: Any, *, batched: bool,
-        batch_size: int, concurrency: int, workers: int, factors: Sequence[str] = (),
+        batch_size: int, concurrency: int, workers: int, factors: Collection[str] = (),
     ) -> None:  # fmt: skip
         """Check the arguments. ``factors`` are the columns of the design, whose names metrics must not have."""
         check_options(batch_size, workers, None, concurrency)

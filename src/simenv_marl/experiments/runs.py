@@ -106,7 +106,7 @@ def run_experiment(
     runner = Runner(
         contenders or {}, points, options, metric, team, batched=bool(batched), batch_size=batch_size,
         concurrency=concurrency, workers=workers,
-        factors=list(table.columns),
+        factors=rows[0],
     )  # fmt: skip
     if runner.contenders.get(BY_RULE):
         raise OptionValueError(
@@ -122,7 +122,7 @@ def run_experiment(
         folder = Path(store).absolute()  # other processes may have another working directory
     except TypeError as error:
         raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
-    storage = Store(folder, list(table.columns), runner.metrics)
+    storage = Store(folder, rows[0], runner.metrics)
     storage.read(keys)
     storage.check_rows(keys)
     session = f"{time_ns():016x}{uuid4().hex[:8]}"  # of all processes that do runs now; later ones sort after it

@@ -17,7 +17,7 @@ import json
 import os
 import re
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -69,7 +69,7 @@ class Store:
         sample: A row of the design, as JSON, of which a run has succeeded; empty if there is none.
     """
 
-    def __init__(self, folder: Path, factors: Sequence[str], metrics: Iterable[str]) -> None:
+    def __init__(self, folder: Path, factors: Collection[str], metrics: Iterable[str]) -> None:
         """All runs have these factors, in the order of the design, and these metrics."""
         self.folder, self._factors = folder, factors
         self._header = {"simenv_marl": VERSION, "factors": sorted(factors), "metrics": sorted(metrics)}

@@ -264,7 +264,7 @@ def test_episodes_without_decisions_are_collected():
     assert found[bee].episodes.tolist() == [1, 3]
     nothing = found[ant]
     assert len(nothing) == 0
-    assert nothing.agents.dtype == np.int64
+    assert nothing.agents.dtype == nothing.episodes.dtype == np.int64
     assert nothing.observations.shape == nothing.next_observations.shape == nothing.actions.shape == (0, 2)
     assert nothing.seeds == (0, 1, 2, 3)
     assert len(collect_episodes(source, {ant: ones}, seeds=[])[ant]) == 0

@@ -132,9 +132,9 @@ class Runner:
                 "there is no option policies here; pass the policies of each contender in contenders="
             )
         self.contenders: Mapping[str, Mapping[Any, Any]] = contenders
-        self.metrics: dict[str, Callable[[Any], Any]] = {"metric": metric}
+        self.metrics: Mapping[str, Callable[[Any], Any]] = {"metric": metric}
         if metric is None or isinstance(metric, Mapping):
-            self.metrics = dict(metric or {})
+            self.metrics = metric or {}
         for name, function in self.metrics.items():
             if not isinstance(name, str) or not callable(function):
                 raise OptionValueError(

@@ -245,8 +245,8 @@ def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_
     for difference, number in ((1e3, 2), (1e15, 2), (1e-12, np.inf)):
         assert found.seeds_needed(difference)["b"] == number
         assert np.isnan(found.seeds_needed(difference)["same"])
-    for difference, power in ((0, 0.8), ("a", 0.8), (1, 1), (1, "a")):
-        with pytest.raises(OptionValueError):
+    for wrong, difference, power in (("diff", 0, 0.8), ("diff", "a", 2), ("power", 1, 1), ("power", 1, "a")):
+        with pytest.raises(OptionValueError, match=f"^{wrong}"):
             found.seeds_needed(difference, power=power)
     with pytest.raises(OptionValueError, match="no baseline"):
         Evaluation(returns, None, 0.95).seeds_needed(1)

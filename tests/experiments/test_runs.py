@@ -412,8 +412,8 @@ def test_a_store_is_where_its_user_is(tmp_path, monkeypatch):
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
         monkeypatch.chdir(tmp_path / name)  # where workers that were started before are not
-        run("store", DESIGN[:1], workers=2)
-        assert len(lines(tmp_path / name / "store")) == 12
+        run("new/store", DESIGN[:1], workers=2)
+        assert len(lines(tmp_path / name / "new" / "store")) == 12
 
 
 def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):

@@ -21,7 +21,7 @@ from simenv_marl.errors import (
     WrongThreadError,
 )
 from simenv_marl.remote import ProcessSimulation
-from simenv_marl.remote.child import GRACE, Child
+from simenv_marl.remote.child import GRACE, STDERR_TAIL, Child
 from tests.outside.reservoirs import BOTH, PRICE, broken, by_its_rule, child, plays_by_its_rule, reservoirs
 from tests.processes import alone, descriptors, gone, runs
 from tests.worlds.faulty import AT_ONCE, FAULTS
@@ -172,6 +172,10 @@ def test_long_lines_cross_in_both_directions(make_env):
     with pytest.raises(WireError, match=r"the limit is 16,777,216"):
         env.reset(seed=1, options={"long": "o" * (16 << 20)})
     assert plays_by_its_rule(env, hours=6, words=100_000)  # on its standard error
+    os.kill(child(env), signal.SIGKILL)
+    with pytest.raises(ProcessDiedError) as caught:
+        env.reset()
+    assert len(str(caught.value)) < 2 * STDERR_TAIL
 
 
 def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
@@ -226,8 +230,9 @@ def fail_many_times() -> None:
             env.step(RULE)
         env.close()
     for _ in range(3):
-        with pytest.raises(ProcessDiedError):
-            aec_env(broken("at once", "exit 3")).reset()
+        for simulation in (broken("at once", "exit 3"), ProcessSimulation("/nowhere", BOTH)):
+            with pytest.raises(ProcessDiedError):
+                aec_env(simulation).reset()
     assert descriptors() == before
 
 

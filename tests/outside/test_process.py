@@ -3,6 +3,7 @@
 import copy
 import gc
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -319,7 +320,10 @@ def test_an_environment_that_is_gone_takes_its_process_along():
 def test_copies_are_made_of_the_same_and_have_processes_of_their_own(make_env):
     env = make_env(aec_env, reservoirs())
     env.reset(seed=1)
-    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(aec_env(reservoirs({"broker.price": PICKLED}))))):
+    for twin in (
+        copy.deepcopy(env),
+        pickle.loads(pickle.dumps(aec_env(reservoirs({"broker.price": PICKLED}, env=os.environ)))),
+    ):
         assert child(twin) is None
         twin.reset(seed=1)
         assert child(twin) not in (None, child(env))

@@ -71,8 +71,10 @@ def test_apply_may_ask_the_rule_and_leave_it_at_that():
 
     def apply(action, call, *, _rule):
         asked.append(_rule(call))
+        late.append((_rule, call))
         return asked[-1]
 
+    late = []
     definition = replace(PRICE, action_space_mapping=None, apply=apply)
     assert simulate(telling({"broker.price": definition}), {"broker.price": lambda _: 0}, seed=1).result == by_its_rule(
         1

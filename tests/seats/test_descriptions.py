@@ -125,7 +125,7 @@ def test_a_label_that_looks_like_another_action_is_the_label():
     ([" open", "shut", "ajar"], " open", 0),
     (["1.5", "2", "3"], "1.50", 0),
     (["1", "2", "3"], '{"action": 2.0}', 1),
-    (["open", "half open", "shut"], "I choose half open, to be safe.", 1),
+    (["open", "half open", "shut"], "I choose half open; half open is safe.", 1),
     (["open", "half open", "shut"], "<think>shut or open?</think> open", None),
     (["open", "half open", "shut"], '```json\n{"action": "shut"}\n```', 2),
     (["open", "half open", "shut"], 'Perhaps {"action": "open"}, or rather {"action": "shut"}.', 2),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import pickle
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from math import isfinite
 from numbers import Real
@@ -117,7 +117,7 @@ class Player:
 
     def start(self, seen: dict[str, Any]) -> None:
         """Prepare a branch, in which a step may already have returned something."""
-        self.view._shows, self.seen = False, dict(seen)
+        self.view._shows, self.seen = False, seen
         if isinstance(self.view, SimulationEnv) and isinstance(self.base, Mapping):
             self.episode.delegate(self.base)  # the simulation answers for all other agents
 
@@ -337,7 +337,7 @@ def rollout_from(
     try:
         player = player_of(env, policy.base)
         player.start(progress.seen)
-        made = replace(progress, rewards=progress.rewards.copy(), times=progress.times.copy())
+        made = copy.deepcopy(progress)
         _continue(made, player, actions, policy, stop)
         made.seen, made.over = player.seen, player.over
         made.seconds += perf_counter() - began

@@ -212,7 +212,7 @@ class Rollouts:
                 errors[place] = np.std(values, ddof=1) / np.sqrt(len(values))
         best = max(finalists, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
         if self.reseeds:
-            warn_of_futures(self._name, list(self.outcomes.values()), returns)
+            warn_of_futures(self._name, self.outcomes.values(), returns)
         if self._policy.horizon is not None and self._policy.horizon_by == "decision":
             warn_of_times(self._name, self._times)
         correlation = correlation_of(returns)
@@ -318,7 +318,7 @@ class RolloutPolicy:
 
     def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
         """Try candidates; return the plans that are left."""
-        left = list(range(len(rollouts.actions)))
+        left: Sequence[int] = range(len(rollouts.actions))
         for rounds in range(ceil(log2(len(left))), 0, -1):
             more = min(max(1, budget // (len(left) * rounds)), budget // len(left))
             budget -= more * len(left)

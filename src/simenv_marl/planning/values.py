@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
 from typing import Any, Final
@@ -67,7 +67,7 @@ def correlation_of(returns: NDArray[np.float64], least: int = 3) -> float:
     return float(np.mean(found)) if found else float("nan")
 
 
-def warn_of_futures(name: str, outcomes: Sequence[list[Any]], returns: NDArray[np.float64]) -> None:
+def warn_of_futures(name: str, outcomes: Iterable[list[Any]], returns: NDArray[np.float64]) -> None:
     """Warn of futures that are all the same although chance was drawn anew, and of those that candidates do not share.
 
     Args:

@@ -353,6 +353,7 @@ def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_game, 
 def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_game, tmp_path):
     path = tmp_path / "game.jsonl"
     game = make_game(record=path)
+    assert json.loads(path.read_text()) == {"simulation": "shop", "seed": 5, "seats": ["buyer"]}
     play(game, [2] * 8)
     game.restart(6)
     play(game, [1])

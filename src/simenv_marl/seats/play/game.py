@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import signal
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from itertools import islice
 from pathlib import Path
@@ -44,9 +44,9 @@ class Game:
         known: list[str] = getattr(self.root, "possible_agents", [])
         for seat in set(seats).difference(known or seats):
             raise OptionValueError(f"there is no agent {seat!r}; the agents are {known}{did_you_mean(seat, known)}")
-        self.name, self.given, self.limit, self.record = name, list(seats), limit, record
+        self.name, self.given, self.limit, self.record = name, seats, limit, record
         self.known = dict.fromkeys(self.given or known)
-        self.taken: set[str] = set()  # the seats that people have
+        self.taken: Collection[str] = ()  # the seats that people have
         self.late: Counter[str] = Counter()  # decisions that the rule took because of the limit
         self.checkpoints: dict[int, Any] = {}
         self.ends: dict[str, tuple[int, float]] = {}  # of agents: when, and their returns
@@ -210,7 +210,7 @@ class Game:
         """Do what a message says; return whether this has changed the game."""
         do = message.get("do")
         if seat is None:
-            self.taken = set(message["taken"] or ())
+            self.taken = message["taken"]
             self._set_deadline()
             return self.skipping is not None
         if do in ("act", "rule", "try"):
@@ -350,7 +350,7 @@ class Game:
         fans = []
         for candidate in self.fan:
             courses = [course + course[-1:] * (self.horizon - len(course)) for course in candidate["courses"]]
-            numbers = np.nan_to_num(np.array(courses, np.float64))
+            numbers = np.nan_to_num(courses)
             bands = (
                 np.quantile(numbers, (0.1, 0.5, 0.9), axis=0).transpose(2, 0, 1).round(6).tolist() if courses else []
             )
@@ -372,7 +372,7 @@ class Game:
             "returns": self.returns(),
             "history": self.line[max(0, self.turn - SHOWN) : self.turn + 1],
             "left": None if self.deadline is None else max(0.0, self.deadline - monotonic()),
-            "late": dict(self.late),
+            "late": self.late,
             "picture": self.picture,
             "notice": self.notice,
         }

@@ -278,12 +278,11 @@ def _run(table: Table, host: str, listening: socket.socket, end: Callable[[], No
 
     @asynccontextmanager
     async def lifespan(app: Any) -> AsyncIterator[None]:
-        reader, writer = asyncio.create_task(table.read_game()), asyncio.create_task(table.write_game())
+        reader, _writer = asyncio.create_task(table.read_game()), asyncio.create_task(table.write_game())
         reader.add_done_callback(lambda task: setattr(server, "should_exit", True))
         yield
         died.append(reader.done())
         await asyncio.to_thread(end)
-        writer.cancel()
         await reader
 
     config: dict[str, Any] = {"http": _Protocol, "ws_max_size": LONGEST, "timeout_graceful_shutdown": 1}

@@ -3,7 +3,9 @@
 import copy
 import pickle
 import random
-from functools import cache
+import socket
+from functools import cache, partial
+from itertools import count
 from unittest.mock import Mock
 
 import numpy as np
@@ -14,6 +16,7 @@ from simenv_marl import (
     RULE,
     aec_env,
     branch,
+    clone,
     evaluate,
     joint_env,
     parallel_env,
@@ -24,10 +27,10 @@ from simenv_marl import (
 )
 from simenv_marl.data import collect_episodes, compare_with_rule, record_dataset
 from simenv_marl.errors import ClosedError, CopyError, InvalidActionError, OptionValueError, ReentrancyError
-from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values
+from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, tree
 from tests.conftest import DRIVERS
 from tests.planning.test_action_values import GRAZING, METHODS, Herd, begun, greedy, made
-from tests.worlds.duels import LEFT, Duel, points, worth
+from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
 from tests.worlds.inventory import Shop, best_values, state
 from tests.worlds.models import define, step
 
@@ -375,6 +378,53 @@ def test_actions_that_are_masked_by_then_are_left_to_the_base():
     given = locked(action_mask_mapping=lambda lock: [1, 1, 1, not lock.tried])
     told = choice(TreeSearchPolicy(futures=10), given=given)
     assert (told.best, told.counts.sum()) == (RULE, 50)
+
+
+class Line(socket.socket):
+    def __del__(self):
+        self.close()
+
+
+class Opens(Unseeded):
+    """Opens what no fork can share, and keeps it."""
+
+    def right(self):
+        if self.turn == 1:
+            self.opened = Line()
+        return 1
+
+
+class Lends(Unseeded):
+    """The same, for all duels of a process."""
+
+    def right(self):
+        Lends.opened = Line() if self.turn == 1 else None
+        return 1
+
+
+@pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
+@pytest.mark.parametrize(
+    ("model", "most", "cost"), [(Opens, 200, 0), (Lends, 200, 0), (Unseeded, 3, 0), (Unseeded, 200, 1e9)]
+)
+def test_states_that_a_search_keeps_change_no_value_and_are_closed(model, most, cost, monkeypatch):
+    twins = []
+
+    def noted(*given, **options):
+        twins.append(clone(*given, **options))
+        return twins[-1]
+
+    monkeypatch.setattr(tree, "perf_counter", partial(next, count(0, cost)))  # which a fork takes
+    monkeypatch.setattr(tree, "_MOST", most)
+    monkeypatch.setattr(tree, "clone", noted)
+    kept, replayed = (
+        TreeSearchPolicy(depth=4, futures=8, method=method).choose(made("single", model)).returns
+        for method in (None, "replay")
+    )
+    np.testing.assert_array_equal(kept, replayed)
+    assert (len(twins) > 1) == (cost == 0)
+    for twin in twins:
+        with pytest.raises(ClosedError):
+            twin.step(1)
 
 
 def test_agents_that_end_before_the_depth():

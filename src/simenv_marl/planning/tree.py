@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from math import inf, log, sqrt
 from threading import Lock
 from time import perf_counter
@@ -13,7 +14,7 @@ from typing import Any, Final
 
 from ..core.clone import branch, clone
 from ..errors import BranchError, OptionValueError
-from .player import Progress, is_count, is_number, rollout_from
+from .player import Progress, is_count, is_number, rollout_from, try_out
 from .rollouts import Plan, RolloutPolicy, Rollouts
 
 _AT_ONCE: Final = 8
@@ -142,7 +143,7 @@ class Node:
         env: The clone, which is never stepped again; None if there were too many already.
         progress: What the candidates have brought.
         outcome: What they bring in the end, if the base decides from there.
-        lock: Held while the clone is cloned.
+        lock: Held while the clone, or one of its clones, is used here.
     """
 
     def __init__(self, env: Any, progress: Progress, outcome: Any = None) -> None:
@@ -168,18 +169,25 @@ class States:
         """Reach the state of a plan from that of its longest part that was reached before."""
         parts = (self._nodes.get(plan[:length]) for length in range(len(plan) - 1, -1, -1))
         parent = next(node for node in parts if node is not None and node.env is not None)
-        with parent.lock:
-            env = clone(parent.env, time_limit=self._policy.time_limit)
+        root, actions = self._nodes[()], [self._actions[place] for place in plan]
         node = Node(None, parent.progress)
         try:
-            actions = [self._actions[place] for place in plan]
+            with parent.lock:
+                env = clone(parent.env, method="fork", time_limit=self._policy.time_limit)
+        except BranchError:  # it has opened something since; a replay belongs to the thread that makes it
+            once = partial(try_out, tries=[(actions, 0)], policy=self._policy)
+            with root.lock:
+                [node.outcome] = branch(root.env, once, time_limit=self._policy.time_limit)
+            return node
+        try:
             node.progress, node.outcome = env.unwrapped.call(_take, actions, self._policy, parent.progress)
             if len(self._nodes) < _MOST:
                 node.env = env
             return node
         finally:
             if node.env is None:
-                env.close()
+                with parent.lock:  # whose process waits for it
+                    env.close()
 
     def close(self) -> None:
         """End all clones."""

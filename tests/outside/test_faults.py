@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -306,10 +307,15 @@ def test_processes_that_do_not_see_the_end_of_their_input_are_ended_together(mon
 
 
 def test_an_end_that_follows_a_stop_is_not_the_next_episode(make_env):
-    env = before_its_fault("end after stop", make_env)
-    with pytest.raises(WireError, match=r"has sent .*end.* (after \"stop\"|before the start)"):
+    for arrived, text in ((False, '(after "stop"|before the start)'), (True, "before the start")):
+        env = before_its_fault("end after stop", make_env)
+        if arrived:
+            process = env.unwrapped.simulation._child
+            process.break_off()
+            select.select([process._reading], [], [])
+        with pytest.raises(WireError, match=f"has sent .*end.* {text}"):
+            env.reset(seed=2)
         env.reset(seed=2)
-    env.reset(seed=2)
 
 
 INTERRUPTS = """

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -320,10 +321,8 @@ def test_an_environment_that_is_gone_takes_its_process_along():
 def test_copies_are_made_of_the_same_and_have_processes_of_their_own(make_env):
     env = make_env(aec_env, reservoirs())
     env.reset(seed=1)
-    for twin in (
-        copy.deepcopy(env),
-        pickle.loads(pickle.dumps(aec_env(reservoirs({"broker.price": PICKLED}, env=os.environ)))),
-    ):
+    other = aec_env(reservoirs({"broker.price": PICKLED}, env=MappingProxyType({**os.environ})))
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(other))):
         assert child(twin) is None
         twin.reset(seed=1)
         assert child(twin) not in (None, child(env))

@@ -80,6 +80,7 @@ def test_apply_may_ask_the_rule_and_leave_it_at_that():
         1
     )
     assert asked[0] == pytest.approx(1.1)
+    assert [rule(call) for rule, call in late] == [RULE] * len(asked), "no decision is due any more"
 
 
 def test_what_the_rule_has_decided_cannot_be_replaced():
@@ -180,6 +181,18 @@ def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
     assert terminations == {"0.0": True, "0.1": False, "1.0": False, "1.1": False}
     calls = env.unwrapped.simulation.expected_calls("sheep.graze")
     assert [(call.entity, call.time) for (call,) in calls] == [("1.0", 1.0), ("1.1", 1.0)], "one decides now"
+
+
+def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_env):
+    one, decided, again = {"point": "sheep.graze", "entity": "b"}, {"decided": 1, "value": 3}, {**CALL, "decide": 2}
+    removed = [{"remove": name, "point": "sheep.graze"} for name in "ab"]
+    frames = CALL, decided, {"expect": [one]}, *removed, again, {**decided, "decided": 2}, {"end": {}}
+    names = {}
+    named = replace(GRAZE, agent=lambda call: names.setdefault(call, f"sheep_{len(names)}"))
+    env = make_env(aec_env, speaking(HELLO, *frames), {"sheep.graze": named})
+    play(env, seed=1)
+    assert [call.entity for call in names] == ["a", "b", "a"]
+    assert env.unwrapped.simulation.expected_calls("sheep.graze") == []
 
 
 def test_a_process_that_does_not_expect_has_no_expected_calls(make_env):

@@ -21,7 +21,7 @@ from simenv_marl.errors import (
     WireError,
     WrongThreadError,
 )
-from simenv_marl.remote import ProcessSimulation
+from simenv_marl.remote import ProcessSimulation, guardian
 from simenv_marl.remote.child import GRACE, STDERR_TAIL, Child
 from tests.outside.reservoirs import BOTH, PRICE, broken, by_its_rule, child, plays_by_its_rule, reservoirs
 from tests.processes import alone, descriptors, gone, runs
@@ -227,6 +227,7 @@ def fail_many_times() -> None:
     for what in ("exit 3", "garbage", "silence"):
         env = before_its_fault(what)
         env.unwrapped.simulation._child.timeout = 0.3
+        os.kill(guardian._shell.pid, signal.SIGSTOP)
         with pytest.raises(ProcessError):
             env.step(RULE)
         env.close()

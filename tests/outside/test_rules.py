@@ -12,7 +12,8 @@ from simenv_marl import RULE, aec_env, make_step, parallel_env, simulate
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
 from simenv_marl.errors import DefinitionError, SimulationError, WireError
 from simenv_marl.remote import ProcessSimulation
-from tests.outside.reservoirs import BOTH, BOTH_HERE, PRICE, Here, by_its_rule, reservoirs
+from tests.outside.reservoirs import BOTH, BOTH_HERE, PRICE, Here, by_its_rule, child, reservoirs
+from tests.processes import runs
 from tests.worlds import by_client
 from tests.worlds.models import play
 
@@ -193,6 +194,18 @@ def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_e
     play(env, seed=1)
     assert [call.entity for call in names] == ["a", "b", "a"]
     assert env.unwrapped.simulation.expected_calls("sheep.graze") == []
+
+
+def test_an_error_here_ends_a_process_that_is_not_waiting(make_env):
+    rewards = [0.0]
+    once = {"sheep.graze": replace(GRAZE, reward_mapping=lambda call: rewards.pop())}
+    removed = {"remove": "a", "point": "sheep.graze"}
+    env = make_env(aec_env, speaking(HELLO, CALL, {"decided": 1, "value": 3}, removed, {"end": {}}), once)
+    env.reset(seed=1)
+    number = child(env)
+    with pytest.raises(IndexError):
+        env.step(RULE)
+    assert not runs(number)
 
 
 def test_a_process_that_does_not_expect_has_no_expected_calls(make_env):

@@ -111,7 +111,8 @@ def test_an_episode_equals_that_of_the_environment(make_game):
 
 
 @pytest.mark.parametrize("forks", [True, False])
-def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks):
+def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks, monkeypatch):
+    monkeypatch.setattr("simenv_marl.seats.play.game.CHECKPOINTS", 4)
     game = make_game()
     game.forks = forks
     play(game, [1, 3, 0, 2])
@@ -126,11 +127,15 @@ def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks):
         game.handle("buyer", {"do": do})
         assert game.turn == turn
     assert json.dumps(game.line) == before
-    assert game.notice == ""
+    old = game.env
     game.jump(4)
-    state = play(game, [0, 2, 1, 1, 0, 2])
-    assert state["returns"]["buyer"] == as_by_hand([1, 3, 0, 2, 1, 1, 0, 2])[1]
-    assert bool(game.checkpoints) == forks
+    assert old is game.root or not old.agents
+    game.decide(2, "person")
+    assert max(game.checkpoints, default=0) <= 4
+    state = play(game, [2, 1, 1, 0, 2])
+    assert state["returns"]["buyer"] == as_by_hand([1, 3, 2, 2, 1, 1, 0, 2])[1]
+    assert len(game.checkpoints) == (4 if forks else 0)
+    assert game.notice == ""
 
 
 def test_a_seat_whose_agent_never_decides_is_told_at_the_end(make_game):
@@ -183,6 +188,7 @@ def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(m
     assert "buyer decides" in texts[4]
     assert "'fly'" in texts[7]
     assert len(game.line) == 1
+    assert not game.root.agents  # it is closed in the end
 
 
 def test_a_masked_action_is_refused(make_game):

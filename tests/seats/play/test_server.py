@@ -1,6 +1,8 @@
 """The command and its server: links, keys, hosts, limits of messages and connections, and the end."""
 
+import asyncio
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -10,6 +12,7 @@ import sys
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from unittest.mock import AsyncMock
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -21,6 +24,8 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 client = pytest.importorskip("websockets.sync.client")
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+
+from simenv_marl.seats.play.server import Table  # noqa: E402
 
 ROOT = Path(__file__).parents[3]
 SHOP = "tests.seats.play.worlds:Shop"
@@ -230,15 +235,33 @@ def test_many_connections_end_old_spectators_and_no_player(server, page, buyer):
     buyer.wait_for_turn(1)
 
 
+def test_a_page_that_is_gone_leaves_no_task():
+    async def visit():
+        await Table(None, {"type": "state"}, print).serve(page)
+        await asyncio.sleep(0)
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    page = AsyncMock()
+    page.receive.return_value = {"type": "websocket.disconnect"}
+    asyncio.run(visit())
+
+
+def test_a_game_that_takes_long_is_killed_in_the_end():
+    server = Server("--seat", "buyer", simulation="tests.seats.play.worlds:EndlessShop")
+    server.page("buyer").wait("state")
+    assert server.end()[0] == 0
+
+
 def test_the_end_leaves_no_process(tmp_path):
-    server = Server("--seat", "buyer", "--record", str(tmp_path / "game.jsonl"))
+    arguments = "--seat", "buyer", "--record", str(tmp_path / "game.jsonl")
+    server = Server(*arguments, simulation="tests.seats.play.worlds:ClosedShop")
     buyer = server.page("buyer")
     buyer.wait("fan")
     children = server.children()
     assert children
     code, out, err = server.end()
     assert (code, err) == (0, "")
-    assert out.startswith("The returns: buyer")
+    assert out.startswith("It is closed.\nThe returns: buyer")
     buyer.wait_for_the_end()
     deadline = time.monotonic() + 30
     while living := [child for child in children if is_alive(child)]:
@@ -271,6 +294,7 @@ def test_the_end_of_the_game_ends_the_server():
 def test_what_cannot_be_played_is_told(arguments, told, capsys):
     assert main(["play", *arguments]) == 2
     assert told in capsys.readouterr().err
+    assert not multiprocessing.active_children()
 
 
 def test_a_missing_extra_is_told(monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 import os
 import random
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -82,6 +83,25 @@ class FixedShop(Shop):
 
 
 FixedShop.points = {Shop.order: ORDER}
+
+
+class ClosedShop(Shop):
+    """It takes some time to close."""
+
+    def close(self):
+        time.sleep(0.2)
+        print("It is closed.", flush=True)
+
+
+class EndlessShop(Shop):
+    """It does not go on after a decision."""
+
+    def run(self):
+        self.order()
+        time.sleep(600)
+
+
+EndlessShop.points = {Shop.order: ORDER}
 
 
 class BrokenShop(Shop):

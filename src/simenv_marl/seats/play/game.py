@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import signal
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from itertools import islice
 from pathlib import Path
@@ -203,7 +203,6 @@ class Game:
                     continue
             else:
                 continue
-            work.close()
             work, working = self.work(), True
 
     def handle(self, seat: str | None, message: dict[str, Any]) -> bool:
@@ -257,7 +256,7 @@ class Game:
 
     # -- what takes time ---------------------------------------------------------------------------
 
-    def work(self) -> Generator[dict[str, Any] | None]:
+    def work(self) -> Iterator[dict[str, Any] | None]:
         """Let the rule decide where no person does; then show the decision, and try out what may be decided."""
         shown = monotonic()
         while self.now is not None and self._leaves_to_rule(self.now["agent"]):

@@ -219,25 +219,6 @@ def test_others_of_a_single_view_follow_the_base_by_agent(method):
         action_values(declared, base={"third": RULE})
 
 
-def test_a_base_may_change_what_it_gets():
-    class Flock(Herd):
-        def run(self):
-            for self.moves in range(6):
-                self.sum += self.graze("other" if self.moves % 3 == 2 else "one")
-
-    def changes(observation, info):
-        observation += 1
-        info["asked"] = info.get("asked", 0) + 1
-        return int(observation[0]) + info["asked"]
-
-    env = begun(joint_env(Flock, GRAZING, possible_agents=["one", "other"]), 1)
-    values = [
-        action_values(env, [RULE], futures=1, base={"other": base}).means[0]
-        for base in (changes, lambda seen: int(seen[0]) + 2)
-    ]
-    assert values == [22, 22]
-
-
 class Mortal(Duel):
     ceiling = 3.0
 

@@ -25,7 +25,6 @@ from ..core.agent import Agent
 from ..core.clone import pending_view
 from ..core.policies import PLANNING, AskingPolicy, base_of, stand_in, two_arguments
 from ..core.rng import is_seed
-from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
 from ..errors import (
     EpisodeOverError,
@@ -153,8 +152,7 @@ class Player:
         if name in self.seen:
             return self.seen[name]
         agent = self.record if name == self.agent else self.episode.agents[name]
-        observation = agent.point.blank() if agent.observation is None else duplicate(agent.observation)
-        return observation, dict(agent.info)
+        return agent.point.blank() if agent.observation is None else agent.observation, agent.info
 
     # -- through wrappers -------------------------------------------------------------------------
 

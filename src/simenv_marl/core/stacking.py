@@ -82,7 +82,7 @@ def stack_masks(masks: Sequence[Any]) -> Any:
     return _map(lambda *arrays: np.stack(arrays), *masks)
 
 
-def taken(stack: Any, index: NDArray[Any]) -> Any:
+def taken(stack: Any, index: NDArray[Any] | int) -> Any:
     """Take the rows of a stack with the given indices, in that order."""
     return _map(lambda array: array[index], stack)
 

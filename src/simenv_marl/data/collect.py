@@ -337,7 +337,7 @@ def _compare(found: Trajectories, tolerance: float) -> Comparison:
         return Comparison(found, found.actions, np.zeros(0, np.bool_))
     check_known(found)
     assert found.action_space is not None
-    actions = [taken(found.actions, np.array(row)) if action is RULE else action for row, action in enumerate(recorded)]
+    actions = [taken(found.actions, row) if action is RULE else action for row, action in enumerate(recorded)]
     policy_actions = stacker(found.action_space)(actions)
     pairs = zip(leaves(found.actions), leaves(policy_actions), strict=True)
     agreements = [_agreements(one, other, tolerance) for (_, one), (_, other) in pairs]

@@ -84,11 +84,11 @@ def record_dataset(
     return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
 
 
-def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]:
+def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Any:
     """Return the name of each data set, by the key of its policy."""
     if isinstance(dataset_id, str) and len(policies) == 1:
         return {next(iter(policies)): dataset_id}
-    names = list(dataset_id.values()) if isinstance(dataset_id, Mapping) else []
+    names = dataset_id.values() if isinstance(dataset_id, Mapping) else ()
     if not names or not all(isinstance(name, str) for name in names):
         raise OptionValueError(
             f"dataset_id must be a name, or for {len(policies)} policies a dict from their keys to names, not"
@@ -102,7 +102,7 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]
         )
     if len(set(names)) < len(names):
         raise OptionValueError(f"each policy needs a data set of its own: {short_repr(dict(dataset_id))}")
-    return dict(dataset_id)
+    return dataset_id
 
 
 def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -> Any:
@@ -208,8 +208,8 @@ def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
         own = taken(columns, np.append(rows, len(found) + place))
         yield buffer(
             seed=seed if seed < 2**63 else str(seed),  # Minari reads the string as an integer
-            observations=_object_lists(own["observations"]),
-            actions=_object_lists(taken(found.actions, rows)),
+            observations=own["observations"],
+            actions=taken(found.actions, rows),
             rewards=found.rewards[rows],
             terminations=found.terminations[rows],
             truncations=found.truncations[rows],
@@ -220,12 +220,3 @@ def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
 def _extend(values: NDArray[Any], number: int, filler: Any) -> NDArray[Any]:
     """Append rows that consist of a filler."""
     return np.concatenate([values, np.full((number, *values.shape[1:]), filler, values.dtype)])
-
-
-def _object_lists(stack: Any) -> Any:
-    """Return a stack with lists in place of arrays of objects."""
-    if isinstance(stack, Mapping):
-        return {key: _object_lists(part) for key, part in stack.items()}
-    if isinstance(stack, tuple):
-        return tuple(_object_lists(part) for part in stack)
-    return list(stack) if stack.dtype == object else stack

@@ -323,7 +323,7 @@ def test_actions_are_replayed_as_they_were_given():
     """Actions of the user and of a policy, who change them later; and nobody is asked again for what he has said."""
     amount = {
         "action_space": spaces.Box(-9, 9, (1,), np.float32),
-        "action_space_mapping": lambda action: float(action[0]),
+        "action_space_mapping": lambda action: -action.__imul__(-1).item(),
         "reward_mapping": lambda walk: 0.0,
     }
     buffer, action, asked = np.zeros(1, np.float32), np.zeros(1, np.float32), []

@@ -118,6 +118,14 @@ def test_clones_have_many_generations_and_end_when_they_are_collected():
     assert ended(*numbers)
 
 
+def test_a_clones_process_has_no_descriptors_that_it_does_not_need():
+    env = trip()
+    other, number = clone(env, method="fork"), len(descriptors())
+    twin = clone(env, method="fork")
+    for each in (twin, clone(twin, method="fork"), other):
+        assert each.call(lambda env: len(descriptors())) == number - (each is other)
+
+
 @METHODS
 def test_wrappers_keep_count(method):
     env = trip("single, limited", Free)

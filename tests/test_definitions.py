@@ -141,8 +141,10 @@ def test_a_definition_that_is_replaced_in_part_is_made_ready_as_a_whole():
     same = dataclasses.replace(definition, agent="ant_0")
     assert same.action_space_mapping(1) == "yes"
     assert same.removed_by == {"package.module.function": None}
-    more = {"action_space": spaces.Discrete(3), "action_space_mapping": {0: "no", 1: "yes", 2: "maybe"}}
-    other = dataclasses.replace(definition, **more, removed_by=["package.module.other"])
+    answers, removed_by = {0: "no", 1: "yes", 2: "maybe"}, {"package.module.other": None}
+    more = {"action_space": spaces.Discrete(3), "action_space_mapping": answers, "removed_by": removed_by}
+    other = dataclasses.replace(definition, **more)
+    answers.clear(), removed_by.clear()
     assert other.action_space_mapping(2) == "maybe"
     assert other.removed_by == {"package.module.other": None}
     with pytest.raises(DefinitionError, match="must have just the actions"):

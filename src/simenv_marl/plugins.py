@@ -270,15 +270,14 @@ class Plugins:
 
     memory: dict[Any, Any] | None = None
 
-    def __init__(self, entries: Iterable[Any], named: Mapping[str, Hook] = MappingProxyType({})) -> None:
+    def __init__(self, entries: Any, named: Mapping[str, Hook] = MappingProxyType({})) -> None:
         """Find the targets, and check that the handlers fit; ``named`` has the names that the simulation defines."""
-        given = list(entries)
         with LOCK:
-            self.handlers = [_make_handler(entry, named, self) for entry in given]
+            self.handlers = [_make_handler(entry, named, self) for entry in entries]
         self.hooks = dict.fromkeys(handler.target for handler in self.handlers)
         self.entries: list[Entry] = [(own.function, own.target.name, own.position) for own in self.handlers]
         # With the given target where its name would not lead to it in another process.
-        pairs = zip(self.entries, given, strict=True)
+        pairs = zip(self.entries, entries, strict=True)
         self.portable: list[Entry] = [entry if is_importable(entry[1]) else own for entry, own in pairs]
 
     @property

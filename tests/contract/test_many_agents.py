@@ -128,7 +128,7 @@ def test_a_roster_is_declared_by_point_where_there_are_several():
         clerk()
 
     points = {clerk: define(agent="clerk_0"), **beings(), **others()}
-    rosters = {Being.act: ["being_1", "being_0"], f"{HERE}.Other.act": ("other_0",)}
+    rosters = {Being.act: ["being_1", "being_0"], f"{HERE}.Other.act": iter(["other_0"])}
     env = aec_env(script(main), points, possible_agents=rosters)
     assert sorted(env.possible_agents) == ["being_0", "being_1", "clerk_0", "other_0"]
     assert decisions(play(env, 1)) == ["other_0", "being_1", "clerk_0"]

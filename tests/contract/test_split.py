@@ -54,7 +54,7 @@ def points(**changes):
             "action_space_mapping": lambda action: action,
             "reward_mapping": lambda station, *call: float(station.load),
             "agent": lambda station, *call: station.name,
-            "split": lambda grid, wanted, most: grid.stations,
+            "split": lambda grid, wanted, most: iter(grid.stations),
             "gather": lambda items, found, *call: {item.name: one for item, one in zip(items, found, strict=True)},
             "part": lambda result, station, *call: result[station.name],
         } | changes)
@@ -101,7 +101,7 @@ def test_all_views_and_policies_answer_items():
     one.step(8)
     assert one.simulation.log == [(first, 8, last) for first, _, last in plain(5).log[:1]]
     assert simulate(Day, {Grid.allot: lambda seen: 6}, points=points(), seed=5).log == [(6, 6, 6)] * 4
-    days = simulate_many(Day, {Grid.allot: lambda seen: np.full(len(seen), 6)}, points=points(), seeds=[1, 2])
+    days = simulate_many(Day, {Grid.allot: lambda seen: (6 for _ in seen)}, points=points(), seeds=[1, 2])
     assert [day.log for day in days] == [[(6, 6, 6)] * 4] * 2
 
 

@@ -344,7 +344,9 @@ def test_copies_of_an_exposed_iterable_have_its_handlers():
         copied = copy.deepcopy(items)
         copied[0].append(5)
         assert list(copied) == [[1, 5, 1, 5], [2, 2]]
-        assert list(copy.copy(items)) == list(items) == [[1, 1], [2, 2]]
+        shallow = copy.copy(items)
+        shallow.append([3])
+        assert (list(shallow)[:2], list(items)) == ([[1, 1], [2, 2]], [[1, 1], [2, 2]])
         restored = pickle.loads(pickle.dumps(items))
         assert list(restored) == [[1], [2]]
     assert type(restored) is type(items)

@@ -225,7 +225,7 @@ class Agent:
         if mask is not None:
             info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
         if self.informs_rule_action:
-            info["rule_action"], self.informs_rule_action = duplicate(self.rule_action), False
+            info["rule_action"], self.informs_rule_action = self.rule_action, False
         return info
 
     def clear_observation(self) -> None:

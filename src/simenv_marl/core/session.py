@@ -207,7 +207,6 @@ class Session:
         again.script, again.just_ended = None, []  # the other view has reported the ends
         again.last_time = last_time
         if not same(_decision(again), decision):
-            again.close()
             raise BranchError(
                 f"{type(self.simulation).__name__} does not repeat its decisions with the same seed and the same"
                 ' actions: some of its random numbers do not follow from the seed. Use method="fork", or'

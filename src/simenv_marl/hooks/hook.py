@@ -210,7 +210,7 @@ class Hook:
         with suppress(TypeError, ValueError):  # the signature is unknown
             self.signature = inspect.signature(function, follow_wrapped=False)
         self.bound = bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
-        parameters = [] if self.signature is None else list(self.signature.parameters.values())
+        parameters = () if self.signature is None else self.signature.parameters.values()
         first = [
             p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
         ]

@@ -68,6 +68,7 @@ def ended(*numbers):
 def test_a_clone_does_what_the_environment_does_and_neither_sees_the_other(view, options, method):
     for taken in (0, 3):
         env = trip(view, taken=taken, **OPTIONS[options])
+        env.unwrapped.np_random.random()
         twin, other = clone(env, method=method), clone(env, method=method)
         deeper = clone(twin, method=method)
         other.reset(seed=9)
@@ -119,11 +120,13 @@ def test_clones_have_many_generations_and_end_when_they_are_collected():
 
 
 def test_a_clones_process_has_no_descriptors_that_it_does_not_need():
-    env = trip()
-    other, number = clone(env, method="fork"), len(descriptors())
-    twin = clone(env, method="fork")
-    for each in (twin, clone(twin, method="fork"), other):
-        assert each.call(lambda env: len(descriptors())) == number - (each is other)
+    with open(__file__, encoding="utf-8"):  # each has its own opening
+        env = trip()
+        other, number = clone(env, method="fork"), len(descriptors())
+        twin = clone(env, method="fork")
+        twin.call(lambda env: setattr(sys, "unraisablehook", lambda unclosed: os._exit(1)))
+        for each in (twin, clone(twin, method="fork"), other):
+            assert each.call(lambda env: len(descriptors())) == number - (each is other)
 
 
 @METHODS

@@ -13,6 +13,7 @@ from functools import partial
 import greenlet
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, branch, clone, evaluate, simulate, simulate_many, single_env
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
@@ -193,7 +194,7 @@ def test_an_exit_in_a_coroutine_surfaces_and_later_coroutines_are_answered():
 
 
 def test_ctrl_c_cancels_the_coroutines_and_unwinds_the_simulations():
-    cancelled, begun = [], threading.Event()
+    cancelled = []
 
     async def endless(observation, *, _decision):
         try:
@@ -209,12 +210,16 @@ def test_ctrl_c_cancels_the_coroutines_and_unwinds_the_simulations():
         time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    with pytest.raises(KeyboardInterrupt):
-        levels(endless, concurrency=3)
-    thread.join()
-    assert sorted(cancelled) == [0, 1, 2]
+    for play in (
+        partial(levels, concurrency=3),
+        lambda policy: simulate(Tank, {"filler": policy}, points=POINTS, seed=3),
+    ):
+        begun, thread = threading.Event(), threading.Thread(target=interrupt)
+        thread.start()
+        with pytest.raises(KeyboardInterrupt):
+            play(endless)
+        thread.join()
+    assert sorted(cancelled) == [0, 1, 2, 3]
 
 
 def test_it_works_where_an_event_loop_runs_already():
@@ -334,6 +339,29 @@ def test_a_policy_gets_the_pending_decision(waits, many):
     assert first.mask is None
     assert first.choices is None
     assert not first.in_clone
+
+
+def test_what_a_policy_does_to_its_decision_changes_nothing_else():
+    def spoil(observation, *, _decision):
+        assert _decision.observation_labels == {"level": "Level"}
+        before = float(observation["level"][0])
+        _decision.observation["level"][:] = before + 1
+        _decision.observation_labels.clear()
+        _decision.choices.clear()
+        _decision.mask[:] = 1
+        assert observation["level"] == before
+        return 2 * (_decision.number - 1)
+
+    given = {
+        "observation_space": spaces.Dict({"level": spaces.Box(-50, 50, (1,))}),
+        "observation_space_mapping": lambda tank: {"level": [tank.level]},
+        "observation_labels": {"level": "Level"},
+        "action_labels": None,
+        "action_space_mapping": None,
+        "choices": lambda tank: [0.0, 1.0],
+    }
+    with pytest.raises(InvalidActionError, match="masked"):
+        simulate(Tank, {"filler": spoil}, points={Tank.fill: replace(POINTS[Tank.fill], **given)}, seed=0)
 
 
 def test_rewards_of_forced_moves_add_up_in_the_pending_decision():

@@ -104,7 +104,9 @@ def test_a_checkpoint_rewinds_when_what_it_was_cloned_from_is_gone(method):
     checkpoint = clone(clone(env, method=method), method=method)
     env.close()
     found = [future(clone(checkpoint, method=method)) for _ in range(3)]
-    assert found == [future(trip("single, limited", taken=2))] * 3 == [future(checkpoint)] * 3
+    for _ in range(4):
+        found += branch(checkpoint, lambda twin, number: future(twin), method=method)
+    assert found == [future(trip("single, limited", taken=2))] * 7 == [future(checkpoint)] * 7
 
 
 def test_clones_have_many_generations_and_end_when_they_are_collected():
@@ -137,8 +139,9 @@ def test_wrappers_keep_count(method):
     told = twin.unwrapped.call(lambda env: (env._elapsed_steps, env.step(1)[3], env._elapsed_steps))
     assert (told, twin._elapsed_steps, env._elapsed_steps) == ((2, False, 3), 3, 1)
     assert clone(twin, method=method).step(1)[3] is twin.step(1)[3] is True
-    twin.unwrapped.call(lambda env: env.reset(seed=5))
-    assert twin._elapsed_steps == 0
+    twin.note = "old"
+    twin.unwrapped.call(lambda env: (env.reset(seed=5), delattr(env, "note")))
+    assert (twin._elapsed_steps, hasattr(twin, "note")) == (0, False)
     assert future(twin) == future(trip("single, limited", Free, taken=0, seed=5))
     outer = TimeLimit(clone(trip(), method=method), 2)
     outer.reset(seed=4)

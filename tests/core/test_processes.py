@@ -12,9 +12,24 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import branch, make_step, single_env, vector_env
+from simenv_marl.core.forks import Fork
 from simenv_marl.core.packing import RemoteTraceback, pack_error, unpack_error
 from simenv_marl.errors import BranchError, InvalidActionError, WorkerError, error_text
 from tests.worlds.counters import FORK, FORKS
+
+# -- their ends ---------------------------------------------------------------------------------------
+
+
+@FORKS
+def test_a_fork_ends_with_its_work_or_where_it_cannot_be_separated():
+    fork = Fork.begin(lambda connection: None, lambda: None, wait=False)
+    assert os.waitpid(fork.process, 0)[1] == 0
+    fork.end()
+    with pytest.raises(BranchError, match="died"):
+        Fork.begin(print, lambda: 1 / 0, wait=True)
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+
 
 # -- errors of all kinds ------------------------------------------------------------------------------
 

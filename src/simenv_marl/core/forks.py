@@ -259,6 +259,7 @@ def start(
         except BaseException:
             os._exit(1)
     elif wait:
+        there.close()  # else the end of the process would go unnoticed
         separated = b""
         try:
             separated = here.recv(1)

@@ -281,9 +281,6 @@ def _applying(agent: Agent, inner: Any) -> Any:
             agent.applying -= 1
         try:
             resume, sent = inner.send, (yield waits)
-        except GeneratorExit:
-            inner.close()
-            raise
         except BaseException as error:
             resume, sent = inner.throw, error
 

@@ -1,7 +1,9 @@
 """Errors cross to other processes as they are."""
 
 import os
+import signal
 import sys
+import time
 import traceback
 from dataclasses import dataclass
 from pickle import PicklingError
@@ -20,13 +22,22 @@ from tests.worlds.counters import FORK, FORKS
 # -- their ends ---------------------------------------------------------------------------------------
 
 
+def interrupt(path):
+    os.kill(os.getppid(), signal.SIGINT)
+    time.sleep(1)
+    path.touch()
+
+
 @FORKS
-def test_a_fork_ends_with_its_work_or_where_it_cannot_be_separated():
+def test_a_fork_ends_with_its_work_or_where_it_cannot_be_separated(tmp_path):
     fork = Fork.begin(lambda connection: None, lambda: None, wait=False)
     assert os.waitpid(fork.process, 0)[1] == 0
     fork.end()
     with pytest.raises(BranchError, match="died"):
         Fork.begin(print, lambda: 1 / 0, wait=True)
+    with pytest.raises(KeyboardInterrupt):
+        Fork.begin(print, lambda: interrupt(tmp_path / "went on"), wait=True)
+    assert not (tmp_path / "went on").exists()
     with pytest.raises(ChildProcessError):
         os.waitpid(-1, os.WNOHANG)
 

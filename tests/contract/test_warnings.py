@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 import pytest
 
-from simenv_marl import aec_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl import RULE, aec_env, parallel_env, simulate, simulate_many, single_env, vector_env
 from simenv_marl.core import rng
 from simenv_marl.errors import UnknownPointError
 from tests.worlds.models import calling, decision, define
@@ -200,6 +200,8 @@ def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> N
     env = aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1", "ant_9"])
     env.reset()
     env.close()
+    one, ruled = decision(agent="one_0"), decision(agent="ruled_0")
+    through(aec_env(calling(one, ruled), [one, ruled], policies={"ruled_0": RULE}))
     assert heard(ABSENT) == []
 
 

@@ -201,7 +201,9 @@ def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> N
     env.reset()
     env.close()
     one, ruled = decision(agent="one_0"), decision(agent="ruled_0")
-    through(aec_env(calling(one, ruled), [one, ruled], policies={"ruled_0": RULE}))
+    env = single_env(calling(one, ruled), [one, ruled], agent="one_0", policies={"ruled_0": RULE})
+    env.reset()
+    env.step(0)
     assert heard(ABSENT) == []
 
 

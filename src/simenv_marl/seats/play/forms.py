@@ -89,7 +89,8 @@ def candidates_of(space: spaces.Space[Any], mask: Any) -> list[Any]:
         legal = np.arange(space.n) if mask is None else np.flatnonzero(mask)
         return [int(space.start) + int(place) for place in legal[: MOST - 1]]
     if isinstance(space, spaces.Box) and space.low.size == 1 and space.is_bounded():
-        return list(np.unique(np.linspace(space.low, space.high, 5).astype(space.dtype), axis=0).tolist())
+        found: list[Any] = np.unique(np.linspace(space.low, space.high, 5).astype(space.dtype), axis=0).tolist()
+        return found
     return []
 
 

@@ -20,14 +20,16 @@ matrix: .venv/.matrix
 # These fork all the time, and a fork takes four times as long in a process in which all the other tests run.
 FORKING := tests/planning tests/seats tests/test_branch.py tests/test_clone.py docs/branches.md docs/seats.md docs/reference/planning.md
 # What test-studies runs, and what test-outside runs because it needs more than a compiler.
-ELSEWHERE := tests/studies $(addprefix tests/outside/test_,$(addsuffix .py,energyplus enki fmi ros))
-test: lint docs
+STUDIES := tests/studies tests/test_benchmarks.py
+ELSEWHERE := $(STUDIES) $(addprefix tests/outside/test_,$(addsuffix .py,energyplus enki fmi ros))
+test: .venv/.test
+	$(MAKE) --jobs 2 --output-sync lint docs
 	$(BIN)/python -m pytest -n 2 --order random $(FORKING)
 	$(BIN)/python -m pytest -n 2 --order random $(addprefix --ignore=,$(FORKING) $(ELSEWHERE))
 
-# One quick run of each study, from its command line to its figures.
+# One quick run of each study, from its command line to its figures, and of the benchmark.
 test-studies: .venv/.test
-	$(BIN)/python -m pytest -n 2 tests/studies
+	$(BIN)/python -m pytest -n 2 $(STUDIES)
 
 # All tests that there are. Run it before a release: it takes more than an hour on two cores.
 test-all: test test-studies test-wheel test-oldest test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-clusters test-outside

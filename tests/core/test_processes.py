@@ -6,6 +6,7 @@ import sys
 import time
 import traceback
 from dataclasses import dataclass
+from pathlib import Path
 from pickle import PicklingError
 from types import GetSetDescriptorType, MemberDescriptorType
 
@@ -17,6 +18,7 @@ from simenv_marl import branch, make_step, single_env, vector_env
 from simenv_marl.core.forks import Fork
 from simenv_marl.core.packing import RemoteTraceback, pack_error, unpack_error
 from simenv_marl.errors import BranchError, InvalidActionError, WorkerError, error_text
+from tests.processes import alone
 from tests.worlds.counters import FORK, FORKS
 
 # -- their ends ---------------------------------------------------------------------------------------
@@ -28,18 +30,23 @@ def interrupt(path):
     path.touch()
 
 
-@FORKS
-def test_a_fork_ends_with_its_work_or_where_it_cannot_be_separated(tmp_path):
+def fork_and_look_for_children(folder: str) -> None:
+    went_on = Path(folder) / "went on"
     fork = Fork.begin(lambda connection: None, lambda: None, wait=False)
     assert os.waitpid(fork.process, 0)[1] == 0
     fork.end()
     with pytest.raises(BranchError, match="died"):
         Fork.begin(print, lambda: 1 / 0, wait=True)
     with pytest.raises(KeyboardInterrupt):
-        Fork.begin(print, lambda: interrupt(tmp_path / "went on"), wait=True)
-    assert not (tmp_path / "went on").exists()
+        Fork.begin(print, lambda: interrupt(went_on), wait=True)
+    assert not went_on.exists()
     with pytest.raises(ChildProcessError):
         os.waitpid(-1, os.WNOHANG)
+
+
+@FORKS
+def test_a_fork_ends_with_its_work_or_where_it_cannot_be_separated(tmp_path):
+    alone(fork_and_look_for_children, str(tmp_path))
 
 
 # -- errors of all kinds ------------------------------------------------------------------------------

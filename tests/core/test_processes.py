@@ -32,8 +32,10 @@ def interrupt(path):
 
 def fork_and_look_for_children(folder: str) -> None:
     went_on = Path(folder) / "went on"
-    fork = Fork.begin(lambda connection: None, lambda: None, wait=False)
+    fork = Fork.begin(lambda connection: connection.recv(1), lambda: None, wait=False)
+    fork.connection.send(b"ab")
     assert os.waitpid(fork.process, 0)[1] == 0
+    assert fork._has_ended()  # also where it has left something unread
     fork.end()
     with pytest.raises(BranchError, match="died"):
         Fork.begin(print, lambda: 1 / 0, wait=True)

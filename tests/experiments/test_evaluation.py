@@ -416,3 +416,12 @@ def test_importing_the_package_imports_none_of_what_experiments_need():
     code = "import sys, simenv_marl; print({'pandas', 'scipy.stats', 'pydoe', 'SALib'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_returns_are_not_counted_where_two_points_have_the_same_agent_which_is_told():
+    class Doubled(Shop):
+        order, sell = map(NEAR[Shop.order], (Shop.order, Shop.sell))
+
+    with pytest.warns(UserWarning, match="not counted, .* have the same agent 'keeper'"):
+        found = evaluate(Doubled, {"rule": {}}, seeds=[1])
+    assert found.frame["length"].tolist() == [0]

@@ -686,8 +686,7 @@ class House:
         return 0
 
     def time(self):
-        self.word()
-        return float(self.step)
+        return self.step + len(self.word()) / 10
 
     def state(self):
         return [len(self.word())]
@@ -713,6 +712,7 @@ def test_plugins_apply_in_the_simulation_and_in_mappings_of_their_environment():
     assert env.render() == "mine"
     assert env.unwrapped.state().tolist() == [4]
     env.close()
+    assert joint_env(House, House.water, plugins=[says("mine")]).reset()[1]["time"] == 0.4
     assert simulation.log == ["mine"] * 5
     assert simulation.word() == "plain"
     assert simulate(House, points=House.water, plugins=iter([says("mine")])).log == ["mine"] * 7

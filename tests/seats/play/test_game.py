@@ -288,7 +288,7 @@ def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_game):
 def test_after_the_limit_the_rule_decides_and_is_counted(make_game, monkeypatch):
     game = make_game(limit=30.0)
     assert settle(game)["left"] is None  # nobody is there
-    game.handle(None, {"taken": ["buyer"]})
+    assert not game.handle(None, {"taken": ["buyer"]})  # the game stays as it is
     assert 0 < game.snapshot()["left"] <= 30
     times = iter(range(0, 10**9, 10))
     monkeypatch.setattr("simenv_marl.seats.play.game.monotonic", lambda: next(times))
@@ -370,6 +370,10 @@ def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_ga
         replay(path, Shop, episode=2)
     with pytest.raises(OptionValueError, match="does not repeat"):
         replay(path, FixedShop, episode=0)
+    seen = json.loads(path.read_text().splitlines()[-1])["seen"]
+    path.write_text(path.read_text().replace(seen, "another"))
+    with pytest.raises(OptionValueError, match="or with another observation"):
+        replay(path, Shop)
     path.write_text("{")
     with pytest.raises(StoreError, match="cannot be read"):
         replay(path, Shop)

@@ -378,7 +378,7 @@ def _watch_resources() -> None:
     if bool(STACKS) == bool(_PATCHES):
         return
     with LOCK:
-        for owner, name in _OPENING if STACKS and not _PATCHES else ():
+        for owner, name in () if _PATCHES else _OPENING:
             before = vars(owner)[name]
             patch = _noting(before)
             setattr(owner, name, patch)

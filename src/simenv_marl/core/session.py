@@ -184,8 +184,7 @@ class Session:
     def recording(self) -> tuple[Any, ...]:
         """Return what a replay of the episode needs: seed, options, kind, answers, decision, and last time."""
         episode = self.episode
-        if episode is None or (episode.pending or episode.consulted) is None:
-            raise self.refusal()
+        assert episode is not None
         if len(episode.tape) == episode.tape_size or episode.plan.solo:
             raise BranchError(
                 f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of the environment that"

@@ -292,9 +292,10 @@ def test_the_end_of_the_game_ends_the_server():
     ],
 )
 def test_what_cannot_be_played_is_told(arguments, told, capsys):
+    before = set(multiprocessing.active_children())  # joblib keeps its own for the next time
     assert main(["play", *arguments]) == 2
     assert told in capsys.readouterr().err
-    assert not multiprocessing.active_children()
+    assert set(multiprocessing.active_children()) <= before
 
 
 def test_a_missing_extra_is_told(monkeypatch, capsys):

@@ -25,6 +25,7 @@ from tests.worlds.counters import FORK, FORKS
 
 
 def interrupt(path):
+    time.sleep(0.1)  # until the parent waits
     os.kill(os.getppid(), signal.SIGINT)
     time.sleep(1)
     path.touch()

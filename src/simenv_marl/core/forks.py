@@ -259,9 +259,9 @@ def start(
         except BaseException:
             os._exit(1)
     elif wait:
-        there.close()  # else the end of the process would go unnoticed
         separated = b""
         try:
+            there.close()  # else the end of the process would go unnoticed
             separated = here.recv(1)
         finally:
             if not separated:  # it has died, or an interrupt has ended the wait

@@ -24,8 +24,8 @@ STUDIES := tests/studies tests/test_benchmarks.py
 ELSEWHERE := $(STUDIES) $(addprefix tests/outside/test_,$(addsuffix .py,energyplus enki fmi ros))
 test: .venv/.test
 	$(MAKE) --jobs 2 --output-sync lint docs
-	$(BIN)/python -m pytest -n 2 --order random $(FORKING)
-	$(BIN)/python -m pytest -n 2 --order random $(addprefix --ignore=,$(FORKING) $(ELSEWHERE))
+	$(BIN)/python -m pytest -n 2 --dist worksteal --order random $(FORKING)
+	$(BIN)/python -m pytest -n 2 --dist worksteal --order random $(addprefix --ignore=,$(FORKING) $(ELSEWHERE))
 
 # One quick run of each study, from its command line to its figures, and of the benchmark.
 test-studies: .venv/.test

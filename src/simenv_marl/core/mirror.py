@@ -87,7 +87,7 @@ class ForkedSession(Session):
         """Take over a process in which the episode of a session goes on."""
         self.plan, self.bound_plan = original.plan, None
         self.is_copy = True
-        self.state, self.options, self.seed = original.state, original.options, original.seed
+        self.state, self.options, self.seed = "over", original.options, original.seed
         self.np_random_seed, self._np_random = original.np_random_seed, copy.deepcopy(original._np_random)
         self.exclusive = self.lock = ExclusiveLock()
         self._fork, self._limit = fork, time_limit

@@ -290,7 +290,8 @@ class Session:
     # -- branches ---------------------------------------------------------------------------------
 
     def step_out(self) -> None:
-        """Restore the user's global generators in a branch that was forked from inside a policy."""
+        """Leave the reset or step in a branch that was forked from inside a policy; restore the user's generators."""
+        self.state = "over"  # a reset that has come to its first decision is still moving
         if self._rng is not None:
             self._rng.step_out()
 

@@ -139,7 +139,6 @@ class PlannerEnv(SimulationEnv):
         if not self._branched:
             self._branched = True
             self._session.step_out()
-            self._session.state = "over"  # a reset that has come to its first decision is still moving
             self.episode.single_out(self._own)
 
     def _check_pending(self) -> None:

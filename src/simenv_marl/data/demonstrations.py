@@ -84,7 +84,7 @@ def record_dataset(
     return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
 
 
-def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Any:
+def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Mapping[Any, str]:
     """Return the name of each data set, by the key of its policy."""
     if isinstance(dataset_id, str) and len(policies) == 1:
         return {next(iter(policies)): dataset_id}
@@ -102,7 +102,8 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Any:
         )
     if len(set(names)) < len(names):
         raise OptionValueError(f"each policy needs a data set of its own: {short_repr(dict(dataset_id))}")
-    return dataset_id
+    named: Mapping[Any, str] = dataset_id
+    return named
 
 
 def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -> Any:

@@ -4,9 +4,9 @@ Run it with ``python -m tools.mutants``, or ``make mutants``. It writes each res
 per line. A second call resumes where the first stopped; with ``--again`` it retries the survivors, for example after
 tests were added. It draws mutants from all modules except ``testing`` and those that draw plots.
 
-Before the first mutant, it runs all tests once and measures which tests execute which lines, and their durations. Only
-tests that execute a mutant's function run for it: first those that execute its line, some quick ones of each file
-before the others.
+Before the first mutant, it runs all tests once and measures their durations, and which tests execute which lines, also
+in processes that they start. Only tests that execute a mutant's module run for it: first those that execute its line,
+then those that execute its function, some quick ones of each file before the others.
 
 A mutant that survives can cost half an hour, because nearly all tests execute some functions of the core. ``--most``
 limits the tests for each mutant to the first ones; the report says how many of them ran.
@@ -51,6 +51,16 @@ FIRST = 6
 """The number of tests of each file that come first, its quickest ones."""
 QUICK = 0.2
 """The longest duration of those tests, in seconds."""
+PROCESSES = """[run]
+source_pkgs = simenv_marl
+branch = true
+concurrency = greenlet, thread
+parallel = true
+data_file = {folder}/processes
+context = ${{PYTEST_CURRENT_TEST-}}
+patch = _exit
+"""
+"""The settings of Coverage.py for processes that a test starts: their data name the test."""
 
 
 @dataclass(frozen=True)
@@ -69,17 +79,16 @@ class Measured:
         """List the tests that could find a mutant, in the order in which they should run.
 
         First those that execute its line; then those that execute any line of its function, because the measurement
-        can miss lines after a switch between stacks. If no test executes the function, as with code that runs at
-        import, all tests of the files that execute any line of its module.
+        can miss lines after a switch between stacks; then those that execute any line of its module, because the
+        measurement misses forks. If no test executes the module, as with code that runs at import, all tests.
         """
         lines = self.lines.get(mutant.module, {})
         found = [
             {test for line, tests in lines.items() if first <= line <= last for test in tests}
-            for first, last in (mutant.lines, mutant.function)
+            for first, last in (mutant.lines, mutant.function, (0, math.inf))
         ]
         if not any(found):
-            files = {file_of(test) for tests in lines.values() for test in tests}
-            found = [{test for test in self.seconds if not files or file_of(test) in files}]
+            found = [set(self.seconds)]
         return list(dict.fromkeys(test for tests in found for test in self.ordered(tests)))
 
     def ordered(self, found: set[str]) -> list[str]:
@@ -202,12 +211,12 @@ def measure(cache: Path) -> Measured:
     print("measuring which tests execute which lines", flush=True)
     with tempfile.TemporaryDirectory(prefix="mutants-") as temporary:
         folder = copied(Path(temporary).resolve())
-        notes, data = folder / "notes.jsonl", folder / "coverage"
+        notes, data, settings = folder / "notes.jsonl", folder / "coverage", folder / "settings.ini"
+        settings.write_text(PROCESSES.format(folder=folder), encoding="utf-8")
         options = ["-q", "-n", "2", "--driver", "greenlet", "-p", "tools.mutants_plugin", "--cov", "--cov-context=test"]
         command = [sys.executable, "-m", "pytest", *options, "--cov-report=", "tests"]
-        subprocess.run(
-            command, cwd=folder, env=environment(folder, MUTANTS_NOTE=notes, COVERAGE_FILE=data), check=False
-        )
+        variables = environment(folder, MUTANTS_NOTE=notes, MUTANTS_COVERAGE=settings, COVERAGE_FILE=data)
+        subprocess.run(command, cwd=folder, env=variables, check=False)
         measured = measured_in(folder, notes, data)
     numbers = {name: number for number, name in enumerate(measured.seconds)}
     compact = {
@@ -219,9 +228,7 @@ def measure(cache: Path) -> Measured:
 
 
 def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
-    """Read the measurements of the tests of a copy."""
-    from coverage import CoverageData
-
+    """Read the measurements of the tests of a copy, and of the processes that they have started."""
     outcomes: dict[str, tuple[str, float]] = {}
     for name, outcome, seconds in read(notes):
         if outcomes.get(name, ("passed",))[0] == "passed":
@@ -229,17 +236,34 @@ def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
     for name in (name for name, (outcome, _) in outcomes.items() if outcome != "passed"):
         print(f"left out, because it fails without a mutant: {name}", flush=True)
     seconds_of = {name: seconds for name, (outcome, seconds) in outcomes.items() if outcome == "passed"}
-    covered = CoverageData(str(data))
-    covered.read()
-    lines: dict[str, dict[int, list[str]]] = {}
-    for path in covered.measured_files():
+    lines: dict[str, dict[int, set[str]]] = {}
+    at_import = set()
+    for module, line, contexts in covered(data, folder):
+        lines.setdefault(module, {})[line] = {context.rpartition("|")[0] for context in contexts} & seconds_of.keys()
+        if "" in contexts:
+            at_import.add((module, line))
+    for part in folder.glob("processes.*"):
+        for module, line, contexts in covered(part, folder):
+            if (module, line) not in at_import:
+                tests = {context.rpartition(" (")[0] for context in contexts} & seconds_of.keys()
+                lines.setdefault(module, {}).setdefault(line, set()).update(tests)
+    both = {
+        module: {line: sorted(tests | set(map(twin, tests))) for line, tests in of_module.items() if tests}
+        for module, of_module in lines.items()
+    }
+    return Measured(seconds_of | {twin(name): 2 * seconds for name, seconds in seconds_of.items()} | seconds_of, both)
+
+
+def covered(data: Path, folder: Path) -> Iterator[tuple[str, int, list[str]]]:
+    """Iterate over the modules and lines that a file of Coverage.py has, with the contexts of each."""
+    from coverage import CoverageData
+
+    measured = CoverageData(str(data))
+    measured.read()
+    for path in measured.measured_files():
         module = Path(path).resolve().relative_to(folder / PACKAGE).as_posix()
-        of_module = lines.setdefault(module, {})
-        for line, contexts in covered.contexts_by_lineno(path).items():
-            tests = {context.rpartition("|")[0] for context in contexts} & seconds_of.keys()
-            if tests:
-                of_module[line] = sorted(tests | set(map(twin, tests)))
-    return Measured(seconds_of | {twin(name): 2 * seconds for name, seconds in seconds_of.items()} | seconds_of, lines)
+        for line, contexts in measured.contexts_by_lineno(path).items():
+            yield module, line, contexts
 
 
 def twin(test: str) -> str:
@@ -337,6 +361,15 @@ def run(command: list[str], folder: Path, variables: dict[str, str], limit: floa
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
+            end_processes_of(folder)
+
+
+def end_processes_of(folder: Path) -> None:
+    """End the processes that the tests of a copy have left in sessions of their own."""
+    for variables in Path("/proc").glob("[0-9]*/environ"):
+        with suppress(OSError):
+            if f"MUTANTS_ROOT={folder}\0".encode() in variables.read_bytes():
+                os.kill(int(variables.parent.name), signal.SIGKILL)
 
 
 def report(results: list[dict[str, Any]]) -> None:

@@ -1,8 +1,9 @@
 """A pytest plugin for ``tools.mutants``: it records the durations of tests, and runs chosen tests in a given order.
 
-Two environment variables with the name of a file each control it. To ``MUTANTS_NOTE`` it writes each test's name,
+Three environment variables with the name of a file each control it. To ``MUTANTS_NOTE`` it writes each test's name,
 outcome and seconds. ``MUTANTS_TESTS`` is a JSON object that maps the names of the tests to run, in their order, to the
-time limit of each in seconds. A test that takes longer ends the whole process.
+time limit of each in seconds. A test that takes longer ends the whole process. ``MUTANTS_COVERAGE`` has the settings
+with which Coverage.py measures the Python processes that a test starts.
 """
 
 from __future__ import annotations
@@ -28,6 +29,13 @@ def pytest_configure(config: Any) -> None:
 
     if not Path(simenv_marl.__file__).is_relative_to(_ROOT):
         raise pytest.UsageError(f"{simenv_marl.__file__} is not below {_ROOT}")
+
+
+def pytest_collection_finish() -> None:
+    """Have Coverage.py measure the processes that are started from now on."""
+    if settings := os.environ.get("MUTANTS_COVERAGE"):
+        os.environ["COVERAGE_PROCESS_START"] = settings
+        os.environ.pop("COVERAGE_FILE", None)  # it goes before the file that the settings name
 
 
 @pytest.hookimpl(trylast=True)

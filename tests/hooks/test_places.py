@@ -7,6 +7,7 @@ import threading
 import time
 import types
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from textwrap import dedent
 from unittest import mock
 
@@ -16,7 +17,7 @@ from simenv_marl import aec_env
 from simenv_marl.decision import point_of, registered
 from simenv_marl.errors import PatchError, UnknownTargetError
 from simenv_marl.hooks.handlers import Installation
-from simenv_marl.hooks.hook import hook_of
+from simenv_marl.hooks.hook import hook_of, hooks
 from simenv_marl.hooks.places import PlacedHook, find_hook, places_of, resolve
 from simenv_marl.plugins import (
     ChangedResult,
@@ -57,8 +58,10 @@ def function():
     return "rule"
 
 
-def hook_of_name(name):
-    return find_hook(f"{HERE}.{name}", UnknownTargetError)
+def calls_of(path):
+    """A call of what is found here by a path, its owner, and its name there."""
+    owner, attribute = resolve(f"{HERE}.{path}", UnknownTargetError)
+    return lambda: getattr(owner() if isinstance(owner, type) else owner, attribute)(), owner, attribute
 
 
 @pytest.fixture
@@ -125,7 +128,7 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised, make_module):
     gc.collect()
     assert function is refusing.alias is original
     assert hook_of(vars(_Base)["method"]) is None
-    kept = Installation([(hook_of_name("_Base.method"), None)])
+    kept = Installation([(find_hook(f"{HERE}._Base.method", UnknownTargetError), None)])
     kept.uninstall()
     assert not kept.complete  # so that an environment that is used again sets all of it again
 
@@ -195,74 +198,47 @@ def _dawdling(monkeypatch):
         monkeypatch.setattr(PlacedHook, name, dawdle(getattr(PlacedHook, name)))
 
 
-SOURCE = """
-class Base:
-    def method(self): return "rule"
-    def look(self): return "rule"
-
-class Sub(Base): pass
-
-def function(): return "rule"
-"""
-
-
 @pytest.mark.usefixtures("_dawdling")
-@pytest.mark.parametrize("path", ["Base.method", "Sub.method", "function"])
-def test_threads_come_and_go_at_once(path, monkeypatch, make_module):
-    """In each round eight of them come to a module that is new, and go."""
-    module, rounds, before, ready = make_module("new_model"), [], [], threading.Barrier(8)
-    monkeypatch.setattr("simenv_marl.hooks.places.modules", {"new_model": module})  # looking at all takes its time
-    name, (*owner_name, attribute) = f"new_model.{path}", path.split(".")
-
-    def owner():
-        return getattr(module, owner_name[0]) if owner_name else module
-
-    def call():
-        return getattr(owner()() if owner_name else module, attribute)()
-
-    def work():
-        for number in range(10):
-            if ready.wait(30) == 0:
-                exec(SOURCE, vars(module))
-                before.append(vars(owner()).get(attribute))
-            ready.wait(30)
-            called = []
-            plugins = [(lambda *_: None, "new_model.Base.look", "before")]
-            env = aec_env(calling(call), {name: define()}, plugins=plugins)
-            with handlers((lambda *_: called.append(1), name, "before")):  # noqa: B023
-                env.reset()
-                assert called
-                env.step(1)
-                ready.wait(30)
-            assert env.unwrapped.simulation.log == [1]
-            env.close()
-            ready.wait(30)
-            assert vars(owner()).get(attribute) is before[number]
-            assert hook_of(vars(module.Base)["look"]) is None
-        rounds.append(number)
-
-    threads = [threading.Thread(target=work, daemon=True) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert rounds == [9] * 8
-
-
-@pytest.mark.parametrize("name", ["_Base.method", "_Base.static", "_Base.of_class", "Sub.method", "function"])
-@pytest.mark.parametrize("end", ["close", "drop"])
-def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(name, end):
-    owner, attribute = resolve(f"{HERE}.{name}", UnknownTargetError)
+@pytest.mark.parametrize("path", ["_Base.method", "Sub.method", "function"])
+def test_threads_come_and_go_at_once(path, monkeypatch):
+    """In each round eight of them look for a function that has no hook yet, and go."""
+    monkeypatch.setattr("simenv_marl.hooks.places.modules", {HERE: sys.modules[HERE]})  # all take too long
+    name, ready = f"{HERE}.{path}", threading.Barrier(8)
+    call, owner, attribute = calls_of(path)
     before = vars(owner).get(attribute)
 
-    def call():
-        return getattr(owner() if isinstance(owner, type) else owner, attribute)()
+    def come_and_go(_):
+        called = []
+        env = aec_env(calling(call), {name: define()}, plugins=[(lambda *_: None, f"{HERE}._Base.look", "before")])
+        with handlers((lambda *_: called.append(1), name, "before")):
+            env.reset()
+            assert called
+            env.step(1)
+            ready.wait(30)
+        assert env.unwrapped.simulation.log == [1]
+        env.close()
+        ready.wait(30)
+        assert vars(owner).get(attribute) is before
+        assert hook_of(vars(_Base)["look"]) is None
 
-    expected, points = call(), {f"{HERE}.{name}": define(agent="one_0")}
+    with ThreadPoolExecutor(8) as threads:
+        for _ in range(10):
+            list(threads.map(come_and_go, range(8)))
+            gc.collect()
+            assert not any(hook.name == name for hook in hooks())
+
+
+@pytest.mark.parametrize("path", ["_Base.method", "_Base.static", "_Base.of_class", "Sub.method", "function"])
+@pytest.mark.parametrize("end", ["close", "drop"])
+def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(path, end):
+    call, owner, attribute = calls_of(path)
+    before, expected = vars(owner).get(attribute), call()
+    name = f"{HERE}.{path}"
+    points = {name: define(agent="one_0")}
     for _ in range(3):
         env = aec_env(calling(call), points)
         env.reset()
-        hook = hook_of_name(name)
+        hook = find_hook(name, UnknownTargetError)
         with mock.patch.object(owner, attribute, return_value="mocked"):
             if end == "close":
                 env.close()

@@ -15,7 +15,7 @@ from simenv_marl.hooks.hook import hook_of, hooks
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
-from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play
+from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, script
 from tests.worlds.undone import left_as_they_were
 
 # Traders and brokers decide under one name here: it is about functions, and not about agents.
@@ -166,10 +166,7 @@ def test_a_plain_function_becomes_a_decision_point(name, call, rule, how):
     assert call() == rule
 
 
-BASE, SUB = {BID: define()}, {f"{MARKET}.Broker.bid": define()}
-
-
-def test_an_inherited_point_is_decided_for_the_named_class_and_gets_the_called_class():
+def test_an_inherited_point_gets_the_called_class():
     seen = []
     env = aec_env(
         calling(lambda: Broker.opening(), lambda: Junior.opening(), lambda: Dealer.opening()),
@@ -180,33 +177,24 @@ def test_an_inherited_point_is_decided_for_the_named_class_and_gets_the_called_c
     assert seen == [Broker, Junior, Junior]
 
 
-def test_base_and_subclass_may_both_be_points():
-    env = aec_env(
-        calling(lambda: Trader().bid("tea"), lambda: Broker().bid("tea")),
-        {BID: define(agent="trader_0"), f"{MARKET}.Broker.bid": define(agent="broker_0")},
-    )
-    # RULE for the broker runs what it has inherited, which is a decision of its own.
-    turns = play(env, {"broker_0": RULE, "trader_0": 7})
-    assert decisions(turns) == ["trader_0", "broker_0", "trader_0"]
-    assert env.unwrapped.simulation.log == [7, 7]
+BASE, SUB = {BID: define(agent="trader_0")}, {f"{MARKET}.Broker.bid": define(agent="broker_0")}
 
 
-BIDDERS = (Trader, Broker, Junior, Dealer, Cautious)
+@pytest.mark.parametrize("points", [(BASE, SUB), (SUB, BASE), (BASE | SUB, SUB), (SUB, BASE | SUB)], ids=plainly)
+def test_environments_of_a_base_class_and_of_a_subclass_get_along(points):
+    def bids():
+        return [kind().bid("tea") for kind in (Trader, Broker, Junior, Dealer, Cautious)]
 
-
-@pytest.mark.parametrize(("first", "second"), [(BASE, SUB), (SUB, BASE)], ids=["base-first", "subclass-first"])
-@pytest.mark.parametrize("closed", [0, 1])
-def test_environments_of_a_base_class_and_of_a_subclass_get_along(first, second, closed):
-    bids = calling(*[lambda kind=kind: kind().bid("tea") for kind in BIDDERS])
-    expected = [[9, 9, 9, 9, 8] if points is BASE else [5, 9, 9, 5, 4] for points in (first, second)]
-    envs = [aec_env(bids, first), aec_env(bids, second)]
-    assert [log_of(env) for env in envs] == expected
-    for number in (closed, 1 - closed):
-        envs[number].close()
-        assert log_of(envs[1 - closed]) == expected[1 - closed]
-        assert log_of(envs[number]) == expected[number]  # which patches again
-        envs[number].close()
-    assert [kind().bid("tea") for kind in BIDDERS] == [5, 5, 5, 5, 4]
+    envs = [aec_env(script(lambda simulation: simulation.log.extend(bids())), named) for named in points]
+    for _ in range(2):  # the second time they patch again
+        for env, named in zip(envs, points, strict=True):
+            assert log_of(env) == ([5, 9, 9, 5, 4] if named is SUB else [9, 9, 9, 9, 8])
+            # RULE for the broker runs what it has inherited, which may be a decision of its own.
+            play(env, {"broker_0": RULE, "trader_0": 7})
+            assert env.unwrapped.simulation.log == ([5, 5, 5, 5, 4] if named is SUB else [7, 7, 7, 7, 6])
+        for env in envs:
+            env.close()
+        assert bids() == [5, 5, 5, 5, 4]
     assert "bid" not in vars(Broker)
 
 

@@ -1,6 +1,7 @@
 """A page's code needs only what can be installed or what the page links; the page says how to get anything else."""
 
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -20,7 +21,10 @@ BUDGETS = CONFIG["tool"]["simenv_marl"]["budgets"]
 EXTRAS = set(CONFIG["project"]["optional-dependencies"])
 ROOMS = {page.stem: page for page in (DOCS / "reference").glob("*.md")}
 PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md")) + sorted(f"reference/{room}" for room in ROOMS)
-FRONT = ["README.md", "CONTRIBUTING.md", *(f"docs/{page}.md" for page in PAGES)]
+FRONT = [
+    *("README.md", "CONTRIBUTING.md", "SECURITY.md", ".github/PULL_REQUEST_TEMPLATE.md"),
+    *(f"docs/{page}.md" for page in PAGES),
+]
 BESIDE = {"dask", "gym", "gym_fin", "tensordict"}
 """Packages that other packages bring, or that a reader who comes from them has."""
 
@@ -59,30 +63,15 @@ def linked(page, text):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_code_of_a_page_imports_what_can_be_installed_or_saved(page):
+def test_the_code_of_a_page_fits_on_it_and_needs_what_can_be_installed_or_saved_or_what_it_says_how_to_get(page):
     text, code = code_of(page)
     saved = {path.stem for path in linked(page, text)}
     assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {"examples", "studies"}
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_a_page_links_each_example_that_it_imports_or_runs(page):
-    text, _ = code_of(page)
-    assert set(sources(text)) <= linked(page, text)
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_a_page_says_how_to_get_what_only_the_repository_has(page):
-    text, _ = code_of(page)
+    assert set(sources(text)) <= linked(page, text)  # each example that it imports or runs
     first = re.search(r"(?<![\w./])(?:benchmarks|examples|studies)[./]\w|^make \w|`make \w", text, re.MULTILINE)
-    if first:
+    if first:  # only the repository has it
         up_to_there = " ".join(text[: text.find("\n\n", first.end())].split())
         assert re.search(r"[Cc]lone the repository\b.* from its root\b", up_to_there)
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_the_code_of_a_page_fits_on_it(page):
-    text, _ = code_of(page)
     code = re.findall(r"^```(?:python|console|sh)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert [line for line in "".join(code).splitlines() if len(line) > 100] == []
 
@@ -152,7 +141,8 @@ def commands_of(text):
 def untested(command, written):
     """What a command runs or installs, and no test; ``written`` are the modules that a command before it writes."""
     if command.startswith("make "):
-        recipe = subprocess.run([*command.split(), "--dry-run"], cwd=ROOT, capture_output=True, text=True).stdout
+        dry_run = [*shlex.split(command), "--dry-run"]
+        recipe = subprocess.run(dry_run, cwd=ROOT, capture_output=True, text=True, check=True).stdout
         command = "; ".join(re.findall(r"-m (?:examples|studies)\S+", recipe)) or "-m pytest"
     extras = re.findall(r"pip install .*\[(.+)\]", command)
     programs = [name.replace("$script", "*") for name in re.findall(r"-m (simenv_marl \S+|[\w.$]+)", command)]

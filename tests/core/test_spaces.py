@@ -189,6 +189,13 @@ def test_each_element_of_a_box_counts_and_bounds_are_legal_in_every_precision(nu
                 assert check(given) is ILLEGAL
 
 
+@pytest.mark.parametrize("shape", [(1,), (2,)])
+def test_integers_are_clipped_without_wrapping_around(shape):
+    check = action_check(spaces.Box(-5, 2**63 - 1, shape, np.int64), clips=True)
+    for given, clipped in ((np.uint64(2**64 - 1), 2**63 - 1), (np.int64(-(2**63)), -5), (np.int64(7), 7)):
+        assert_alike(check(np.full(shape, given)), np.full(shape, clipped))
+
+
 def test_parts_of_actions_are_checked_like_actions():
     given = {"pair": [np.int8(6), {"bits": np.array([1, 0, 1], np.int8)}], "box": [0.5, 1]}
     found = action_check(TREE)(given)

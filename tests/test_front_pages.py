@@ -7,7 +7,6 @@ import re
 import sys
 from pathlib import Path
 
-import pytest
 from examples.greenhouse_coop import model
 
 import simenv_marl
@@ -17,28 +16,20 @@ from .clients import page
 SOURCES = Path(simenv_marl.__file__).parent
 
 
-@pytest.fixture
-def run():
-    """Runs code, and returns its names."""
-    all_names = []
-
-    def execute(code):
-        names = {}
-        all_names.append(names)
-        exec(code, names)
-        return names
-
-    yield execute
-    for names in all_names:
-        names.clear()  # a suspended simulation holds its globals, and these hold its environment
+def run(code):
+    """Run code. Returns its names."""
+    names = {}
+    exec(code, names)
+    return names
 
 
-def test_the_code_of_the_front_page_has_the_rewards_that_it_shows(run):
+def test_the_code_of_the_front_page_has_the_rewards_that_it_shows():
     (code,) = page.blocks("index.md")
     env = run(code)["env"]
     assert env.reset(seed=1)[0] == [5.0]
     rewards = [env.step(action)[1] for action in (1, 1, 0, 1, 1)]
     assert rewards == [-1.0, -2.0, -1.0, -2.0, -3.0]
+    env.close()
 
 
 def test_pictures_and_links_of_the_readme_lead_to_files():
@@ -62,20 +53,21 @@ def turns(env, seed):
     return told
 
 
-def test_a_hand_written_environment_and_its_successor_tell_the_same(run):
+def test_a_hand_written_environment_and_its_successor_tell_the_same():
     before, after = map(run, page.blocks("coming-from.md", "PettingZoo"))
     told = [turns(before["StallEnv"](), seed) for seed in range(20)]
     assert told == [turns(after["env"], seed) for seed in range(20)]
     assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
 
 
-def test_the_environment_of_the_paper_in_todays_words(run, monkeypatch):
+def test_the_environment_of_the_paper_in_todays_words(monkeypatch):
     monkeypatch.setitem(sys.modules, "model", model)
     (code,) = page.blocks("coming-from.md", "Sim-Env")
     names = run(code)
     assert names["terminated"]
     assert names["alive"](names["env"].simulation.greenhouse) == 0
     assert -1 <= names["reward"] <= 1
+    names["env"].close()
 
 
 def messages():

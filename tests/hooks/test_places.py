@@ -1,13 +1,9 @@
 """Where functions are found, set, and put back."""
 
 import gc
-import random
 import sys
-import threading
-import time
 import types
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from textwrap import dedent
 from unittest import mock
 
@@ -17,8 +13,8 @@ from simenv_marl import aec_env
 from simenv_marl.decision import point_of, registered
 from simenv_marl.errors import PatchError, UnknownTargetError
 from simenv_marl.hooks.handlers import Installation
-from simenv_marl.hooks.hook import hook_of, hooks
-from simenv_marl.hooks.places import PlacedHook, find_hook, places_of, resolve
+from simenv_marl.hooks.hook import hook_of
+from simenv_marl.hooks.places import find_hook, places_of, resolve
 from simenv_marl.plugins import (
     ChangedResult,
     attach_handler,
@@ -56,12 +52,6 @@ class Sub(_Base):
 
 def function():
     return "rule"
-
-
-def calls_of(path):
-    """A call of what is found here by a path, its owner, and its name there."""
-    owner, attribute = resolve(f"{HERE}.{path}", UnknownTargetError)
-    return lambda: getattr(owner() if isinstance(owner, type) else owner, attribute)(), owner, attribute
 
 
 @pytest.fixture
@@ -180,58 +170,14 @@ def test_modules_may_come_while_names_are_looked_for(monkeypatch, make_module):
     assert places_of(function) == [(sys.modules[HERE], "function")]
 
 
-@pytest.fixture
-def _dawdling(monkeypatch):
-    """Others may have their turn between any two looks and changes at a place."""
-    drawn = random.Random(1)
-
-    def dawdle(function):
-        def slow(*args):
-            time.sleep(drawn.choice([0, 1e-3]))
-            value = function(*args)
-            time.sleep(drawn.choice([0, 1e-3]))
-            return value
-
-        return slow
-
-    for name in ("__init__", "is_free", "_apply", "_revert"):
-        monkeypatch.setattr(PlacedHook, name, dawdle(getattr(PlacedHook, name)))
-
-
-@pytest.mark.usefixtures("_dawdling")
-@pytest.mark.parametrize("path", ["_Base.method", "Sub.method", "function"])
-def test_threads_come_and_go_at_once(path, monkeypatch):
-    """In each round eight of them look for a function that has no hook yet, and go."""
-    monkeypatch.setattr("simenv_marl.hooks.places.modules", {HERE: sys.modules[HERE]})  # all take too long
-    name, ready = f"{HERE}.{path}", threading.Barrier(8)
-    call, owner, attribute = calls_of(path)
-    before = vars(owner).get(attribute)
-
-    def come_and_go(_):
-        called = []
-        env = aec_env(calling(call), {name: define()}, plugins=[(lambda *_: None, f"{HERE}._Base.look", "before")])
-        with handlers((lambda *_: called.append(1), name, "before")):
-            env.reset()
-            assert called
-            env.step(1)
-            ready.wait(30)
-        assert env.unwrapped.simulation.log == [1]
-        env.close()
-        ready.wait(30)
-        assert vars(owner).get(attribute) is before
-        assert hook_of(vars(_Base)["look"]) is None
-
-    with ThreadPoolExecutor(8) as threads:
-        for _ in range(10):
-            list(threads.map(come_and_go, range(8)))
-            gc.collect()
-            assert not any(hook.name == name for hook in hooks())
-
-
 @pytest.mark.parametrize("path", ["_Base.method", "_Base.static", "_Base.of_class", "Sub.method", "function"])
 @pytest.mark.parametrize("end", ["close", "drop"])
 def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(path, end):
-    call, owner, attribute = calls_of(path)
+    owner, attribute = resolve(f"{HERE}.{path}", UnknownTargetError)
+
+    def call():
+        return getattr(owner() if isinstance(owner, type) else owner, attribute)()
+
     before, expected = vars(owner).get(attribute), call()
     name = f"{HERE}.{path}"
     points = {name: define(agent="one_0")}

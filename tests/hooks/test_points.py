@@ -5,6 +5,7 @@ import sys
 import threading
 import types
 from concurrent.futures import ThreadPoolExecutor
+from time import sleep
 
 import pytest
 
@@ -12,6 +13,8 @@ from simenv_marl import RULE, SimEnvError, aec_env, generate_env
 from simenv_marl.core.points import find_point
 from simenv_marl.errors import AgentError, DefinitionError, PatchError, UnknownPointError
 from simenv_marl.hooks.hook import hook_of, hooks
+from simenv_marl.hooks.places import PlacedHook, resolve
+from simenv_marl.plugins import handlers
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
@@ -202,20 +205,15 @@ def test_environments_of_a_base_class_and_of_a_subclass_get_along(points):
 
 
 @pytest.mark.parametrize("end", ["close", "collect", "collect in mid-episode"])
-@pytest.mark.parametrize(
-    ("name", "place"),
-    [("Trader.rounded", Trader), ("Trader.opening", Trader), ("Broker.bid", Broker), ("price", shop)],
-)
-def test_patches_last_until_the_last_environment_is_gone(name, place, end):
-    attribute = name.rpartition(".")[2]
-    before = vars(place).get(attribute)
-    simulation = calling(Trader().day, lambda: Broker().bid("tea"), lambda: shop.total("tea"))
+@pytest.mark.parametrize("name", ["Trader.rounded", "Trader.opening", "Broker.bid", "price"])
+def test_patches_last_until_the_last_environment_is_gone(name, end):
+    owner, attribute = resolve(f"{MARKET}.{name}", UnknownPointError)
+    before = vars(owner).get(attribute)
+    simulation = calling(Broker().day, lambda: market.price("tea"))
     envs = [aec_env(simulation, {f"{MARKET}.{name}": define()}) for _ in range(3)]
     while envs:
-        patched = vars(place)[attribute]
-        assert patched is not before
-        assert place is shop or type(patched) is type(vars(Trader)[attribute])
-        env = envs.pop(1 if len(envs) > 1 else 0)
+        assert vars(owner)[attribute] is not before
+        env = envs.pop(len(envs) // 2)
         if end == "collect in mid-episode":
             env.reset()
         if end == "close":
@@ -223,7 +221,7 @@ def test_patches_last_until_the_last_environment_is_gone(name, place, end):
             env.close()
         del env
         gc.collect()
-    assert vars(place).get(attribute) is before
+    assert vars(owner).get(attribute) is before
 
 
 def test_modules_that_are_imported_between_reset_and_step_decide_and_are_restored(monkeypatch):
@@ -293,16 +291,28 @@ def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_
     assert log_of(aec_env(calling(decorated), decorated)) == [9]
 
 
-def test_threads_that_register_and_name_points_at_once_find_the_same(monkeypatch):
-    def work(number):
-        start.wait()
-        return [define()(lambda: 0) for _ in range(100)], [find_point(name, define())[0] for name in names]
+def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_each_other(monkeypatch):
+    def dawdle(hook, *args):
+        sleep(1e-3)
+        make(hook, *args)
 
-    crowd, names = types.ModuleType("crowd"), [f"crowd.Plain{number}.choose" for number in range(20)]
+    def work(_):
+        meet.wait()
+        registered = [define()(lambda: 0) for _ in range(100)]
+        points = [find_point(name, define())[0] for name in names]
+        with handlers(*[(called.append, name, "before") for name in names]):
+            meet.wait()
+            crowd.Plain().choose_0()
+            meet.wait()
+        return registered, points
+
+    crowd, names = types.ModuleType("crowd"), [f"crowd.Plain.choose_{number}" for number in range(20)]
+    crowd.Plain = type("Plain", (), {name.rpartition(".")[2]: lambda self: 0 for name in names})
     monkeypatch.setitem(sys.modules, "crowd", crowd)
-    vars(crowd).update({f"Plain{number}": type("Plain", (), {"choose": lambda self: 0}) for number in range(20)})
-    start = threading.Barrier(8)
-    with ThreadPoolExecutor(8) as threads:
+    make, called, meet = PlacedHook.__init__, [], threading.Barrier(8, timeout=30)
+    monkeypatch.setattr(PlacedHook, "__init__", dawdle)
+    with left_as_they_were(crowd.Plain), ThreadPoolExecutor(8) as threads:
         found = list(threads.map(work, range(8)))
-    assert all(placed == found[0][1] for _, placed in found)
+    assert all(points == found[0][1] for _, points in found)
     assert {hook_of(choose) for registered, _ in found for choose in registered} <= set(hooks())
+    assert len(called) == 8 * 8

@@ -40,14 +40,8 @@ POINTS = {BET: define(agent="player_0", observation_space_mapping=lambda casino,
 
 def world():
     """The state of all global generators."""
-    numpy_state = np.random.get_state(legacy=False)
-    return (
-        random.getstate(),
-        numpy_state["state"]["key"].tolist(),
-        numpy_state["state"]["pos"],
-        numpy_state["has_gauss"],
-        numpy_state["gauss"],
-    )
+    name, key, *others = np.random.get_state()
+    return random.getstate(), name, key.tolist(), others
 
 
 @pytest.fixture(params=["copied as bytes", "by their own functions"])

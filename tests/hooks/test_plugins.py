@@ -245,15 +245,25 @@ def test_methods_may_be_exposed_in_either_order_again_and_for_one_class_alone():
     assert isinstance(expose_to_plugins(expose_to_plugins(Trader.opening)), classmethod)
 
 
-def test_functions_without_a_dotted_name_can_be_exposed():
-    first, function, length = local(), local(), expose_to_plugins(len)
+def test_what_has_no_dotted_name_can_be_exposed_and_all_that_is_exposed_or_has_handlers_is_listed():
+    gc.collect()  # other tests have exposed functions, too
+    first, function, length, items = local(), local(), expose_to_plugins(len), expose_to_plugins({1})
+    name = f"{HERE}.local.<locals>.function"
     assert expose_to_plugins(function) is function
-    with handlers(
-        (lambda value, more=0: 9, f"{HERE}.local.<locals>.function", "instead"),
+    assert exposed_functions().count("an iterable set") == 1
+    assert {name, "builtins.len"} < set(exposed_functions())
+    assert BID not in exposed_functions()
+    entries = [
         (lambda thing, **kwargs: ChangedResult(kwargs["_result"] + 1), length, "after"),
-    ):
+        (failing, BID, "instead"),
+        (lambda value, more=0: 9, name, "instead"),
+    ]
+    with handlers(*entries):
+        assert BID in exposed_functions()
+        targets = ["builtins.len", BID, name]
+        assert attached_handlers() == [(entry[0], name, entry[2]) for entry, name in zip(entries, targets, strict=True)]
         assert (first(1), function(1)) == (1, 9)  # the latest of that name
-        assert length([1, 2]) == 3
+        assert (length([1, 2]), list(items)) == (3, [1])
     assert length([1, 2]) == 2
 
 
@@ -352,15 +362,6 @@ def test_exposing_anything_but_functions_and_iterables_is_refused(thing, why):
         expose_to_plugins(thing)
 
 
-@pytest.mark.parametrize(
-    ("target", "position", "handler"), [(two, "before", None), (two, "after", print), (BID, "after", None)], ids=plainly
-)
-def test_removing_what_is_not_attached_is_refused(target, position, handler):
-    with handlers((two, two, "after")), pytest.raises(HandlerError, match="handlers are attached") as caught:
-        remove_handler(target, position, handler)
-    assert ("no handler is attached" in str(caught.value)) is (handler is None)
-
-
 # -- for a while ----------------------------------------------------------------------------------
 
 
@@ -376,8 +377,13 @@ def test_blocks_and_removals_take_away_nothing_but_their_own():
         function(1)
     function(2)
     remove_handler(function, "before", see)
+    with pytest.raises(HandlerError, match=r"print is not attached 'before' .*; handlers are attached: before"):
+        remove_handler(function, "before", print)
     function(3)
     remove_handler(function, "before")  # all of them
+    for nowhere in (function, BID):
+        with pytest.raises(HandlerError, match=r"no handler is attached 'before' .*; handlers are attached: nowhere"):
+            remove_handler(nowhere, "before")
     with pytest.raises(ZeroDivisionError), handlers((failing, function, "instead")):
         function(4)
     function(5)
@@ -521,20 +527,6 @@ def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited(with_hand
 
 
 # -- seeing what happens --------------------------------------------------------------------------
-
-
-def test_exposed_functions_and_attached_handlers_are_listed():
-    gc.collect()  # other tests have exposed functions, too
-    function, items, length, choose = local(), expose_to_plugins({1}), expose_to_plugins(len), decision()
-    name = f"{HERE}.local.<locals>.function"
-    assert exposed_functions().count("an iterable set") == 1
-    assert {name, "builtins.len"} < set(exposed_functions())
-    assert BID not in exposed_functions()
-    with handlers((print, function, "before"), (failing, BID, "instead")):
-        assert BID in exposed_functions()
-        assert attached_handlers() == [(failing, BID, "instead"), (print, name, "before")]
-    assert decision_points().count("tests.worlds.models.decision.<locals>.choose") == 1
-    assert (choose(), list(items), length([1])) == ("rule", [1], 1)
 
 
 def test_calls_are_traced_in_the_order_in_which_they_begin():
@@ -822,6 +814,7 @@ def test_decision_functions_can_be_named_whether_they_are_exposed_before_or_afte
 
     over, under, log = expose_to_plugins(define()(choose)), define(agent="under_0")(expose_to_plugins(choose)), []
     assert inspect.unwrap(over) is inspect.unwrap(under) is choose
+    assert decision_points().count(f"{choose.__module__}.{choose.__qualname__}") == 1
     for point, agent in ((over, "choose_0"), (under, "under_0")):
         env = aec_env(calling(point), point)
         with handlers((lambda _result: log.append(_result), point, "after")):

@@ -7,6 +7,7 @@ import gc
 import inspect
 import pickle
 import sys
+from contextlib import closing
 from random import Random
 
 import numpy as np
@@ -105,22 +106,15 @@ def failing(*args, **kwargs):
 
 
 def of_the_process(call, *entries):
-    for entry in entries:
-        attach_handler(*entry)
-    try:
+    with handlers(*entries):
         return call()
-    finally:
-        for handler, target, position in entries:
-            remove_handler(target, position, handler)
 
 
 def of_an_environment(call, *entries):
     """The simulation calls it."""
     env = aec_env(calling(call, CHOOSE), CHOOSE, plugins=entries)
-    try:
+    with closing(env):
         env.reset()
-    finally:
-        env.close()
     return env.simulation.log[0]
 
 

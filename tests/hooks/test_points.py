@@ -7,11 +7,15 @@ import types
 from concurrent.futures import ThreadPoolExecutor
 from time import sleep
 
+import numpy as np
 import pytest
 
-from simenv_marl import RULE, SimEnvError, aec_env, generate_env
-from simenv_marl.core.points import find_point
-from simenv_marl.errors import AgentError, DefinitionError, PatchError, UnknownPointError
+from simenv_marl import RULE, SimEnvError, aec_env, generate_env, single_env
+from simenv_marl.core import agent, packing
+from simenv_marl.core.packing import pack, pack_plainly, unpack
+from simenv_marl.core.points import find_point, portable
+from simenv_marl.decision import point_of
+from simenv_marl.errors import AgentError, DefinitionError, PatchError, RewardError, UnknownPointError
 from simenv_marl.hooks.hook import hook_of, hooks
 from simenv_marl.hooks.places import PlacedHook, resolve
 from simenv_marl.plugins import handlers
@@ -316,3 +320,52 @@ def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_
     assert all(points == found[0][1] for _, points in found)
     assert {hook_of(choose) for registered, _ in found for choose in registered} <= set(hooks())
     assert len(called) == 8 * 8
+
+
+# -- in other processes ---------------------------------------------------------------------------
+
+
+def test_a_point_is_itself_again_where_it_is_and_comes_along_with_its_hook():
+    local = decision(agent="local_0")
+    point, _ = point_of(Home.heat)
+    assert unpack(pack(point)) is point
+    hook = unpack(pack(hook_of(local)))
+    assert hook is not hook_of(local)
+    assert hook.definition.agent == "local_0"
+
+
+def test_functions_go_to_other_processes_by_name(monkeypatch):
+    """The name leads there, whatever binds them: nothing is made anew."""
+    functions = [Home.heat, Trader.bid, Home.light.__func__]
+    assert [portable(function) for function in functions[:2]] == [f"{HOME}.heat", BID]
+    assert portable(lambda: 0).__name__ == "<lambda>"
+    parcels = list(map(pack, functions))
+    monkeypatch.setattr(packing, "_known", {})  # as where nothing has come from yet
+    assert list(map(unpack, parcels)) == functions
+
+
+def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypatch):
+    main = sys.modules["__main__"]
+    monkeypatch.delattr(main, "__file__", raising=False)
+    with monkeypatch.context() as notebook:
+        notebook.setattr(main, "Cell", type("Cell", (), {"__module__": "__main__", "value": 3}), raising=False)
+        parcel = pack_plainly(main.Cell)
+    assert unpack(parcel).value == 3
+
+
+# -- quick rewards --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("others", [[], ["a difference that was made elsewhere"]])
+def test_each_reward_is_checked_also_where_no_difference_was_made(others, monkeypatch):
+    monkeypatch.setattr(agent, "DIFFERENCES", others)
+    rewards = iter([0.0, 2, np.float32(0.5), "2", 0.0, float("nan")])
+    decide = decision(reward_mapping=lambda: next(rewards))
+    env = single_env(calling(*[decide] * 4), decide)
+    env.reset()
+    assert [repr(env.step(1)[1]) for _ in range(2)] == ["2.0", "0.5"]
+    with pytest.raises(RewardError, match="not one number"):
+        env.step(1)
+    env.reset()
+    with pytest.raises(RewardError, match="not finite"):
+        env.step(1)

@@ -152,7 +152,7 @@ lint: .venv/.test
 	$(BIN)/lint-imports
 
 # Links, the map, words, names in the reference, and whether tests run the commands that pages show.
-PAGE_TESTS := tests/test_pages.py tests/test_front_pages.py
+PAGE_TESTS := tests/test_pages.py
 docs: .venv/.test
 	$(BIN)/sphinx-build --fail-on-warning --quiet docs docs/_build
 	$(BIN)/python -m pytest --quiet $(PAGE_TESTS)

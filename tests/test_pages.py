@@ -1,5 +1,7 @@
-"""A page's code needs only what can be installed or what the page links; the page says how to get anything else."""
+"""Pages: their code runs and needs only what can be got as they say, and what they quote is what the library says."""
 
+import builtins
+import random
 import re
 import shlex
 import subprocess
@@ -11,8 +13,11 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+from examples.greenhouse_coop import model
 
 import simenv_marl
+from tests.clients.page import blocks
+from tests.worlds.models import play
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -161,3 +166,79 @@ def test_a_command_of_a_page_is_run_by_tests_or_marked_as_not_run(page):
     written = re.findall(r"-m simenv_marl new \w+ (\w+)", text)
     found = {command: missing for command in commands_of(text) if (missing := untested(command, written))}
     assert found == {}
+
+
+# -- the pages that a newcomer meets first ---------------------------------------------------------
+
+
+def run(code):
+    """Run code. Returns its names."""
+    names = {}
+    exec(code, names)
+    return names
+
+
+def test_the_code_of_the_front_page_has_the_rewards_that_it_shows():
+    (code,) = blocks("index.md")
+    env = run(code)["env"]
+    assert env.reset(seed=1)[0] == [5.0]
+    rewards = [env.step(action)[1] for action in (1, 1, 0, 1, 1)]
+    assert rewards == [-1.0, -2.0, -1.0, -2.0, -3.0]
+    env.close()
+
+
+def test_pictures_and_links_of_the_readme_lead_to_files():
+    """No badge stands for a service that does not exist."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", text)
+    links = [link for link in re.findall(r"\]\(([^)]*)\)", text) if not link.startswith("https://")]
+    assert pictures
+    assert [path for path in (*pictures, *links) if not (ROOT / path).is_file()] == []
+
+
+def told_in_an_episode(env, seed):
+    """What is told in an episode of random actions, turn by turn."""
+    actions = random.Random(seed)
+    turns = play(env, lambda agent, env: actions.randrange(4), seed=seed)
+    return [(turn.agent, turn.observation.tolist(), *turn[2:5]) for turn in turns]
+
+
+def test_a_hand_written_environment_and_its_successor_tell_the_same():
+    before, after = map(run, blocks("coming-from.md", "PettingZoo"))
+    told = [told_in_an_episode(before["StallEnv"](), seed) for seed in range(20)]
+    assert told == [told_in_an_episode(after["env"], seed) for seed in range(20)]
+    assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
+
+
+def test_the_environment_of_the_paper_in_todays_words(monkeypatch):
+    monkeypatch.setitem(sys.modules, "model", model)
+    (code,) = blocks("coming-from.md", "Sim-Env")
+    names = run(code)
+    assert names["terminated"]
+    assert names["alive"](names["env"].simulation.greenhouse) == 0
+    assert -1 <= names["reward"] <= 1
+    names["env"].close()
+
+
+def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are():
+    text = (DOCS / "problems.md").read_text(encoding="utf-8")
+    quoted = re.findall(r"^### (.+)$", text, re.MULTILINE)  # the headings
+    assert len(quoted) >= 20
+    sources = (path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
+    said = "".join(re.sub(r'"\s+f?"', "", source) for source in sources)  # each text in one line
+    for quote in quoted:
+        parts = [re.escape(part.strip()) for part in quote.replace("`", "").split("...")]
+        assert re.search(".*".join(parts), said), quote
+    named = set(re.findall(r"`([A-Z]\w+Error)`", text))
+    assert {name for name in named if not hasattr(builtins, name)} <= set(simenv_marl.errors.__all__)
+
+
+TERMS = (
+    "parameter sharing", "centralised training", "CTDE", "self-play", "black death", "discrete-event simulation",
+    "agent-based model", "semi-MDP", "callback", "hook", "DAgger", "action mask", "PPO", "wrapper", "seed", "pickle",
+    "AEC", "turn-based", "MARL", "behavior cloning",
+)  # fmt: skip
+
+
+def test_the_glossary_explains_the_terms_that_users_search_for():
+    assert set(TERMS) <= set((DOCS / "glossary.md").read_text(encoding="utf-8").splitlines())

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, SimEnvError, aec_env, generate_env, single_env
-from simenv_marl.core import agent, packing
+from simenv_marl.core import packing
 from simenv_marl.core.packing import pack, pack_plainly, unpack
 from simenv_marl.core.points import find_point, portable
 from simenv_marl.decision import point_of
@@ -358,7 +358,7 @@ def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypa
 
 @pytest.mark.parametrize("others", [[], ["a difference that was made elsewhere"]])
 def test_each_reward_is_checked_also_where_no_difference_was_made(others, monkeypatch):
-    monkeypatch.setattr(agent, "DIFFERENCES", others)
+    monkeypatch.setattr("simenv_marl.core.agent.DIFFERENCES", others)
     rewards = iter([0.0, 2, np.float32(0.5), "2", 0.0, float("nan")])
     decide = decision(reward_mapping=lambda: next(rewards))
     env = single_env(calling(*[decide] * 4), decide)

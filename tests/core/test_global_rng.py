@@ -127,16 +127,12 @@ class Seeding(Casino):
         self.log = [self.bet(0)]
 
 
-def test_simulate_leaves_generators_alone_also_those_that_a_model_seeds():
-    def draw(observation):
-        return int(observation[0])
-
-    before, logs = world(), []
-    for kind, seed in ((Casino, 3), (Casino, 3), (Seeding, 1), (Seeding, 2)):
-        logs.append(simulate(kind, {BET: draw}, points=POINTS, seed=seed, global_rng=True).log)
-        assert world() == before
-    assert logs[0] == logs[1]
-    assert logs[2] == logs[3]
+def test_simulations_may_seed_the_generators_themselves():
+    before = world()
+    policies = {BET: lambda observation: int(observation[0])}
+    one, other = (simulate(Seeding, policies, points=POINTS, seed=seed, global_rng=True) for seed in (1, 2))
+    assert one.log == other.log
+    assert world() == before
 
 
 @pytest.mark.usefixtures("_states")

@@ -620,16 +620,17 @@ def test_plugins_apply_in_the_simulation_and_in_mappings_of_their_environment():
 def test_environments_with_opposite_plugins_are_interleaved_in_every_view(make):
     words = {"one": [says("one")], "two": [says("two")], "plain": []}
     envs = {word: make(House, House.water, plugins=plugins) for word, plugins in words.items()}
-    for word, env in envs.items():
-        env.reset(seed=1)
-        assert [entry[1:] for entry in attached_handlers(env)] == [(WORD, "instead")] * (word != "plain")
     for _ in range(2):
-        for env in envs.values():
-            step(env, 1, "waterer_0")
-            assert House().word() == "plain"
-    for word, env in envs.items():
-        assert env.unwrapped.simulation.log == [word] * 6
-        env.close()
+        for word, env in envs.items():
+            env.reset(seed=1)
+            assert [entry[1:] for entry in attached_handlers(env)] == [(WORD, "instead")] * (word != "plain")
+        for _ in range(2):
+            for env in envs.values():
+                step(env, 1, "waterer_0")
+                assert House().word() == "plain"
+        for word, env in envs.items():
+            env.close()
+            assert set(env.unwrapped.simulation.log) == {word}
 
 
 def test_handlers_of_the_process_run_before_the_environments():
@@ -688,35 +689,15 @@ def test_nothing_is_patched_but_while_there_is_an_environment():
     before = vars(House)["word"]
     made = generate_env(House, House.water, plugins=[says("mine")])
     assert vars(House)["word"] is before
-    one, two = made(), made(plugins=[])
+    env = made(plugins=[])
+    env.reset()
+    assert env.unwrapped.simulation.word() == "plain"
+    assert vars(House)["word"] is before
+    env = made()
     assert vars(House)["word"] is not before
-    for env, word in ((one, "mine"), (two, "plain"), (one, "mine")):
-        env.reset()
-        env.close()
-        assert set(env.unwrapped.simulation.log) == {word}
-        assert vars(House)["word"] is before
-    one.reset()
-    del one, env
+    del env
     gc.collect()
     assert vars(House)["word"] is before
-
-
-def test_the_simulations_own_methods_can_be_extended():
-    def run(self):
-        self.log += [CHOOSE(), CHOOSE()]
-        return TRUNCATED
-
-    plugins = [
-        (run, f"{HERE}.House.run", "instead"),
-        (lambda self, seed=None: ChangedArgs(self, seed=77), f"{HERE}.House.reset", "before"),
-        (lambda self, seed=None: self.log.append(seed), f"{HERE}.House.reset", "after"),
-        (lambda self: self.log.append("made"), f"{HERE}.House.__init__", "after"),
-    ]
-    env = aec_env(House, CHOOSE, plugins=plugins)
-    turns = play(env, 3)
-    assert env.unwrapped.simulation.log == ["made", "plain", 77, 3, 3]
-    assert turns[-1].truncated
-    env.close()
 
 
 # -- handlers and decisions -------------------------------------------------------------------------
@@ -727,11 +708,19 @@ def ventilate(self):
     return "rule"
 
 
-def test_a_plugin_may_decide():
-    env = aec_env(House, [House.water, ventilate], plugins=[(ventilate, WORD, "instead")])
+def test_a_plugin_may_decide_and_extend_the_simulations_own_methods():
+    plugins = [
+        (lambda self: self.log.append("made"), f"{HERE}.House.__init__", "after"),
+        (lambda self, seed=None: ChangedArgs(self, seed=77), f"{HERE}.House.reset", "before"),
+        (lambda self, seed=None: self.log.append(seed), f"{HERE}.House.reset", "after"),
+        (lambda self, _result: ChangedResult(TRUNCATED), f"{HERE}.House.run", "after"),
+        (ventilate, WORD, "instead"),
+    ]
+    env = aec_env(House, [House.water, ventilate], plugins=plugins)
     turns = play(env, {"waterer_0": 1, "ventilator_0": 7})
     assert decisions(turns) == ["ventilator_0", "waterer_0", "ventilator_0"] * 3
-    assert env.unwrapped.simulation.log == ["rule", *[7] * 6]  # during reset the rule decides
+    assert env.unwrapped.simulation.log == ["made", "rule", 77, *[7] * 6]  # during reset the rule decides
+    assert turns[-1].truncated
     env.close()
 
 

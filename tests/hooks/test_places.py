@@ -20,43 +20,21 @@ from simenv_marl.hooks.handlers import Installation
 from simenv_marl.hooks.hook import Hook, hook_of, made_with, unwrap
 from simenv_marl.hooks.places import find_hook, places_of, resolve
 from simenv_marl.hooks.stacks import STACKS, outside_simulation, stack_of
-from simenv_marl.plugins import (
-    ChangedResult,
-    attach_handler,
-    attached_handlers,
-    expose_to_plugins,
-    handlers,
-)
+from simenv_marl.plugins import ChangedResult, attach_handler, attached_handlers, expose_to_plugins, handlers
+from tests.foreign import market, shop
+from tests.foreign.market import Trader
+from tests.hooks.forms import BID, FORMS, MARKET
 from tests.worlds.models import calling, define, play
 
-HERE = __name__
+PRICE = f"{MARKET}.price"
 
 
-class _Base:
-    def method(self):
-        return "rule"
-
-    @staticmethod
-    def static():
-        return "static"
-
-    @classmethod
-    def of_class(cls):
-        return cls.__name__
-
+class _Hiding:
     def __hidden(self):
         return "hidden"
 
     def look(self):
         return self.__hidden()
-
-
-class Sub(_Base):
-    pass
-
-
-def function():
-    return "rule"
 
 
 @pytest.fixture
@@ -141,11 +119,11 @@ def test_outside_a_simulation_its_interceptors_are_masked(monkeypatch):
 # -- names ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["__hidden", "_Base__hidden"])
+@pytest.mark.parametrize("name", ["__hidden", "_Hiding__hidden"])
 def test_private_names_are_found_as_they_are_written_and_as_they_are(name):
-    with handlers((lambda self: "taken", f"{HERE}._Base.{name}", "instead")):
-        assert _Base().look() == "taken"
-    assert _Base().look() == "hidden"
+    with handlers((lambda self: "taken", f"{__name__}._Hiding.{name}", "instead")):
+        assert _Hiding().look() == "taken"
+    assert _Hiding().look() == "hidden"
 
 
 def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
@@ -178,18 +156,18 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised, make_module):
             super().__setattr__(name, value)
 
     refusing = make_module("refusing_module", kind=Refusing)
-    refusing.alias = original = function
-    good, bad = (lambda self: 1, f"{HERE}._Base.method", "instead"), (lambda: 1, f"{HERE}.function", "instead")
+    refusing.alias = original = market.price
+    good, bad = (lambda *args: 1, BID, "instead"), (lambda *args, **kwargs: 1, PRICE, "instead")
     with pytest.raises(raised, match="sealed"):
         attach_handler(*bad)
     with pytest.raises(raised, match="sealed"), handlers(good, bad):
         raise AssertionError
     with pytest.raises(raised, match="sealed"):
-        aec_env(calling(function), {f"{HERE}.function": define()}, plugins=[good])
+        aec_env(calling(market.price), {PRICE: define()}, plugins=[good])
     gc.collect()
-    assert function is refusing.alias is original
-    assert hook_of(vars(_Base)["method"]) is None
-    kept = Installation([(find_hook(f"{HERE}._Base.method", UnknownTargetError), None)])
+    assert market.price is shop.price is refusing.alias is original
+    assert hook_of(vars(Trader)["bid"]) is None
+    kept = Installation([(find_hook(BID, UnknownTargetError), None)])
     kept.uninstall()
     assert not kept.complete  # so that an environment that is used again sets all of it again
 
@@ -238,20 +216,15 @@ def test_modules_may_come_while_names_are_looked_for(monkeypatch, make_module):
             return types.ModuleType
 
     monkeypatch.setitem(sys.modules, "lazy_module", Lazy())
-    assert places_of(function) == [(sys.modules[HERE], "function")]
+    assert set(places_of(market.price)) == {(market, "price"), (shop, "price"), (shop, "cost")}
 
 
-@pytest.mark.parametrize("path", ["_Base.method", "_Base.static", "_Base.of_class", "Sub.method", "function"])
+@pytest.mark.parametrize("form", ["method", "static", "of a class", "inherited", "function"])
 @pytest.mark.parametrize("end", ["close", "drop"])
-def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(path, end):
-    owner, attribute = resolve(f"{HERE}.{path}", UnknownTargetError)
-
-    def call():
-        return getattr(owner() if isinstance(owner, type) else owner, attribute)()
-
-    before, expected = vars(owner).get(attribute), call()
-    name = f"{HERE}.{path}"
-    points = {name: define(agent="one_0")}
+def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(form, end):
+    name, call, expected = FORMS[form]
+    owner, attribute = resolve(name, UnknownTargetError)
+    before, points = vars(owner).get(attribute), {name: define(agent="one_0")}
     for _ in range(3):
         env = aec_env(calling(call), points)
         env.reset()

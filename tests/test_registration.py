@@ -110,13 +110,11 @@ def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_ve
 
 
 def test_points_are_those_that_are_named(register):
-    ids = register(Voyage, Boat.set_sail, name="named")
-    assert ids == ["named/SetSail-v0", "named/Joint-v0", "named/coop_v0"]
-    assert pettingzoo.make("aec", "named/coop_v0").possible_agents == ["sail_0"]
-    assert list(made("named/Joint-v0").action_space.spaces) == ["sail_0"]
-    steering = {f"{Boat.__module__}.Boat.steer_boat": define(action_space=spaces.Discrete(2))}
+    steering = {f"{Boat.__module__}.Boat.steer_boat": define(action_space=spaces.Discrete(2), agent="helm_0")}
     ids = register(Voyage, steering, name="named")
-    assert ids[0] == "named/SteerBoat-v0"
+    assert ids == ["named/SteerBoat-v0", "named/Joint-v0", "named/coop_v0"]
+    assert pettingzoo.make("aec", "named/coop_v0").possible_agents == ["helm_0"]
+    assert list(made("named/Joint-v0").action_space.spaces) == ["helm_0"]
     assert made(ids[0]).action_space == spaces.Discrete(2)
 
 

@@ -241,15 +241,12 @@ def test_masks_are_new_arrays(given):
 @pytest.mark.parametrize(
     ("given", "match"),
     [
-        ([1, 0], "shape"),
-        ([[1, 0, 1]], "shape"),
-        (1, "shape"),
-        ([0.5, 1, 0], "other than 0 and 1"),
-        ([1, 256, 0], "other than 0 and 1"),
-        (np.array([1, 2, 1], np.int8), "other than 0 and 1"),
-        (np.array([0, -1, 0], np.int8), "other than 0 and 1"),
-        ([0, 0, 0], "no legal action"),
-        (np.array([False, False, False]), "no legal action"),
+        *((given, "shape") for given in ([1, 0], [[1, 0, 1]], 1)),
+        *(
+            (given, "other than 0 and 1")
+            for given in ([0.5, 1, 0], [1, 256, 0], np.int8([1, 2, 1]), np.int8([0, -1, 0]))
+        ),
+        *((given, "no legal action") for given in ([0, 0, 0], np.array([False, False, False]))),
     ],
     ids=repr,
 )

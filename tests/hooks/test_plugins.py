@@ -25,7 +25,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.errors import HandlerError, OptionValueError, PatchError, UnknownTargetError
+from simenv_marl.errors import HandlerError, PatchError, UnknownTargetError
 from simenv_marl.hooks.hook import hook_of
 from simenv_marl.plugins import (
     ChangedArgs,
@@ -340,12 +340,6 @@ def test_handlers_that_cannot_work_are_refused_when_they_are_attached(entry, err
     assert hook_of(two) is None
     with pytest.raises(error):
         generate_env(House, House.water, plugins=[good, entry])
-
-
-@pytest.mark.parametrize("plugins", ["text", 3, {BID: print}])
-def test_plugins_are_a_list(plugins):
-    with pytest.raises(OptionValueError):
-        generate_env(House, House.water, plugins=plugins)
 
 
 @pytest.mark.parametrize(("thing", "why"), [(Trader, "expose one of its"), (3, "neither")])

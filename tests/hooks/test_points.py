@@ -22,7 +22,7 @@ from simenv_marl.plugins import handlers
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
-from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, script
+from tests.worlds.models import calling, decision, decisions, define, plainly, play, script
 from tests.worlds.undone import left_as_they_were
 
 # Traders and brokers decide under one name here: it is about functions, and not about agents.
@@ -99,19 +99,13 @@ def test_points_may_be_named_in_all_forms(points, agents):
     assert env.unwrapped.simulation.log.count(1) == len(agents)  # what is not named runs its rule
 
 
-@pytest.mark.parametrize("where", ["class", "instance", "factory"])
-def test_without_points_the_simulation_names_them(where):
-    class Own(Script):
-        points = (Home.cool,)
-
-    own = Own(lambda simulation: [Home().heat(), Home().cool()])
-    if where == "factory":
-        own.points = {Home.cool: define()}
-    elif where == "instance":
-        own.points = f"{HOME}.cool"
-    source = (lambda: own) if where == "factory" else own
-    assert decisions(play(aec_env(source))) == ["cool_0"]
-    assert decisions(play(aec_env(source, Home.heat))) == ["heat_0"]
+@pytest.mark.parametrize("points", [[Home.cool], f"{HOME}.cool", {Home.cool: define()}], ids=plainly)
+def test_without_points_the_simulation_names_them(points):
+    simulation = script(lambda simulation: [Home().heat(), Home().cool()])()
+    simulation.points = points
+    for source in (simulation, lambda: simulation):
+        assert decisions(play(aec_env(source))) == ["cool_0"]
+        assert decisions(play(aec_env(source, Home.heat))) == ["heat_0"]
 
 
 def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch):

@@ -104,7 +104,6 @@ def test_help_explains_every_option(name):
 @pytest.mark.parametrize(
     ("name", "known", "hint"),
     [
-        ("max_step", ["max_steps", "agent"], "; did you mean max_steps?"),
         ("sheep_1", ["sheep_0", "sheep_2", "wolf_0"], "; did you mean sheep_2 or sheep_0?"),
         ("quite different", ["max_steps"], ""),
         (3, ["3"], ""),

@@ -5,7 +5,6 @@ import pickle
 import sys
 import types
 import weakref
-from textwrap import dedent
 from types import SimpleNamespace
 from unittest import mock
 
@@ -35,19 +34,6 @@ class _Hiding:
 
     def look(self):
         return self.__hidden()
-
-
-@pytest.fixture
-def make_module(monkeypatch):
-    """Makes modules of a name and a source, which are forgotten at the end."""
-
-    def make(name, source="", kind=types.ModuleType):
-        module = kind(name)
-        exec(dedent(source), vars(module))
-        monkeypatch.setitem(sys.modules, name, module)
-        return module
-
-    return make
 
 
 # -- calls ------------------------------------------------------------------------------------------
@@ -139,8 +125,11 @@ def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
 # -- set and put back -------------------------------------------------------------------------------
 
 
-def test_a_function_is_found_by_what_its_module_calls_it(make_module):
-    module, log = make_module("renaming_module", "def first(): return 1\nsecond = first\ndel first"), []
+def test_a_function_is_found_by_what_its_module_calls_it(monkeypatch):
+    module, log = types.ModuleType("renaming_module"), []
+    module.second = lambda: 1
+    module.second.__module__ = module.__name__
+    monkeypatch.setitem(sys.modules, module.__name__, module)
     with handlers((lambda: log.append("called"), module.second, "before")):
         assert [entry[1] for entry in attached_handlers()] == ["renaming_module.second"]
         assert module.second() == 1
@@ -148,14 +137,15 @@ def test_a_function_is_found_by_what_its_module_calls_it(make_module):
 
 
 @pytest.mark.parametrize(("error", "raised"), [(TypeError, PatchError), (ZeroDivisionError, ZeroDivisionError)])
-def test_a_patch_that_fails_half_way_is_undone(error, raised, make_module):
+def test_a_patch_that_fails_half_way_is_undone(error, raised, monkeypatch):
     class Refusing(types.ModuleType):
         def __setattr__(self, name, value):
             if name == "alias" and hook_of(value) is not None:
                 raise error("sealed")
             super().__setattr__(name, value)
 
-    refusing = make_module("refusing_module", kind=Refusing)
+    refusing = Refusing("refusing_module")
+    monkeypatch.setitem(sys.modules, "refusing_module", refusing)
     refusing.alias = original = market.price
     good, bad = (lambda *args: 1, BID, "instead"), (lambda *args, **kwargs: 1, PRICE, "instead")
     with pytest.raises(raised, match="sealed"):
@@ -206,13 +196,13 @@ def test_models_of_points_and_of_targets_are_collected_with_these():
     assert name not in registered()
 
 
-def test_modules_may_come_while_names_are_looked_for(monkeypatch, make_module):
+def test_modules_may_come_while_names_are_looked_for(monkeypatch):
     class Lazy:
         """Stands in for a module that is imported as soon as something is asked of it."""
 
         @property
         def __class__(self):
-            make_module(f"late_module_{len(sys.modules)}")
+            monkeypatch.setitem(sys.modules, f"late_module_{len(sys.modules)}", types.ModuleType("late_module"))
             return types.ModuleType
 
     monkeypatch.setitem(sys.modules, "lazy_module", Lazy())

@@ -285,8 +285,6 @@ def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_
     assert local.decide() == "rule"
     with pytest.raises(PatchError, match="is the name of another object"):
         aec_env(calling(decide), {decide: define()})
-    decorated = decision(decide)
-    assert log_of(aec_env(calling(decorated), decorated)) == [9]
 
 
 def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_each_other(monkeypatch):

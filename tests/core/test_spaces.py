@@ -67,6 +67,7 @@ def test_observations_are_cast(space, value, expected):
         *((DIAL, value, "must be an integer") for value in (6.5, "6x", None, np.inf)),
         (TREE, {"box": [1, 2]}, "keys"),
         (TREE, {"box": [1, 2], "pear": [6, {"bits": [1, 0, 0]}]}, "keys"),
+        (TREE, {"box": [1, 2], "pair": [6, {"bits": [1, 0, 0]}], "pear": 3}, "keys"),
         (TREE, 3, "keys"),
         (TREE, {"box": [1, 2], "pair": [6]}, "2 parts"),
         (TREE, {"box": [1, 2], "pair": {0: 6, 1: 7}}, "2 parts"),

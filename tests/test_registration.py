@@ -52,9 +52,6 @@ def test_there_is_an_id_for_each_point_and_one_for_all_views_of_several_agents()
             assert isinstance(env, base)
             assert env.possible_agents == ["helm_0", "sail_0"]
     assert set(gymnasium.make(JOINT).action_space.spaces) == {"helm_0", "sail_0"}
-    flat = gymnasium.make(JOINT, flatten=True)
-    assert flat.action_space.shape == (2,)
-    assert flat.observation_space.shape == (4,)
 
 
 def sailed(env):

@@ -16,7 +16,6 @@ import pytest
 from simenv_marl import (
     RULE,
     TRUNCATED,
-    SimEnvError,
     aec_env,
     generate_env,
     joint_env,
@@ -334,9 +333,8 @@ def two(a, b):
 )
 def test_handlers_that_cannot_work_are_refused_when_they_are_attached(entry, error):
     good = (nothing, f"{HERE}.two", "before")
-    with pytest.raises(error) as caught, handlers(good, entry):
+    with pytest.raises(error), handlers(good, entry):
         raise AssertionError
-    assert isinstance(caught.value, SimEnvError)
     assert hook_of(two) is None
     with pytest.raises(error):
         generate_env(House, House.water, plugins=[good, entry])

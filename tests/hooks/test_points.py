@@ -10,7 +10,7 @@ from time import sleep
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, SimEnvError, aec_env, generate_env, single_env
+from simenv_marl import RULE, aec_env, generate_env, single_env
 from simenv_marl.core import packing
 from simenv_marl.core.packing import pack, pack_plainly, unpack
 from simenv_marl.core.points import find_point, portable
@@ -147,9 +147,8 @@ def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch
 )
 def test_points_that_cannot_be_decided_are_refused_at_construction(points, error, match):
     for make in (aec_env, generate_env):
-        with pytest.raises(error, match=match) as caught:
+        with pytest.raises(error, match=match):
             make(home(), points)
-        assert isinstance(caught.value, SimEnvError)
 
 
 # -- undecorated models ---------------------------------------------------------------------------

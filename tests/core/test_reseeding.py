@@ -91,19 +91,16 @@ def test_streams_are_not_those_that_a_model_makes_of_the_same_seed():
     assert drawn.isdisjoint([random.Random(7).random(), np.random.RandomState(7).random(), *plain])
 
 
-def test_the_global_generators_are_left_alone():
-    model, before = SimpleNamespace(draw=random.random, numpy=np.random.mtrand._rand, own=random.Random()), world()
-    assert reseed_generators(model, 3) == 1
-    assert world() == before
-
-
-def test_where_there_are_none_it_says_what_to_do():
-    model = SimpleNamespace(
-        random=random, draw=np.random.random, function=world, chance=random.SystemRandom(), kind=random.Random
-    )
+def test_global_generators_are_left_alone_and_where_there_are_no_others_it_says_what_to_do():
+    model = SimpleNamespace(random=random, draw=random.random, numpy=np.random.mtrand._rand, function=world)
+    model.chance, model.kind = random.SystemRandom(), random.Random
+    before = world()
     for nothing in (object(), model):
         with pytest.raises(SimulationError, match=r"no random generator[\s\S]*attribute[\s\S]*global_rng=True"):
             reseed_generators(nothing, 3)
+    model.own = random.Random()
+    assert reseed_generators(model, 3) == 1
+    assert world() == before
 
 
 @pytest.mark.parametrize("seed", [-1, True, 1.5, "7"])

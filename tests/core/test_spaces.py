@@ -23,14 +23,6 @@ def assert_alike(one, other):
     """Also in their types, and in those of their parts."""
     assert same(one, other)
     assert repr(one) == repr(other)
-    assert [type(leaf) for leaf in leaves(one)] == [type(leaf) for leaf in leaves(other)]
-
-
-def leaves(value):
-    """The values in a nested value that have no parts."""
-    if isinstance(value, dict | tuple | list):
-        return [leaf for part in (value.values() if isinstance(value, dict) else value) for leaf in leaves(part)]
-    return [value]
 
 
 # -- observations ---------------------------------------------------------------------------------
@@ -78,6 +70,13 @@ def test_observations_are_cast(space, value, expected):
 def test_invalid_observations_are_refused(space, value, match):
     with pytest.raises(ObservationError, match=match):
         observation_cast(space)(value)
+
+
+def leaves(value):
+    """The values in a nested value that have no parts."""
+    if isinstance(value, dict | tuple | list):
+        return [leaf for part in (value.values() if isinstance(value, dict) else value) for leaf in leaves(part)]
+    return [value]
 
 
 @pytest.mark.parametrize(

@@ -195,7 +195,6 @@ def test_environments_of_a_base_class_and_of_a_subclass_get_along(points):
         for env in envs:
             env.close()
         assert bids() == [5, 5, 5, 5, 4]
-    assert "bid" not in vars(Broker)
 
 
 # -- restoring ------------------------------------------------------------------------------------

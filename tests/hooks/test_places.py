@@ -21,11 +21,10 @@ from simenv_marl.hooks.places import find_hook, places_of, resolve
 from simenv_marl.hooks.stacks import STACKS, outside_simulation, stack_of
 from simenv_marl.plugins import ChangedResult, attach_handler, attached_handlers, expose_to_plugins, handlers
 from tests.foreign import market, shop
-from tests.foreign.market import Trader
-from tests.hooks.forms import BID, FORMS, MARKET
+from tests.hooks.forms import FORMS, MARKET
 from tests.worlds.models import calling, define, play
 
-PRICE = f"{MARKET}.price"
+PRICE, LOOK = f"{MARKET}.price", f"{__name__}._Hiding.look"
 
 
 class _Hiding:
@@ -146,17 +145,17 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised, monkeypatch):
     refusing = Refusing("refusing_module")
     monkeypatch.setitem(sys.modules, "refusing_module", refusing)
     refusing.alias = original = market.price
-    good, bad = (lambda *args: 1, BID, "instead"), (lambda *args, **kwargs: 1, PRICE, "instead")
+    good, bad = (lambda self: 1, LOOK, "instead"), (lambda *args, **kwargs: 1, PRICE, "instead")
+    with pytest.raises(raised, match="sealed"):
+        aec_env(calling(market.price), {PRICE: define()}, plugins=[good])
     with pytest.raises(raised, match="sealed"):
         attach_handler(*bad)
     with pytest.raises(raised, match="sealed"), handlers(good, bad):
         raise AssertionError
-    with pytest.raises(raised, match="sealed"):
-        aec_env(calling(market.price), {PRICE: define()}, plugins=[good])
     gc.collect()
     assert market.price is shop.price is refusing.alias is original
-    assert hook_of(vars(Trader)["bid"]) is None
-    kept = Installation([(find_hook(BID, UnknownTargetError), None)])
+    assert hook_of(vars(_Hiding)["look"]) is None
+    kept = Installation([(find_hook(LOOK, UnknownTargetError), None)])
     kept.uninstall()
     assert not kept.complete  # so that an environment that is used again sets all of it again
 

@@ -38,7 +38,7 @@ test-all: test test-studies test-wheel test-oldest test-templates test-pythons t
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
 	$(addprefix tests/contract/test_,$(addsuffix .py,conformance environments episodes errors identity joint many_agents \
 	messages one_agent rounds simulate)) \
-	tests/core/test_points.py tests/core/test_spaces.py tests/envs/test_vector.py
+	tests/core/test_spaces.py tests/envs/test_vector.py tests/hooks/test_points.py
 check: lint
 	$(BIN)/python -m pytest --quiet -n 2 $(CHECK_TESTS)
 
@@ -152,7 +152,7 @@ lint: .venv/.test
 	$(BIN)/lint-imports
 
 # Links, the map, words, names in the reference, and whether tests run the commands that pages show.
-PAGE_TESTS := tests/test_pages.py tests/test_front_pages.py
+PAGE_TESTS := tests/test_pages.py
 docs: .venv/.test
 	$(BIN)/sphinx-build --fail-on-warning --quiet docs docs/_build
 	$(BIN)/python -m pytest --quiet $(PAGE_TESTS)

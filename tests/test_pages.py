@@ -1,6 +1,9 @@
-"""A page's code needs only what can be installed or what the page links; the page says how to get anything else."""
+"""Pages: their code runs and needs only what can be got as they say, and what they quote is what the library says."""
 
+import builtins
+import random
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -10,8 +13,11 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+from examples.greenhouse_coop import model
 
 import simenv_marl
+from tests.clients.page import blocks
+from tests.worlds.models import play
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -20,7 +26,10 @@ BUDGETS = CONFIG["tool"]["simenv_marl"]["budgets"]
 EXTRAS = set(CONFIG["project"]["optional-dependencies"])
 ROOMS = {page.stem: page for page in (DOCS / "reference").glob("*.md")}
 PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md")) + sorted(f"reference/{room}" for room in ROOMS)
-FRONT = ["README.md", "CONTRIBUTING.md", *(f"docs/{page}.md" for page in PAGES)]
+FRONT = [
+    *("README.md", "CONTRIBUTING.md", "SECURITY.md", ".github/PULL_REQUEST_TEMPLATE.md"),
+    *(f"docs/{page}.md" for page in PAGES),
+]
 BESIDE = {"dask", "gym", "gym_fin", "tensordict"}
 """Packages that other packages bring, or that a reader who comes from them has."""
 
@@ -59,30 +68,15 @@ def linked(page, text):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_code_of_a_page_imports_what_can_be_installed_or_saved(page):
+def test_the_code_of_a_page_fits_on_it_and_needs_what_can_be_installed_or_saved_or_what_it_says_how_to_get(page):
     text, code = code_of(page)
     saved = {path.stem for path in linked(page, text)}
     assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {"examples", "studies"}
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_a_page_links_each_example_that_it_imports_or_runs(page):
-    text, _ = code_of(page)
-    assert set(sources(text)) <= linked(page, text)
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_a_page_says_how_to_get_what_only_the_repository_has(page):
-    text, _ = code_of(page)
+    assert set(sources(text)) <= linked(page, text)  # each example that it imports or runs
     first = re.search(r"(?<![\w./])(?:benchmarks|examples|studies)[./]\w|^make \w|`make \w", text, re.MULTILINE)
-    if first:
+    if first:  # only the repository has it
         up_to_there = " ".join(text[: text.find("\n\n", first.end())].split())
         assert re.search(r"[Cc]lone the repository\b.* from its root\b", up_to_there)
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_the_code_of_a_page_fits_on_it(page):
-    text, _ = code_of(page)
     code = re.findall(r"^```(?:python|console|sh)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert [line for line in "".join(code).splitlines() if len(line) > 100] == []
 
@@ -152,7 +146,8 @@ def commands_of(text):
 def untested(command, written):
     """What a command runs or installs, and no test; ``written`` are the modules that a command before it writes."""
     if command.startswith("make "):
-        recipe = subprocess.run([*command.split(), "--dry-run"], cwd=ROOT, capture_output=True, text=True).stdout
+        dry_run = [*shlex.split(command), "--dry-run"]
+        recipe = subprocess.run(dry_run, cwd=ROOT, capture_output=True, text=True, check=True).stdout
         command = "; ".join(re.findall(r"-m (?:examples|studies)\S+", recipe)) or "-m pytest"
     extras = re.findall(r"pip install .*\[(.+)\]", command)
     programs = [name.replace("$script", "*") for name in re.findall(r"-m (simenv_marl \S+|[\w.$]+)", command)]
@@ -171,3 +166,79 @@ def test_a_command_of_a_page_is_run_by_tests_or_marked_as_not_run(page):
     written = re.findall(r"-m simenv_marl new \w+ (\w+)", text)
     found = {command: missing for command in commands_of(text) if (missing := untested(command, written))}
     assert found == {}
+
+
+# -- the pages that a newcomer meets first ---------------------------------------------------------
+
+
+def run(code):
+    """Run code. Returns its names."""
+    names = {}
+    exec(code, names)
+    return names
+
+
+def test_the_code_of_the_front_page_has_the_rewards_that_it_shows():
+    (code,) = blocks("index.md")
+    env = run(code)["env"]
+    assert env.reset(seed=1)[0] == [5.0]
+    rewards = [env.step(action)[1] for action in (1, 1, 0, 1, 1)]
+    assert rewards == [-1.0, -2.0, -1.0, -2.0, -3.0]
+    env.close()
+
+
+def test_pictures_and_links_of_the_readme_lead_to_files():
+    """No badge stands for a service that does not exist."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", text)
+    links = [link for link in re.findall(r"\]\(([^)]*)\)", text) if not link.startswith("https://")]
+    assert pictures
+    assert [path for path in (*pictures, *links) if not (ROOT / path).is_file()] == []
+
+
+def told_in_an_episode(env, seed):
+    """What is told in an episode of random actions, turn by turn."""
+    actions = random.Random(seed)
+    turns = play(env, lambda agent, env: actions.randrange(4), seed=seed)
+    return [(turn.agent, turn.observation.tolist(), *turn[2:5]) for turn in turns]
+
+
+def test_a_hand_written_environment_and_its_successor_tell_the_same():
+    before, after = map(run, blocks("coming-from.md", "PettingZoo"))
+    told = [told_in_an_episode(before["StallEnv"](), seed) for seed in range(20)]
+    assert told == [told_in_an_episode(after["env"], seed) for seed in range(20)]
+    assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
+
+
+def test_the_environment_of_the_paper_in_todays_words(monkeypatch):
+    monkeypatch.setitem(sys.modules, "model", model)
+    (code,) = blocks("coming-from.md", "Sim-Env")
+    names = run(code)
+    assert names["terminated"]
+    assert names["alive"](names["env"].simulation.greenhouse) == 0
+    assert -1 <= names["reward"] <= 1
+    names["env"].close()
+
+
+def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are():
+    text = (DOCS / "problems.md").read_text(encoding="utf-8")
+    quoted = re.findall(r"^### (.+)$", text, re.MULTILINE)  # the headings
+    assert len(quoted) >= 20
+    sources = (path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
+    said = "".join(re.sub(r'"\s+f?"', "", source) for source in sources)  # each text in one line
+    for quote in quoted:
+        parts = [re.escape(part.strip()) for part in quote.replace("`", "").split("...")]
+        assert re.search(".*".join(parts), said), quote
+    named = set(re.findall(r"`([A-Z]\w+Error)`", text))
+    assert {name for name in named if not hasattr(builtins, name)} <= set(simenv_marl.errors.__all__)
+
+
+TERMS = (
+    "parameter sharing", "centralised training", "CTDE", "self-play", "black death", "discrete-event simulation",
+    "agent-based model", "semi-MDP", "callback", "hook", "DAgger", "action mask", "PPO", "wrapper", "seed", "pickle",
+    "AEC", "turn-based", "MARL", "behavior cloning",
+)  # fmt: skip
+
+
+def test_the_glossary_explains_the_terms_that_users_search_for():
+    assert set(TERMS) <= set((DOCS / "glossary.md").read_text(encoding="utf-8").splitlines())

@@ -38,10 +38,3 @@ def test_read_the_docs_builds_what_make_docs_builds():
     assert (ROOT / config["sphinx"]["configuration"]).is_file()
     (install,) = config["python"]["install"]
     assert set(install["extra_requirements"]) <= PROJECT["optional-dependencies"].keys()
-
-
-@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "SECURITY.md", ".github/PULL_REQUEST_TEMPLATE.md"])
-def test_targets_that_are_named_exist(page):
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for named in (ROOT / page).read_text(encoding="utf-8").split("`make ")[1:]:
-        assert f"\n{named.partition('`')[0]}:" in makefile

@@ -129,8 +129,6 @@ def test_models_steps_and_parameters_that_cannot_be_are_refused():
 def test_points_are_those_that_are_named():
     with pytest.raises(UnknownPointError, match="points is empty"):
         aec_env(SteppedSimulation(Walk, 5))
-    assert simulate(SteppedSimulation(Walk, 5), seed=2).model.place == walked(2, 5)
-    table = evaluate(SteppedSimulation(Walk, 5), {"rule": {}}, seeds=range(2)).frame
-    assert table["return"].tolist() == [0.0, 0.0]
+    assert evaluate(SteppedSimulation(Walk, 5), {"rule": {}}, seeds=[1]).frame["return"].tolist() == [0.0]
     played = simulate(SteppedSimulation(Walk, 5), {"stride_0": lambda place: 2}, points=STRIDE, seed=2)
     assert played.model.place == walked(2, 5, drift=1.0)

@@ -87,6 +87,7 @@ def test_environments_have_names_metadata_and_spaces_of_their_own(make):
         ),
         *(({"max_steps": wrong}, OptionValueError, "max_steps") for wrong in (0, -1, 2.0, "3")),
         *(({"driver": wrong}, OptionValueError, "driver") for wrong in ("magic", None)),
+        *(({"plugins": wrong}, OptionValueError, "plugins") for wrong in ("text", 3, {PUMP: print})),
         *(({"policies": wrong}, OptionValueError, "polic") for wrong in (3, [PUMP], {"pump_0": 3}, {"pump_0": None})),
         ({"render_mode": 3}, OptionValueError, "render_mode"),
         *(

@@ -40,14 +40,8 @@ POINTS = {BET: define(agent="player_0", observation_space_mapping=lambda casino,
 
 def world():
     """The state of all global generators."""
-    numpy_state = np.random.get_state(legacy=False)
-    return (
-        random.getstate(),
-        numpy_state["state"]["key"].tolist(),
-        numpy_state["state"]["pos"],
-        numpy_state["has_gauss"],
-        numpy_state["gauss"],
-    )
+    name, key, *others = np.random.get_state()
+    return random.getstate(), name, key.tolist(), others
 
 
 @pytest.fixture(params=["copied as bytes", "by their own functions"])
@@ -79,46 +73,26 @@ def plain(seed):
 @pytest.mark.usefixtures("_states")
 @DRIVERS
 @pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
-def test_an_environment_draws_as_the_plain_run_with_its_seed(make, driver):
-    points = {BET: define(agent="player_0")}
-    log = plain(7)
-    random.seed(99)
-    np.random.seed(99)
-    before = world()
-    env = make(Casino, points, global_rng=True, driver=driver)
-    for _ in range(2):
-        env.reset(seed=7)
+def test_environments_draw_as_the_plain_runs_with_their_seeds_and_untouched_by_each_other_and_their_user(make, driver):
+    logs = {seed: plain(seed) for seed in (7, 8)}
+    envs = {seed: make(Casino, {BET: define(agent="player_0")}, global_rng=True, driver=driver) for seed in logs}
+
+    def assert_untouched(move, *args, **kwargs):
+        before = world()
+        move(*args, **kwargs)
         assert world() == before
-        while env._session.episode is not None and not env._session.episode.over:
-            random.setstate(before[0])  # whatever its user draws meanwhile
-            env.step(RULE)
-            assert world() == before
-        assert env.unwrapped.simulation.log == log
-    env.reset(seed=7)
-    env.close()
-    assert world() == before
+        random.gauss(0, 1), np.random.random()
 
-
-@pytest.mark.usefixtures("_states")
-@DRIVERS
-def test_interleaved_environments_are_as_reproducible_as_alone(driver):
-    def run(seed):
-        env = aec_env(Casino, POINTS, global_rng=True, driver=driver)
-        env.reset(seed=seed)
-        seen = []
+    for _ in range(2):
+        for seed, env in envs.items():
+            assert_untouched(env.reset, seed=seed)
         for _ in range(6):
-            seen.append(env.last()[0].tolist())
-            env.step(RULE)
-            yield
-        yield seen, list(env.simulation.log)
-
-    expected = [list(run(seed))[-1] for seed in (1, 2, 1)]
-    runs = [run(seed) for seed in (1, 2, 1)]
-    for steps in range(7):
-        found = [next(each) for each in runs]
-        np.random.seed(steps)  # the user draws as well
-    assert found == expected
-    assert expected[0] == expected[2] != expected[1]
+            for env in envs.values():
+                assert_untouched(env.step, RULE)
+        assert {seed: env.unwrapped.simulation.log for seed, env in envs.items()} == logs
+    for env in envs.values():
+        assert_untouched(env.reset)
+        assert_untouched(env.close)
 
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
@@ -129,7 +103,9 @@ def test_without_it_generators_are_everybodys():
     env.step(RULE)
     assert world() != before
     env = aec_env(Casino, POINTS, global_rng=True)
+    before = world()
     play(env)
+    assert world() == before
     assert env.simulation.log[:4] == plain(env.simulation.seed)[:4]  # of the seed that it drew
     assert env.provenance()["options"] == {"global_rng": True}
     with pytest.raises(OptionValueError, match="global_rng"):
@@ -151,16 +127,12 @@ class Seeding(Casino):
         self.log = [self.bet(0)]
 
 
-def test_simulate_leaves_generators_alone_also_those_that_a_model_seeds():
-    def draw(observation):
-        return int(observation[0])
-
-    before, logs = world(), []
-    for kind, seed in ((Casino, 3), (Casino, 3), (Seeding, 1), (Seeding, 2)):
-        logs.append(simulate(kind, {BET: draw}, points=POINTS, seed=seed, global_rng=True).log)
-        assert world() == before
-    assert logs[0] == logs[1]
-    assert logs[2] == logs[3]
+def test_simulations_may_seed_the_generators_themselves():
+    before = world()
+    policies = {BET: lambda observation: int(observation[0])}
+    one, other = (simulate(Seeding, policies, points=POINTS, seed=seed, global_rng=True) for seed in (1, 2))
+    assert one.log == other.log
+    assert world() == before
 
 
 @pytest.mark.usefixtures("_states")

@@ -1,48 +1,30 @@
-"""Where functions are found, set, and put back."""
+"""Wrappers of a model's functions: who takes part in their calls, where they are found, set, and put back."""
 
 import gc
-import random
+import pickle
 import sys
-import threading
-import time
 import types
 import weakref
-from textwrap import dedent
+from types import SimpleNamespace
 from unittest import mock
 
+import cloudpickle
 import pytest
+from greenlet import getcurrent, greenlet
 
 from simenv_marl import aec_env
+from simenv_marl.decision import point_of, registered
 from simenv_marl.errors import PatchError, UnknownTargetError
 from simenv_marl.hooks.handlers import Installation
-from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.places import PlacedHook, find_hook, places_of, resolve
-from simenv_marl.plugins import (
-    ChangedResult,
-    attach_handler,
-    attached_handlers,
-    expose_to_plugins,
-    handlers,
-)
+from simenv_marl.hooks.hook import Hook, hook_of, made_with, unwrap
+from simenv_marl.hooks.places import find_hook, places_of, resolve
+from simenv_marl.hooks.stacks import STACKS, outside_simulation, stack_of
+from simenv_marl.plugins import ChangedResult, attach_handler, attached_handlers, expose_to_plugins, handlers
+from tests.foreign import market, shop
+from tests.hooks.forms import FORMS, MARKET
 from tests.worlds.models import calling, define, play
 
-HERE = __name__
-
-
-class Base:
-    def method(self):
-        return "rule"
-
-    @staticmethod
-    def static():
-        return "static"
-
-    @classmethod
-    def of_class(cls):
-        return cls.__name__
-
-    def look(self):
-        return "rule"
+PRICE, LOOK = f"{MARKET}.price", f"{__name__}._Hiding.look"
 
 
 class _Hiding:
@@ -53,53 +35,79 @@ class _Hiding:
         return self.__hidden()
 
 
-class Sub(Base):
-    pass
+# -- calls ------------------------------------------------------------------------------------------
 
 
-def function():
-    return "rule"
+def rule(first, second=2, *, third=3):
+    return first, second, third
 
 
-def hook_of_name(name):
-    return find_hook(f"{HERE}.{name}", UnknownTargetError)
+@pytest.mark.parametrize(
+    ("function", "args", "kwargs"),
+    [
+        (rule, (1,), {}),
+        (rule, (1, 5), {"third": 7}),
+        (rule, (), {"first": 1}),
+        (lambda model, /: 0, (1,), {}),
+        (lambda model=None: 0, (), {}),
+        (lambda getcurrent: 0, (), {"getcurrent": 1}),  # a name that wrappers use
+        (lambda *models: 0, (1, 2), {}),
+        (lambda *, model: 0, (), {"model": 1}),
+        (lambda: 0, (), {}),
+    ],
+)
+def test_an_interceptor_gets_the_arguments_as_they_were_passed(function, args, kwargs):
+    hook = Hook(function, "somewhere.Model.function")
+    made, other = hook.make_wrapper("one"), hook.make_wrapper("other")
+    hook.enter(getcurrent(), lambda *given: given, None)
+    assert made(*args, **kwargs) == other(*args, **kwargs) == (args, kwargs)
+    with pytest.raises(TypeError):
+        made(1, wrong=2)
+    hook.leave(getcurrent())
+    assert hook.interceptors == {}
+    assert (made_with(made), made_with(other)) == ("one", "other")
+    assert hook_of(made) is hook_of(other) is hook
+    assert unwrap(made) is unwrap(function) is function
 
 
-@pytest.fixture
-def make_module(monkeypatch):
-    """Makes modules of a name and a source, which are forgotten at the end."""
+def test_a_wrapper_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
+    scope = {"__name__": "__main__"}
+    exec("def function(number): return number", scope)
+    made = Hook(scope["function"], "__main__.function").make_wrapper("made with")
+    again = pickle.loads(cloudpickle.dumps(made))
+    hook = hook_of(again)
+    assert (again(3), made_with(again)) == (3, "made with")
+    hook.enter(getcurrent(), lambda args, kwargs: "intercepted", None)
+    assert again(3) == "intercepted"
+    hook.leave(getcurrent())
 
-    def make(name, source="", kind=types.ModuleType):
-        module = kind(name)
-        exec(dedent(source), vars(module))
-        monkeypatch.setitem(sys.modules, name, module)
-        return module
 
-    return make
+def test_outside_a_simulation_its_interceptors_are_masked(monkeypatch):
+    here, told = getcurrent(), []
+    stack = SimpleNamespace(leave_hooks=told.append, enter_hooks=lambda: told.append("entered"))
+
+    def in_a_greenlet_of_the_model():
+        with outside_simulation():  # only that is masked, which has no hooks of its own to leave
+            assert stack_of(getcurrent()) is None
+        return stack_of(getcurrent())
+
+    monkeypatch.setitem(STACKS, here, stack)
+    assert greenlet(in_a_greenlet_of_the_model).switch() is stack
+    with outside_simulation():
+        assert stack_of(here) is greenlet(lambda: stack_of(getcurrent())).switch() is None
+        with outside_simulation():
+            assert told == [here]
+    assert stack_of(here) is stack
+    assert told == [here, "entered"]
 
 
 # -- names ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["__hidden", "_Hiding__hidden"])
-def test_private_names_are_found_as_they_are_written_and_as_they_are(name):
-    with handlers((lambda self: "taken", f"{HERE}._Hiding.{name}", "instead")):
+def test_private_names_are_found_as_they_are_written():
+    with handlers((lambda self: "taken", f"{__name__}._Hiding.__hidden", "instead")):
         assert _Hiding().look() == "taken"
     assert _Hiding().look() == "hidden"
-
-
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [
-        ("nowhere", "it needs a dotted name"),
-        ("no_such_package_at_all.function", "no module 'no_such_package_at_all'"),
-        (f"{HERE}.Missing.method", "has no 'Missing'"),
-        (f"{HERE}.Base.missing", "has no 'missing'"),
-    ],
-)
-def test_a_name_that_leads_to_nothing_says_what_is_missing(name, why):
-    with pytest.raises(UnknownTargetError, match=why):
-        resolve(name, UnknownTargetError)
 
 
 def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
@@ -115,8 +123,11 @@ def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
 # -- set and put back -------------------------------------------------------------------------------
 
 
-def test_a_function_is_found_by_what_its_module_calls_it(make_module):
-    module, log = make_module("renaming_module", "def first(): return 1\nsecond = first\ndel first"), []
+def test_a_function_is_found_by_what_its_module_calls_it(monkeypatch):
+    module, log = types.ModuleType("renaming_module"), []
+    module.second = lambda: 1
+    module.second.__module__ = module.__name__
+    monkeypatch.setitem(sys.modules, module.__name__, module)
     with handlers((lambda: log.append("called"), module.second, "before")):
         assert [entry[1] for entry in attached_handlers()] == ["renaming_module.second"]
         assert module.second() == 1
@@ -124,26 +135,27 @@ def test_a_function_is_found_by_what_its_module_calls_it(make_module):
 
 
 @pytest.mark.parametrize(("error", "raised"), [(TypeError, PatchError), (ZeroDivisionError, ZeroDivisionError)])
-def test_a_patch_that_fails_half_way_is_undone(error, raised, make_module):
+def test_a_patch_that_fails_half_way_is_undone(error, raised, monkeypatch):
     class Refusing(types.ModuleType):
         def __setattr__(self, name, value):
             if name == "alias" and hook_of(value) is not None:
                 raise error("sealed")
             super().__setattr__(name, value)
 
-    refusing = make_module("refusing_module", kind=Refusing)
-    refusing.alias = original = function
-    good, bad = (lambda self: 1, f"{HERE}.Base.method", "instead"), (lambda: 1, f"{HERE}.function", "instead")
+    refusing = Refusing("refusing_module")
+    monkeypatch.setitem(sys.modules, "refusing_module", refusing)
+    refusing.alias = original = market.price
+    good, bad = (lambda self: 1, LOOK, "instead"), (lambda *args, **kwargs: 1, PRICE, "instead")
+    with pytest.raises(raised, match="sealed"):
+        aec_env(calling(market.price), {PRICE: define()}, plugins=[good])
     with pytest.raises(raised, match="sealed"):
         attach_handler(*bad)
     with pytest.raises(raised, match="sealed"), handlers(good, bad):
         raise AssertionError
-    with pytest.raises(raised, match="sealed"):
-        aec_env(calling(function), {f"{HERE}.function": define()}, plugins=[good])
     gc.collect()
-    assert function is refusing.alias is original
-    assert hook_of(vars(Base)["method"]) is None
-    kept = Installation([(hook_of_name("Base.method"), None)])
+    assert market.price is shop.price is refusing.alias is original
+    assert hook_of(vars(_Hiding)["look"]) is None
+    kept = Installation([(find_hook(LOOK, UnknownTargetError), None)])
     kept.uninstall()
     assert not kept.complete  # so that an environment that is used again sets all of it again
 
@@ -151,7 +163,7 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised, make_module):
 # -- nothing stays behind ---------------------------------------------------------------------------
 
 
-def test_classes_of_points_and_of_targets_are_collected():
+def test_models_of_points_and_of_targets_are_collected_with_these():
     references = []
     for _ in range(20):
 
@@ -159,12 +171,18 @@ def test_classes_of_points_and_of_targets_are_collected():
             def decide(self):
                 return 0
 
+            @define()
+            def decorated(self):
+                return 0
+
             @expose_to_plugins
             def __iter__(self):
                 yield from [1, 2]
 
         references.append(weakref.ref(Model))
-        env = aec_env(calling(lambda model=Model: model().decide()), {Model.decide: define()})
+        name = point_of(Model.decorated)[0].name
+        assert name in registered()
+        env = aec_env(calling(lambda model=Model: model().decide()), {Model.decide: define(), Model.decorated: None})
         env.reset()
         env.close()
         with handlers((lambda model, _result: ChangedResult(_result + 1), Model.__iter__, "after_next")):
@@ -173,107 +191,32 @@ def test_classes_of_points_and_of_targets_are_collected():
     gc.collect()
     gc.collect()
     assert [reference() for reference in references] == [None] * 20
+    assert name not in registered()
 
 
-def test_modules_may_come_while_names_are_looked_for(monkeypatch, make_module):
+def test_modules_may_come_while_names_are_looked_for(monkeypatch):
     class Lazy:
         """Stands in for a module that is imported as soon as something is asked of it."""
 
         @property
         def __class__(self):
-            make_module(f"late_module_{len(sys.modules)}")
+            monkeypatch.setitem(sys.modules, f"late_module_{len(sys.modules)}", types.ModuleType("late_module"))
             return types.ModuleType
 
     monkeypatch.setitem(sys.modules, "lazy_module", Lazy())
-    assert places_of(function) == [(sys.modules[HERE], "function")]
+    assert set(places_of(market.price)) == {(market, "price"), (shop, "price"), (shop, "cost")}
 
 
-@pytest.fixture
-def _dawdling(monkeypatch):
-    """Others may have their turn between any two looks and changes at a place."""
-    drawn = random.Random(1)
-
-    def dawdle(function):
-        def slow(*args):
-            time.sleep(drawn.choice([0, 1e-3]))
-            value = function(*args)
-            time.sleep(drawn.choice([0, 1e-3]))
-            return value
-
-        return slow
-
-    for name in ("__init__", "is_free", "_apply", "_revert"):
-        monkeypatch.setattr(PlacedHook, name, dawdle(getattr(PlacedHook, name)))
-
-
-SOURCE = """
-class Base:
-    def method(self): return "rule"
-    def look(self): return "rule"
-
-class Sub(Base): pass
-
-def function(): return "rule"
-"""
-
-
-@pytest.mark.usefixtures("_dawdling")
-@pytest.mark.parametrize("path", ["Base.method", "Sub.method", "function"])
-def test_threads_come_and_go_at_once(path, monkeypatch, make_module):
-    """In each round eight of them come to a module that is new, and go."""
-    module, rounds, before, ready = make_module("new_model"), [], [], threading.Barrier(8)
-    monkeypatch.setattr("simenv_marl.hooks.places.modules", {"new_model": module})  # looking at all takes its time
-    name, (*owner_name, attribute) = f"new_model.{path}", path.split(".")
-
-    def owner():
-        return getattr(module, owner_name[0]) if owner_name else module
-
-    def call():
-        return getattr(owner()() if owner_name else module, attribute)()
-
-    def work():
-        for number in range(10):
-            if ready.wait(30) == 0:
-                exec(SOURCE, vars(module))
-                before.append(vars(owner()).get(attribute))
-            ready.wait(30)
-            called = []
-            plugins = [(lambda *_: None, "new_model.Base.look", "before")]
-            env = aec_env(calling(call), {name: define()}, plugins=plugins)
-            with handlers((lambda *_: called.append(1), name, "before")):  # noqa: B023
-                env.reset()
-                assert called
-                env.step(1)
-                ready.wait(30)
-            assert env.unwrapped.simulation.log == [1]
-            env.close()
-            ready.wait(30)
-            assert vars(owner()).get(attribute) is before[number]
-            assert hook_of(vars(module.Base)["look"]) is None
-        rounds.append(number)
-
-    threads = [threading.Thread(target=work, daemon=True) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert rounds == [9] * 8
-
-
-@pytest.mark.parametrize("name", ["Base.method", "Base.static", "Base.of_class", "Sub.method", "function"])
+@pytest.mark.parametrize("form", ["method", "static", "of a class", "inherited", "function"])
 @pytest.mark.parametrize("end", ["close", "drop"])
-def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(name, end):
-    owner, attribute = resolve(f"{HERE}.{name}", UnknownTargetError)
-    before = vars(owner).get(attribute)
-
-    def call():
-        return getattr(owner() if isinstance(owner, type) else owner, attribute)()
-
-    expected, points = call(), {f"{HERE}.{name}": define(agent="one_0")}
+def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(form, end):
+    name, call, expected = FORMS[form]
+    owner, attribute = resolve(name, UnknownTargetError)
+    before, points = vars(owner).get(attribute), {name: define(agent="one_0")}
     for _ in range(3):
         env = aec_env(calling(call), points)
         env.reset()
-        hook = hook_of_name(name)
+        hook = find_hook(name, UnknownTargetError)
         with mock.patch.object(owner, attribute, return_value="mocked"):
             if end == "close":
                 env.close()

@@ -385,8 +385,9 @@ def test_metrics_are_numbers_strings_or_none():
     frame = evaluate(Shop, {"rule": {}}, seeds=[0, 1], points=POINTS, metric=values).frame
     assert [frame[name].tolist() for name in "fsa"] == [[0.5] * 6, [None] * 3 + ["a"] * 3, [3] * 6]
     assert frame["n"].dtype == np.float64
-    with pytest.raises(OptionValueError, match="metric 'x' must be a number"):
-        evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda s: [1]})
+    for odd in ([1], 10**5000, 2**13_999):
+        with pytest.raises(OptionValueError, match="metric 'x' must be a number of no more than 4,200 digits"):
+            evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop, odd=odd: odd})
 
 
 def test_objects_that_no_worker_can_unpickle_are_refused_before_anything_runs(tmp_path):

@@ -99,7 +99,7 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
 
 
 @pytest.mark.parametrize("arguments", [{"workers": 2}, {"batched": True}, {"batched": True, "workers": 2}], ids=str)
-def test_the_same_comes_of_all_ways_to_run_it(arguments):
+def test_the_same_comes_of_all_ways_to_run_it(arguments, capsys):
     def policy(observations):
         asked.append(len(observations))
         return much_of_many(observations)
@@ -107,7 +107,8 @@ def test_the_same_comes_of_all_ways_to_run_it(arguments):
     asked, given = [], {"seeds": SEEDS, "points": POINTS, "metric": level}
     contenders = {"rule": {}, "much": {"keeper": policy if arguments.get("batched") else much}}
     alone = evaluate(Shop, CONTENDERS, **given)
-    assert evaluate(Shop, contenders, **given, **arguments).frame.equals(alone.frame)
+    assert evaluate(Shop, contenders, progress=True, **given, **arguments).frame.equals(alone.frame)
+    assert "24/24" in capsys.readouterr().err
     assert "metric" in alone.frame.columns
     if arguments == {"batched": True}:
         assert max(asked) == len(SEEDS)
@@ -335,6 +336,10 @@ def test_pictures_show_each_seed_and_can_be_read():
     assert {label.get_rotation() for label in axes.get_xticklabels()} == {0}
 
 
+def returning(what):
+    return lambda observation: what
+
+
 @pytest.mark.parametrize(
     ("match", "arguments"),
     [
@@ -358,13 +363,14 @@ def test_pictures_show_each_seed_and_can_be_read():
         ("has the name of another column", {"metric": {"seed": level}}),
         ("workers", {"workers": -2}),
         ("policies of each contender", {"policies": {}}),
+        ("pickle", {"contenders": {"a": {"keeper": returning(threading.Lock())}}, "workers": 1}),
         ("of 'keeper' in 'mixed', <Mixture.*batched=True", {"contenders": MIXED}),
     ],
 )  # fmt: skip
 def test_invalid_arguments_are_refused_before_anything_runs(match, arguments):
     made = []
     given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
-    with pytest.raises((OptionValueError, UnknownPointError), match=match):
+    with pytest.raises((OptionValueError, UnknownPointError, TypeError), match=match):
         evaluate(lambda: made.append(1) or Shop(), **given)
     assert len(made) <= len(POINTS)  # looked at, and not run
 
@@ -390,31 +396,15 @@ def test_metrics_are_numbers_strings_or_none():
             evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop, odd=odd: odd})
 
 
-def test_objects_that_no_worker_can_unpickle_are_refused_before_anything_runs(tmp_path):
-    class Writing(Shop):
-        def reset(self, seed):
-            (tmp_path / str(seed)).touch()
-            super().reset(seed)
-
-    lock = threading.Lock()
-    with pytest.raises(TypeError, match="pickle"):
-        evaluate(Writing, {"rule": {}, "a": {"keeper": lambda o: lock}}, seeds=[1], points=POINTS, workers=1)
-    assert not list(tmp_path.iterdir())
-
-
-def test_progress_is_shown(capsys):
-    evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, progress=True)
-    assert "24/24" in capsys.readouterr().err
-
-
 def test_a_missing_package_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[experiments\]"):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS)
 
 
-def test_importing_the_package_imports_none_of_what_experiments_need():
-    code = "import sys, simenv_marl; print({'pandas', 'scipy.stats', 'pydoe', 'SALib'} & sys.modules.keys())"
+def test_importing_the_package_imports_neither_its_checks_nor_what_experiments_need():
+    names = {"pandas", "scipy.stats", "pydoe", "SALib", "simenv_marl.testing"}
+    code = f"import sys, simenv_marl; print({names} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

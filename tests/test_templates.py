@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import api_test
 
 from simenv_marl import simulate
 from simenv_marl.__main__ import main
@@ -154,12 +152,6 @@ def test_masks_of_the_simpy_template_tell_which_actions_are_legal_and_infos_how_
         over = terminated or truncated
     assert info["time"] == 480.0
     assert 0 < minutes <= 480.0  # from the first decision to the end
-
-
-@pytest.mark.filterwarnings("ignore:This environment does not have possible_agents")  # as rabbits are born
-def test_gymnasium_and_pettingzoo_accept_the_environments():
-    check_env(import_module("simenv_marl.testing.templates.plain").env(), skip_render_check=True)
-    api_test(import_module("simenv_marl.testing.templates.mesa").env(), num_cycles=500)
 
 
 def test_nothing_is_overwritten_and_folders_may_be_out_of_reach(tmp_path, capsys):

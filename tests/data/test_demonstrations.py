@@ -19,21 +19,18 @@ def twos(observations):
     return [2] * len(observations)
 
 
-def test_mixtures_tell_what_they_are_made_of():
-    assert repr(Mixture({ones: 3, RULE: 1})) == "<Mixture: 0.75 ones, 0.25 rule>"
-    assert "0.5 functools.partial" in repr(Mixture([(partial(ones), 1), (RULE, 1)]))
-
-
 def test_mixtures_leave_each_decision_to_one_of_their_policies():
-    ant = decision(agent="ant_0")
-    policies = {ant: Mixture({ones: 3, twos: 1, RULE: 4})}
-    found = collect_episodes(calling(*[ant] * 20), policies, seeds=range(100))[ant]
+    ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 3)
+    mixture = Mixture({ones: 3, twos: 1, RULE: 4})
+    assert repr(mixture) == "<Mixture: 0.375 ones, 0.125 twos, 0.5 rule>"
+    assert "0.5 functools.partial" in repr(Mixture([(partial(ones), 1), (RULE, 1)]))
+    found = collect_episodes(calling(*[ant] * 20), {ant: mixture}, seeds=range(100))[ant]
     component = found.extras["component"]
     assert [float((component == number).mean()) for number in range(3)] == pytest.approx([0.375, 0.125, 0.5], abs=0.04)
-    assert (found.actions[component == 0] == 1).all()
-    assert (found.actions[component == 1] == 2).all()
+    assert found.actions.tolist() == (component + 1).tolist()
     assert found.by_rule.tolist() == (component == 2).tolist()
-    logs = [simulation.log for simulation in simulate_many(calling(*[ant] * 20), policies, seeds=range(2))]
+    assert found.known.all()
+    logs = [simulation.log for simulation in simulate_many(calling(*[ant] * 20), {ant: mixture}, seeds=range(2))]
     assert logs == [[[1, 2, "rule"][own] for own in component[start : start + 20]] for start in (0, 20)]
 
 

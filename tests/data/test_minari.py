@@ -13,7 +13,7 @@ from simenv_marl.data import Mixture, collect_episodes, record_dataset, save_dat
 from simenv_marl.errors import DefinitionError, OptionValueError
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import Script, calling, decision, script
+from tests.worlds.models import Timed, calling, decision, script
 from tests.worlds.undone import models_of_pages_forgotten
 
 minari = pytest.importorskip("minari")
@@ -108,10 +108,6 @@ def test_all_kinds_of_spaces_are_read_again(space):
 
 
 def test_infos_are_as_many_as_observations():
-    class Timed(Script):
-        def time(self):
-            return 10.0 * len(self.log)
-
     def main(simulation):
         simulation.log += [ant()]
         simulation.log += [ant()]
@@ -200,22 +196,21 @@ TOLD = beings(rule_action_mapping=lambda decided, being: being.health % 10)
 """Their rule takes their health as an action."""
 
 
-def test_the_rule_demonstrates():
-    recorded = record_dataset(NAME, script(herd), {Being.act: RULE}, points=TOLD, seeds=[3, 1, 5])
-    for episode in minari.load_dataset(NAME):
-        assert episode.actions.tolist() == episode.observations[:-1, 1].tolist()
-        assert episode.infos["by_rule"].tolist() == [True] * len(episode) + [False]
-    assert recorded.storage.metadata["algorithm_name"] == "rule"
-
-
-def test_mixtures_demonstrate_and_say_who_decided():
+def test_the_rule_demonstrates_alone_and_in_mixtures_which_say_who_decided():
     mixture = Mixture({RULE: 1, ones: 1})
-    recorded = record_dataset(NAME, script(herd), {Being.act: mixture}, points=TOLD, seeds=range(5))
-    by_rule = np.concatenate([episode.infos["by_rule"][:-1] for episode in recorded])
+    for dataset_id, policy, name in (
+        ("simenv/rule-v0", RULE, "rule"),
+        ("simenv/mixed-v0", mixture, "<Mixture: 0.5 rule, 0.5 ones>"),
+    ):
+        policies, given = {Being.act: policy}, {"points": TOLD, "seeds": range(5)}
+        recorded = record_dataset(dataset_id, script(herd), policies, **given)
+        found = collect_episodes(script(herd), policies, **given)[Being.act]
+        check(found, recorded)
+        assert found.actions.tolist() == np.where(found.by_rule, found.observations[:, 1], 1).tolist()
+        assert recorded.storage.metadata["algorithm_name"] == name
     component = np.concatenate([episode.infos["component"][:-1] for episode in recorded])
-    assert 0 < by_rule.sum() < len(by_rule)
-    assert np.array_equal(component == 0, by_rule)
-    assert recorded.storage.metadata["algorithm_name"] == "<Mixture: 0.5 rule, 0.5 ones>"
+    assert np.array_equal(component == 0, found.by_rule)
+    assert 0 < found.by_rule.sum() < len(found)
 
 
 def test_unknown_rule_actions_are_refused():

@@ -18,18 +18,13 @@ from simenv_marl.data.timeline import UNKNOWN
 from simenv_marl.errors import MissingExtraError, OptionValueError, UnknownAgentError
 from tests.contract.test_simulate_many import ones
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import Script, calling, decision, script
+from tests.worlds.models import Timed, calling, decision, script
 
 
 @pytest.fixture(autouse=True)
 def _without_windows():
     yield
     assert "matplotlib.pyplot" not in sys.modules or not matplotlib.pyplot.get_fignums()
-
-
-class Clocked(Script):
-    def time(self):
-        return 10.0 * len(self.log)
 
 
 def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **definition):
@@ -96,7 +91,7 @@ def test_the_clock_is_what_runs_from_left_to_right():
 
     bee = decision(agent="bee_0")  # who never decides, and so tells no time
     given = {"points": beings() | {bee: None}, "seeds": [1]}
-    found = collect_episodes(lambda: Clocked(main), {Being.act: ones, bee: ones}, **given)
+    found = collect_episodes(lambda: Timed(main), {Being.act: ones, bee: ones}, **given)
     first, _, second, paid = plot_timeline(found).axes
     assert dots(first) == [([[0, 1]], True)]
     assert dots(second) == [([[10, 1], [20, 1], [30, 1]], True)]

@@ -188,12 +188,3 @@ def test_episodes_that_were_collected_have_the_actions_of_the_rule(rule, definit
     assert found.by_rule.all()
     assert found.known.tolist() == [action is not None for action in expected]
     assert found.actions.tolist() == [action or 0 for action in expected]
-
-
-def test_a_policy_may_decide_some_of_them():
-    function = decision(counting(), rule_action_mapping=lambda tens: tens // 10)
-    answers = iter([RULE, 9, RULE, 8])
-    found = collect_episodes(four(function), {function: lambda observations: [next(answers)]}, seeds=[0])[function]
-    assert found.actions.tolist() == [1, 9, 2, 8]
-    assert found.by_rule.tolist() == [True, False, True, False]
-    assert found.known.all()

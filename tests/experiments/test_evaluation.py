@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from collections import Counter
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from scipy import stats
 from statsmodels.stats.power import TTestPower
 from tools.coverage_of_intervals import measure
 
-from simenv_marl import RULE, aec_env, branch, evaluate, make_step, simulate
+from simenv_marl import RULE, aec_env, evaluate, make_step, simulate
 from simenv_marl.data import Mixture
 from simenv_marl.data.plots import interval, is_proportion
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
@@ -19,7 +20,7 @@ from simenv_marl.experiments import Evaluation, Variant
 from simenv_marl.planning import RolloutPolicy
 from tests.conftest import DRIVERS
 from tests.worlds.many_worlds import Colony, Design, colony_points
-from tests.worlds.models import calling, decision, notes
+from tests.worlds.models import notes, play
 from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some
 
 SEEDS = range(12)
@@ -36,15 +37,10 @@ def of_teams(**returns):
 
 
 def returns_by_hand(policies, seed, make=Shop, points=POINTS, **options):
-    env = aec_env(make, points, **options)
-    env.reset(seed=seed)
-    found = {}
-    while env.agents:
-        name = env.agent_selection
-        observation, reward, terminated, truncated, _ = env.last()
-        found[name] = found.get(name, 0.0) + reward
-        policy = policies.get(name, lambda observation: RULE)
-        env.step(None if terminated or truncated else policy(observation))
+    found = Counter()
+    decide = lambda agent, env: policies[agent](env.observe(agent)) if agent in policies else RULE  # noqa: E731
+    for turn in play(aec_env(make, points, **options), decide, seed=seed):
+        found[turn.agent] += turn.reward
     return found
 
 
@@ -123,17 +119,6 @@ def test_planners_decide_as_they_do_in_simulate(arguments):
         assert found[name].tolist() == [simulate(Shop, policies, points=NEAR, seed=seed).level for seed in range(2)]
 
 
-def test_futures_of_an_agent_that_is_alone_end_with_max_steps():
-    choose, truncated = decision(agent="a_0"), []
-
-    def planner(observation, *, _environment):
-        truncated.append(branch(_environment, lambda env, _: [env.step(RULE)[3] for _ in range(3 - len(truncated))], 1))
-        return 1
-
-    evaluate(calling(*[choose] * 5), {"one": {choose: planner}}, seeds=[0], points=choose, max_steps=3)
-    assert truncated == [[[False, False, True]], [[False, True]], [[True]]]
-
-
 MIXED = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {"keeper": much_of_many}}
 
 
@@ -192,12 +177,6 @@ def test_events_that_were_not_seen_have_no_interval_of_zero_width():
     assert 0.25 < unknown < 0.45
 
 
-@pytest.mark.parametrize("values", [[1, 0, None], [True, False, None], [True, True], [np.nan, 1.0, 0.0]])
-def test_missing_values_do_not_hide_a_proportion(values):
-    assert is_proportion(np.array(values))
-    assert not is_proportion(np.array([*values, 2], object))
-
-
 def test_the_summary_says_why_there_is_no_interval():
     contenders = {"a": {}, "same": {}, "some": {"keeper": some}}
     found = evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1})
@@ -213,13 +192,16 @@ def test_the_summary_says_why_there_is_no_interval():
     found.plot()
 
 
-def test_shares_have_intervals_by_wilsons_score():
+def test_shares_have_intervals_by_wilsons_score_also_where_some_are_missing():
     some_seeds = np.arange(12) < 3
     wilson = stats.binomtest(3, 12).proportion_ci(0.95, method="wilson")
     student = stats.ttest_1samp(2.0 * some_seeds, 0).confidence_interval(0.95)
     for values, expected in ((some_seeds, wilson), (some_seeds.astype(int), wilson), (2 * some_seeds, student)):
         low, high = Evaluation(of_teams(a=values), None, 0.95).summary().loc["a", ["low", "high"]]
         assert (low, high) == pytest.approx(tuple(expected))
+    for values in ([1, 0, None], [True, False, None], [True, True], [np.nan, 1.0, 0.0]):
+        assert is_proportion(np.array(values))
+        assert not is_proportion(np.array([*values, 2], object))
 
 
 def test_the_probability_of_improvement_counts_ties_half():

@@ -21,12 +21,12 @@ import pandas as pd
 import pytest
 
 from simenv_marl import evaluate
-from simenv_marl.data import Mixture
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, StoreError, UnknownPointError
 from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.experiments import store as stores
 from simenv_marl.plugins import ChangedResult
 from simenv_marl.remote import ProcessSimulation
+from tests.outside.reservoirs import BOTH, command
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script
 from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
@@ -246,13 +246,10 @@ def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
         ("cannot be stored", {"design": {"days": [object()]}}),
         ("4,200 digits", {"design": {"days": [10**5000]}}),
         ("must be a DataFrame", {"design": 3}),
-        ("there are none", {"seeds": []}),
         ("'rule' is always the model as it is", {"contenders": {"rule": {"keeper": much}}}),
-        ("stranger", {"contenders": {"a": {"stranger": much}}}),
         ("unknown|no option", {"nonsense": 3}),
         ("no option policies here; .* in contenders=", {"policies": {"a": {"keeper": much}}}),
         ("team", {"team": 3}),
-        ("'a', .* batched=True", {"contenders": {"a": {"keeper": Mixture({much_of_many: 1})}}}),
     ],
 )
 def test_invalid_arguments_are_refused_before_anything_is_stored(match, arguments, tmp_path):
@@ -454,32 +451,18 @@ def test_rows_have_definitions_and_simulations_of_their_own(arguments, tmp_path)
     assert frame["return"].tolist() == 2 * expected
 
 
-CHILD = """
-import json, os
-reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
-lines, out = os.fdopen(reading), os.fdopen(writing, "w")
-def send(frame):
-    print(json.dumps(frame), file=out, flush=True)
-send({"hello": 1, "points": ["say"]})
-for line in lines:
-    if "start" in json.loads(line):
-        send({"end": {"result": [os.environ["HARBOUR"], os.getcwd(), os.getpid()]}})
-"""
-
-
 def test_a_process_is_kept_only_while_it_would_be_started_alike(tmp_path, monkeypatch):
     def make(name, folder):
         (tmp_path / folder).mkdir(exist_ok=True)
         monkeypatch.setenv("HARBOUR", name)
         monkeypatch.chdir(tmp_path / folder)
-        return ProcessSimulation([sys.executable, "-c", CHILD], {"say": POINTS[Shop.sell]})
+        return ProcessSimulation(["sh", "-c", telling, "sh", *command()], BOTH)
 
-    metric = {"seen": lambda s: "|".join(s.result[:2]), "pid": lambda s: s.result[2]}
+    telling = f'echo "$HARBOUR $PWD" >> {tmp_path / "started"}; exec "$@"'
     rows = {"name": ["a", "b", "b"], "folder": ["c", "c", "d"]}
-    frame = run_experiment(make, rows, seeds=[1, 2], metric=metric, store=tmp_path / "store")
-    started = [f"a|{tmp_path / 'c'}", f"b|{tmp_path / 'c'}", f"b|{tmp_path / 'd'}"]
-    assert frame["seen"].tolist() == [one for one in started for seed in range(2)]
-    assert frame["pid"].nunique() == 3
+    run_experiment(make, rows, seeds=[1, 2], store=tmp_path / "store")
+    started = (tmp_path / "started").read_text().splitlines()
+    assert started == [f"{name} {tmp_path / folder}" for name, folder in ("ac", "bc", "bd")]
 
 
 class Deadly(Shop):

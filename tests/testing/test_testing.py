@@ -511,11 +511,7 @@ def test_the_order_of_calls_is_shown_in_short(calls, told):
     assert order_of(calls) == told
 
 
-class Thing:
-    __slots__ = ("other", "value")
-
-    def __init__(self, value):
-        self.value = value
+Thing = dataclasses.make_dataclass("Thing", ["value", ("other", object, None)], eq=False, slots=True)
 
 
 def holding(**attributes):

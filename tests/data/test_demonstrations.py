@@ -11,6 +11,7 @@ from simenv_marl import RULE, simulate_many
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset, save_dataset
 from simenv_marl.errors import DefinitionError, MissingExtraError, OptionValueError
 from tests.contract.test_simulate_many import ones
+from tests.worlds.lives import life
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, plainly, script
 
@@ -65,14 +66,13 @@ def test_mixtures_give_policies_what_is_theirs():
         seen.extend(zip(observations[:, 0].tolist(), masks, identities, strict=True))
         return [1] * len(observations), {"dropped": np.zeros(len(observations))}
 
-    def main(simulation):
-        simulation.crowd = [Being(number) for number in range(6)]
-        for being in simulation.crowd:
-            being.act()
-
-    points = beings(action_mask_mapping=lambda being: mask)
-    found = collect_episodes(script(main), {Being.act: Mixture({informed: 1, twos: 1})}, points=points, seeds=range(9))
-    own = found[Being.act]
+    source, points = (
+        life(", ".join(f"{number} acts" for number in range(6))),
+        beings(action_mask_mapping=lambda _: mask),
+    )
+    own = collect_episodes(source, {Being.act: Mixture({informed: 1, twos: 1})}, points=points, seeds=range(9))[
+        Being.act
+    ]
     rows = np.flatnonzero(own.extras["component"] == 0)
     expected = [(own.observations[r, 0], mask, (own.seeds[own.episodes[r]], own.turns[r])) for r in rows]
     assert sorted(seen) == sorted(expected)

@@ -280,17 +280,6 @@ def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, give
     assert f"of the contender '{contender}'" in notes(caught.value)
 
 
-def test_metrics_that_are_no_numbers_have_no_mean():
-    metrics = {"day": lambda shop: "monday", "huge": lambda shop: 10**400, "some": lambda shop: shop.seed or None}
-    found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=metrics, baseline="rule")
-    assert set(found.values("day")["rule"]) == {"monday"}
-    for look in (found.summary, found.improvement, found.plot, lambda metric: found.seeds_needed(1, metric=metric)):
-        for metric in ("day", "huge"):  # no float can hold the latter
-            with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
-                look(metric=metric)
-    assert np.isnan(found.summary("some")["mean"]).all()
-
-
 def test_a_variant_brings_its_own_points_and_policies():
     variant = Variant("v", Shop, points=POINTS, parameters={"days": 2}, policies={"keeper": much})
     frame = evaluate(variant, {"rule": {}}, seeds=SEEDS, metric=level).frame
@@ -363,16 +352,24 @@ def test_an_agent_must_not_be_called_team():
         evaluate(Shop, {"rule": {}}, seeds=[1], points=points)
 
 
-def test_metrics_are_numbers_strings_or_none():
-    values = {
-        "f": lambda shop: np.float32(0.5),
-        "s": lambda shop: "a" if shop.seed else None,
-        "n": lambda shop: shop.seed or None,
-        "a": lambda shop: np.array(3),
+def test_metrics_are_numbers_strings_or_none_and_those_that_are_no_numbers_have_no_mean():
+    metrics = {
+        "float": lambda shop: np.float32(0.5),
+        "array": lambda shop: np.array(3),
+        "some": lambda shop: shop.seed or None,
+        "text": lambda shop: "a" if shop.seed else None,
+        "huge": lambda shop: 10**400,  # which no float can hold
     }
-    frame = evaluate(Shop, {"rule": {}}, seeds=[0, 1], points=POINTS, metric=values).frame
-    assert [frame[name].tolist() for name in "fsa"] == [[0.5] * 6, [None] * 3 + ["a"] * 3, [3] * 6]
-    assert frame["n"].dtype == np.float64
+    found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=metrics, baseline="rule")
+    expected = {"float": [0.5, 0.5], "array": [3, 3], "text": [None, "a"], "huge": [10**400] * 2}
+    team = found.frame[(found.frame["agent"] == "team") & (found.frame["contender"] == "rule")]
+    assert {name: team[name].tolist() for name in expected} == expected
+    assert team["some"].dtype == np.float64
+    assert np.isnan(found.summary("some")["mean"]).all()
+    for look in (found.summary, found.improvement, found.plot, lambda metric: found.seeds_needed(1, metric=metric)):
+        for metric in ("text", "huge"):
+            with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
+                look(metric=metric)
     for odd in ([1], 10**5000, 2**13_999):
         with pytest.raises(OptionValueError, match="metric 'x' must be a number of no more than 4,200 digits"):
             evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop, odd=odd: odd})

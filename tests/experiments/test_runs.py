@@ -21,7 +21,7 @@ import pandas as pd
 import pytest
 
 from simenv_marl import evaluate
-from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, StoreError, UnknownPointError
+from simenv_marl.errors import AgentError, OptionValueError, StoreError, UnknownPointError
 from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.experiments import store as stores
 from simenv_marl.plugins import ChangedResult
@@ -486,19 +486,12 @@ def test_a_run_that_kills_its_worker_is_a_row_and_the_others_go_on(batched, tmp_
     assert run_experiment(Deadly, design, store=tmp_path / "a", workers=2, **given).equals(frame)
 
 
-@pytest.mark.parametrize("lacks", ["joblib", "death"])
-def test_workers_that_cannot_be_are_refused_before_anything_runs(lacks, tmp_path, monkeypatch):
-    def make(**row):
-        raise AssertionError("nothing may run")
-
-    if lacks == "joblib":
-        monkeypatch.setitem(sys.modules, "joblib", None)
-        monkeypatch.setitem(sys.modules, "joblib.parallel", None)
-    with joblib.parallel_config(backend="multiprocessing" if lacks == "death" else "loky"):
-        with pytest.raises((MissingExtraError, OptionValueError), match="joblib"):
-            evaluate(make, {"rule": {}}, seeds=[1], workers=2)
-        with pytest.raises((MissingExtraError, OptionValueError), match="joblib"):
-            run_experiment(make, {"days": [1]}, seeds=[1], workers=2, store=tmp_path / "store")
+def test_a_backend_that_does_not_tell_of_the_death_of_its_workers_is_refused_before_anything_runs(tmp_path):
+    with joblib.parallel_config(backend="multiprocessing"):
+        with pytest.raises(OptionValueError, match="joblib"):
+            evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, workers=2)
+        with pytest.raises(OptionValueError, match="joblib"):
+            run(tmp_path / "store", workers=2)
     assert not (tmp_path / "store").exists()
 
 

@@ -5,12 +5,10 @@ import errno
 import json
 import math
 import os
-import random
 import signal
 import subprocess
 import sys
 import textwrap
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -503,8 +501,9 @@ def test_integers_of_too_many_digits_are_errors_of_their_run_or_of_their_policy(
 
 
 SCRIPT = """
-    import sys
-    sys.path.insert(0, sys.argv[3])
+    import os, signal, sys
+    from pathlib import Path
+    sys.path.insert(0, sys.argv[1])
     import pandas as pd
     from simenv_marl.experiments import run_experiment
     from tests.worlds.shops import POINTS, Shop, level, some
@@ -513,8 +512,13 @@ SCRIPT = """
         def order(self):
             return 3
 
+        def run(self):
+            if most and sum(path.read_bytes().count(b"\\n") for path in Path(store).glob("*.jsonl")) >= most:
+                os.killpg(0, signal.SIGKILL)
+            super().run()
+
+    store, workers, most = sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
     if __name__ == "__main__":
-        store, workers = sys.argv[1], int(sys.argv[2])
         undecided = run_experiment(Own, {"days": [1]}, seeds=[1], store=f"{store}.undecided", workers=workers)
         assert undecided[["agent", "length"]].values.tolist() == [["team", 0]]
         order, sell = POINTS.values()
@@ -525,6 +529,7 @@ SCRIPT = """
         frame.to_pickle(f"{store}.table")
 """
 """Workers find what a script defines, and a model need not decide."""
+"""Workers find what a script defines, and a model need not decide."""
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
@@ -532,33 +537,17 @@ SCRIPT = """
 def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_path):
     script, store = tmp_path / "script.py", tmp_path / "store"
     script.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
-    chance, kills, known = random.Random(workers), 0, 0
 
-    def start(folder, number):
-        command = [sys.executable, "-W", "error::UserWarning", script, folder, str(number), ROOT]
-        return subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE)
+    def start(folder, number, most):
+        command = [sys.executable, "-W", "error::UserWarning", script, ROOT, folder, str(number), str(most)]
+        return subprocess.run(command, start_new_session=True, stderr=subprocess.PIPE, text=True, check=False)
 
-    for number in range(100):
-        with start(store, workers) as process:
-            begun = len(list(store.glob("*.jsonl")))
-            deadline = time.monotonic() + 60  # until it has begun to run
-            while process.poll() is None and len(list(store.glob("*.jsonl"))) == begun and time.monotonic() < deadline:
-                time.sleep(0.005)
-            try:
-                # Ever longer, so that also on a machine that is busy with other things it gets to the end.
-                process.wait(chance.uniform(0.0, 0.8 if workers else 0.25) * (1 + number))
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                kills += 1
-            process.wait()
-        now = len(lines(store))
-        assert now >= known
-        known = now
-        if (tmp_path / "store.table").exists():
-            break
-    assert kills >= (1 if workers else 3)
-    with start(tmp_path / "undisturbed", 0) as process:
-        process.wait()
+    for most in (1, 9, 30):
+        assert start(store, workers, most).returncode == -signal.SIGKILL
+        assert len(lines(store)) >= most
+    for folder, number in ((store, workers), (tmp_path / "undisturbed", 0)):
+        done = start(folder, number, 0)
+        assert done.returncode == 0, done.stderr
     tables = [pd.read_pickle(tmp_path / f"{name}.table") for name in ("store", "undisturbed")]
     assert tables[0].equals(tables[1])
     keys = [(json.dumps(entry["factors"]), entry["contender"], entry["seed"]) for entry in lines(store)]

@@ -1,4 +1,4 @@
-"""Demonstrations by the rule and by others: mixtures and comparisons. Of data sets: ``clients/test_minari.py``."""
+"""Demonstrations by the rule and by others: mixtures and comparisons. Of data sets: ``test_minari.py``."""
 
 import sys
 from functools import partial
@@ -66,13 +66,9 @@ def test_mixtures_give_policies_what_is_theirs():
         seen.extend(zip(observations[:, 0].tolist(), masks, identities, strict=True))
         return [1] * len(observations), {"dropped": np.zeros(len(observations))}
 
-    source, points = (
-        life(", ".join(f"{number} acts" for number in range(6))),
-        beings(action_mask_mapping=lambda _: mask),
-    )
-    own = collect_episodes(source, {Being.act: Mixture({informed: 1, twos: 1})}, points=points, seeds=range(9))[
-        Being.act
-    ]
+    source = life("0 acts, 1 acts, 2 acts, 3 acts, 4 acts, 5 acts")
+    given = {"points": beings(action_mask_mapping=lambda being: mask), "seeds": range(9)}
+    own = collect_episodes(source, {Being.act: Mixture({informed: 1, twos: 1})}, **given)[Being.act]
     rows = np.flatnonzero(own.extras["component"] == 0)
     expected = [(own.observations[r, 0], mask, (own.seeds[own.episodes[r]], own.turns[r])) for r in rows]
     assert sorted(seen) == sorted(expected)

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from simenv_marl import RULE, TRUNCATED
 from simenv_marl.data import Mixture, collect_episodes, record_dataset, save_dataset
 from simenv_marl.errors import DefinitionError, OptionValueError
+from tests.contract.test_simulate_many import ones
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Timed, calling, decision, script
@@ -25,10 +26,6 @@ SAID = {"author": "An", "description": "?"}
 @pytest.fixture(autouse=True)
 def _where_data_sets_lie(monkeypatch, tmp_path):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data sets"))
-
-
-def ones(observations):
-    return np.ones(len(observations), np.int64)
 
 
 def part(stack, rows):

@@ -94,22 +94,6 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
     assert np.isfinite(found.summary().to_numpy()).all()
 
 
-@pytest.mark.parametrize("arguments", [{"workers": 2}, {"batched": True}, {"batched": True, "workers": 2}], ids=str)
-def test_the_same_comes_of_all_ways_to_run_it(arguments, capsys):
-    def policy(observations):
-        asked.append(len(observations))
-        return much_of_many(observations)
-
-    asked, given = [], {"seeds": SEEDS, "points": POINTS, "metric": level}
-    contenders = {"rule": {}, "much": {"keeper": policy if arguments.get("batched") else much}}
-    alone = evaluate(Shop, CONTENDERS, **given)
-    assert evaluate(Shop, contenders, progress=True, **given, **arguments).frame.equals(alone.frame)
-    assert "24/24" in capsys.readouterr().err
-    assert "metric" in alone.frame.columns
-    if arguments == {"batched": True}:
-        assert max(asked) == len(SEEDS)
-
-
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
 def test_planners_decide_as_they_do_in_simulate(arguments):
     planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1, method="replay")
@@ -123,8 +107,11 @@ MIXED = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_mixtures_decide_as_policies_of_many(workers):
-    values = evaluate(Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers).values()
+def test_mixtures_decide_as_policies_of_many(workers, capsys):
+    found = evaluate(Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers, progress=True)
+    assert "24/24" in capsys.readouterr().err
+    values, alone = found.values(), evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS).values()
+    assert values["much"].equals(alone["much"])
     assert (values["mixed"] <= values["much"]).all()
     assert values["mixed"].mean() < values["much"].mean() - 2
 

@@ -151,8 +151,7 @@ def test_stored_runs_are_not_run_again(tmp_path):
 
     def again(days, seeds=range(3), contenders=None, **options):
         calls.clear()
-        given = {"contenders": contenders, "seeds": seeds, "points": POINTS, **options}
-        return run_experiment(make, {"days": days}, store=tmp_path, **given)
+        return run(tmp_path, {"days": days}, make=make, seeds=seeds, contenders=contenders, **options)
 
     first = again([1, 2])
     assert again([1, 2]).equals(first)
@@ -164,9 +163,9 @@ def test_stored_runs_are_not_run_again(tmp_path):
     assert set(failed["agent"]) == {"team"}
     assert set(failed["status"]) == {"error"}
     assert "'stranger' did not decide in this episode; these agents did: keeper, helper" in failed["error"][0]
-    known = len(lines(tmp_path))
+    assert len(lines(tmp_path)) == 3 * 3
     assert set(again([1, 2, 3, 1], team=lambda returns: returns.pop("keeper"))["status"]) == {"ok"}  # it is mended
-    assert len(lines(tmp_path)) == known == 3 * 3
+    assert len(lines(tmp_path)) == 3 * 3
     again([3, 1, 2], range(4), {"much": {"keeper": much}})
     assert len(lines(tmp_path)) == 3 * 4 * 2
     with pytest.warns(UserWarning, match="1 rows that this design does not have"):
@@ -194,14 +193,6 @@ def test_a_line_that_is_no_run_is_a_run_that_is_missing(damage, tmp_path):
         assert again().equals(first)
 
 
-@pytest.mark.parametrize("cut", [1, 20, 700])
-def test_a_run_whose_line_is_torn_is_run_again(cut, tmp_path):
-    first = run(tmp_path)
-    (path,) = tmp_path.glob("*.jsonl")
-    path.write_bytes(path.read_bytes()[:-cut])
-    assert run(tmp_path).equals(first)
-
-
 def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
     attempt = 0
 
@@ -211,7 +202,7 @@ def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
         return Shop(days)
 
     def again(**arguments):
-        return run_experiment(make, {"days": [1]}, seeds=[1], points=POINTS, store=tmp_path, **arguments)
+        return run(tmp_path, {"days": [1]}, make=make, seeds=[1], contenders=None, **arguments)
 
     for attempt in range(4):
         assert again(retry_errors=True)["error"].tolist() == [f"OSError: attempt {attempt}"]
@@ -266,9 +257,6 @@ def test_a_store_of_another_experiment_is_refused(tmp_path):
     ):
         with pytest.raises(OptionValueError, match=match):
             run(tmp_path, **arguments)
-    with pytest.warns(UserWarning, match="1 rows that this design does not have"):
-        run(tmp_path, DESIGN[1:])
-    assert len(run(tmp_path)) > 0
     other = tmp_path / "other"
     other.mkdir()
     for name in (".hidden", "thesis.tex"):
@@ -346,24 +334,24 @@ def test_another_version_of_a_package_is_warned_of(tmp_path):
         assert run(tmp_path).equals(first)
 
 
-def test_a_full_disk_is_an_error_and_stored_runs_stay(tmp_path, monkeypatch):
-    real, written = os.write, []
-
+@pytest.mark.parametrize(("batched", "cut"), [(False, 1), (True, 20), (True, 700)])
+def test_a_full_disk_is_an_error_stored_runs_stay_and_the_one_whose_line_is_torn_is_run_again(
+    batched, cut, tmp_path, monkeypatch
+):
     def write(file, data):
-        if len(written) == 5:
-            real(file, data[: len(data) // 2])
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         written.append(data)
-        return real(file, data)
+        if len(written) <= 5:
+            return real(file, data)
+        real(file, data[:-cut])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    for batched in (False, True):
-        written.clear()
-        with monkeypatch.context() as patch:
-            patch.setattr(stores.os, "write", write)
-            with pytest.raises(StoreError, match="No space left"):
-                run(tmp_path / str(batched), contenders=None, batched=batched)
-        assert len(lines(tmp_path / str(batched))) == 5
-        assert run(tmp_path / str(batched), contenders=None).equals(run(tmp_path / "whole", contenders=None))
+    real, written = os.write, []
+    with monkeypatch.context() as patch:
+        patch.setattr(stores.os, "write", write)
+        with pytest.raises(StoreError, match="No space left"):
+            run(tmp_path / "full", contenders=None, batched=batched)
+    assert len(lines(tmp_path / "full")) == 5
+    assert run(tmp_path / "full", contenders=None).equals(run(tmp_path / "whole", contenders=None))
 
 
 def test_a_store_that_cannot_be_written_or_read_is_an_error(tmp_path):

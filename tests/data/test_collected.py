@@ -157,16 +157,6 @@ def test_arrays_have_the_documented_shapes_and_dtypes():
     assert "6 decisions" in repr(found)
 
 
-def test_spaces_are_those_of_the_decision_point():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", action_space=spaces.Discrete(3))
-    found = collect_episodes(calling(ant), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
-    assert found[ant].action_space == spaces.Discrete(10)
-    assert found[bee].action_space == spaces.Discrete(3)  # which has never decided
-    assert found[ant].observation_space.shape == (2,)
-    unborn = collect_episodes(script(lambda s: None), {"being_3": ones}, points=beings(), seeds=[1])
-    assert unborn["being_3"].action_space is None
-
-
 def test_observations_actions_and_masks_of_several_parts_are_stacked():
     ant = decision(
         agent="ant_0",
@@ -222,33 +212,41 @@ def test_extras_that_do_not_fit_are_refused(second, match):
         collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2))
 
 
-def test_episodes_without_decisions_are_collected():
+def test_agents_that_never_decide_have_arrays_without_rows_and_the_spaces_of_their_point():
     ant, bee = decision(agent="ant_0", action_space=spaces.Box(0, 1, (2,))), decision(agent="bee_0")
     source = script(lambda simulation: bee() if simulation.seed % 2 else None)
     found = collect_episodes(source, {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))
     assert found[bee].episodes.tolist() == [1, 3]
+    assert found[bee].action_space == spaces.Discrete(10)
     nothing = found[ant]
     assert len(nothing) == 0
+    assert nothing.action_space == spaces.Box(0, 1, (2,))
     assert nothing.agents.dtype == nothing.episodes.dtype == np.int64
     assert nothing.observations.shape == nothing.next_observations.shape == nothing.actions.shape == (0, 2)
     assert nothing.seeds == (0, 1, 2, 3)
     assert len(collect_episodes(source, {ant: ones}, seeds=[])[ant]) == 0
+    unborn = collect_episodes(source, {"being_3": ones}, points=beings(), seeds=[1])
+    assert unborn["being_3"].action_space is None
 
 
 def test_collect_is_called_with_each_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
-    def found(**options):
+    def found(policies, **options):
         source = script(lambda simulation: [ant() and None for _ in range(simulation.seed)])  # the last end first
-        given = {"points": [ant, bee], "seeds": [4, 0, 2], **options}
-        return collect_episodes(source, {ant: ones, bee: ones}, **given)
+        return collect_episodes(source, policies, points=[ant, bee], seeds=[4, 0, 2], **options)
 
-    collected = found(collect=lambda simulation: simulation.seed)
+    both = {ant: ones, bee: ones}
+    collected = found(both, collect=lambda simulation: simulation.seed)
     assert collected[ant].collected == collected[bee].collected == (4, 0, 2)  # also of whom has never decided
-    assert found()[ant].collected is None
+    assert found(both)[ant].collected is None
+    assert found({}) == {}
     for wrong in ({"collect": 3}, {"batch_size": 0}, {"batch_size": 1.5}, {"workers": 1.5}):
         with pytest.raises(OptionValueError, match=next(iter(wrong))):
-            found(**wrong)
+            found(both, **wrong)
+    for policies, error, told in (([1], OptionValueError, "policies"), ({"nobody": ones}, UnknownPointError, "nobody")):
+        with pytest.raises(error, match=told):
+            found(policies)
 
 
 def test_one_name_at_points_whose_spaces_differ_is_refused():
@@ -270,11 +268,3 @@ def test_points_without_a_policy_of_the_call_are_no_agents():
     found = collect_episodes(calling(ant, bee, ant), {"ant_0": ones}, points=[ant, bee], seeds=[1])
     assert found["ant_0"].turns.tolist() == [0, 1]
     assert asked == []
-
-
-@pytest.mark.parametrize("policies", [[1], {"nobody": ones}])
-def test_invalid_policies_are_refused(policies):
-    ant = decision(agent="ant_0")
-    assert collect_episodes(calling(ant), {}, points=ant, seeds=[1]) == {}
-    with pytest.raises((OptionValueError, UnknownPointError), match=r"policies|nobody"):
-        collect_episodes(calling(ant), policies, points=ant, seeds=[1])

@@ -100,36 +100,28 @@ def test_invalid_mixtures_are_refused(parts):
         Mixture(parts)
 
 
-def test_without_minari_the_extra_is_named(monkeypatch):
+def test_each_policy_needs_a_data_set_of_its_own_and_without_minari_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari.dataset.minari_dataset", None)
     monkeypatch.setitem(sys.modules, "minari", None)
-    ant = decision(agent="ant_0")
-    found = collect_episodes(calling(ant), {ant: ones}, seeds=[1])
-    for call, error, match in (
-        (lambda: record_dataset("ants-v0", calling(ant), {ant: ones}, seeds=[1]), MissingExtraError, r"marl\[minari\]"),
-        (lambda: save_dataset("ants-v0", found[ant]), MissingExtraError, r"marl\[minari\]"),
-        (lambda: save_dataset("ants-v0", found), OptionValueError, "under each key"),
-        (lambda: record_dataset("ants-v0", calling(ant), ones, seeds=[1]), OptionValueError, "policies"),
-    ):
-        with pytest.raises(error, match=match):
-            call()
-
-
-@pytest.mark.parametrize(
-    ("dataset_id", "match"),
-    [
-        ("both-v0", "2 policies"),
-        ({"ant_0": "same-v0", "bee_0": "same-v0"}, "own"),
-        ({"cat_0": "cats-v0"}, "cat_0"),
-        (None, "dataset_id"),
-        ({"ant_0": 3}, "dataset_id"),
-    ],
-    ids=str,
-)
-def test_each_policy_needs_a_data_set_of_its_own(dataset_id, match):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    with pytest.raises(OptionValueError, match=match):
-        record_dataset(dataset_id, calling(ant, bee), {"ant_0": ones, "bee_0": ones}, points=[ant, bee], seeds=[1])
+    both, given = {"ant_0": ones, "bee_0": ones}, {"points": [ant, bee], "seeds": [1]}
+    found = collect_episodes(calling(ant, bee), both, **given)
+    for dataset_id, policies, told in (
+        ("both-v0", both, "2 policies"),
+        ({"ant_0": "same-v0", "bee_0": "same-v0"}, both, "own"),
+        ({"cat_0": "cats-v0"}, both, "cat_0"),
+        (None, both, "dataset_id"),
+        ({"ant_0": 3}, both, "dataset_id"),
+        ("ants-v0", ones, "policies"),
+    ):
+        with pytest.raises(OptionValueError, match=told):
+            record_dataset(dataset_id, calling(ant, bee), policies, **given)
+    with pytest.raises(OptionValueError, match="under each key"):
+        save_dataset("ants-v0", found)
+    with pytest.raises(MissingExtraError, match=r"marl\[minari\]"):
+        save_dataset("ants-v0", found["ant_0"])
+    with pytest.raises(MissingExtraError, match=r"marl\[minari\]"):
+        record_dataset("ants-v0", calling(ant, bee), {ant: ones}, **given)
 
 
 def test_unknown_rule_actions_are_refused_before_anything_runs(monkeypatch):
@@ -161,21 +153,14 @@ def crowd(simulation):
     for step in range(3):
         for being in simulation.crowd:
             being.health = step
-            simulation.log.append(being.act())
+            being.act()
 
 
 @pytest.mark.parametrize("size", [1, 8])
 def test_policies_are_asked_while_the_rule_decides(size):
-    logs = []
-
-    def main(simulation):
-        logs.append(simulation.log)
-        crowd(simulation)
-
     given = {"points": TOLD, "seeds": [1, 2], "batch_size": size}
-    found = compare_with_rule(script(main), {Being.act: ones}, **given)[Being.act]
-    alone = collect_episodes(script(main), {Being.act: RULE}, **given)[Being.act]
-    assert logs == [["rule"] * 9] * 4
+    found = compare_with_rule(script(crowd), {Being.act: ones}, **given)[Being.act]
+    alone = collect_episodes(script(crowd), {Being.act: RULE}, **given)[Being.act]
     assert found.policy_actions.tolist() == [1] * 18
     assert found.agreements.tolist() == [False, True, False] * 6
     assert found.agreement == pytest.approx(1 / 3)

@@ -53,6 +53,7 @@ def check(found, dataset):
         assert same(episode.terminations, found.terminations[rows])
         assert same(episode.truncations, found.truncations[rows])
         assert same(episode.infos["by_rule"], np.append(found.by_rule[rows], False))
+        assert all(same(episode.infos[name][:-1], values[rows]) for name, values in found.extras.items())
         assert metadata[place]["seed"] == found.seeds[found.episodes[start]]
         assert metadata[place]["agent"] == found.names[found.agents[start]]
         assert metadata[place]["episode"] == found.episodes[start]
@@ -74,12 +75,23 @@ def herd(simulation):
     return TRUNCATED
 
 
-def test_data_sets_hold_what_was_collected():
-    policies, points, seeds = {Being.act: lambda seen: seen[:, 1].astype(int) % 3}, beings(), [3, 1, 5, 2**70]
-    recorded = record_dataset(NAME, script(herd), policies, points=points, seeds=seeds, batch_size=2)
-    found = collect_episodes(script(herd), policies, points=points, seeds=seeds)[Being.act]
+def thirds(seen):
+    return seen[:, 1].astype(int) % 3
+
+
+@pytest.mark.parametrize(
+    ("policy", "name"),
+    [(thirds, "thirds"), (RULE, "rule"), (Mixture({RULE: 1, ones: 1}), "<Mixture: 0.5 rule, 0.5 ones>")],
+)
+def test_data_sets_hold_what_was_collected_and_say_who_decided(policy, name):
+    points = beings(rule_action_mapping=lambda decided, being: being.health)
+    given = {"points": points, "seeds": [3, 1, 5, 2**70]}
+    recorded = record_dataset(NAME, script(herd), {Being.act: policy}, batch_size=2, **given)
+    found = collect_episodes(script(herd), {Being.act: policy}, **given)[Being.act]
     check(found, recorded)
     check(found, minari.load_dataset(NAME))
+    assert recorded.storage.metadata["algorithm_name"] == name
+    assert found.actions[found.by_rule].tolist() == found.observations[found.by_rule, 1].tolist()
     sampled = list(minari.load_dataset(NAME).sample_episodes(5))
     assert all(len(episode.observations) == len(episode.actions) + 1 for episode in sampled)
 
@@ -187,27 +199,6 @@ def test_an_interrupt_leaves_no_name_taken(number, monkeypatch):
         record_dataset(names, calling(ant, bee), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
     assert not minari.list_local_datasets()
     assert not list(Path(os.environ["MINARI_DATASETS_PATH"]).rglob("*-v0"))
-
-
-TOLD = beings(rule_action_mapping=lambda decided, being: being.health % 10)
-"""Their rule takes their health as an action."""
-
-
-def test_the_rule_demonstrates_alone_and_in_mixtures_which_say_who_decided():
-    mixture = Mixture({RULE: 1, ones: 1})
-    for dataset_id, policy, name in (
-        ("simenv/rule-v0", RULE, "rule"),
-        ("simenv/mixed-v0", mixture, "<Mixture: 0.5 rule, 0.5 ones>"),
-    ):
-        policies, given = {Being.act: policy}, {"points": TOLD, "seeds": range(5)}
-        recorded = record_dataset(dataset_id, script(herd), policies, **given)
-        found = collect_episodes(script(herd), policies, **given)[Being.act]
-        check(found, recorded)
-        assert found.actions.tolist() == np.where(found.by_rule, found.observations[:, 1], 1).tolist()
-        assert recorded.storage.metadata["algorithm_name"] == name
-    component = np.concatenate([episode.infos["component"][:-1] for episode in recorded])
-    assert np.array_equal(component == 0, found.by_rule)
-    assert 0 < found.by_rule.sum() < len(found)
 
 
 def test_unknown_rule_actions_are_refused():

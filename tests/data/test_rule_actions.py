@@ -16,9 +16,9 @@ from tests.worlds.models import calling, decision, notes, play, script
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
 
-def counting():
-    tens = iter(range(10, 100, 10))
-    return lambda: next(tens)
+def in_turn(values):
+    remaining = iter(values)
+    return lambda: next(remaining)
 
 
 def begun(source, function, **options):
@@ -38,7 +38,7 @@ def begun(source, function, **options):
 )
 @DRIVERS
 def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping, told, driver):
-    function = decision(counting(), rule_action_mapping=mapping)
+    function = decision(in_turn([10, 20, 30]), rule_action_mapping=mapping)
     env = begun(calling(*[function] * 4), function, driver=driver)
     expected = [{} if action is None else {"rule_action": action} for action in told]
     assert [env.step(action)[4] for action in (RULE, 7, RULE, RULE)] == expected
@@ -49,13 +49,13 @@ def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping,
     ("mapping", "error", "match", "note"),
     [
         (lambda tens: tens, InvalidActionError, "the rule's decision 10 to the action 10", "seed 3"),
-        ({20: 4}, InvalidActionError, "no action for the rule's decision 10", "counting"),
+        ({20: 4}, InvalidActionError, "no action for the rule's decision 10", "in_turn"),
         (lambda tens: 1 / 0, ZeroDivisionError, "division", "seed 3"),
     ],
     ids=["outside the space", "not in the dict", "raising"],
 )
 def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
-    function = decision(counting(), rule_action_mapping=mapping)
+    function = decision(in_turn([10, 20, 30]), rule_action_mapping=mapping)
 
     def main(simulation):
         try:
@@ -161,11 +161,9 @@ MOVES = {0: "stay", 1: "north", 2: "south"}
 )
 def test_episodes_that_were_collected_have_the_actions_of_the_rule(rule, definition, expected):
     if "choices" in definition:
-        offers = iter([*definition["choices"], ["a"]])
-        definition = {"choices": lambda: next(offers)}
+        definition = {"choices": in_turn([*definition["choices"], ["a"]])}
     given = {"action_space": spaces.Discrete(3)} if "rule_action_mapping" not in definition else {}
-    decided = iter(rule)
-    function = decision(lambda: next(decided), **given, **definition)
+    function = decision(in_turn(rule), **given, **definition)
     found = collect_episodes(calling(*[function] * 4), {function: RULE}, seeds=[0])[function]
     assert found.by_rule.all()
     assert found.known.tolist() == [action is not None for action in expected]

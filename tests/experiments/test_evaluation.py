@@ -164,16 +164,21 @@ def test_events_that_were_not_seen_have_no_interval_of_zero_width():
     assert 0.25 < unknown < 0.45
 
 
-def test_the_summary_says_why_there_is_no_interval():
-    contenders = {"a": {}, "same": {}, "some": {"keeper": some}}
+def test_the_summary_says_why_there_is_no_interval_and_improvements_count_ties_half():
+    contenders = {"a": {}, "same": {}, "some": {"keeper": some}, "much": {"keeper": much}}
     found = evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1})
-    summary = found.summary()
+    summary, equal = found.summary(), "differences: all are equal"
     assert summary.loc["a", ["difference", "difference_low", "difference_high"]].tolist() == [0, 0, 0]
     assert summary.loc["same", ["difference_low", "difference_high"]].isna().all()
-    assert summary["note"].to_dict() == {"a": "", "same": "differences: all are equal", "some": ""}
+    assert summary["note"].to_dict() == {"a": "", "same": equal, "some": "", "much": equal}
     assert set(found.summary("one")["note"]) == {"all are equal"}
     assert np.isnan(found.seeds_needed(1.0)["same"])
     assert str(found) == f"{found!r}\n{summary.to_string(float_format='{:.6g}'.format)}"
+    improvement = found.improvement()
+    assert improvement["probability"][["same", "much"]].tolist() == [0.5, 1.0]
+    expected = stats.binomtest(12, 12).proportion_ci(0.95, method="wilson")
+    assert improvement.loc["much", ["low", "high"]].tolist() == pytest.approx(list(expected))
+    assert improvement.loc["same", ["low", "high"]].isna().all()
     found = evaluate(Shop, contenders, seeds=[1], points=POINTS)
     assert set(found.summary()["note"]) == {"a single value"}
     found.plot()
@@ -189,15 +194,6 @@ def test_shares_have_intervals_by_wilsons_score_also_where_some_are_missing():
     for values in ([1, 0, None], [True, False, None], [True, True], [np.nan, 1.0, 0.0]):
         assert is_proportion(np.array(values))
         assert not is_proportion(np.array([*values, 2], object))
-
-
-def test_the_probability_of_improvement_counts_ties_half():
-    found = evaluate(Shop, {"a": {}, "same": {}, "much": {"keeper": much}}, seeds=SEEDS, points=POINTS, baseline="a")
-    improvement = found.improvement()
-    assert improvement["probability"].to_dict() == {"same": 0.5, "much": 1.0}
-    expected = stats.binomtest(12, 12).proportion_ci(0.95, method="wilson")
-    assert improvement.loc["much", ["low", "high"]].tolist() == pytest.approx(list(expected))
-    assert improvement.loc["same", ["low", "high"]].isna().all()
 
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95])

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from scipy import stats
 from statsmodels.stats.power import TTestPower
 from tools.coverage_of_intervals import measure
 
-from simenv_marl import RULE, aec_env, evaluate, make_step, simulate
+from simenv_marl import RULE, aec_env, evaluate, simulate
 from simenv_marl.data import Mixture
 from simenv_marl.data.plots import interval, is_proportion
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
@@ -21,7 +22,7 @@ from simenv_marl.planning import RolloutPolicy
 from tests.conftest import DRIVERS
 from tests.worlds.many_worlds import Colony, Design, colony_points
 from tests.worlds.models import notes, play
-from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some
+from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some
 
 SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
@@ -330,7 +331,7 @@ def test_invalid_arguments_are_refused_before_anything_runs(match, arguments):
 
 
 def test_an_agent_must_not_be_called_team():
-    points = {Shop.order: make_step(**OBSERVED, action_space_mapping=int, reward_mapping=level, agent="team")}
+    points = {Shop.order: replace(POINTS[Shop.order], agent="team")}
     with pytest.raises(AgentError, match="team"):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=points)
 

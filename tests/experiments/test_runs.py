@@ -510,7 +510,7 @@ SCRIPT = """
         undecided = run_experiment(Own, {"days": [1]}, seeds=[1], store=f"{store}.undecided", workers=workers)
         assert undecided[["agent", "length"]].values.tolist() == [["team", 0]]
         order, sell = POINTS.values()
-        design = pd.DataFrame({"days": range(1, 7), "price": 0.5, "kind": ["slow"] * 5 + ["faulty"]})
+        design = pd.DataFrame({"days": range(1, 7), "price": 0.5, "kind": ["plain"] * 5 + ["faulty"]})
         frame = run_experiment(Own, design, contenders={"some": {"__main__.Own.order": some}}, seeds=range(4),
                                points={"__main__.Own.order": order, Shop.sell: sell}, metric=level, store=store,
                                workers=workers)

@@ -415,26 +415,20 @@ def test_a_name_that_no_agent_has_is_an_error_of_its_contender(arguments, tmp_pa
     assert frame[frame["agent"] == "being_4"]["length"].tolist() == [1] * 4
 
 
-SHARED = dict(POINTS)
-ONE = Shop()
-
-
-def make_by_shared_points(scale):
-    for point in POINTS:
-        SHARED[point] = replace(POINTS[point], reward_mapping=lambda shop: float(scale))
-    shop = Shop()
-    shop.points = SHARED
-    return shop
-
-
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
 def test_rows_have_definitions_and_simulations_of_their_own(arguments, tmp_path):
-    frame = run_experiment(make_by_shared_points, {"scale": [1, 10]}, seeds=[1, 2], store=tmp_path / "a", **arguments)
+    def make(scale):
+        """Return the same object for all rows, whose points are replaced."""
+        for point, definition in POINTS.items():
+            one.points[point] = replace(definition, reward_mapping=lambda shop: float(scale))
+        return one
+
+    one, given = Shop(), {"seeds": [1, 2], "metric": level}
+    one.points = {}
+    frame = run_experiment(make, {"scale": [1, 10]}, store=tmp_path, **given, **arguments)
     assert frame["return"].tolist() == [3, 3, 6] * 2 + [30, 30, 60] * 2
-    given = {"seeds": range(4), "points": POINTS}
-    frame = run_experiment(lambda day: ONE, {"day": [1, 2]}, store=tmp_path / "b", **given, **arguments)
-    expected = evaluate(Shop, {"rule": {}}, **given).frame["return"].tolist()
-    assert frame["return"].tolist() == 2 * expected
+    alone = evaluate(Shop, {"rule": {}}, points=POINTS, **given).frame["metric"].tolist()
+    assert frame["metric"].tolist() == 2 * alone
 
 
 def test_a_process_is_kept_only_while_it_would_be_started_alike(tmp_path, monkeypatch):
@@ -460,16 +454,15 @@ class Deadly(Shop):
 
 @pytest.mark.parametrize("batched", [False, True])
 def test_a_run_that_kills_its_worker_is_a_row_and_the_others_go_on(batched, tmp_path):
-    design = {"days": [1, 2, 3]}
-    given = {"seeds": range(4), "points": POINTS, "batched": batched}
-    frame = run_experiment(Deadly, design, store=tmp_path / "a", workers=2, **given)
-    whole = run_experiment(Shop, design, store=tmp_path / "b", **given)
+    given = {"design": {"days": [1, 2, 3]}, "contenders": None, "batched": batched}
+    frame = run(tmp_path / "a", make=Deadly, workers=2, **given)
+    whole = run(tmp_path / "b", **given)
     failed = frame["status"] == "error"
     assert frame.loc[failed, ["days", "seed"]].to_numpy().tolist() == [[2, 1]]
     assert "worker died in this run, twice" in frame.loc[failed, "error"].item()
     at = (whole["days"] == 2) & (whole["seed"] == 1)
     assert frame.loc[~failed, "return"].tolist() == whole.loc[~at, "return"].tolist()
-    assert run_experiment(Deadly, design, store=tmp_path / "a", workers=2, **given).equals(frame)
+    assert run(tmp_path / "a", make=Deadly, workers=2, **given).equals(frame)
 
 
 def test_a_backend_that_does_not_tell_of_the_death_of_its_workers_is_refused_before_anything_runs(tmp_path):

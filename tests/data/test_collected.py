@@ -14,8 +14,9 @@ from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, Un
 from simenv_marl.experiments import Variant
 from tests.contract.test_simulate_many import by_row, ones
 from tests.worlds import worlds
+from tests.worlds.lives import life
 from tests.worlds.many_worlds import Announcing, Being, Colony, Other, beings, colony_points, designs, others
-from tests.worlds.models import Script, calling, decision, play, script
+from tests.worlds.models import Timed, calling, decision, play, script
 
 some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=6)
 sizes = st.integers(1, 8)
@@ -116,26 +117,17 @@ def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
 
 
 def test_agents_are_collected_under_their_own_keys():
-    def main(simulation):
-        for number in (0, 1, 2, 1, 0):
-            simulation.log.append(Being(number).act())
-
     points = beings(observation_space_mapping=lambda being: [being.number, 0], removed_by=())
     policies = {Being.act: ones, "being_1": lambda observations: [2] * len(observations), "being_2": RULE}
-    found = collect_episodes(script(main), policies, points=points, seeds=[3, 4])
+    source = life("0 acts, 1 acts, 2 acts, 1 acts, 0 acts")
+    found = collect_episodes(source, policies, points=points, seeds=[3, 4])
     assert list(found) == [Being.act, "being_1", "being_2"]
     assert found["being_2"].by_rule.tolist() == [True] * 2
-    assert found["being_2"].observations.tolist() == [[2, 0]] * 2
-    assert found["being_1"].names == ("being_1",)
     assert found["being_1"].actions.tolist() == [2] * 4
     assert found["being_1"].seeds == (3, 4)
-    assert found[Being.act].names == ("being_0",)
-    assert found[Being.act].observations.tolist() == [[0, 0]] * 4
-
-
-class Timed(Script):
-    def time(self):
-        return len(self.log) * 2
+    for (key, own), number in zip(found.items(), (0, 1, 2), strict=True):
+        assert own.names == (f"being_{number}",), key
+        assert own.observations[:, 0].tolist() == [number] * len(own)
 
 
 def test_arrays_have_the_documented_shapes_and_dtypes():
@@ -159,91 +151,54 @@ def test_arrays_have_the_documented_shapes_and_dtypes():
         for name in names.split():
             array = getattr(found, name)
             assert (array.shape, array.dtype) == (shape, dtype), name
-    assert found.times.tolist() == [0, 2] * 3
-    assert found.elapsed.tolist() == [2, 2] * 3
+    assert found.times.tolist() == [0, 10] * 3
+    assert found.elapsed.tolist() == [10, 10] * 3
     assert len(found) == 6
     assert "6 decisions" in repr(found)
 
 
-def test_policies_can_tell_decisions_apart():
-    ant = decision(agent="ant_0")
-    bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 1)
-
-    def policy(observations, infos, identities):
-        assert len(observations) == len(infos) == len(identities)
-        seeds, turns = zip(*identities, strict=True)
-        return [RULE] * len(identities), {"seeds": seeds, "turns": turns}
-
-    for size in (1, 3):
-        found = collect_episodes(calling(ant, bee, ant), {ant: policy, bee: ones}, seeds=[7, 5, 9], batch_size=size)
-        own = found[ant]
-        assert own.extras["seeds"].tolist() == [own.seeds[episode] for episode in own.episodes] == [7, 7, 5, 5, 9, 9]
-        assert own.extras["turns"].tolist() == own.turns.tolist() == [0, 2] * 3
-
-
-def test_spaces_are_those_of_the_decision_point():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", action_space=spaces.Discrete(3))
-    found = collect_episodes(calling(ant), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
-    assert found[ant].action_space == spaces.Discrete(10)
-    assert found[bee].action_space == spaces.Discrete(3)  # which has never decided
-    assert found[ant].observation_space.shape == (2,)
-    unborn = collect_episodes(script(lambda s: None), {"being_3": ones}, points=beings(), seeds=[1])
-    assert unborn["being_3"].action_space is None
-
-
-def test_observations_of_composite_spaces_are_stacked():
+def test_observations_actions_and_masks_of_several_parts_are_stacked():
     ant = decision(
         agent="ant_0",
         observation_space=spaces.Dict(a=spaces.Discrete(5), b=spaces.Tuple([spaces.Box(0, 9, (2,)), spaces.Text(5)])),
         observation_space_mapping=lambda: {"a": 3, "b": ([1, 2], "ant")},
         action_space=spaces.Dict(c=spaces.Box(0, 9, (2,)), d=spaces.MultiDiscrete([3, 3])),
     )
-    answers = iter([[{"c": np.array([1, 2], np.float32), "d": np.array([0, 2])}, RULE], RULE])
-    found = collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2))[ant]
-    assert found.observations["a"].tolist() == [3] * 4
-    assert found.observations["b"][0].shape == (4, 2)
-    assert found.next_observations["b"][1].tolist() == ["ant"] * 4
-    assert found.actions["c"].tolist() == [[1, 2], [0, 0], [0, 0], [0, 0]]
-    assert found.actions["d"].tolist() == [[0, 2], [0, 0], [0, 0], [0, 0]]
-    assert found.by_rule.tolist() == [False, True, True, True]
-
-
-def test_masks_of_several_parts_are_stacked():
-    ant = decision(
-        agent="ant_0",
-        action_space=spaces.MultiDiscrete([2, 3]),
-        action_mask_mapping=lambda: ([0, 1], [1, 0, 0]),
+    bee = decision(
+        agent="bee_0", action_space=spaces.MultiDiscrete([2, 3]), action_mask_mapping=lambda: ([0, 1], [1, 0, 0])
     )
-    found = collect_episodes(calling(ant, ant), {ant: lambda observations: [[1, 0]]}, seeds=[1])[ant]
-    assert found.action_masks[0].tolist() == [[0, 1]] * 2
-    assert found.action_masks[1].tolist() == [[1, 0, 0]] * 2
-    assert found.actions.tolist() == [[1, 0]] * 2
+    answers = iter([[{"c": np.array([1, 2], np.float32), "d": np.array([0, 2])}, RULE], RULE])
+    policies = {ant: lambda observations: next(answers), bee: lambda observations: [[1, 0]] * len(observations)}
+    found = collect_episodes(calling(ant, ant, bee), policies, seeds=range(2))
+    of_ant, of_bee = found.values()
+    assert of_ant.observations["a"].tolist() == [3] * 4
+    assert of_ant.observations["b"][0].shape == (4, 2)
+    assert of_ant.next_observations["b"][1].tolist() == ["ant"] * 4
+    assert of_ant.actions["c"].tolist() == [[1, 2], [0, 0], [0, 0], [0, 0]]
+    assert of_ant.actions["d"].tolist() == [[0, 2], [0, 0], [0, 0], [0, 0]]
+    assert of_ant.by_rule.tolist() == [False, True, True, True]
+    assert [part.tolist() for part in of_bee.action_masks] == [[[0, 1]] * 2, [[1, 0, 0]] * 2]
+    assert of_bee.actions.tolist() == [[1, 0]] * 2
 
 
-def test_extras_stand_row_by_row_whatever_the_policy_does_to_them_later():
-    buffer = np.zeros((2, 3), np.float32)
+def test_policies_can_tell_decisions_apart_and_their_extras_stand_row_by_row():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    buffer = np.zeros((3, 2), np.float32)
 
-    def policy(observations, infos):
-        numbers = observations[:, 0] * 10 + observations[:, 1]
-        own = buffer[: len(numbers)]
-        own[:] = numbers[:, np.newaxis]
+    def policy(observations, infos, identities):
+        assert len(observations) == len(infos) == len(identities)
+        own = buffer[: len(identities)]  # which is used again
+        own[:] = identities
         observations[:] = 99  # which is its own
-        return ones(observations), {"values": numbers, "arrays": own}
+        return ones(observations), {"seeds": [seed for seed, _ in identities], "arrays": own}
 
-    def main(simulation):
-        for _ in range(1 + simulation.seed % 3):
-            for number in (0, 1):
-                being = Being(number)
-                being.health = simulation.seed
-                being.act()
-
-    points = beings(observation_space_mapping=lambda being: [being.number, being.health], removed_by=())
-    found = collect_episodes(script(main), {Being.act: policy}, points=points, seeds=[5, 1, 3], batch_size=2)[Being.act]
-    values = (found.observations @ [10, 1]).tolist()
-    assert set(values) == {1, 11, 3, 13, 5, 15}
-    assert found.extras["values"].tolist() == values
-    assert found.extras["arrays"].tolist() == [[value] * 3 for value in values]
-    assert found.extras["arrays"].dtype == np.float32
+    for size in (1, 2, 3):
+        found = collect_episodes(calling(ant, bee, ant), {ant: policy, bee: ones}, seeds=[7, 5, 9], batch_size=size)
+        own = found[ant]
+        assert own.extras["seeds"].tolist() == [own.seeds[episode] for episode in own.episodes] == [7, 7, 5, 5, 9, 9]
+        assert own.extras["arrays"][:, 1].tolist() == own.turns.tolist() == [0, 2] * 3
+        assert own.extras["arrays"].dtype == np.float32
+        assert own.observations.tolist() == [[1, 2]] * 6
 
 
 @pytest.mark.parametrize(
@@ -257,33 +212,41 @@ def test_extras_that_do_not_fit_are_refused(second, match):
         collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2))
 
 
-def test_episodes_without_decisions_are_collected():
+def test_agents_that_never_decide_have_arrays_without_rows_and_the_spaces_of_their_point():
     ant, bee = decision(agent="ant_0", action_space=spaces.Box(0, 1, (2,))), decision(agent="bee_0")
     source = script(lambda simulation: bee() if simulation.seed % 2 else None)
     found = collect_episodes(source, {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))
     assert found[bee].episodes.tolist() == [1, 3]
+    assert found[bee].action_space == spaces.Discrete(10)
     nothing = found[ant]
     assert len(nothing) == 0
+    assert nothing.action_space == spaces.Box(0, 1, (2,))
     assert nothing.agents.dtype == nothing.episodes.dtype == np.int64
     assert nothing.observations.shape == nothing.next_observations.shape == nothing.actions.shape == (0, 2)
     assert nothing.seeds == (0, 1, 2, 3)
     assert len(collect_episodes(source, {ant: ones}, seeds=[])[ant]) == 0
+    unborn = collect_episodes(source, {"being_3": ones}, points=beings(), seeds=[1])
+    assert unborn["being_3"].action_space is None
 
 
 def test_collect_is_called_with_each_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
-    def found(**options):
+    def found(policies, **options):
         source = script(lambda simulation: [ant() and None for _ in range(simulation.seed)])  # the last end first
-        given = {"points": [ant, bee], "seeds": [4, 0, 2], **options}
-        return collect_episodes(source, {ant: ones, bee: ones}, **given)
+        return collect_episodes(source, policies, points=[ant, bee], seeds=[4, 0, 2], **options)
 
-    collected = found(collect=lambda simulation: simulation.seed)
+    both = {ant: ones, bee: ones}
+    collected = found(both, collect=lambda simulation: simulation.seed)
     assert collected[ant].collected == collected[bee].collected == (4, 0, 2)  # also of whom has never decided
-    assert found()[ant].collected is None
+    assert found(both)[ant].collected is None
+    assert found({}) == {}
     for wrong in ({"collect": 3}, {"batch_size": 0}, {"batch_size": 1.5}, {"workers": 1.5}):
         with pytest.raises(OptionValueError, match=next(iter(wrong))):
-            found(**wrong)
+            found(both, **wrong)
+    for policies, error, told in (([1], OptionValueError, "policies"), ({"nobody": ones}, UnknownPointError, "nobody")):
+        with pytest.raises(error, match=told):
+            found(policies)
 
 
 def test_one_name_at_points_whose_spaces_differ_is_refused():
@@ -305,11 +268,3 @@ def test_points_without_a_policy_of_the_call_are_no_agents():
     found = collect_episodes(calling(ant, bee, ant), {"ant_0": ones}, points=[ant, bee], seeds=[1])
     assert found["ant_0"].turns.tolist() == [0, 1]
     assert asked == []
-
-
-@pytest.mark.parametrize("policies", [[1], {"nobody": ones}])
-def test_invalid_policies_are_refused(policies):
-    ant = decision(agent="ant_0")
-    assert collect_episodes(calling(ant), {}, points=ant, seeds=[1]) == {}
-    with pytest.raises((OptionValueError, UnknownPointError), match=r"policies|nobody"):
-        collect_episodes(calling(ant), policies, points=ant, seeds=[1])

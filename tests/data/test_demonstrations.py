@@ -1,4 +1,4 @@
-"""Demonstrations by the rule and by others: mixtures and comparisons. Of data sets: ``clients/test_minari.py``."""
+"""Demonstrations by the rule and by others: mixtures and comparisons. Of data sets: ``test_minari.py``."""
 
 import sys
 from functools import partial
@@ -11,6 +11,7 @@ from simenv_marl import RULE, simulate_many
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset, save_dataset
 from simenv_marl.errors import DefinitionError, MissingExtraError, OptionValueError
 from tests.contract.test_simulate_many import ones
+from tests.worlds.lives import life
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, plainly, script
 
@@ -19,21 +20,18 @@ def twos(observations):
     return [2] * len(observations)
 
 
-def test_mixtures_tell_what_they_are_made_of():
-    assert repr(Mixture({ones: 3, RULE: 1})) == "<Mixture: 0.75 ones, 0.25 rule>"
-    assert "0.5 functools.partial" in repr(Mixture([(partial(ones), 1), (RULE, 1)]))
-
-
 def test_mixtures_leave_each_decision_to_one_of_their_policies():
-    ant = decision(agent="ant_0")
-    policies = {ant: Mixture({ones: 3, twos: 1, RULE: 4})}
-    found = collect_episodes(calling(*[ant] * 20), policies, seeds=range(100))[ant]
+    ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 3)
+    mixture = Mixture({ones: 3, twos: 1, RULE: 4})
+    assert repr(mixture) == "<Mixture: 0.375 ones, 0.125 twos, 0.5 rule>"
+    assert "0.5 functools.partial" in repr(Mixture([(partial(ones), 1), (RULE, 1)]))
+    found = collect_episodes(calling(*[ant] * 20), {ant: mixture}, seeds=range(100))[ant]
     component = found.extras["component"]
     assert [float((component == number).mean()) for number in range(3)] == pytest.approx([0.375, 0.125, 0.5], abs=0.04)
-    assert (found.actions[component == 0] == 1).all()
-    assert (found.actions[component == 1] == 2).all()
+    assert found.actions.tolist() == (component + 1).tolist()
     assert found.by_rule.tolist() == (component == 2).tolist()
-    logs = [simulation.log for simulation in simulate_many(calling(*[ant] * 20), policies, seeds=range(2))]
+    assert found.known.all()
+    logs = [simulation.log for simulation in simulate_many(calling(*[ant] * 20), {ant: mixture}, seeds=range(2))]
     assert logs == [[[1, 2, "rule"][own] for own in component[start : start + 20]] for start in (0, 20)]
 
 
@@ -68,14 +66,9 @@ def test_mixtures_give_policies_what_is_theirs():
         seen.extend(zip(observations[:, 0].tolist(), masks, identities, strict=True))
         return [1] * len(observations), {"dropped": np.zeros(len(observations))}
 
-    def main(simulation):
-        simulation.crowd = [Being(number) for number in range(6)]
-        for being in simulation.crowd:
-            being.act()
-
-    points = beings(action_mask_mapping=lambda being: mask)
-    found = collect_episodes(script(main), {Being.act: Mixture({informed: 1, twos: 1})}, points=points, seeds=range(9))
-    own = found[Being.act]
+    source = life("0 acts, 1 acts, 2 acts, 3 acts, 4 acts, 5 acts")
+    given = {"points": beings(action_mask_mapping=lambda being: mask), "seeds": range(9)}
+    own = collect_episodes(source, {Being.act: Mixture({informed: 1, twos: 1})}, **given)[Being.act]
     rows = np.flatnonzero(own.extras["component"] == 0)
     expected = [(own.observations[r, 0], mask, (own.seeds[own.episodes[r]], own.turns[r])) for r in rows]
     assert sorted(seen) == sorted(expected)
@@ -107,36 +100,28 @@ def test_invalid_mixtures_are_refused(parts):
         Mixture(parts)
 
 
-def test_without_minari_the_extra_is_named(monkeypatch):
+def test_each_policy_needs_a_data_set_of_its_own_and_without_minari_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari.dataset.minari_dataset", None)
     monkeypatch.setitem(sys.modules, "minari", None)
-    ant = decision(agent="ant_0")
-    found = collect_episodes(calling(ant), {ant: ones}, seeds=[1])
-    for call, error, match in (
-        (lambda: record_dataset("ants-v0", calling(ant), {ant: ones}, seeds=[1]), MissingExtraError, r"marl\[minari\]"),
-        (lambda: save_dataset("ants-v0", found[ant]), MissingExtraError, r"marl\[minari\]"),
-        (lambda: save_dataset("ants-v0", found), OptionValueError, "under each key"),
-        (lambda: record_dataset("ants-v0", calling(ant), ones, seeds=[1]), OptionValueError, "policies"),
-    ):
-        with pytest.raises(error, match=match):
-            call()
-
-
-@pytest.mark.parametrize(
-    ("dataset_id", "match"),
-    [
-        ("both-v0", "2 policies"),
-        ({"ant_0": "same-v0", "bee_0": "same-v0"}, "own"),
-        ({"cat_0": "cats-v0"}, "cat_0"),
-        (None, "dataset_id"),
-        ({"ant_0": 3}, "dataset_id"),
-    ],
-    ids=str,
-)
-def test_each_policy_needs_a_data_set_of_its_own(dataset_id, match):
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    with pytest.raises(OptionValueError, match=match):
-        record_dataset(dataset_id, calling(ant, bee), {"ant_0": ones, "bee_0": ones}, points=[ant, bee], seeds=[1])
+    both, given = {"ant_0": ones, "bee_0": ones}, {"points": [ant, bee], "seeds": [1]}
+    found = collect_episodes(calling(ant, bee), both, **given)
+    for dataset_id, policies, told in (
+        ("both-v0", both, "2 policies"),
+        ({"ant_0": "same-v0", "bee_0": "same-v0"}, both, "own"),
+        ({"cat_0": "cats-v0"}, both, "cat_0"),
+        (None, both, "dataset_id"),
+        ({"ant_0": 3}, both, "dataset_id"),
+        ("ants-v0", ones, "policies"),
+    ):
+        with pytest.raises(OptionValueError, match=told):
+            record_dataset(dataset_id, calling(ant, bee), policies, **given)
+    with pytest.raises(OptionValueError, match="under each key"):
+        save_dataset("ants-v0", found)
+    with pytest.raises(MissingExtraError, match=r"marl\[minari\]"):
+        save_dataset("ants-v0", found["ant_0"])
+    with pytest.raises(MissingExtraError, match=r"marl\[minari\]"):
+        record_dataset("ants-v0", calling(ant, bee), {ant: ones}, **given)
 
 
 def test_unknown_rule_actions_are_refused_before_anything_runs(monkeypatch):
@@ -168,21 +153,14 @@ def crowd(simulation):
     for step in range(3):
         for being in simulation.crowd:
             being.health = step
-            simulation.log.append(being.act())
+            being.act()
 
 
 @pytest.mark.parametrize("size", [1, 8])
 def test_policies_are_asked_while_the_rule_decides(size):
-    logs = []
-
-    def main(simulation):
-        logs.append(simulation.log)
-        crowd(simulation)
-
     given = {"points": TOLD, "seeds": [1, 2], "batch_size": size}
-    found = compare_with_rule(script(main), {Being.act: ones}, **given)[Being.act]
-    alone = collect_episodes(script(main), {Being.act: RULE}, **given)[Being.act]
-    assert logs == [["rule"] * 9] * 4
+    found = compare_with_rule(script(crowd), {Being.act: ones}, **given)[Being.act]
+    alone = collect_episodes(script(crowd), {Being.act: RULE}, **given)[Being.act]
     assert found.policy_actions.tolist() == [1] * 18
     assert found.agreements.tolist() == [False, True, False] * 6
     assert found.agreement == pytest.approx(1 / 3)

@@ -11,9 +11,10 @@ from gymnasium import spaces
 from simenv_marl import RULE, TRUNCATED
 from simenv_marl.data import Mixture, collect_episodes, record_dataset, save_dataset
 from simenv_marl.errors import DefinitionError, OptionValueError
+from tests.contract.test_simulate_many import ones
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import Script, calling, decision, script
+from tests.worlds.models import Timed, calling, decision, script
 from tests.worlds.undone import models_of_pages_forgotten
 
 minari = pytest.importorskip("minari")
@@ -25,10 +26,6 @@ SAID = {"author": "An", "description": "?"}
 @pytest.fixture(autouse=True)
 def _where_data_sets_lie(monkeypatch, tmp_path):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data sets"))
-
-
-def ones(observations):
-    return np.ones(len(observations), np.int64)
 
 
 def part(stack, rows):
@@ -56,6 +53,7 @@ def check(found, dataset):
         assert same(episode.terminations, found.terminations[rows])
         assert same(episode.truncations, found.truncations[rows])
         assert same(episode.infos["by_rule"], np.append(found.by_rule[rows], False))
+        assert all(same(episode.infos[name][:-1], values[rows]) for name, values in found.extras.items())
         assert metadata[place]["seed"] == found.seeds[found.episodes[start]]
         assert metadata[place]["agent"] == found.names[found.agents[start]]
         assert metadata[place]["episode"] == found.episodes[start]
@@ -77,12 +75,23 @@ def herd(simulation):
     return TRUNCATED
 
 
-def test_data_sets_hold_what_was_collected():
-    policies, points, seeds = {Being.act: lambda seen: seen[:, 1].astype(int) % 3}, beings(), [3, 1, 5, 2**70]
-    recorded = record_dataset(NAME, script(herd), policies, points=points, seeds=seeds, batch_size=2)
-    found = collect_episodes(script(herd), policies, points=points, seeds=seeds)[Being.act]
+def thirds(seen):
+    return seen[:, 1].astype(int) % 3
+
+
+@pytest.mark.parametrize(
+    ("policy", "name"),
+    [(thirds, "thirds"), (RULE, "rule"), (Mixture({RULE: 1, ones: 1}), "<Mixture: 0.5 rule, 0.5 ones>")],
+)
+def test_data_sets_hold_what_was_collected_and_say_who_decided(policy, name):
+    points = beings(rule_action_mapping=lambda decided, being: being.health)
+    given = {"points": points, "seeds": [3, 1, 5, 2**70]}
+    recorded = record_dataset(NAME, script(herd), {Being.act: policy}, batch_size=2, **given)
+    found = collect_episodes(script(herd), {Being.act: policy}, **given)[Being.act]
     check(found, recorded)
     check(found, minari.load_dataset(NAME))
+    assert recorded.storage.metadata["algorithm_name"] == name
+    assert found.actions[found.by_rule].tolist() == found.observations[found.by_rule, 1].tolist()
     sampled = list(minari.load_dataset(NAME).sample_episodes(5))
     assert all(len(episode.observations) == len(episode.actions) + 1 for episode in sampled)
 
@@ -108,10 +117,6 @@ def test_all_kinds_of_spaces_are_read_again(space):
 
 
 def test_infos_are_as_many_as_observations():
-    class Timed(Script):
-        def time(self):
-            return 10.0 * len(self.log)
-
     def main(simulation):
         simulation.log += [ant()]
         simulation.log += [ant()]
@@ -194,28 +199,6 @@ def test_an_interrupt_leaves_no_name_taken(number, monkeypatch):
         record_dataset(names, calling(ant, bee), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
     assert not minari.list_local_datasets()
     assert not list(Path(os.environ["MINARI_DATASETS_PATH"]).rglob("*-v0"))
-
-
-TOLD = beings(rule_action_mapping=lambda decided, being: being.health % 10)
-"""Their rule takes their health as an action."""
-
-
-def test_the_rule_demonstrates():
-    recorded = record_dataset(NAME, script(herd), {Being.act: RULE}, points=TOLD, seeds=[3, 1, 5])
-    for episode in minari.load_dataset(NAME):
-        assert episode.actions.tolist() == episode.observations[:-1, 1].tolist()
-        assert episode.infos["by_rule"].tolist() == [True] * len(episode) + [False]
-    assert recorded.storage.metadata["algorithm_name"] == "rule"
-
-
-def test_mixtures_demonstrate_and_say_who_decided():
-    mixture = Mixture({RULE: 1, ones: 1})
-    recorded = record_dataset(NAME, script(herd), {Being.act: mixture}, points=TOLD, seeds=range(5))
-    by_rule = np.concatenate([episode.infos["by_rule"][:-1] for episode in recorded])
-    component = np.concatenate([episode.infos["component"][:-1] for episode in recorded])
-    assert 0 < by_rule.sum() < len(by_rule)
-    assert np.array_equal(component == 0, by_rule)
-    assert recorded.storage.metadata["algorithm_name"] == "<Mixture: 0.5 rule, 0.5 ones>"
 
 
 def test_unknown_rule_actions_are_refused():

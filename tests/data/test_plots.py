@@ -18,7 +18,7 @@ from simenv_marl.data.timeline import UNKNOWN
 from simenv_marl.errors import MissingExtraError, OptionValueError, UnknownAgentError
 from tests.contract.test_simulate_many import ones
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import Script, calling, decision, script
+from tests.worlds.models import Timed, calling, decision, script
 
 
 @pytest.fixture(autouse=True)
@@ -27,14 +27,11 @@ def _without_windows():
     assert "matplotlib.pyplot" not in sys.modules or not matplotlib.pyplot.get_fignums()
 
 
-class Clocked(Script):
-    def time(self):
-        return 10.0 * len(self.log)
-
-
 def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **definition):
     def main(simulation):
         simulation.crowd = [Being(place) for place in range(number)]
+        for being in simulation.crowd:
+            being.health = simulation.seed
         for step in range(steps):
             for being in list(simulation.crowd):
                 being.act()
@@ -47,10 +44,10 @@ def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **d
     return collect_episodes(script(main), policies, points=beings(**definition), seeds=seeds)
 
 
-def asked(*functions, answers=None, seeds=(1,), **options):
-    given = iter([]) if answers is None else iter(answers)
-    policy = lambda seen: next(given, ones(seen))  # noqa: E731
-    return collect_episodes(calling(*functions), dict.fromkeys(functions, policy), seeds=seeds, **options)
+def answered(function, *answers):
+    """An episode of a decision function, whose decisions are answered so."""
+    remaining = iter(answers)
+    return collect_episodes(calling(*[function] * len(answers)), {function: lambda seen: next(remaining)}, seeds=[1])
 
 
 def of(axes, kind):
@@ -70,21 +67,30 @@ def ticks(axes):
     return [label.get_text() for label in axes.get_yticklabels()]
 
 
-def test_charts_show_each_action_and_each_reward():
+def test_charts_show_each_action_by_its_name_and_each_reward():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: 2.0)
-    answers = {ant: iter([3, 4, 5]), bee: iter([7, 8])}
+    answers = {ant: iter([1, 2, 3]), bee: iter([7, 8])}
     policies = {key: lambda observations, own=own: [next(own)] for key, own in answers.items()}
-    figure = plot_timeline(collect_episodes(calling(ant, bee, ant, bee, ant), policies, seeds=[17]))
+    found = collect_episodes(calling(ant, bee, ant, bee, ant), policies, seeds=[17])
+    figure = plot_timeline(found)
     of_ant, paid_ant, of_bee, paid_bee = figure.axes
     assert "17" in figure.get_suptitle()
-    assert dots(of_ant) == [([[0, 3], [2, 4], [4, 5]], True)]
+    assert dots(of_ant) == [([[0, 1], [2, 2], [4, 3]], True)]
     assert dots(of_bee) == [([[1, 7], [3, 8]], True)]
     bars = [line.tolist() for line in of(paid_bee, LineCollection)[0].get_segments()]
     assert bars == [[[1, 0], [1, 2]], [[3, 0], [3, 2]]]
     assert "decision" in paid_bee.get_xlabel()
-    assert ticks(of_ant) == ["3", "4", "5"]
-    assert "sum 4" in [text.get_text() for text in paid_bee.texts]
-    assert "sum 0" in [text.get_text() for text in paid_ant.texts]
+    assert [axes.texts[0].get_text() for axes in (paid_ant, paid_bee)] == ["sum 0", "sum 4"]
+    letters = list("abcdefghij")
+    for given, names in (
+        (None, ["1", "2", "3", "7", "8"]),
+        (letters, ["b", "c", "d", "h", "i"]),
+        ({1: "left"}, ["left", "2", "3", "7", "8"]),
+        ({ant: {1: "dig"}, bee: letters}, ["dig", "2", "3", "h", "i"]),
+    ):
+        assert [name for axes in plot_timeline(found, action_names=given).axes[::2] for name in ticks(axes)] == names
+    with pytest.raises(OptionValueError, match="action_names"):
+        plot_timeline(found, action_names="dig")
 
 
 def test_the_clock_is_what_runs_from_left_to_right():
@@ -96,7 +102,7 @@ def test_the_clock_is_what_runs_from_left_to_right():
 
     bee = decision(agent="bee_0")  # who never decides, and so tells no time
     given = {"points": beings() | {bee: None}, "seeds": [1]}
-    found = collect_episodes(lambda: Clocked(main), {Being.act: ones, bee: ones}, **given)
+    found = collect_episodes(lambda: Timed(main), {Being.act: ones, bee: ones}, **given)
     first, _, second, paid = plot_timeline(found).axes
     assert dots(first) == [([[0, 1]], True)]
     assert dots(second) == [([[10, 1], [20, 1], [30, 1]], True)]
@@ -112,7 +118,7 @@ def test_the_clock_is_what_runs_from_left_to_right():
 def test_decisions_of_the_rule_look_different(known):
     names = {**dict(enumerate("abcdefghi")), 9: "rule"} if known else int
     ant = decision(agent="ant_0", action_space_mapping=names)
-    found = asked(ant, ant, ant, answers=[[1], RULE, [3]])
+    found = answered(ant, [1], RULE, [3])
     by_policy, by_rule = dots(plot_timeline(found).axes[0])
     assert by_policy == ([[0, 1], [2, 3]], True)
     assert ([place for place, _ in by_rule[0]], by_rule[1]) == ([1], False)
@@ -122,25 +128,11 @@ def test_decisions_of_the_rule_look_different(known):
     assert dots(plot_timeline(found[ant]).axes[0]) == [by_policy, by_rule]
 
 
-def test_actions_have_names():
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    policies = {"ant_0": lambda seen: [1], "bee_0": lambda seen: [2]}
-    found = collect_episodes(calling(ant, bee), policies, points=[ant, bee], seeds=[1])
-    for given, names in (
-        (["no", "left", "right"], [["left"], ["right"]]),
-        ({1: "left"}, [["left"], ["2"]]),
-        ({"ant_0": {1: "dig"}, "bee_0": ["a", "b", "fly"]}, [["dig"], ["fly"]]),
-    ):
-        assert [ticks(axes) for axes in plot_timeline(found, action_names=given).axes[::2]] == names
-    with pytest.raises(OptionValueError, match="action_names"):
-        plot_timeline(found, action_names="dig")
-
-
 def test_actions_of_several_parts_have_a_chart_for_each_part():
     space = spaces.Dict(how=spaces.Box(0, 1, (2,), np.float32), what=spaces.Discrete(3), say=spaces.Text(9))
     ant = decision(agent="ant_0", action_space=space)
     action = {"how": np.array([0.5, 0.25], np.float32), "what": 2, "say": "hello"}
-    by_name = {axes.get_ylabel(): axes for axes in plot_timeline(asked(ant, ant, answers=[[action]] * 2)).axes}
+    by_name = {axes.get_ylabel(): axes for axes in plot_timeline(answered(ant, [action], [action])).axes}
     assert set(by_name) == {"how", "what", "say", "reward"}
     assert dots(by_name["how"]) == [([[0, 0.5], [1, 0.5]], True), ([[0, 0.25], [1, 0.25]], True)]
     assert dots(by_name["what"]) == [([[0, 2], [1, 2]], True)]
@@ -166,7 +158,7 @@ def drawn(axes):
     return sorted((cell.x0, cell.x1, (cell.y0 + cell.y1) / 2) for cell in cells)
 
 
-def test_many_agents_have_a_row_each():
+def test_many_agents_have_a_row_each_and_some_can_be_chosen():
     found = herd(200, 3, dying=range(0, 200, 2))
     figure = plot_timeline(found)
     actions, rewards = figure.axes[:2]
@@ -179,6 +171,12 @@ def test_many_agents_have_a_row_each():
     # The first decides but once, at 0, and ends when all have decided; the second decides again then.
     assert cells[:2] == [pytest.approx((0, 200, 0)), pytest.approx((1, 200, 1))]
     assert [(line.get_marker(), len(line.get_xdata())) for line in actions.lines] == [("x", 100), ("|", 100)]
+    figure = plot_timeline(found, agents=["being_7", "being_3"])
+    assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == ["being_7  (Being.act)", "being_3  (Being.act)"]
+    with pytest.raises(UnknownAgentError, match="being_200"):
+        plot_timeline(found, agents=["being_200"])
+    with pytest.raises(OptionValueError, match="agents"):
+        plot_timeline(found, agents="being_7")
 
 
 def test_rows_are_coloured_by_the_action():
@@ -228,44 +226,31 @@ def test_numbers_and_too_many_different_actions_share_a_scale():
         assert scale.get_clim() == (0, most)
 
 
-def test_some_agents_can_be_chosen():
-    found = herd(50, 3)
-    figure = plot_timeline(found, agents=["being_7", "being_3"])
-    assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == ["being_7  (Being.act)", "being_3  (Being.act)"]
-    with pytest.raises(UnknownAgentError, match="being_50"):
-        plot_timeline(found, agents=["being_50"])
-    with pytest.raises(OptionValueError, match="agents"):
-        plot_timeline(found, agents="being_7")
-
-
-def test_episodes_are_counted_from_either_end():
-    ant = decision(agent="ant_0")
-    found = asked(ant, ant, seeds=[7, 8, 9])
+def test_episodes_are_counted_from_either_end_also_those_without_decisions():
+    ant = decision(agent="ant_0", reward_mapping=lambda: 3.0)
+    main = lambda simulation: ant() if simulation.seed else None  # noqa: E731
+    found = collect_episodes(script(main), {ant: ones}, seeds=[0, 8, 9])
     assert plot_timeline(found, np.int64(1)).get_suptitle() == "Episode 1, seed 8"
     assert plot_timeline(found, -1).get_suptitle() == "Episode 2, seed 9"
+    with pytest.raises(OptionValueError, match=r"episode 0 \(seed 0\)"):
+        plot_timeline(found, -3)
     for episode in (3, -4, 1.0, None):
         with pytest.raises(OptionValueError, match="episode"):
             plot_timeline(found, episode)
-
-
-def test_episodes_without_decisions_are_plotted():
-    ant = decision(agent="ant_0", reward_mapping=lambda: 3.0)
-    main = lambda simulation: ant() if simulation.seed else None  # noqa: E731
-    found = collect_episodes(script(main), {ant: ones}, seeds=[0, 1, 2])
-    with pytest.raises(OptionValueError, match=r"episode 0 \(seed 0\)"):
-        plot_timeline(found, 0)
-    plot_timeline(found, 1)
     for per in ("policy", "agent", "team"):
         assert [values for _, values in rows_of(plot_returns(found, per=per))] == [[3, 3]]
     with pytest.raises(OptionValueError, match="no agent has decided"):
         plot_returns(collect_episodes(script(main), {ant: ones}, seeds=[0]))
 
 
-@pytest.mark.parametrize("wrong", [None, {}, {"ant": 1}])
 @pytest.mark.parametrize("draw", [plot_timeline, plot_returns])
-def test_invalid_arguments_are_refused(draw, wrong):
-    with pytest.raises(OptionValueError, match="draw"):
-        draw(wrong)
+def test_other_things_cannot_be_drawn_and_nothing_without_matplotlib_whose_extra_is_named(draw, monkeypatch):
+    for wrong in (None, {}, {"ant": 1}):
+        with pytest.raises(OptionValueError, match="draw"):
+            draw(wrong)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtraError, match=r"simenv-marl\[plots\]"):
+        draw(herd(1, 1))
 
 
 def test_pictures_are_drawn_where_they_are_asked_for():
@@ -278,25 +263,8 @@ def test_pictures_are_drawn_where_they_are_asked_for():
     assert plot_returns(found, ax=axes) is axes.figure
 
 
-@pytest.mark.parametrize("draw", [plot_timeline, plot_returns])
-def test_without_matplotlib_the_extra_is_named(monkeypatch, draw):
-    found = asked(decision(agent="ant_0"))
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(MissingExtraError, match=r"simenv-marl\[plots\]"):
-        draw(found)
-
-
 def paid_by_seed(number, factor=1.0):
-    def main(simulation):
-        simulation.crowd = [Being(place) for place in range(number)]
-        for being in simulation.crowd:
-            being.health = simulation.seed * factor
-        for _ in range(2):
-            for being in simulation.crowd:
-                being.act()
-
-    points = beings(reward_mapping=lambda being: being.health + being.number)
-    return collect_episodes(script(main), {Being.act: ones}, points=points, seeds=[1, 2, 6])
+    return herd(number, 2, seeds=[1, 2, 6], reward_mapping=lambda being: being.health * factor + being.number)
 
 
 def rows_of(figure):
@@ -343,8 +311,7 @@ def test_several_collections_stand_side_by_side():
 
 def test_hundreds_of_agents_are_too_many_rows():
     many = herd(100, 1)
-    with pytest.raises(OptionValueError, match="100 rows"):
-        plot_returns(many, per="agent")
+    for per, told in (("agent", "100 rows"), ("wolf", "per")):
+        with pytest.raises(OptionValueError, match=told):
+            plot_returns(many, per=per)
     plot_returns(many)
-    with pytest.raises(OptionValueError, match="per"):
-        plot_returns(many, per="wolf")

@@ -1,9 +1,6 @@
 """Which action a decision of the rule corresponds to, for those who learn from the rule."""
 
-from __future__ import annotations
-
 import asyncio
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,19 +16,12 @@ from tests.worlds.models import calling, decision, notes, play, script
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
 
-def counting() -> Any:
-    tens = iter(range(10, 100, 10))
-    return lambda: next(tens)
+def in_turn(values):
+    remaining = iter(values)
+    return lambda: next(remaining)
 
 
-def four(function: Any) -> Any:
-    def main(simulation: Any) -> None:
-        simulation.log += [function() for _ in range(4)]
-
-    return script(main)
-
-
-def begun(source: Any, function: Any, **options: Any) -> Any:
+def begun(source, function, **options):
     env = single_env(source, function, **options)
     env.reset(seed=3)
     return env
@@ -48,8 +38,8 @@ def begun(source: Any, function: Any, **options: Any) -> Any:
 )
 @DRIVERS
 def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping, told, driver):
-    function = decision(counting(), rule_action_mapping=mapping)
-    env = begun(four(function), function, driver=driver)
+    function = decision(in_turn([10, 20, 30]), rule_action_mapping=mapping)
+    env = begun(calling(*[function] * 4), function, driver=driver)
     expected = [{} if action is None else {"rule_action": action} for action in told]
     assert [env.step(action)[4] for action in (RULE, 7, RULE, RULE)] == expected
     assert env.simulation.log == [10, 7, 20, 30]
@@ -59,13 +49,13 @@ def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping,
     ("mapping", "error", "match", "note"),
     [
         (lambda tens: tens, InvalidActionError, "the rule's decision 10 to the action 10", "seed 3"),
-        ({20: 4}, InvalidActionError, "no action for the rule's decision 10", "counting"),
+        ({20: 4}, InvalidActionError, "no action for the rule's decision 10", "in_turn"),
         (lambda tens: 1 / 0, ZeroDivisionError, "division", "seed 3"),
     ],
     ids=["outside the space", "not in the dict", "raising"],
 )
 def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
-    function = decision(counting(), rule_action_mapping=mapping)
+    function = decision(in_turn([10, 20, 30]), rule_action_mapping=mapping)
 
     def main(simulation):
         try:
@@ -105,7 +95,7 @@ def test_arrays_of_rule_actions_are_cast_and_copied():
     decided = np.array([0.25, 0.5])
     space = spaces.Box(0, 1, (2,), np.float32)
     function = decision(lambda: decided, action_space=space, rule_action_mapping=lambda value: value)
-    env = begun(four(function), function)
+    env = begun(calling(*[function] * 4), function)
     action = env.step(RULE)[4]["rule_action"]
     assert action.dtype == np.float32
     action[:] = 0
@@ -116,49 +106,41 @@ def test_arrays_of_rule_actions_are_cast_and_copied():
 def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
     tank = {"level": 0}
 
-    def fill():
+    def pour():
         tank["level"] += 3
 
-    fill = decision(fill, apply=lambda action: None, rule_action_mapping=lambda nothing: tank["level"])
-
-    def main(simulation):
-        for _ in range(3):
-            fill()
-        tank["level"] = 5  # what comes after is not looked at
-
-    env = begun(script(main), fill)
+    fill = decision(pour, apply=lambda action: None, rule_action_mapping=lambda nothing: tank["level"])
+    last = lambda: tank.update(level=5)  # noqa: E731  # what comes after the decision is not looked at
+    env = begun(calling(fill, fill, fill, last), fill)
     assert [env.step(RULE)[4]["rule_action"] for _ in range(3)] == [3, 6, 9]
 
 
 @DRIVERS
 def test_generators_and_coroutines_have_rule_actions(driver):
-    def choose_slowly():
+    def slowly():
         yield "wait"
         return 3
 
-    async def choose_later():
+    async def later():
         await asyncio.sleep(0)
         return 4
 
-    slowly = decision(choose_slowly, rule_action_mapping=lambda decided: decided + 1, agent="slow_0")
-    later = decision(choose_later, rule_action_mapping=lambda decided: decided + 1, agent="late_0")
+    def process():
+        yield from slow()
+        yield from slow()
+
+    async def task():
+        await late()
+        await late()
 
     def main(simulation):
-        def process():
-            for _ in range(2):
-                simulation.log.append((yield from slowly()))
+        simulation.log += process()
+        asyncio.run(task())
 
-        async def twice():
-            for _ in range(2):
-                simulation.log.append(await later())
-
-        simulation.log += list(process())
-        asyncio.run(twice())
-
-    env = aec_env(script(main), [slowly, later], driver=driver)
+    slow, late = (decision(rule, agent=rule.__name__, rule_action_mapping=lambda n: n + 1) for rule in (slowly, later))
+    env = aec_env(script(main), [slow, late], driver=driver)
     told = [(turn.agent, turn.info.get("rule_action")) for turn in play(env, RULE, seed=0)]
-    assert told == [("slow_0", None), ("slow_0", 4), ("late_0", None), ("late_0", 5), ("slow_0", 4), ("late_0", 5)]
-    assert env.simulation.log == [3, 3, "wait", "wait", 4, 4]
+    assert told == [("slowly", None), ("slowly", 4), ("later", None), ("later", 5), ("slowly", 4), ("later", 5)]
 
 
 MOVES = {0: "stay", 1: "north", 2: "south"}
@@ -179,21 +161,10 @@ MOVES = {0: "stay", 1: "north", 2: "south"}
 )
 def test_episodes_that_were_collected_have_the_actions_of_the_rule(rule, definition, expected):
     if "choices" in definition:
-        offers = iter([*definition["choices"], ["a"]])
-        definition = {"choices": lambda: next(offers)}
+        definition = {"choices": in_turn([*definition["choices"], ["a"]])}
     given = {"action_space": spaces.Discrete(3)} if "rule_action_mapping" not in definition else {}
-    decided = iter(rule)
-    function = decision(lambda: next(decided), **given, **definition)
-    found = collect_episodes(four(function), {function: RULE}, seeds=[0])[function]
+    function = decision(in_turn(rule), **given, **definition)
+    found = collect_episodes(calling(*[function] * 4), {function: RULE}, seeds=[0])[function]
     assert found.by_rule.all()
     assert found.known.tolist() == [action is not None for action in expected]
     assert found.actions.tolist() == [action or 0 for action in expected]
-
-
-def test_a_policy_may_decide_some_of_them():
-    function = decision(counting(), rule_action_mapping=lambda tens: tens // 10)
-    answers = iter([RULE, 9, RULE, 8])
-    found = collect_episodes(four(function), {function: lambda observations: [next(answers)]}, seeds=[0])[function]
-    assert found.actions.tolist() == [1, 9, 2, 8]
-    assert found.by_rule.tolist() == [True, False, True, False]
-    assert found.known.all()

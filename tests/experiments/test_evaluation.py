@@ -3,6 +3,8 @@
 import subprocess
 import sys
 import threading
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,7 +13,7 @@ from scipy import stats
 from statsmodels.stats.power import TTestPower
 from tools.coverage_of_intervals import measure
 
-from simenv_marl import RULE, aec_env, branch, evaluate, make_step, simulate
+from simenv_marl import RULE, aec_env, evaluate, simulate
 from simenv_marl.data import Mixture
 from simenv_marl.data.plots import interval, is_proportion
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
@@ -19,8 +21,8 @@ from simenv_marl.experiments import Evaluation, Variant
 from simenv_marl.planning import RolloutPolicy
 from tests.conftest import DRIVERS
 from tests.worlds.many_worlds import Colony, Design, colony_points
-from tests.worlds.models import calling, decision, notes
-from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some
+from tests.worlds.models import notes, play
+from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some
 
 SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
@@ -36,15 +38,10 @@ def of_teams(**returns):
 
 
 def returns_by_hand(policies, seed, make=Shop, points=POINTS, **options):
-    env = aec_env(make, points, **options)
-    env.reset(seed=seed)
-    found = {}
-    while env.agents:
-        name = env.agent_selection
-        observation, reward, terminated, truncated, _ = env.last()
-        found[name] = found.get(name, 0.0) + reward
-        policy = policies.get(name, lambda observation: RULE)
-        env.step(None if terminated or truncated else policy(observation))
+    found = Counter()
+    decide = lambda agent, env: policies[agent](env.observe(agent)) if agent in policies else RULE  # noqa: E731
+    for turn in play(aec_env(make, points, **options), decide, seed=seed):
+        found[turn.agent] += turn.reward
     return found
 
 
@@ -98,21 +95,6 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
     assert np.isfinite(found.summary().to_numpy()).all()
 
 
-@pytest.mark.parametrize("arguments", [{"workers": 2}, {"batched": True}, {"batched": True, "workers": 2}], ids=str)
-def test_the_same_comes_of_all_ways_to_run_it(arguments):
-    def policy(observations):
-        asked.append(len(observations))
-        return much_of_many(observations)
-
-    asked, given = [], {"seeds": SEEDS, "points": POINTS, "metric": level}
-    contenders = {"rule": {}, "much": {"keeper": policy if arguments.get("batched") else much}}
-    alone = evaluate(Shop, CONTENDERS, **given)
-    assert evaluate(Shop, contenders, **given, **arguments).frame.equals(alone.frame)
-    assert "metric" in alone.frame.columns
-    if arguments == {"batched": True}:
-        assert max(asked) == len(SEEDS)
-
-
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
 def test_planners_decide_as_they_do_in_simulate(arguments):
     planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1, method="replay")
@@ -122,23 +104,15 @@ def test_planners_decide_as_they_do_in_simulate(arguments):
         assert found[name].tolist() == [simulate(Shop, policies, points=NEAR, seed=seed).level for seed in range(2)]
 
 
-def test_futures_of_an_agent_that_is_alone_end_with_max_steps():
-    choose, truncated = decision(agent="a_0"), []
-
-    def planner(observation, *, _environment):
-        truncated.append(branch(_environment, lambda env, _: [env.step(RULE)[3] for _ in range(3 - len(truncated))], 1))
-        return 1
-
-    evaluate(calling(*[choose] * 5), {"one": {choose: planner}}, seeds=[0], points=choose, max_steps=3)
-    assert truncated == [[[False, False, True]], [[False, True]], [[True]]]
-
-
 MIXED = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {"keeper": much_of_many}}
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_mixtures_decide_as_policies_of_many(workers):
-    values = evaluate(Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers).values()
+def test_mixtures_decide_as_policies_of_many(workers, capsys):
+    found = evaluate(Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers, progress=True)
+    assert "24/24" in capsys.readouterr().err
+    values, alone = found.values(), evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS).values()
+    assert values["much"].equals(alone["much"])
     assert (values["mixed"] <= values["much"]).all()
     assert values["mixed"].mean() < values["much"].mean() - 2
 
@@ -191,43 +165,36 @@ def test_events_that_were_not_seen_have_no_interval_of_zero_width():
     assert 0.25 < unknown < 0.45
 
 
-@pytest.mark.parametrize("values", [[1, 0, None], [True, False, None], [True, True], [np.nan, 1.0, 0.0]])
-def test_missing_values_do_not_hide_a_proportion(values):
-    assert is_proportion(np.array(values))
-    assert not is_proportion(np.array([*values, 2], object))
-
-
-def test_the_summary_says_why_there_is_no_interval():
-    contenders = {"a": {}, "same": {}, "some": {"keeper": some}}
+def test_the_summary_says_why_there_is_no_interval_and_improvements_count_ties_half():
+    contenders = {"a": {}, "same": {}, "some": {"keeper": some}, "much": {"keeper": much}}
     found = evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1})
-    summary = found.summary()
+    summary, equal = found.summary(), "differences: all are equal"
     assert summary.loc["a", ["difference", "difference_low", "difference_high"]].tolist() == [0, 0, 0]
     assert summary.loc["same", ["difference_low", "difference_high"]].isna().all()
-    assert summary["note"].to_dict() == {"a": "", "same": "differences: all are equal", "some": ""}
+    assert summary["note"].to_dict() == {"a": "", "same": equal, "some": "", "much": equal}
     assert set(found.summary("one")["note"]) == {"all are equal"}
     assert np.isnan(found.seeds_needed(1.0)["same"])
     assert str(found) == f"{found!r}\n{summary.to_string(float_format='{:.6g}'.format)}"
+    improvement = found.improvement()
+    assert improvement["probability"][["same", "much"]].tolist() == [0.5, 1.0]
+    expected = stats.binomtest(12, 12).proportion_ci(0.95, method="wilson")
+    assert improvement.loc["much", ["low", "high"]].tolist() == pytest.approx(list(expected))
+    assert improvement.loc["same", ["low", "high"]].isna().all()
     found = evaluate(Shop, contenders, seeds=[1], points=POINTS)
     assert set(found.summary()["note"]) == {"a single value"}
     found.plot()
 
 
-def test_shares_have_intervals_by_wilsons_score():
+def test_shares_have_intervals_by_wilsons_score_also_where_some_are_missing():
     some_seeds = np.arange(12) < 3
     wilson = stats.binomtest(3, 12).proportion_ci(0.95, method="wilson")
     student = stats.ttest_1samp(2.0 * some_seeds, 0).confidence_interval(0.95)
     for values, expected in ((some_seeds, wilson), (some_seeds.astype(int), wilson), (2 * some_seeds, student)):
         low, high = Evaluation(of_teams(a=values), None, 0.95).summary().loc["a", ["low", "high"]]
         assert (low, high) == pytest.approx(tuple(expected))
-
-
-def test_the_probability_of_improvement_counts_ties_half():
-    found = evaluate(Shop, {"a": {}, "same": {}, "much": {"keeper": much}}, seeds=SEEDS, points=POINTS, baseline="a")
-    improvement = found.improvement()
-    assert improvement["probability"].to_dict() == {"same": 0.5, "much": 1.0}
-    expected = stats.binomtest(12, 12).proportion_ci(0.95, method="wilson")
-    assert improvement.loc["much", ["low", "high"]].tolist() == pytest.approx(list(expected))
-    assert improvement.loc["same", ["low", "high"]].isna().all()
+    for values in ([1, 0, None], [True, False, None], [True, True], [np.nan, 1.0, 0.0]):
+        assert is_proportion(np.array(values))
+        assert not is_proportion(np.array([*values, 2], object))
 
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95])
@@ -297,17 +264,6 @@ def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, give
     assert f"of the contender '{contender}'" in notes(caught.value)
 
 
-def test_metrics_that_are_no_numbers_have_no_mean():
-    metrics = {"day": lambda shop: "monday", "huge": lambda shop: 10**400, "some": lambda shop: shop.seed or None}
-    found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=metrics, baseline="rule")
-    assert set(found.values("day")["rule"]) == {"monday"}
-    for look in (found.summary, found.improvement, found.plot, lambda metric: found.seeds_needed(1, metric=metric)):
-        for metric in ("day", "huge"):  # no float can hold the latter
-            with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
-                look(metric=metric)
-    assert np.isnan(found.summary("some")["mean"]).all()
-
-
 def test_a_variant_brings_its_own_points_and_policies():
     variant = Variant("v", Shop, points=POINTS, parameters={"days": 2}, policies={"keeper": much})
     frame = evaluate(variant, {"rule": {}}, seeds=SEEDS, metric=level).frame
@@ -335,6 +291,10 @@ def test_pictures_show_each_seed_and_can_be_read():
     assert {label.get_rotation() for label in axes.get_xticklabels()} == {0}
 
 
+def returning(what):
+    return lambda observation: what
+
+
 @pytest.mark.parametrize(
     ("match", "arguments"),
     [
@@ -358,52 +318,45 @@ def test_pictures_show_each_seed_and_can_be_read():
         ("has the name of another column", {"metric": {"seed": level}}),
         ("workers", {"workers": -2}),
         ("policies of each contender", {"policies": {}}),
+        ("pickle", {"contenders": {"a": {"keeper": returning(threading.Lock())}}, "workers": 1}),
         ("of 'keeper' in 'mixed', <Mixture.*batched=True", {"contenders": MIXED}),
     ],
 )  # fmt: skip
 def test_invalid_arguments_are_refused_before_anything_runs(match, arguments):
     made = []
     given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
-    with pytest.raises((OptionValueError, UnknownPointError), match=match):
+    with pytest.raises((OptionValueError, UnknownPointError, TypeError), match=match):
         evaluate(lambda: made.append(1) or Shop(), **given)
     assert len(made) <= len(POINTS)  # looked at, and not run
 
 
 def test_an_agent_must_not_be_called_team():
-    points = {Shop.order: make_step(**OBSERVED, action_space_mapping=int, reward_mapping=level, agent="team")}
+    points = {Shop.order: replace(POINTS[Shop.order], agent="team")}
     with pytest.raises(AgentError, match="team"):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=points)
 
 
-def test_metrics_are_numbers_strings_or_none():
-    values = {
-        "f": lambda shop: np.float32(0.5),
-        "s": lambda shop: "a" if shop.seed else None,
-        "n": lambda shop: shop.seed or None,
-        "a": lambda shop: np.array(3),
+def test_metrics_are_numbers_strings_or_none_and_those_that_are_no_numbers_have_no_mean():
+    metrics = {
+        "float": lambda shop: np.float32(0.5),
+        "array": lambda shop: np.array(3),
+        "some": lambda shop: shop.seed or None,
+        "text": lambda shop: "a" if shop.seed else None,
+        "huge": lambda shop: 10**400,  # which no float can hold
     }
-    frame = evaluate(Shop, {"rule": {}}, seeds=[0, 1], points=POINTS, metric=values).frame
-    assert [frame[name].tolist() for name in "fsa"] == [[0.5] * 6, [None] * 3 + ["a"] * 3, [3] * 6]
-    assert frame["n"].dtype == np.float64
-    with pytest.raises(OptionValueError, match="metric 'x' must be a number"):
-        evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda s: [1]})
-
-
-def test_objects_that_no_worker_can_unpickle_are_refused_before_anything_runs(tmp_path):
-    class Writing(Shop):
-        def reset(self, seed):
-            (tmp_path / str(seed)).touch()
-            super().reset(seed)
-
-    lock = threading.Lock()
-    with pytest.raises(TypeError, match="pickle"):
-        evaluate(Writing, {"rule": {}, "a": {"keeper": lambda o: lock}}, seeds=[1], points=POINTS, workers=1)
-    assert not list(tmp_path.iterdir())
-
-
-def test_progress_is_shown(capsys):
-    evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, progress=True)
-    assert "24/24" in capsys.readouterr().err
+    found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=metrics, baseline="rule")
+    expected = {"float": [0.5, 0.5], "array": [3, 3], "text": [None, "a"], "huge": [10**400] * 2}
+    team = found.frame[(found.frame["agent"] == "team") & (found.frame["contender"] == "rule")]
+    assert {name: team[name].tolist() for name in expected} == expected
+    assert team["some"].dtype == np.float64
+    assert np.isnan(found.summary("some")["mean"]).all()
+    for look in (found.summary, found.improvement, found.plot, lambda metric: found.seeds_needed(1, metric=metric)):
+        for metric in ("text", "huge"):
+            with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
+                look(metric=metric)
+    for odd in ([1], 10**5000, 2**13_999):
+        with pytest.raises(OptionValueError, match="metric 'x' must be a number of no more than 4,200 digits"):
+            evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop, odd=odd: odd})
 
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch):
@@ -412,8 +365,9 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
         evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS)
 
 
-def test_importing_the_package_imports_none_of_what_experiments_need():
-    code = "import sys, simenv_marl; print({'pandas', 'scipy.stats', 'pydoe', 'SALib'} & sys.modules.keys())"
+def test_importing_the_package_imports_neither_its_checks_nor_what_experiments_need():
+    names = {"pandas", "scipy.stats", "pydoe", "SALib", "simenv_marl.testing"}
+    code = f"import sys, simenv_marl; print({names} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -1,17 +1,12 @@
 """A small shop whose keeper and helper decide, for experiments: its returns are known without the library."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 from gymnasium import spaces
 
 from simenv_marl import make_step
-
-OBSERVED = {
-    "observation_space": spaces.Box(-1e9, 1e9, (1,), np.float64),
-    "observation_space_mapping": lambda shop: [shop.level],
-    "action_space": spaces.Discrete(10),
-}
 
 
 class Shop:
@@ -43,36 +38,24 @@ class Shop:
         return 1
 
 
-POINTS = {
-    Shop.order: make_step(
-        **OBSERVED,
-        action_space_mapping=lambda action: action,
-        reward_mapping=lambda shop: shop.level,
-        agent="keeper",
-    ),
-    Shop.sell: make_step(
-        **OBSERVED,
-        action_space_mapping=lambda action: action,
-        reward_mapping=lambda shop: 1.0,
-        agent="helper",
-    ),
-}
-
-
-NEAR = {
-    point: make_step(
-        **OBSERVED,
-        action_space_mapping=lambda action: action,
-        reward_mapping=lambda shop: -abs(shop.level),
-        agent=definition.agent,
-    )
-    for point, definition in POINTS.items()
-}
-"""Points at which both are to keep the level near to nothing, so that chance matters to those who plan."""
-
-
 def level(shop):
     return shop.level
+
+
+DECIDED = {
+    "observation_space": spaces.Box(-1e9, 1e9, (1,), np.float64),
+    "observation_space_mapping": lambda shop: [shop.level],
+    "action_space": spaces.Discrete(10),
+    "action_space_mapping": lambda action: action,
+}
+POINTS = {
+    Shop.order: make_step(**DECIDED, reward_mapping=level, agent="keeper"),
+    Shop.sell: make_step(**DECIDED, reward_mapping=lambda shop: 1.0, agent="helper"),
+}
+NEAR = {
+    point: replace(definition, reward_mapping=lambda shop: -abs(shop.level)) for point, definition in POINTS.items()
+}
+"""Points at which both are to keep the level near to nothing, so that chance matters to those who plan."""
 
 
 def much(observation):

@@ -9,32 +9,25 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test, state_test
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec, turn_based_aec_to_parallel
 
-from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, make_step
-from tests.worlds.models import play
+from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, parallel_env
+from simenv_marl.envs import pad_agents
+from tests.worlds.many_worlds import HERE, ROSTER, Announcing, Design, colony_points
+from tests.worlds.models import define, play
 
 OBSERVATION = spaces.Box(-10, 10, (3,), np.float32)
-
-
-def define(agent, **changes):
-    return make_step(
-        **{
-            "observation_space": OBSERVATION,
-            "observation_space_mapping": lambda walk: [walk.place, walk.moves % 10, 1.0],
-            "action_space": spaces.Discrete(3),
-            "action_space_mapping": {0: -1.0, 1: 0.0, 2: 1.0},
-            "reward_mapping": lambda walk: walk.place / 10,
-            "agent": agent,
-        }
-        | changes
-    )
-
-
-def every_other(walk):
-    return [1, walk.moves % 2, 1]
+STEPS = {
+    "observation_space": OBSERVATION,
+    "observation_space_mapping": lambda walk: [walk.place, walk.moves % 10, 1.0],
+    "action_space": spaces.Discrete(3),
+    "action_space_mapping": {0: -1.0, 1: 0.0, 2: 1.0},
+    "reward_mapping": lambda walk: walk.place / 10,
+}
+PUSHES = {"action_space": spaces.Box(-1, 1, (1,), np.float32), "action_space_mapping": lambda action: float(action[0])}
+MASKED = {"action_mask_mapping": lambda walk: [1, walk.moves % 2, 1]}
 
 
 class Walk:
@@ -42,63 +35,51 @@ class Walk:
 
     render_modes = ("ansi",)
 
-    def __init__(self, order=("ant", "bee")):
-        self.order = order
+    def __init__(self, order=("ant", "bee"), times=20, ends=None):
+        self.order, self.times, self.ends = order, times, ends
 
     def reset(self, seed=None):
         self.random, self.place, self.moves = random.Random(seed), 1.0, 1
 
     def run(self):
-        order = list(self.order) * 20
+        order = list(self.order) * self.times
         if not self.order:
             order = self.random.choices(["ant", "bee", "cat"], k=self.random.randrange(1, 40))
         for name in order:
             step = getattr(self, name)() + self.random.uniform(-0.5, 0.5)
             self.moves += 1
             self.place = max(-9.0, min(9.0, self.place + step))
+        return self.ends
 
     def render(self, mode):
         return f"at {self.place}"
 
-    @define("ant_0")
+    @define(agent="ant_0", **STEPS)
     def ant(self):
         return 0.5
 
-    @define(
-        "bee_0", action_space=spaces.Box(-1, 1, (1,), np.float32), action_space_mapping=lambda action: float(action[0])
-    )
+    @define(agent="bee_0", **STEPS | PUSHES)
     def bee(self):
         return -0.5
 
-    @define("cat_0", action_mask_mapping=every_other)
+    @define(agent="cat_0", **STEPS, **MASKED)
     def cat(self):
         return 0.1
 
 
-class Step(Walk):
-    def run(self):
-        self.place += self.ant()
-
-
-class Truncated(Step):
-    def run(self):
-        super().run()
-        return TRUNCATED
-
-
-def walk(*order):
-    return lambda: Walk(order)
+def walk(*order, **options):
+    return lambda: Walk(order, **options)
 
 
 ANT, BEE, CAT = Walk.ant, Walk.bee, Walk.cat
 TWICE_IN_A_ROW = walk("ant", "ant", "bee")
 SHAPES = {
     "one agent": (walk("ant"), ANT, {}),
-    "one step": (Step, [BEE, ANT], {}),
+    "one step": (walk("ant", times=1), [BEE, ANT], {}),
     "twice in a row": (TWICE_IN_A_ROW, [ANT, BEE], {}),
     "any order": (walk(), [ANT, BEE, CAT], {}),
     "one never acts": (walk("bee", "cat"), [ANT, BEE, CAT], {}),
-    "truncated by itself": (Truncated, ANT, {}),
+    "truncated by itself": (walk("ant", times=1, ends=TRUNCATED), ANT, {}),
     "truncated by steps": (Walk, [ANT, BEE], {"max_steps": 7}),
     "policies": (TWICE_IN_A_ROW, [ANT, BEE], {"policies": {BEE: RULE}}),
 }
@@ -133,12 +114,11 @@ def test_pettingzoos_conversions_pass_its_tests():
 
 
 def test_pettingzoos_tests_pass_with_masks_in_observations():
-    cat = define(
-        "cat_0",
-        observation_space=spaces.Dict({"observation": OBSERVATION, "action_mask": spaces.Box(0, 1, (3,), np.int8)}),
-        observation_space_mapping=lambda walk: {"observation": [walk.place, walk.moves % 10, 1.0]},
-        action_mask_mapping=every_other,
-    )
+    seen = {
+        "observation_space": spaces.Dict({"observation": OBSERVATION, "action_mask": spaces.Box(0, 1, (3,), np.int8)}),
+        "observation_space_mapping": lambda walk: {"observation": [walk.place, walk.moves % 10, 1.0]},
+    }
+    cat = define(agent="cat_0", **STEPS | seen, **MASKED)
     shape = walk("bee", "cat"), {CAT: cat}, {}
     with warnings.catch_warnings():
         # PettingZoo keeps a list of its own environments whose observations may be dicts.
@@ -147,6 +127,28 @@ def test_pettingzoos_tests_pass_with_masks_in_observations():
         api_test(made(shape, "aec"), num_cycles=100)
     seed_test(partial(made, shape, "aec"), num_cycles=100)
     parallel_api_test(made(shape, "parallel"), num_cycles=100)
+
+
+@pytest.mark.filterwarnings(r"ignore:\s*This environment does not have possible_agents")  # where none are declared
+@pytest.mark.filterwarnings("ignore:No agents present")  # after the end, where there is none
+@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")  # all that there is to see of the absent
+@pytest.mark.parametrize("roster", ["unknown", "declared", "padded"])
+def test_pettingzoos_tests_pass_where_agents_are_born_and_die(roster):
+    declared = {"possible_agents": {f"{HERE}.Creature.act": ROSTER[:6]}, "undeclared": "rule"}
+    options = {} if roster == "unknown" else declared | {"state_space": "observations"}
+
+    def make(view, **more):
+        colony = Announcing(Design(initial=4, most=8, ticks=6, overseen="after"))
+        env = view(colony, colony_points(overseen=True), **options | more)
+        return pad_agents(env) if roster == "padded" else env
+
+    turns, rounds = partial(make, aec_env), partial(make, parallel_env)
+    api_test(turns(), num_cycles=60)
+    seed_test(turns, num_cycles=30)
+    parallel_api_test(rounds(), num_cycles=60)
+    parallel_seed_test(rounds, num_cycles=30)
+    if options:
+        state_test(turns(), rounds())
 
 
 # -- its wrappers ---------------------------------------------------------------------------------
@@ -173,7 +175,7 @@ def test_illegal_actions_terminate_under_pettingzoos_wrapper():
 
 SINGLES = {
     "one agent": (walk("ant"), ANT, {}),
-    "one step": (Step, ANT, {}),
+    "one step": (walk("ant", times=1), ANT, {}),
     "masked": (walk("bee", "cat"), CAT, {}),
     "truncated": (TWICE_IN_A_ROW, BEE, {"max_steps": 3}),
     "policies": (Walk, [ANT, BEE], {"policies": {BEE: lambda observation: [0.5]}}),

@@ -114,21 +114,11 @@ class Entity:
 
 
 class FuseError(Exception):
-    """What a world raises when its fuse has burnt down."""
+    """What simulations raise that are to fail."""
 
 
 class World:
     """A simulation of a design."""
-
-    fuse: int | None = None
-    """At how many more calls of its rules and mappings it fails; None: never."""
-
-    def burn(self) -> None:
-        """Count a call of a rule or of a mapping."""
-        if self.fuse is not None:
-            self.fuse -= 1
-            if self.fuse == 0:
-                raise FuseError
 
     def __init__(self, design: Design, points: list[Callable[..., Any]]) -> None:
         self.design, self.points = design, points
@@ -160,7 +150,6 @@ class World:
         return function(self)
 
     def rule(self, point: int) -> int:
-        self.burn()
         value = self.random.randrange(7)
         if self.design.kinds[point] == "nested" and point > 0:
             value += self.call(point - 1, value % 3)
@@ -180,9 +169,7 @@ def points_of(design: Design) -> list[Callable[..., Any]]:
 
 def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
     def world_of(thing: Any) -> World:
-        world = thing.world if isinstance(thing, Entity) else thing
-        world.burn()
-        return world
+        return thing.world if isinstance(thing, Entity) else thing
 
     changes: dict[str, Any] = {
         "agent": f"point_{point}",

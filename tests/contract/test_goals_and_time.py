@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env, vector_env
+from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import (
     DefinitionError,
     InvalidActionError,
@@ -93,20 +93,18 @@ def test_goal_based_observations_are_dicts_of_the_users_own():
 def test_rewards_are_computed_anew_for_other_goals():
     env = single_env(Walk, goals())
     env.reset(seed=3)
-    told = [env.step(env.action_space.sample()) for _ in range(8)]
-    assert told[-1][2:4] == (False, True)
-    achieved = np.stack([observation["achieved_goal"] for observation, *_ in told])
-    desired = np.stack([observation["desired_goal"] for observation, *_ in told])
-    infos = np.array([info for *_, info in told])
-    rewards = env.compute_reward(achieved, desired, infos)
-    assert rewards.shape == (8,)
-    assert rewards.tolist() == [reward for _, reward, *_ in told]
+    observations, rewards, _, truncations, infos = zip(
+        *[env.step(env.action_space.sample()) for _ in range(8)], strict=True
+    )
+    assert truncations[-1]
+    achieved, desired = (np.stack([seen[part] for seen in observations]) for part in ("achieved_goal", "desired_goal"))
+    assert env.compute_reward(achieved, desired, infos).tolist() == list(rewards)
     relabelled = env.compute_reward(achieved, np.repeat(achieved[-1:], 8, 0), infos)
+    assert relabelled.shape == (8,)
     assert relabelled[-1] == 0.0
-    for (observation, reward, _, _, info), batched in zip(told, rewards, strict=True):
-        one = env.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
-        assert type(one) is float
-        assert one == reward == batched
+    one = env.compute_reward(achieved[0], desired[0], infos[0])
+    assert type(one) is float
+    assert one == rewards[0]
 
 
 @pytest.mark.parametrize(
@@ -271,23 +269,6 @@ def test_the_time_of_the_announced_and_of_the_dead():
     assert times(turns, "being_1") == [(3, 0), (8, 5), (8, 0)]
 
 
-@pytest.mark.parametrize("make", [single_env, joint_env])
-def test_the_time_of_views_of_one_agent_is_that_of_its_steps(make):
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = make(lambda: Clock((np.int64(1), ant), (2, bee), (3, ant), end=4), ant)
-
-    def told(action):
-        *_, info = env.reset() if action is None else env.step(action)
-        return info["time"], info["elapsed"]
-
-    for _ in range(2):
-        assert told(None) == (1.0, 0.0)
-        with pytest.raises(InvalidActionError, match="is not in its action space"):
-            told({"ant_0": 10} if make is joint_env else 10)  # takes no time
-        assert told({"ant_0": 1} if make is joint_env else 1) == (3.0, 2.0)
-        assert told(RULE) == (4.0, 1.0)
-
-
 def test_rounds_have_the_time_of_the_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
@@ -306,37 +287,43 @@ def test_rounds_have_the_time_of_the_simulation():
 
 
 @pytest.mark.parametrize("action", [1, RULE])
-def test_policies_know_the_time_and_how_much_has_gone_by(action):
+def test_policies_know_the_time_how_much_has_gone_by_and_its_discount(action):
     """Since the decision before, whether the policy has taken that or left it to the rule."""
     ant, seen = decision(agent="ant_0"), []
 
     def policy(observation, info):
-        seen.append((info["time"], info["elapsed"]))
+        seen.append((info["time"], info["elapsed"], info["discount"]))
         return action
 
-    simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy})
-    assert seen == [(1.0, 0.0), (3.0, 2.0), (7.0, 4.0)]
+    simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy}, discount_rate=0.5)
+    assert seen == [(1.0, 0.0, 1.0), (3.0, 2.0, exp(-1.0)), (7.0, 4.0, exp(-2.0))]
 
 
 def told(env):
     """The infos of the agent "ant_0" from the reset to the end, in any view."""
     if hasattr(env, "agent_iter"):
         return [turn.info for turn in play(env, 1)]
+    rounds = hasattr(env, "possible_agents")
+    by_agent = rounds or isinstance(env.action_space, spaces.Dict)
     *_, info = env.reset()
-    infos, rounds = [info], hasattr(env, "possible_agents")
+    infos = [info]
     for _ in range(3):
-        *_, info = env.step({"ant_0": 1} if rounds or isinstance(env.action_space, spaces.Dict) else 1)
+        with pytest.raises(InvalidActionError, match="is not in its action space"):
+            env.step({"ant_0": 10} if by_agent else 10)  # takes no time
+        *_, info = env.step({"ant_0": 1} if by_agent else 1)
         infos.append(info)
     return [info["ant_0"] for info in infos] if rounds else infos
 
 
 @EVERY_VIEW
-def test_a_rate_gives_each_elapsed_time_its_discount(make):
-    ant = decision(agent="ant_0")
-    for rate in (0.25, 0, None):
-        env = make(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, discount_rate=rate)
+@pytest.mark.parametrize("rate", [0.25, 0, None])
+def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discount(make, rate):
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    clock = Clock((np.int64(1), ant), (2, bee), (3, ant), (7, ant), end=8)
+    env = make(clock, ant, discount_rate=rate)
+    for _ in range(2):
         infos = told(env)
-        assert [info["elapsed"] for info in infos] == [0.0, 2.0, 4.0, 1.0]
+        assert [(info["time"], info["elapsed"]) for info in infos] == [(1.0, 0.0), (3.0, 2.0), (7.0, 4.0), (8.0, 1.0)]
         expected = [None if rate is None else exp(-rate * info["elapsed"]) for info in infos]
         assert [info.get("discount") for info in infos] == expected
 
@@ -349,20 +336,6 @@ def test_forced_moves_are_discounted_with_the_decision_after_them():
     env = single_env(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, skip_forced=True, discount_rate=0.5)
     env.reset()
     assert env.step(1)[-1]["discount"] == exp(-3.0)
-
-
-def test_policies_and_vectors_of_simulations_know_the_discount():
-    ant, seen = decision(agent="ant_0"), []
-
-    def policy(observation, info):
-        seen.append(info["discount"])
-        return 1
-
-    simulate(lambda: Clock((1, ant), (3, ant), end=8), {ant: policy}, discount_rate=0.5)
-    assert seen == [1.0, exp(-1.0)]
-    env = vector_env(lambda: Clock((1, ant), (3, ant), end=8), ant, num_envs=2, discount_rate=0.5)
-    env.reset()
-    assert env.step(np.array([1, 1]))[-1]["discount"].tolist() == [exp(-1.0)] * 2
 
 
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
@@ -473,33 +446,26 @@ def test_the_state_may_be_what_all_observe(make):
 # -- pictures -------------------------------------------------------------------------------------
 
 
-def painted(make, render_mode=None):
-    ant = decision(agent="ant_0")
-    return make(lambda: Counted(ant), ant, render_mode=render_mode)
-
-
 @EVERY_VIEW
 def test_the_simulation_renders_in_its_modes(make, capsys):
     step = {"ant_0": 4} if make in (parallel_env, joint_env) else 4
-    env = painted(make, "ansi")
-    assert env.render_mode == "ansi"
-    assert env.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
-    env.reset()
-    assert env.render() == "now 0"
-    env.step(step)
-    assert env.render() == "now 4"
-    env = painted(make, "rgb_array")
-    env.reset()
-    assert env.render().shape == (4, 6, 3)
-    assert env.render().dtype == np.uint8
-    env = painted(make, "human")
-    for act, text in ((env.reset, "now 0\n"), (lambda: env.step(step), "now 4\n"), (env.render, "now 4\n")):
+    ant = decision(agent="ant_0")
+    ansi, array, human, none = (
+        make(lambda: Counted(ant), ant, render_mode=mode) for mode in ("ansi", "rgb_array", "human", None)
+    )
+    assert ansi.render_mode == "ansi"
+    assert ansi.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
+    ansi.reset()
+    assert ansi.render() == "now 0"
+    ansi.step(step)
+    assert ansi.render() == "now 4"
+    array.reset()
+    assert array.render().shape == (4, 6, 3)
+    assert array.render().dtype == np.uint8
+    for act, text in ((human.reset, "now 0\n"), (lambda: human.step(step), "now 4\n"), (human.render, "now 4\n")):
         act()
         assert capsys.readouterr().out == text
-    assert env.render() is None
-    with pytest.warns(UserWarning, match="is not one of the simulation's"):
-        env = painted(make, "video")
-    assert env.render_mode is None
-    env.reset()
+    assert human.render() is None
+    none.reset()
     with pytest.warns(UserWarning, match="render_mode"):
-        assert env.render() is None
+        assert none.render() is None

@@ -45,8 +45,9 @@ PROCESSES = pytest.mark.parametrize("processes", [0, 2])
 def test_matches_sync_vector_env(kind, mode):
     model, decision = VARIETY[kind]
     points = {POINT: decision}
-    ours = vector_env(model, points, num_envs=5, autoreset_mode=mode)
-    theirs = SyncVectorEnv([lambda: single_env(model, points)] * 5, autoreset_mode=mode)
+    options = {"discount_rate": 0.1} if model is Timed else {}
+    ours = vector_env(model, points, num_envs=5, autoreset_mode=mode, **options)
+    theirs = SyncVectorEnv([lambda: single_env(model, points, **options)] * 5, autoreset_mode=mode)
     for name in ("single_observation_space", "single_action_space", "observation_space", "action_space"):
         assert getattr(ours, name) == getattr(theirs, name)
     assert ours.metadata == theirs.metadata

@@ -167,18 +167,6 @@ def test_errors_come_back_as_themselves_and_the_next_reset_works():
         goes_on(envs)
 
 
-class Breaking:
-    """A factory that works in one process alone, and in others raises or ends them."""
-
-    def __init__(self, process: int, *, ends: bool = False) -> None:
-        self.process, self.ends = process, ends
-
-    def __call__(self) -> Any:
-        if os.getpid() == self.process:
-            return Counter()
-        return os._exit(3) if self.ends else 1 / 0
-
-
 @KILLED
 @pytest.mark.parametrize(("how", "code"), [("kill", -9), (7, 7), (1, 1)])
 def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, code):
@@ -325,20 +313,24 @@ def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error):
 
 
 def start_in_vain(error: str) -> None:
-    context = multiprocessing.get_context(FORK)
+    context, home = multiprocessing.get_context(FORK), os.getpid()
+    start, started = context.Process.start, []
+
+    def start_once(process):
+        if started:
+            raise OSError("no more")
+        started.append(process)
+        start(process)
+
+    def model():
+        if os.getpid() == home:
+            return Counter()
+        return os._exit(3) if error == "WorkerError" else 1 / 0
+
     workers().close()  # multiprocessing keeps its shared memory for the next time
     gc.collect()
     before = descriptors()
-    model = Breaking(os.getpid(), ends=error == "WorkerError")
     if error == "OSError":
-        start, started = context.Process.start, []
-
-        def start_once(process):
-            if started:
-                raise OSError("no more")
-            started.append(process)
-            start(process)
-
         context.Process.start = start_once
     with pytest.raises(Exception) as raised:
         workers(model, context=context)

@@ -8,7 +8,17 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    aec_env,
+    joint_env,
+    parallel_env,
+    register_simulation,
+    simulate,
+    single_env,
+    vector_env,
+)
 from simenv_marl.errors import (
     DefinitionError,
     InvalidActionError,
@@ -20,6 +30,7 @@ from simenv_marl.errors import (
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
 from tests.worlds.models import calling, decision, define, play
+from tests.worlds.undone import registries_put_back
 
 EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 
@@ -165,13 +176,14 @@ def test_masks_on_request_are_flat_and_pass_through_wrappers():
 
 
 ONE_MASK = np.array([1] * 4 + [0] * 6, np.int8)
+MASKED = {"action_mask_mapping": lambda: ONE_MASK}
 
 
 @EVERY_VIEW
 @pytest.mark.parametrize(
     ("changes", "mask", "illegal", "legal", "log"),
     [
-        ({"action_mask_mapping": lambda: ONE_MASK}, [[1] * 4 + [0] * 6], [4, 9], [3, 0], [3, 0]),
+        (MASKED, [[1] * 4 + [0] * 6], [4, 9], [3, 0], [3, 0]),
         ({"choices": lambda: "ab", "action_space": spaces.Discrete(3)}, [[1, 1, 0]], [2], [1, 0], ["b", "a"]),
         (
             {
@@ -352,6 +364,63 @@ def test_a_rate_needs_a_simulation_that_has_a_time():
             env.reset()
 
 
+# -- infos ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
+    """There are learners that ask for them once and for all."""
+    ant, bee, elk = decision(agent="ant_0", **MASKED), decision(agent="bee_0", **MASKED), decision(agent="elk_0")
+    env = make(Clock((0, ant), (1, bee), (2, ant), (3, ant), (4, bee), end=5), [ant, bee, elk])
+    always = {"time", "elapsed"} | ({"deciding", "acted"} if make is parallel_env else set())
+    expected = {"ant_0": always | {"action_mask"}, "bee_0": always | {"action_mask"}, "elk_0": always}
+    _, infos = env.reset() or (None, env.infos)
+    assert infos.keys() == expected.keys()
+    while env.agents:
+        assert all(info.keys() == expected[agent] for agent, info in infos.items())
+        if make is aec_env:
+            env.step(None if env.terminations[env.agent_selection] else RULE)
+        else:
+            *_, infos = env.step(RULE)
+            assert infos.keys() == expected.keys()
+    assert all(info.keys() == expected[agent] for agent, info in infos.items())
+
+
+def test_everything_is_legal_for_those_who_have_not_decided_yet():
+    ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
+    env = aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk])
+    env.reset()
+    env.infos["bee_0"]["action_mask"][:] = 0  # the user's own
+    assert env.infos["elk_0"]["action_mask"].tolist() == [1] * 10
+    env.reset()
+    assert env.infos["bee_0"]["action_mask"].tolist() == [1] * 10
+    assert env.infos["bee_0"]["action_mask"].dtype == np.int8
+    for time, elapsed in ((1.0, 0.0), (2.0, 1.0)):
+        env.step(1)
+        assert env.infos["bee_0"]["action_mask"].tolist() == ONE_MASK.tolist()
+        assert (env.infos["bee_0"]["time"], env.infos["bee_0"]["elapsed"]) == (time, elapsed)
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
+def test_a_mask_in_an_observation_without_a_decision_is_open(make):
+    """A mask of zeros would leave a policy nothing to choose from."""
+    seen = spaces.Dict(observations=spaces.Box(0, 9, (1,), np.float32), action_mask=spaces.MultiBinary(10))
+    given = {"observation_space": seen, "observation_space_mapping": lambda: {"observations": [1.0]}}
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **MASKED, **given)
+    env = make(calling(ant, bee), [ant, bee])
+    observations, _ = env.reset() or ({"bee_0": env.observe("bee_0")}, None)
+    observation = observations["bee_0"]
+    assert observation["action_mask"].tolist() == [1] * 10
+    assert observation["observations"].tolist() == [0.0]
+    assert observation in (env.observation_space["bee_0"] if make is joint_env else env.observation_space("bee_0"))
+    if make is parallel_env:
+        observations, *_, infos = env.step({"ant_0": 1})
+        seen, told = observations["bee_0"]["action_mask"], infos["bee_0"]["action_mask"]
+        assert seen.tolist() == told.tolist() == ONE_MASK.tolist()
+        assert seen.dtype == told.dtype == np.int8
+        assert not np.shares_memory(seen, told)
+
+
 # -- the state ------------------------------------------------------------------------------------
 
 
@@ -469,3 +538,40 @@ def test_the_simulation_renders_in_its_modes(make, capsys):
     none.reset()
     with pytest.warns(UserWarning, match="render_mode"):
         assert none.render() is None
+
+
+@pytest.mark.parametrize(
+    "make", [aec_env, parallel_env, single_env, lambda *of, **to: vector_env(*of, num_envs=1, **to)]
+)
+@pytest.mark.parametrize("mode", ["human", "rgb_array", "rgb_array_list"])
+def test_a_mode_that_the_simulation_lacks_is_a_warning(make, mode):
+    ant = decision(agent="ant_0")
+    with pytest.warns(UserWarning, match=f"render_mode '{mode}' is not one of the simulation's .it has none."):
+        env = make(calling(ant), ant, render_mode=mode)
+    assert env.render_mode is None
+
+
+def first_numbers(frames):
+    return [int(frame[0, 0, 0]) for frame in frames]
+
+
+@pytest.mark.parametrize("registered_as", ["a simulation", "a function"])
+def test_lists_of_pictures_have_those_since_the_last_reset_or_render(registered_as):
+    ant = decision(agent="ant_0")
+    with registries_put_back():
+        if registered_as == "a simulation":
+            identity = register_simulation(lambda: Counted(ant), ant, name="drawn")[0]
+        else:
+            identity = "ByFunction-v0"
+            gymnasium.register(identity, lambda **options: single_env(lambda: Counted(ant), ant, **options))
+        env = gymnasium.make(identity, render_mode="rgb_array_list")
+        envs = gymnasium.make_vec(identity, num_envs=2, render_mode="rgb_array_list")
+    for _ in range(2):
+        env.reset()
+        env.step(4)
+        assert first_numbers(env.render()) == [0, 4]
+    env.step(3)
+    assert first_numbers(env.render()) == [7]
+    envs.reset()
+    envs.step(np.array([4, 5]))
+    assert [first_numbers(frames) for frames in envs.render()] == [[0, 4], [0, 5]]

@@ -21,7 +21,7 @@ from simenv_marl.experiments import Variant
 from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
 from tests.contract.test_simulate_many import ones
-from tests.processes import alone, descriptors
+from tests.processes import ROOT, alone, descriptors
 from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import calling, decision, define, notes, script
@@ -176,18 +176,11 @@ def test_an_interrupt_cancels_the_remaining_work(monkeypatch):
 
 SCRIPT = """
     import sys, time
-    import numpy as np
-    from gymnasium import spaces
-    from simenv_marl import make_step, simulate_many
+    from simenv_marl import simulate_many
+    from tests.worlds.models import define
 
     class Model:
-        @make_step(
-            observation_space=spaces.Discrete(100),
-            observation_space_mapping=lambda model: model.level,
-            action_space=spaces.Discrete(100),
-            action_space_mapping=lambda action: action,
-            reward_mapping=lambda model: 0.0,
-        )
+        @define(observation_space_mapping=lambda model: [model.level, 0])
         def decide(self):
             return 0
 
@@ -202,21 +195,23 @@ SCRIPT = """
                     time.sleep(60)
 
     if __name__ == "__main__":
+        policies = {Model.decide: lambda seen: seen[:, 0].astype(int) % 5}
         given = {"seeds": range(3), "collect": lambda model: model.level}
         try:
             for workers in (2, 0):
-                print(simulate_many(Model, {Model.decide: lambda levels: levels + 1}, workers=workers, **given))
+                print(simulate_many(Model, policies, workers=workers, **given))
         except KeyboardInterrupt:
             print("interrupted")
 """
 
 
-def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path):
+def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path, monkeypatch):
     """What a script defines has no name under which workers could import it."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*filter(None, sys.path), str(ROOT)]))
     path, begun = tmp_path / "script.py", tmp_path / "begun"
     path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
     done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=120, check=False)
-    assert done.stdout.splitlines() == ["[7, 15, 23]"] * 2, done.stderr
+    assert done.stdout.splitlines() == ["[0, 8, 11]"] * 2, done.stderr
     command = [sys.executable, path, begun]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True) as process:
         for _ in range(600):

@@ -46,40 +46,21 @@ def _nothing_is_left():
 
 
 class Failing(Counter):
+    """Counts for ever, and calls what the options of its reset have for its seed, after decisions and unwinding."""
+
     def __init__(self) -> None:
         self.process = os.getpid()
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        super().reset(seed, options)
-        self.goal = 100
-        self.how = (options or {}).get(seed)
 
     def run(self) -> Any:
         try:
             while True:
                 self.count += self.decide()
-                self.fail()
+                self.call("decided")
         finally:
-            self.unwind()
+            self.call("unwinding")
 
-    def fail(self) -> None:
-        if self.how == "kill":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if self.how in (1, 7):
-            os._exit(self.how)
-        if self.how == "interrupt":
-            time.sleep(0.1)
-            os.kill(self.options["process"], signal.SIGALRM)
-            time.sleep(0.3)
-
-    def unwind(self) -> None:
-        if self.how == "stubborn":
-            raise LookupError("it would not go") from None
-        if self.how == "hanging":
-            time.sleep(60)
-        if isinstance(self.how, Path):
-            time.sleep(0.3)
-            self.how.touch()
+    def call(self, when: str) -> None:
+        (self.options or {}).get(when, {}).get(self.seed, int)()
 
 
 ONES = np.ones(4, np.int64)
@@ -134,8 +115,10 @@ def test_objects_that_cannot_be_pickled_are_refused():
 
 
 def test_an_error_says_of_which_simulation_and_the_next_reset_works():
-    envs = workers(Failing, definition(reward_mapping=lambda self: float("nan") if self.how == "reward" else 0.0))
-    envs.reset(seed=0, options={2: "reward"})
+    envs = workers(
+        Failing, definition(reward_mapping=lambda self: float("nan") if self.options == {"poor": self.seed} else 0.0)
+    )
+    envs.reset(seed=0, options={"poor": 2})
     with pytest.raises(RewardError, match="not finite") as caught:
         envs.step(ONES)
     assert "sub-environment 2" in notes(caught.value)
@@ -148,10 +131,11 @@ def test_an_error_says_of_which_simulation_and_the_next_reset_works():
 
 
 @KILLED
-@pytest.mark.parametrize(("how", "code"), [("kill", -9), (7, 7), (1, 1)])
-def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, code):
+@pytest.mark.parametrize("code", [-9, 7, 1])
+def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(code):
     envs = workers(Failing)
-    envs.reset(seed=0, options={3: how})
+    end = (lambda: os.kill(os.getpid(), 9)) if code == -9 else (lambda: os._exit(code))
+    envs.reset(seed=0, options={"decided": {3: end}})
     with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* died with exit code {code}") as caught:
         envs.step(ONES)
     assert ("__main__" in str(caught.value)) == (code == 1)  # with which an error in a script ends it
@@ -183,15 +167,19 @@ def test_workers_that_are_killed_between_steps_are_noticed(use):
 
 def test_errors_while_closing_surface_and_the_workers_end():
     envs = workers(Failing, context=multiprocessing.get_context(FORK))
-    envs.reset(seed=0, options=dict.fromkeys(range(4), "stubborn"))
-    with pytest.raises(LookupError, match="it would not go"):
+    envs.reset(seed=0, options={"unwinding": dict.fromkeys(range(4), lambda: {}["it would not go"])})
+    with pytest.raises(KeyError, match="it would not go"):
         envs.close()
     assert envs.closed
 
 
 def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
+    def finish(path: Path) -> None:
+        time.sleep(0.3)
+        path.touch()
+
     envs = workers(Failing)
-    envs.reset(seed=0, options={seed: tmp_path / str(seed) for seed in range(4)})
+    envs.reset(seed=0, options={"unwinding": {seed: partial(finish, tmp_path / str(seed)) for seed in range(4)}})
     there = set(processes_of(envs))
     del envs
     gc.collect()
@@ -202,7 +190,7 @@ def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
 def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
     monkeypatch.setattr("simenv_marl.many.parallel.SECONDS_TO_CLOSE", 0.5)
     envs = workers(Failing)
-    envs.reset(seed=0, options={0: "hanging"})
+    envs.reset(seed=0, options={"unwinding": {0: partial(time.sleep, 60)}})
     with pytest.warns(ResourceWarning, match="did not close"):
         envs.close()
     assert envs.closed
@@ -210,12 +198,18 @@ def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monk
 
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="there is no SIGALRM")
 def test_an_interrupted_step_leaves_the_environment_in_step():
-    envs = workers(Failing)
-    envs.reset(seed=0, options={"process": os.getpid(), 0: "interrupt"})
+    home = os.getpid()
 
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
+    def alarm() -> None:
+        time.sleep(0.1)
+        os.kill(home, signal.SIGALRM)
+        time.sleep(0.3)
+
+    envs = workers(Failing)
+    envs.reset(seed=0, options={"decided": {0: alarm}})
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
         with pytest.raises(KeyboardInterrupt):

@@ -11,7 +11,7 @@ import pytest
 import simpy
 
 from simenv_marl import RULE, aec_env, difference, single_env
-from tests.worlds.models import Script, calling, decision, decisions, play, script, stacks, unwinding
+from tests.worlds.models import calling, decision, decisions, play, script, stacks, unwinding
 
 # -- nested ---------------------------------------------------------------------------------------
 
@@ -75,16 +75,15 @@ def test_errors_pass_through_environments_that_are_nested_deeply():
 def test_a_suspended_nest_is_collected():
     before, unwound, outer = stacks(), [], decision(agent="outer_0")
 
-    class Nest(Script):
-        def run(self):
-            self.inner = single_env(unwinding(INNER, unwound), INNER)
-            self.inner.reset()
-            try:
-                outer()
-            finally:
-                unwound.append("outer")
+    def main(simulation):
+        simulation.inner = single_env(unwinding(INNER, unwound), INNER)
+        simulation.inner.reset()
+        try:
+            outer()
+        finally:
+            unwound.append("outer")
 
-    env = single_env(lambda: Nest(None), outer)
+    env = single_env(script(main), outer)
     env.reset()
     del env
     assert not stacks(before)

@@ -59,13 +59,10 @@ PLAIN.reset(5)
 PLAIN.run()
 
 
-def test_with_rule_throughout_the_run_is_the_plain_one_and_the_rule_runs_once_for_a_call():
-    day = follow_the_rule(aec_env(Day, points()), seed=5)
-    assert (day.log, day.grid.rules) == (PLAIN.log, 4)
-
-
 def test_items_decide_in_order_and_those_that_are_answered_by_the_rule_get_their_part_of_its_result():
     env = aec_env(Day, points())
+    day = follow_the_rule(env, seed=5)
+    assert (day.log, day.grid.rules) == (PLAIN.log, 4)  # the rule runs once for a call
     assert decisions(play(env, {"s_0": 7, "s_1": RULE, "s_2": 7}, seed=5)) == ["s_0", "s_1", "s_2"] * 4
     assert env.simulation.log == [(7, number, 7) for _, number, _ in PLAIN.log]
     assert env.simulation.grid.rules == 4

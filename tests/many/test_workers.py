@@ -107,14 +107,12 @@ def test_functions_that_are_defined_anywhere_reach_the_workers():
     policies = {Model.decide: two, Model.of_class: ones}
     points, plugins = [Model.decide, Model.of_class], [(handler, Model.decide, "before")]
     arguments = {"points": points, "plugins": plugins, "seeds": range(3)}
-    alone = simulate_many(Model, policies, **arguments)
-    shared = simulate_many(Model, policies, workers=2, **arguments)
-    assert [s.log for s in shared] == [s.log for s in alone] == [[(1, 1), (1, 1), (1, 1)]] * 3
-    assert all(type(simulation) is Model for simulation in shared)  # what comes back is what it was
-    rewards = [
-        collect_episodes(Model, policies, workers=number, **arguments)[Model.decide].rewards for number in (0, 2)
-    ]
-    assert rewards[0].tolist() == rewards[1].tolist() == [4.0, 4.0, 1.0] * 3
+    for workers in (0, 2):
+        found = simulate_many(Model, policies, workers=workers, **arguments)
+        assert [simulation.log for simulation in found] == [[(1, 1), (1, 1), (1, 1)]] * 3
+        assert all(type(simulation) is Model for simulation in found)  # what comes back is what it was
+        collected = collect_episodes(Model, policies, workers=workers, **arguments)
+        assert collected[Model.decide].rewards.tolist() == [4.0, 4.0, 1.0] * 3
 
 
 def test_undecorated_models_variants_and_closures_reach_the_workers():

@@ -206,7 +206,6 @@ def test_one_illegal_action_in_a_joint_view_moves_no_sub_environment():
         {**legal, "sail_0": np.array([[0.0], [np.nan]])},
         {**legal, "helm_0": [np.zeros(1), RULE]},
         {"helm_0": np.zeros((2, 1))},
-        {agent: np.zeros((1, 1)) for agent in legal},
         RULE,
     ):
         with pytest.raises(InvalidActionError):

@@ -29,7 +29,7 @@ from simenv_marl.errors import (
 )
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
-from tests.worlds.models import calling, decision, define, play
+from tests.worlds.models import calling, decision, define, play, step
 from tests.worlds.undone import registries_put_back
 
 EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
@@ -213,13 +213,12 @@ def test_masked_actions_are_illegal_in_every_view(make, changes, mask, illegal, 
     assert {part.dtype for part in parts} == {np.dtype(np.int8)}
     for part in parts:
         part[:] = 1  # the user's own
-    together = make in (parallel_env, joint_env)
     for action in illegal:
         with pytest.raises(InvalidActionError, match="is masked"):
-            env.step({"ant_0": action} if together else action)
+            step(env, action, "ant_0")
     assert env.simulation.log == []
     for action in legal:
-        env.step({"ant_0": action} if together else action)
+        step(env, action, "ant_0")
     assert env.simulation.log == log
 
 
@@ -455,7 +454,7 @@ def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
     assert env.state_space is None
     env.reset()
     state = env.state()
-    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    step(env, 4, "ant_0")
     assert state.tolist() == [0, 0]
     state = env.state()
     assert state.tolist() == [1, 4]
@@ -498,7 +497,7 @@ def test_the_state_may_be_what_all_observe(make):
         env.state()
     env.reset()
     assert env.state().tolist() == [1, 2, 1, 0, 0]  # the second has not been observed yet
-    env.step({"ant_0": 4} if make is parallel_env else 4)
+    step(env, 4, "ant_0")
     state = env.state()
     assert state.tolist() == [1, 2, 0, 0, 1]
     assert state in env.state_space
@@ -517,7 +516,6 @@ def test_the_state_may_be_what_all_observe(make):
 
 @EVERY_VIEW
 def test_the_simulation_renders_in_its_modes(make, capsys):
-    step = {"ant_0": 4} if make in (parallel_env, joint_env) else 4
     ant = decision(agent="ant_0")
     ansi, array, human, none = (
         make(lambda: Counted(ant), ant, render_mode=mode) for mode in ("ansi", "rgb_array", "human", None)
@@ -526,12 +524,16 @@ def test_the_simulation_renders_in_its_modes(make, capsys):
     assert ansi.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
     ansi.reset()
     assert ansi.render() == "now 0"
-    ansi.step(step)
+    step(ansi, 4, "ant_0")
     assert ansi.render() == "now 4"
     array.reset()
     assert array.render().shape == (4, 6, 3)
     assert array.render().dtype == np.uint8
-    for act, text in ((human.reset, "now 0\n"), (lambda: human.step(step), "now 4\n"), (human.render, "now 4\n")):
+    for act, text in (
+        (human.reset, "now 0\n"),
+        (lambda: step(human, 4, "ant_0"), "now 4\n"),
+        (human.render, "now 4\n"),
+    ):
         act()
         assert capsys.readouterr().out == text
     assert human.render() is None

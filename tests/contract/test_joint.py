@@ -104,27 +104,6 @@ def test_actions_that_are_refused_move_nothing(flatten, action, match):
     assert env.simulation.log[2:] == ["rule", "rule"]
 
 
-def test_masks_and_choices_are_those_of_the_pending_decision():
-    mask = np.array([1] * 3 + [0] * 7, np.int8)
-    ant = decision(agent="ant_0", action_mask_mapping=lambda: mask)
-    bee = decision(agent="bee_0", choices=lambda: ["x", "y"], action_space=spaces.Discrete(3))
-    cat = decision(agent="cat_0")
-    env = joint_env(calling(ant, bee, cat, ant, bee), [ant, bee, cat])
-    env.reset()
-    *_, info = env.step({"ant_0": 2, "bee_0": 1, "cat_0": 0})
-    assert env.simulation.log == [2, "y", 0]
-    assert {agent: given.tolist() for agent, given in info["action_mask"].items()} == {
-        "ant_0": [1] * 3 + [0] * 7,
-        "bee_0": [1, 1, 0],
-    }
-    info["action_mask"]["ant_0"][:] = 0  # the user's own
-    *_, info = env.step({"ant_0": 2, "bee_0": 2, "cat_0": 0})
-    assert env.simulation.log == [2, "y", 0, 2]
-    assert info["deciding"] == "bee_0"
-    assert info["acted"] == {"ant_0": True, "bee_0": False, "cat_0": False}
-    assert info["action_mask"]["ant_0"].tolist() == mask.tolist() == [1] * 3 + [0] * 7
-
-
 # -- who is there ---------------------------------------------------------------------------------
 
 

@@ -159,16 +159,11 @@ sys.stdout.buffer.write(cloudpickle.dumps(env))
     pickled = run(MODEL + code)
     code = """
 import sys, pickle
+from tests.worlds.models import play
 env = pickle.loads(sys.stdin.buffer.read())
-env.reset(seed=1)
-rewards = []
-for agent in env.agent_iter():
-    observation, reward, ended, *_ = env.last()
-    rewards.append(reward)
-    env.step(None if ended else 2)
-print(agent, rewards, env.simulation.total, env.simulation.two())
+print([turn.reward for turn in play(env, 2, seed=1)], env.simulation.total, env.simulation.two())
 """
-    assert run(code, pickled).decode().strip() == "one_0 [0.0, 7.0, 7.0, 7.0] 21 10"
+    assert run(code, pickled).decode().strip() == "[0.0, 7.0, 7.0, 7.0] 21 10"
 
 
 def test_copies_of_a_model_of_the_main_module_leave_its_class_as_it_stands():

@@ -34,7 +34,7 @@ from simenv_marl.errors import (
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
 from tests.worlds.many_registered import IDS, Voyage
 from tests.worlds.models import decision, notes, script, stacks
-from tests.worlds.worlds import FuseError, designs, seeds
+from tests.worlds.worlds import designs, seeds
 
 pytestmark = FORKS
 PROCESSES = pytest.mark.parametrize("processes", [0, 2])
@@ -263,13 +263,13 @@ def test_observations_are_copies_unless_copy_is_false(kind, copy, processes):
 def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, culprit):
     def fail(thing: Any) -> Any:
         if thing == 3 or (isinstance(thing, Counter) and thing.seed == culprit and thing.count):
-            raise FuseError
+            raise ZeroDivisionError
         return [0, 0] if where.startswith("obs") else 1
 
     stacks_before = stacks()
     envs = begun(vector_env(Counter, {POINT: definition(**{where: fail} if where != "run" else {})}, num_envs=3))
     envs.envs[culprit].simulation.failing = where == "run"
-    with pytest.raises(FuseError) as caught:
+    with pytest.raises(ZeroDivisionError) as caught:
         envs.step(np.where(np.arange(3) == culprit, 3, 1))
     assert f"sub-environment {culprit}" in notes(caught.value)
     assert f"seed {culprit}" in notes(caught.value)

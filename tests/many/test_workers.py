@@ -1,6 +1,5 @@
 """Many simulations, spread over processes by joblib."""
 
-import dataclasses
 import gc
 import os
 import signal
@@ -65,8 +64,7 @@ def test_collected_episodes_are_the_same():
     assert alone["creature_99"].collected == tuple(traces(seeds=range(9)))
     assert list(alone) == list(shared) == list(policies)
     for key, found in alone.items():
-        for field in dataclasses.fields(found):
-            assert same(getattr(found, field.name), getattr(shared[key], field.name)), field.name
+        assert same(vars(found), vars(shared[key]))
 
 
 def test_functions_that_are_defined_anywhere_reach_the_workers():

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from simenv_marl import RULE, TRUNCATED, joint_env, make_step, single_env, vector_env
-from tests.worlds.worlds import FuseError, World, advised, agent_of, points_of
+from tests.worlds.worlds import World, advised, agent_of, points_of
 
 MODES = list(AutoresetMode)
 
@@ -52,7 +52,7 @@ class Counter:
             while self.count < self.goal:
                 self.count += self.decide()
                 if self.failing:
-                    raise FuseError
+                    raise ZeroDivisionError
         finally:
             self.unwound = True
         return TRUNCATED if self.goal % 2 else None

@@ -113,10 +113,6 @@ class Entity:
         self.world, self.number = world, number
 
 
-class FuseError(Exception):
-    """What simulations raise that are to fail."""
-
-
 class World:
     """A simulation of a design."""
 
@@ -129,14 +125,11 @@ class World:
         self.entities = [Entity(self, number) for number in range(3)]
 
     def run(self) -> Any:
-        try:
-            for point, entity in self.design.program:
-                value = self.call(point, entity)
-                self.calls += 1
-                self.level = (self.level * 3 + value + self.random.randrange(4)) % 101
-                self.trace.append((point, value, self.level))
-        finally:
-            self.trace.append("over")
+        for point, entity in self.design.program:
+            value = self.call(point, entity)
+            self.calls += 1
+            self.level = (self.level * 3 + value + self.random.randrange(4)) % 101
+            self.trace.append((point, value, self.level))
         return TRUNCATED if self.design.truncates else None
 
     def call(self, point: int, entity: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 import random
 
 import numpy as np
@@ -15,16 +16,26 @@ from simenv_marl import RULE, aec_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import UnknownAgentError, ViewError
 from tests.worlds.lives import life
-from tests.worlds.many_worlds import ROSTER, Announcing, Answered, Colony, answer, beings, colony_points, designs, seeds
+from tests.worlds.many_worlds import (
+    HERE,
+    ROSTER,
+    Announcing,
+    Answered,
+    Colony,
+    answer,
+    beings,
+    colony_points,
+    designs,
+    seeds,
+)
 from tests.worlds.models import decision, script
 
 EVERYBODY = st.tuples(designs, seeds, st.sampled_from([Colony, Announcing]))
 
 
 def colony(design, kind, view, padded=False):
-    overseen = bool(design.overseen)
-    roster = {f"{Colony.__module__}.Creature.act": ROSTER} if overseen else ROSTER
-    env = view(lambda: kind(design), colony_points(overseen=overseen), possible_agents=roster)
+    points = colony_points(overseen=bool(design.overseen))
+    env = view(lambda: kind(design), points, possible_agents={f"{HERE}.Creature.act": ROSTER})
     return pad_agents(env) if padded else env
 
 
@@ -167,7 +178,7 @@ def test_masks_are_open_and_clocks_go_on():
     assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_an_error_surfaces_and_the_next_episode_is_complete():
+def test_after_an_error_nobody_is_there_before_a_reset():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
     env = pad_agents(aec_env(GENERATIONS, points, possible_agents=NAMES))
     env.reset(seed=0)
@@ -188,15 +199,13 @@ def test_padding_needs_a_view_of_many_agents_and_a_roster():
 
 
 @pytest.mark.parametrize(("view", "action"), VIEWS)
-def test_the_state_of_observations_has_blanks_for_the_removed(view, action):
+def test_the_state_of_observations_has_blanks_for_the_removed_and_a_copy_needs_a_reset(view, action):
     env = pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, state_space="observations"))
     env.reset(seed=0)
     assert env.state()[:2].tolist() == [1, 0]
     env.step(action)
     assert env.state()[:2].tolist() == [0, 0]
-
-
-def test_a_copy_in_mid_episode_has_no_agents_before_its_reset():
-    env = pad_agents(parallel_env(GENERATIONS, beings(), possible_agents=NAMES))
-    env.reset(seed=0)
-    assert copy.deepcopy(env).agents == []
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert twin.agents == []
+        twin.reset(seed=0)
+        assert (twin.agents, twin.state()[:2].tolist()) == (NAMES, [1, 0])

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from simenv_marl import RULE, SimEnvError, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError
-from tests.worlds import random_worlds
 from tests.worlds.models import follow_the_rule
-from tests.worlds.random_worlds import PLAN, POINTS, ROSTER, Yard, designs, outcome, plain, seeds
+from tests.worlds.random_worlds import HERE, PLAN, POINTS, ROSTER, Yard, designs, outcome, plain, seeds
 
 VIEWS = (aec_env, parallel_env, joint_env, single_env)
 
@@ -21,11 +20,10 @@ def seeing(machine_or_yard, *args, **kwargs):
 
 
 PLUGINS = [
-    (seeing, f"{random_worlds.__name__}.{target}", position)
+    (seeing, f"{HERE}.{target}", position)
     for target, position in (
-        ("Yard.note", "before"), ("Yard.note", "after"), ("Yard.plan", "before"), ("Yard.plan", "after"),
-        ("Machine.load", "after"), ("Machine.pace", "before"), ("Machine.work", "before_next"),
-        ("Machine.work", "after_next"), ("Yard.scrap", "before"), ("Yard.manage", "after_next"),
+        ("Yard.note", "before"), ("Yard.plan", "before"), ("Yard.plan", "after"), ("Machine.load", "after"),
+        ("Machine.pace", "before"), ("Machine.work", "before_next"), ("Yard.manage", "after_next"),
     )
 ]  # fmt: skip
 OPTIONS = st.sampled_from([{}, {"plugins": PLUGINS}, {"global_rng": True}, {"state_space": spaces.Box(0, 1e4, (2,))}])

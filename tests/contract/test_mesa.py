@@ -11,20 +11,27 @@ from simenv_marl import aec_env, parallel_env, simulate
 from tests.worlds.models import follow_the_rule
 
 
-class Pasture(example.Meadow):
+class Pasture:
     """The model for some ticks, in which wolves decide as well; it does not say who is going to decide."""
 
-    expected_calls = None
+    ticks, size = 25, {}
 
-    def __init__(self, ticks=25, **parameters):
-        super().__init__(ticks, **parameters)
+    def reset(self, seed=None):
+        self.meadow = example.Meadow(self.ticks, **self.size)
+        self.meadow.reset(seed)
+
+    def run(self):
+        return self.meadow.run()
+
+    @property
+    def model(self):
+        return self.meadow.model
 
 
 class Meadow(Pasture):
     """A small one."""
 
-    def __init__(self):
-        super().__init__(8, width=6, height=6, initial_sheep=14, initial_wolves=6)
+    ticks, size = 8, {"width": 6, "height": 6, "initial_sheep": 14, "initial_wolves": 6}
 
 
 def herd():

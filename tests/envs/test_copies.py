@@ -5,7 +5,6 @@ import pickle
 import subprocess
 import sys
 from functools import partial
-from pathlib import Path
 
 import cloudpickle
 import pytest
@@ -16,9 +15,9 @@ from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, si
 from simenv_marl.envs import SimulationAECEnv
 from simenv_marl.errors import ClosedError, NotResetError
 from simenv_marl.experiments import Variant
+from tests.processes import ROOT
 from tests.worlds.copied import Walk, WalkEnv, blow, define
 
-ROOT = Path(__file__).parents[2]
 VIEWS = {make.__name__: partial(make, Walk, Walk.choose) for make in (aec_env, parallel_env, single_env, joint_env)}
 MAKERS = VIEWS | {
     "generated": partial(WalkEnv, max_steps=2),

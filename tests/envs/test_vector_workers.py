@@ -23,11 +23,9 @@ from simenv_marl import single_env, vector_env
 from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
 from tests.conftest import DRIVERS
 from tests.envs.test_vector import begun
-from tests.processes import alone, descriptors, gone
+from tests.processes import ROOT, alone, descriptors, gone
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
 from tests.worlds.models import notes
-
-ROOT = Path(__file__).parents[2]
 
 pytestmark = FORKS
 

@@ -1,40 +1,31 @@
 """What PettingZoo and Gymnasium check, on shapes of simulations that are awkward for them. Warnings are errors."""
 
 import random
-import warnings
 from functools import partial
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test, state_test
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec, turn_based_aec_to_parallel
 
-from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, make_step
-from tests.worlds.models import play
+from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, parallel_env
+from simenv_marl.envs import pad_agents
+from tests.worlds.many_worlds import HERE, ROSTER, Announcing, Design, colony_points
+from tests.worlds.models import define, play
 
 OBSERVATION = spaces.Box(-10, 10, (3,), np.float32)
-
-
-def define(agent, **changes):
-    return make_step(
-        **{
-            "observation_space": OBSERVATION,
-            "observation_space_mapping": lambda walk: [walk.place, walk.moves % 10, 1.0],
-            "action_space": spaces.Discrete(3),
-            "action_space_mapping": {0: -1.0, 1: 0.0, 2: 1.0},
-            "reward_mapping": lambda walk: walk.place / 10,
-            "agent": agent,
-        }
-        | changes
-    )
-
-
-def every_other(walk):
-    return [1, walk.moves % 2, 1]
+STEPS = {
+    "observation_space": OBSERVATION,
+    "observation_space_mapping": lambda walk: [walk.place, walk.moves % 10, 1.0],
+    "action_space": spaces.Discrete(3),
+    "action_space_mapping": {0: -1.0, 1: 0.0, 2: 1.0},
+    "reward_mapping": lambda walk: walk.place / 10,
+}
+PUSHES = {"action_space": spaces.Box(-1, 1, (1,), np.float32), "action_space_mapping": lambda action: float(action[0])}
+MASKED = {"action_mask_mapping": lambda walk: [1, walk.moves % 2, 1]}
 
 
 class Walk:
@@ -42,63 +33,51 @@ class Walk:
 
     render_modes = ("ansi",)
 
-    def __init__(self, order=("ant", "bee")):
-        self.order = order
+    def __init__(self, order=("ant", "bee"), times=20, ends=None):
+        self.order, self.times, self.ends = order, times, ends
 
     def reset(self, seed=None):
         self.random, self.place, self.moves = random.Random(seed), 1.0, 1
 
     def run(self):
-        order = list(self.order) * 20
+        order = list(self.order) * self.times
         if not self.order:
             order = self.random.choices(["ant", "bee", "cat"], k=self.random.randrange(1, 40))
         for name in order:
             step = getattr(self, name)() + self.random.uniform(-0.5, 0.5)
             self.moves += 1
             self.place = max(-9.0, min(9.0, self.place + step))
+        return self.ends
 
     def render(self, mode):
         return f"at {self.place}"
 
-    @define("ant_0")
+    @define(agent="ant_0", **STEPS)
     def ant(self):
         return 0.5
 
-    @define(
-        "bee_0", action_space=spaces.Box(-1, 1, (1,), np.float32), action_space_mapping=lambda action: float(action[0])
-    )
+    @define(agent="bee_0", **STEPS | PUSHES)
     def bee(self):
         return -0.5
 
-    @define("cat_0", action_mask_mapping=every_other)
+    @define(agent="cat_0", **STEPS, **MASKED)
     def cat(self):
         return 0.1
 
 
-class Step(Walk):
-    def run(self):
-        self.place += self.ant()
-
-
-class Truncated(Step):
-    def run(self):
-        super().run()
-        return TRUNCATED
-
-
-def walk(*order):
-    return lambda: Walk(order)
+def walk(*order, **options):
+    return lambda: Walk(order, **options)
 
 
 ANT, BEE, CAT = Walk.ant, Walk.bee, Walk.cat
 TWICE_IN_A_ROW = walk("ant", "ant", "bee")
 SHAPES = {
     "one agent": (walk("ant"), ANT, {}),
-    "one step": (Step, [BEE, ANT], {}),
+    "one step": (walk("ant", times=1), [BEE, ANT], {}),
     "twice in a row": (TWICE_IN_A_ROW, [ANT, BEE], {}),
     "any order": (walk(), [ANT, BEE, CAT], {}),
     "one never acts": (walk("bee", "cat"), [ANT, BEE, CAT], {}),
-    "truncated by itself": (Truncated, ANT, {}),
+    "truncated by itself": (walk("ant", times=1, ends=TRUNCATED), ANT, {}),
     "truncated by steps": (Walk, [ANT, BEE], {"max_steps": 7}),
     "policies": (TWICE_IN_A_ROW, [ANT, BEE], {"policies": {BEE: RULE}}),
 }
@@ -123,49 +102,62 @@ def test_pettingzoos_tests_pass(shape):
         parallel_seed_test(partial(made, shape, "parallel"), num_cycles=100)
 
 
+@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")  # of those who have not been called yet
 def test_pettingzoos_conversions_pass_its_tests():
-    shape = SHAPES["twice in a row"]
-    with warnings.catch_warnings():
-        # Those who have not been called yet are observed as zeros.
-        warnings.filterwarnings("ignore", message="Observation numpy array is all zeros")
-        api_test(parallel_to_aec(made(shape, "parallel")), num_cycles=20)
+    api_test(parallel_to_aec(made(SHAPES["twice in a row"], "parallel")), num_cycles=20)
     parallel_api_test(turn_based_aec_to_parallel(aec_env(walk("ant", "bee"), [ANT, BEE])), num_cycles=20)
 
 
+# PettingZoo keeps a list of its own environments whose observations may be dicts.
+@pytest.mark.filterwarnings("ignore:Observation is not a NumPy array")
+@pytest.mark.filterwarnings("ignore:Observation space for each agent probably should be")
 def test_pettingzoos_tests_pass_with_masks_in_observations():
-    cat = define(
-        "cat_0",
-        observation_space=spaces.Dict({"observation": OBSERVATION, "action_mask": spaces.Box(0, 1, (3,), np.int8)}),
-        observation_space_mapping=lambda walk: {"observation": [walk.place, walk.moves % 10, 1.0]},
-        action_mask_mapping=every_other,
-    )
-    shape = walk("bee", "cat"), {CAT: cat}, {}
-    with warnings.catch_warnings():
-        # PettingZoo keeps a list of its own environments whose observations may be dicts.
-        warnings.filterwarnings("ignore", message="Observation is not a NumPy array")
-        warnings.filterwarnings("ignore", message="Observation space for each agent probably should be")
-        api_test(made(shape, "aec"), num_cycles=100)
+    seen = {
+        "observation_space": spaces.Dict({"observation": OBSERVATION, "action_mask": spaces.Box(0, 1, (3,), np.int8)}),
+        "observation_space_mapping": lambda walk: {"observation": [walk.place, walk.moves % 10, 1.0]},
+    }
+    shape = walk("bee", "cat"), {CAT: define(agent="cat_0", **STEPS | seen, **MASKED)}, {}
+    api_test(made(shape, "aec"), num_cycles=100)
     seed_test(partial(made, shape, "aec"), num_cycles=100)
     parallel_api_test(made(shape, "parallel"), num_cycles=100)
+
+
+@pytest.mark.filterwarnings(r"ignore:\s*This environment does not have possible_agents")  # where none are declared
+@pytest.mark.filterwarnings("ignore:No agents present")  # after the end, where there is none
+@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")  # all that there is to see of the absent
+@pytest.mark.parametrize("roster", ["unknown", "declared", "padded"])
+def test_pettingzoos_tests_pass_where_agents_are_born_and_die(roster):
+    declared = {"possible_agents": {f"{HERE}.Creature.act": ROSTER[:6]}, "undeclared": "rule"}
+    options = {} if roster == "unknown" else declared | {"state_space": "observations"}
+
+    def make(view, **more):
+        colony = Announcing(Design(initial=4, most=8, ticks=6, overseen="after"))
+        env = view(colony, colony_points(overseen=True), **options | more)
+        return pad_agents(env) if roster == "padded" else env
+
+    turns, rounds = partial(make, aec_env), partial(make, parallel_env)
+    api_test(turns(), num_cycles=60)
+    seed_test(turns, num_cycles=30)
+    parallel_api_test(rounds(), num_cycles=60)
+    parallel_seed_test(rounds, num_cycles=30)
+    if options:
+        state_test(turns(), rounds())
 
 
 # -- its wrappers ---------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.*Illegal move made, game terminating")
 def test_illegal_actions_terminate_under_pettingzoos_wrapper():
     env = wrappers.TerminateIllegalWrapper(aec_env(walk("bee", "cat"), [CAT]), illegal_reward=-1)
     env.reset(seed=1)
-    unwrapped = env.unwrapped
     while env.infos["cat_0"]["action_mask"][1]:
         env.step(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        env.step(1)
+    env.step(1)
     assert env.last()[1:4] == (-1.0, True, True)
     env.step(None)
-    assert env.agents == unwrapped.agents == []
-    turns = play(env, 0, seed=1)
-    assert len(turns) == 21
+    assert env.agents == env.unwrapped.agents == []
+    assert len(play(env, 0, seed=1)) == 21
 
 
 # -- Gymnasium ------------------------------------------------------------------------------------
@@ -173,35 +165,16 @@ def test_illegal_actions_terminate_under_pettingzoos_wrapper():
 
 SINGLES = {
     "one agent": (walk("ant"), ANT, {}),
-    "one step": (Step, ANT, {}),
+    "one step": (walk("ant", times=1), ANT, {}),
     "masked": (walk("bee", "cat"), CAT, {}),
     "truncated": (TWICE_IN_A_ROW, BEE, {"max_steps": 3}),
     "policies": (Walk, [ANT, BEE], {"policies": {BEE: lambda observation: [0.5]}}),
 }
 
 
+# Render modes can be tested on registered environments alone.
+@pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes")
 @pytest.mark.parametrize("shape", SINGLES.values(), ids=SINGLES.keys())
 def test_gymnasiums_check_passes(shape):
-    with warnings.catch_warnings():
-        # The only one: render modes can be tested on registered environments alone.
-        warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes")
-        check_env(made(shape, "single"))
-        check_env(made(shape, "single", "ansi"))
-
-
-def test_gymnasium_makes_generated_classes_and_limits_their_time():
-    name = "simenv_test/Ant-v0"
-    gymnasium.register(id=name, entry_point=generate_env(TWICE_IN_A_ROW, ANT))
-    try:
-        env = gymnasium.make(name, render_mode="ansi", max_episode_steps=2)
-    finally:
-        del gymnasium.registry[name]
-    for _ in range(2):
-        observation, info = env.reset(seed=3)
-        assert observation in env.observation_space
-        assert info == {}
-        assert env.step(1)[2:4] == (False, False)
-        assert env.render().startswith("at ")
-        assert env.step(1)[2:4] == (False, True)
-    assert isinstance(env.unwrapped.simulation, Walk)
-    env.close()
+    check_env(made(shape, "single"))
+    check_env(made(shape, "single", "ansi"))

@@ -8,7 +8,17 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env, vector_env
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    aec_env,
+    joint_env,
+    parallel_env,
+    register_simulation,
+    simulate,
+    single_env,
+    vector_env,
+)
 from simenv_marl.errors import (
     DefinitionError,
     InvalidActionError,
@@ -19,7 +29,8 @@ from simenv_marl.errors import (
 )
 from tests.worlds.lives import life
 from tests.worlds.many_worlds import beings
-from tests.worlds.models import calling, decision, define, play
+from tests.worlds.models import calling, decision, define, play, step
+from tests.worlds.undone import registries_put_back
 
 EVERY_VIEW = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 
@@ -93,20 +104,18 @@ def test_goal_based_observations_are_dicts_of_the_users_own():
 def test_rewards_are_computed_anew_for_other_goals():
     env = single_env(Walk, goals())
     env.reset(seed=3)
-    told = [env.step(env.action_space.sample()) for _ in range(8)]
-    assert told[-1][2:4] == (False, True)
-    achieved = np.stack([observation["achieved_goal"] for observation, *_ in told])
-    desired = np.stack([observation["desired_goal"] for observation, *_ in told])
-    infos = np.array([info for *_, info in told])
-    rewards = env.compute_reward(achieved, desired, infos)
-    assert rewards.shape == (8,)
-    assert rewards.tolist() == [reward for _, reward, *_ in told]
+    observations, rewards, _, truncations, infos = zip(
+        *[env.step(env.action_space.sample()) for _ in range(8)], strict=True
+    )
+    assert truncations[-1]
+    achieved, desired = (np.stack([seen[part] for seen in observations]) for part in ("achieved_goal", "desired_goal"))
+    assert env.compute_reward(achieved, desired, infos).tolist() == list(rewards)
     relabelled = env.compute_reward(achieved, np.repeat(achieved[-1:], 8, 0), infos)
+    assert relabelled.shape == (8,)
     assert relabelled[-1] == 0.0
-    for (observation, reward, _, _, info), batched in zip(told, rewards, strict=True):
-        one = env.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
-        assert type(one) is float
-        assert one == reward == batched
+    one = env.compute_reward(achieved[0], desired[0], infos[0])
+    assert type(one) is float
+    assert one == rewards[0]
 
 
 @pytest.mark.parametrize(
@@ -167,13 +176,14 @@ def test_masks_on_request_are_flat_and_pass_through_wrappers():
 
 
 ONE_MASK = np.array([1] * 4 + [0] * 6, np.int8)
+MASKED = {"action_mask_mapping": lambda: ONE_MASK}
 
 
 @EVERY_VIEW
 @pytest.mark.parametrize(
     ("changes", "mask", "illegal", "legal", "log"),
     [
-        ({"action_mask_mapping": lambda: ONE_MASK}, [[1] * 4 + [0] * 6], [4, 9], [3, 0], [3, 0]),
+        (MASKED, [[1] * 4 + [0] * 6], [4, 9], [3, 0], [3, 0]),
         ({"choices": lambda: "ab", "action_space": spaces.Discrete(3)}, [[1, 1, 0]], [2], [1, 0], ["b", "a"]),
         (
             {
@@ -203,13 +213,12 @@ def test_masked_actions_are_illegal_in_every_view(make, changes, mask, illegal, 
     assert {part.dtype for part in parts} == {np.dtype(np.int8)}
     for part in parts:
         part[:] = 1  # the user's own
-    together = make in (parallel_env, joint_env)
     for action in illegal:
         with pytest.raises(InvalidActionError, match="is masked"):
-            env.step({"ant_0": action} if together else action)
+            step(env, action, "ant_0")
     assert env.simulation.log == []
     for action in legal:
-        env.step({"ant_0": action} if together else action)
+        step(env, action, "ant_0")
     assert env.simulation.log == log
 
 
@@ -271,23 +280,6 @@ def test_the_time_of_the_announced_and_of_the_dead():
     assert times(turns, "being_1") == [(3, 0), (8, 5), (8, 0)]
 
 
-@pytest.mark.parametrize("make", [single_env, joint_env])
-def test_the_time_of_views_of_one_agent_is_that_of_its_steps(make):
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = make(lambda: Clock((np.int64(1), ant), (2, bee), (3, ant), end=4), ant)
-
-    def told(action):
-        *_, info = env.reset() if action is None else env.step(action)
-        return info["time"], info["elapsed"]
-
-    for _ in range(2):
-        assert told(None) == (1.0, 0.0)
-        with pytest.raises(InvalidActionError, match="is not in its action space"):
-            told({"ant_0": 10} if make is joint_env else 10)  # takes no time
-        assert told({"ant_0": 1} if make is joint_env else 1) == (3.0, 2.0)
-        assert told(RULE) == (4.0, 1.0)
-
-
 def test_rounds_have_the_time_of_the_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
@@ -306,37 +298,43 @@ def test_rounds_have_the_time_of_the_simulation():
 
 
 @pytest.mark.parametrize("action", [1, RULE])
-def test_policies_know_the_time_and_how_much_has_gone_by(action):
+def test_policies_know_the_time_how_much_has_gone_by_and_its_discount(action):
     """Since the decision before, whether the policy has taken that or left it to the rule."""
     ant, seen = decision(agent="ant_0"), []
 
     def policy(observation, info):
-        seen.append((info["time"], info["elapsed"]))
+        seen.append((info["time"], info["elapsed"], info["discount"]))
         return action
 
-    simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy})
-    assert seen == [(1.0, 0.0), (3.0, 2.0), (7.0, 4.0)]
+    simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy}, discount_rate=0.5)
+    assert seen == [(1.0, 0.0, 1.0), (3.0, 2.0, exp(-1.0)), (7.0, 4.0, exp(-2.0))]
 
 
 def told(env):
     """The infos of the agent "ant_0" from the reset to the end, in any view."""
     if hasattr(env, "agent_iter"):
         return [turn.info for turn in play(env, 1)]
+    rounds = hasattr(env, "possible_agents")
+    by_agent = rounds or isinstance(env.action_space, spaces.Dict)
     *_, info = env.reset()
-    infos, rounds = [info], hasattr(env, "possible_agents")
+    infos = [info]
     for _ in range(3):
-        *_, info = env.step({"ant_0": 1} if rounds or isinstance(env.action_space, spaces.Dict) else 1)
+        with pytest.raises(InvalidActionError, match="is not in its action space"):
+            env.step({"ant_0": 10} if by_agent else 10)  # takes no time
+        *_, info = env.step({"ant_0": 1} if by_agent else 1)
         infos.append(info)
     return [info["ant_0"] for info in infos] if rounds else infos
 
 
 @EVERY_VIEW
-def test_a_rate_gives_each_elapsed_time_its_discount(make):
-    ant = decision(agent="ant_0")
-    for rate in (0.25, 0, None):
-        env = make(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, discount_rate=rate)
+@pytest.mark.parametrize("rate", [0.25, 0, None])
+def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discount(make, rate):
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    clock = Clock((np.int64(1), ant), (2, bee), (3, ant), (7, ant), end=8)
+    env = make(clock, ant, discount_rate=rate)
+    for _ in range(2):
         infos = told(env)
-        assert [info["elapsed"] for info in infos] == [0.0, 2.0, 4.0, 1.0]
+        assert [(info["time"], info["elapsed"]) for info in infos] == [(1.0, 0.0), (3.0, 2.0), (7.0, 4.0), (8.0, 1.0)]
         expected = [None if rate is None else exp(-rate * info["elapsed"]) for info in infos]
         assert [info.get("discount") for info in infos] == expected
 
@@ -351,20 +349,6 @@ def test_forced_moves_are_discounted_with_the_decision_after_them():
     assert env.step(1)[-1]["discount"] == exp(-3.0)
 
 
-def test_policies_and_vectors_of_simulations_know_the_discount():
-    ant, seen = decision(agent="ant_0"), []
-
-    def policy(observation, info):
-        seen.append(info["discount"])
-        return 1
-
-    simulate(lambda: Clock((1, ant), (3, ant), end=8), {ant: policy}, discount_rate=0.5)
-    assert seen == [1.0, exp(-1.0)]
-    env = vector_env(lambda: Clock((1, ant), (3, ant), end=8), ant, num_envs=2, discount_rate=0.5)
-    env.reset()
-    assert env.step(np.array([1, 1]))[-1]["discount"].tolist() == [exp(-1.0)] * 2
-
-
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
 def test_rates_that_do_not_discount_are_refused(rate):
     with pytest.raises(OptionValueError, match="discount_rate must be a finite number that is not negative, or None"):
@@ -377,6 +361,63 @@ def test_a_rate_needs_a_simulation_that_has_a_time():
     for _ in range(2):
         with pytest.raises(OptionValueError, match=r"has no method time\(\); add one"):
             env.reset()
+
+
+# -- infos ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
+    """There are learners that ask for them once and for all."""
+    ant, bee, elk = decision(agent="ant_0", **MASKED), decision(agent="bee_0", **MASKED), decision(agent="elk_0")
+    env = make(Clock((0, ant), (1, bee), (2, ant), (3, ant), (4, bee), end=5), [ant, bee, elk])
+    always = {"time", "elapsed"} | ({"deciding", "acted"} if make is parallel_env else set())
+    expected = {"ant_0": always | {"action_mask"}, "bee_0": always | {"action_mask"}, "elk_0": always}
+    _, infos = env.reset() or (None, env.infos)
+    assert infos.keys() == expected.keys()
+    while env.agents:
+        assert all(info.keys() == expected[agent] for agent, info in infos.items())
+        if make is aec_env:
+            env.step(None if env.terminations[env.agent_selection] else RULE)
+        else:
+            *_, infos = env.step(RULE)
+            assert infos.keys() == expected.keys()
+    assert all(info.keys() == expected[agent] for agent, info in infos.items())
+
+
+def test_everything_is_legal_for_those_who_have_not_decided_yet():
+    ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
+    env = aec_env(Clock((0, ant), (1, bee), (2, bee), end=3), [ant, bee, elk])
+    env.reset()
+    env.infos["bee_0"]["action_mask"][:] = 0  # the user's own
+    assert env.infos["elk_0"]["action_mask"].tolist() == [1] * 10
+    env.reset()
+    assert env.infos["bee_0"]["action_mask"].tolist() == [1] * 10
+    assert env.infos["bee_0"]["action_mask"].dtype == np.int8
+    for time, elapsed in ((1.0, 0.0), (2.0, 1.0)):
+        env.step(1)
+        assert env.infos["bee_0"]["action_mask"].tolist() == ONE_MASK.tolist()
+        assert (env.infos["bee_0"]["time"], env.infos["bee_0"]["elapsed"]) == (time, elapsed)
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
+def test_a_mask_in_an_observation_without_a_decision_is_open(make):
+    """A mask of zeros would leave a policy nothing to choose from."""
+    seen = spaces.Dict(observations=spaces.Box(0, 9, (1,), np.float32), action_mask=spaces.MultiBinary(10))
+    given = {"observation_space": seen, "observation_space_mapping": lambda: {"observations": [1.0]}}
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **MASKED, **given)
+    env = make(calling(ant, bee), [ant, bee])
+    observations, _ = env.reset() or ({"bee_0": env.observe("bee_0")}, None)
+    observation = observations["bee_0"]
+    assert observation["action_mask"].tolist() == [1] * 10
+    assert observation["observations"].tolist() == [0.0]
+    assert observation in (env.observation_space["bee_0"] if make is joint_env else env.observation_space("bee_0"))
+    if make is parallel_env:
+        observations, *_, infos = env.step({"ant_0": 1})
+        seen, told = observations["bee_0"]["action_mask"], infos["bee_0"]["action_mask"]
+        assert seen.tolist() == told.tolist() == ONE_MASK.tolist()
+        assert seen.dtype == told.dtype == np.int8
+        assert not np.shares_memory(seen, told)
 
 
 # -- the state ------------------------------------------------------------------------------------
@@ -413,7 +454,7 @@ def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
     assert env.state_space is None
     env.reset()
     state = env.state()
-    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    step(env, 4, "ant_0")
     assert state.tolist() == [0, 0]
     state = env.state()
     assert state.tolist() == [1, 4]
@@ -456,7 +497,7 @@ def test_the_state_may_be_what_all_observe(make):
         env.state()
     env.reset()
     assert env.state().tolist() == [1, 2, 1, 0, 0]  # the second has not been observed yet
-    env.step({"ant_0": 4} if make is parallel_env else 4)
+    step(env, 4, "ant_0")
     state = env.state()
     assert state.tolist() == [1, 2, 0, 0, 1]
     assert state in env.state_space
@@ -473,33 +514,66 @@ def test_the_state_may_be_what_all_observe(make):
 # -- pictures -------------------------------------------------------------------------------------
 
 
-def painted(make, render_mode=None):
-    ant = decision(agent="ant_0")
-    return make(lambda: Counted(ant), ant, render_mode=render_mode)
-
-
 @EVERY_VIEW
 def test_the_simulation_renders_in_its_modes(make, capsys):
-    step = {"ant_0": 4} if make in (parallel_env, joint_env) else 4
-    env = painted(make, "ansi")
-    assert env.render_mode == "ansi"
-    assert env.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
-    env.reset()
-    assert env.render() == "now 0"
-    env.step(step)
-    assert env.render() == "now 4"
-    env = painted(make, "rgb_array")
-    env.reset()
-    assert env.render().shape == (4, 6, 3)
-    assert env.render().dtype == np.uint8
-    env = painted(make, "human")
-    for act, text in ((env.reset, "now 0\n"), (lambda: env.step(step), "now 4\n"), (env.render, "now 4\n")):
+    ant = decision(agent="ant_0")
+    ansi, array, human, none = (
+        make(lambda: Counted(ant), ant, render_mode=mode) for mode in ("ansi", "rgb_array", "human", None)
+    )
+    assert ansi.render_mode == "ansi"
+    assert ansi.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
+    ansi.reset()
+    assert ansi.render() == "now 0"
+    step(ansi, 4, "ant_0")
+    assert ansi.render() == "now 4"
+    array.reset()
+    assert array.render().shape == (4, 6, 3)
+    assert array.render().dtype == np.uint8
+    for act, text in (
+        (human.reset, "now 0\n"),
+        (lambda: step(human, 4, "ant_0"), "now 4\n"),
+        (human.render, "now 4\n"),
+    ):
         act()
         assert capsys.readouterr().out == text
-    assert env.render() is None
-    with pytest.warns(UserWarning, match="is not one of the simulation's"):
-        env = painted(make, "video")
-    assert env.render_mode is None
-    env.reset()
+    assert human.render() is None
+    none.reset()
     with pytest.warns(UserWarning, match="render_mode"):
-        assert env.render() is None
+        assert none.render() is None
+
+
+@pytest.mark.parametrize(
+    "make", [aec_env, parallel_env, single_env, lambda *of, **to: vector_env(*of, num_envs=1, **to)]
+)
+@pytest.mark.parametrize("mode", ["human", "rgb_array", "rgb_array_list"])
+def test_a_mode_that_the_simulation_lacks_is_a_warning(make, mode):
+    ant = decision(agent="ant_0")
+    with pytest.warns(UserWarning, match=f"render_mode '{mode}' is not one of the simulation's .it has none."):
+        env = make(calling(ant), ant, render_mode=mode)
+    assert env.render_mode is None
+
+
+def first_numbers(frames):
+    return [int(frame[0, 0, 0]) for frame in frames]
+
+
+@pytest.mark.parametrize("registered_as", ["a simulation", "a function"])
+def test_lists_of_pictures_have_those_since_the_last_reset_or_render(registered_as):
+    ant = decision(agent="ant_0")
+    with registries_put_back():
+        if registered_as == "a simulation":
+            identity = register_simulation(lambda: Counted(ant), ant, name="drawn")[0]
+        else:
+            identity = "ByFunction-v0"
+            gymnasium.register(identity, lambda **options: single_env(lambda: Counted(ant), ant, **options))
+        env = gymnasium.make(identity, render_mode="rgb_array_list")
+        envs = gymnasium.make_vec(identity, num_envs=2, render_mode="rgb_array_list")
+    for _ in range(2):
+        env.reset()
+        env.step(4)
+        assert first_numbers(env.render()) == [0, 4]
+    env.step(3)
+    assert first_numbers(env.render()) == [7]
+    envs.reset()
+    envs.step(np.array([4, 5]))
+    assert [first_numbers(frames) for frames in envs.render()] == [[0, 4], [0, 5]]

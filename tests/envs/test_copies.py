@@ -4,9 +4,7 @@ import copy
 import pickle
 import subprocess
 import sys
-import textwrap
 from functools import partial
-from pathlib import Path
 
 import cloudpickle
 import pytest
@@ -17,10 +15,14 @@ from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, si
 from simenv_marl.envs import SimulationAECEnv
 from simenv_marl.errors import ClosedError, NotResetError
 from simenv_marl.experiments import Variant
+from tests.processes import ROOT
 from tests.worlds.copied import Walk, WalkEnv, blow, define
 
-ROOT = Path(__file__).parents[2]
-VIEWS = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
+VIEWS = {make.__name__: partial(make, Walk, Walk.choose) for make in (aec_env, parallel_env, single_env, joint_env)}
+MAKERS = VIEWS | {
+    "generated": partial(WalkEnv, max_steps=2),
+    "of no name": lambda: generate_env(Walk, Walk.choose, view="aec")(max_steps=2),
+}
 COPIES = pytest.mark.parametrize(
     "copied",
     [
@@ -52,14 +54,14 @@ def episode(env, **reset):
     return repr(told), list(env.unwrapped.simulation.steps)
 
 
-@VIEWS
+@pytest.mark.parametrize("name", MAKERS)
 @COPIES
-def test_a_copy_goes_on_as_the_original_would(make, copied):
+def test_a_copy_goes_on_as_the_original_would(name, copied):
     """Before the first episode, after it, and when it was closed; its generators come along."""
-    env = make(Walk, Walk.choose)
+    env = MAKERS[name]()
     for number in range(3):
         twin = copied(env)
-        assert type(twin) is type(env)
+        assert isinstance(twin, SimulationAECEnv if name == "of no name" else type(env))
         assert twin.simulation is not env.simulation
         seed = {} if number else {"seed": 5}
         assert episode(twin, **seed) == episode(env, **seed)
@@ -69,10 +71,19 @@ def test_a_copy_goes_on_as_the_original_would(make, copied):
     assert twin.provenance()["points"] == env.provenance()["points"]
 
 
-@VIEWS
+@COPIES
+@pytest.mark.parametrize("make", [lambda env: TimeLimit(env, 3), OrderEnforcingWrapper])
+def test_wrappers_are_copied(copied, make):
+    env = make((aec_env if make is OrderEnforcingWrapper else single_env)(Walk, Walk.choose))
+    twin = copied(env)
+    assert type(twin) is type(env)
+    assert episode(twin, seed=2) == episode(env, seed=2)
+
+
+@pytest.mark.parametrize("make", VIEWS.values(), ids=VIEWS)
 @COPIES
 def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
-    env = make(Walk, Walk.choose)
+    env = make()
     env.reset(seed=1)
     env.np_random.random(3)
     twin = copied(env)
@@ -86,32 +97,13 @@ def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
         with pytest.raises(NotResetError, match=r"copy.*reset\(\).*clone\(\)"):
             twin.step(RULE)
     env.step(RULE)  # where it stood
-    assert twin.simulation is not env.simulation
     twin.reset(seed=5)
     twin.step(RULE)
     env.close()
     twin.close()
     with pytest.raises(ClosedError):
         twin.step(RULE)
-    assert episode(copied(env), seed=3) == episode(make(Walk, Walk.choose), seed=3)
-
-
-@COPIES
-@pytest.mark.parametrize(
-    ("make", "kind"),
-    [
-        (partial(WalkEnv, max_steps=2), WalkEnv),
-        (lambda: generate_env(Walk, Walk.choose, view="aec")(max_steps=2), SimulationAECEnv),
-        (lambda: TimeLimit(single_env(Walk, Walk.choose), 3), TimeLimit),
-        (lambda: OrderEnforcingWrapper(aec_env(Walk, Walk.choose)), OrderEnforcingWrapper),
-    ],
-    ids=["generated", "of no name", "Gymnasium's wrapper", "PettingZoo's wrapper"],
-)
-def test_generated_classes_and_wrappers_are_copied(copied, make, kind):
-    env = make()
-    twin = copied(env)
-    assert isinstance(twin, kind)
-    assert episode(twin, seed=2) == episode(env, seed=2)
+    assert episode(copied(env), seed=3) == episode(make(), seed=3)
 
 
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
@@ -128,10 +120,28 @@ def test_a_copy_has_all_options(copied, driver):
     env.close()
 
 
+MODEL = """
+import pickle, sys, cloudpickle
+from simenv_marl import aec_env, difference, single_env
+from tests.worlds.models import define
+
+class Model:
+    def reset(self, seed=None):
+        self.total = 0
+    def run(self):
+        for _ in range(3):
+            self.total += self.one() + self.two()
+    @define(agent="one_0", reward_mapping=difference(lambda model: model.total))
+    def one(self):
+        return 1
+    def two(self):
+        return 10
+"""
+
+
 def run(code, given=None):
     """What a process of its own prints that runs some code."""
-    program = [sys.executable, "-c", textwrap.dedent(code)]
-    ran = subprocess.run(program, input=given, capture_output=True, timeout=120, check=False, cwd=ROOT)
+    ran = subprocess.run([sys.executable, "-c", code], input=given, capture_output=True, timeout=120, cwd=ROOT)
     assert ran.returncode == 0, ran.stderr.decode()
     return ran.stdout
 
@@ -139,84 +149,45 @@ def run(code, given=None):
 def test_cloudpickle_takes_a_model_of_the_main_module_to_another_process():
     """A model in ``__main__``, decorated and not, with differences, lambdas and policies, as in a notebook."""
     code = """
-    import sys, cloudpickle
-    from simenv_marl import aec_env, difference
-    from tests.worlds.models import define
-
-    class Model:
-        def reset(self, seed=None):
-            self.total = 0
-        def run(self):
-            for _ in range(3):
-                self.total += self.one() + self.two()
-        @define(agent="one_0", reward_mapping=difference(lambda model: model.total))
-        def one(self):
-            return 1
-        def two(self):
-            return 10
-
-    points = {Model.one: None, Model.two: define(agent="two_0", action_space_mapping=lambda action: action)}
-    env = aec_env(Model, points, policies={"two_0": lambda observation: 5})
-    env.reset()
-    env.close()
-    sys.stdout.buffer.write(cloudpickle.dumps(env))
-    """
-    pickled = run(code)
+points = {Model.one: None, Model.two: define(agent="two_0", action_space_mapping=lambda action: action)}
+env = aec_env(Model, points, policies={"two_0": lambda observation: 5})
+env.reset()
+env.close()
+sys.stdout.buffer.write(cloudpickle.dumps(env))
+"""
+    pickled = run(MODEL + code)
     code = """
-    import sys, pickle
-    env = pickle.loads(sys.stdin.buffer.read())
-    env.reset(seed=1)
-    rewards = []
-    for agent in env.agent_iter():
-        observation, reward, ended, *_ = env.last()
-        rewards.append(reward)
-        env.step(None if ended else 2)
-    print(agent, rewards, env.simulation.total, env.simulation.two())
-    """
-    assert run(code, pickled).decode().strip() == "one_0 [0.0, 7.0, 7.0, 7.0] 21 10"
+import sys, pickle
+from tests.worlds.models import play
+env = pickle.loads(sys.stdin.buffer.read())
+print([turn.reward for turn in play(env, 2, seed=1)], env.simulation.total, env.simulation.two())
+"""
+    assert run(code, pickled).decode().strip() == "[0.0, 7.0, 7.0, 7.0] 21 10"
 
 
 def test_copies_of_a_model_of_the_main_module_leave_its_class_as_it_stands():
     """As in a script that gives its environments to processes which it has forked, or keeps them in a file."""
     code = """
-    import cloudpickle, pickle
-    from simenv_marl import aec_env, single_env
-    from tests.worlds.copied import define
-
-    class Walk:
-        def reset(self, seed=None):
-            self.place = 0
-        def run(self):
-            for _ in range(3):
-                self.place += self.choose() + self.drift()
-        @define(agent="walker_0")
-        def choose(self):
-            return 1
-        def drift(self):
-            return 0
-
-    drift = Walk.drift
-    for made in (
-        single_env(Walk, Walk.choose),
-        single_env(Walk, "__main__.Walk.choose"),
-        single_env(Walk(), {"__main__.Walk.drift": define(agent="wind_0")}),
-        aec_env(Walk, [Walk.choose]),
-    ):
-        parcels = [module.dumps(made) for module in (pickle, cloudpickle)]
-        made.reset()
-        parcels += [module.dumps(made) for module in (pickle, cloudpickle)]
-        Walk.rate = len(parcels)
-        for parcel in parcels:
-            twin = pickle.loads(parcel)
-            made.step(2)  # goes on as if nothing were
-            twin.reset(seed=1)
-            for _ in range(3):
-                twin.step(2)
-            print(type(twin.unwrapped.simulation) is Walk, twin.unwrapped.simulation.place)
-            twin.close()
-            made.reset()
-        made.close()
-    print(Walk.rate, Walk.drift is drift)
-    """
-    told = ["True 3"] * 8 + ["True 6"] * 4 + ["True 3"] * 4
-    assert run(code).decode().splitlines() == [*told, "4 True"]
+two = Model.two
+for env in (
+    single_env(Model, "__main__.Model.one"),
+    single_env(Model(), {"__main__.Model.two": define(agent="two_0")}),
+    aec_env(Model, [Model.one]),
+):
+    parcels = [module.dumps(env) for module in (pickle, cloudpickle)]
+    env.reset()
+    parcels += [module.dumps(env) for module in (pickle, cloudpickle)]
+    Model.rate = len(parcels)
+    for parcel in parcels:
+        twin = pickle.loads(parcel)
+        env.step(2)  # goes on as if nothing were
+        twin.reset(seed=1)
+        for _ in range(3):
+            twin.step(2)
+        print(type(twin.unwrapped.simulation) is Model, twin.unwrapped.simulation.total)
+        env.reset()
+    env.close()
+print(Model.rate, Model.two is two)
+"""
+    told = ["True 36"] * 4 + ["True 9"] * 4 + ["True 36"] * 4
+    assert run(MODEL + code).decode().splitlines() == [*told, "4 True"]

@@ -17,20 +17,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from gymnasium.vector import AsyncVectorEnv
 
 from simenv_marl import single_env, vector_env
 from simenv_marl.errors import EpisodeOverError, OptionValueError, RewardError, WorkerError
 from tests.conftest import DRIVERS
 from tests.envs.test_vector import begun
-from tests.processes import alone, descriptors, gone
-from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
+from tests.processes import ROOT, alone, descriptors, gone
+from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition
 from tests.worlds.models import notes
-from tests.worlds.worlds import designs, seeds
-
-ROOT = Path(__file__).parents[2]
 
 pytestmark = FORKS
 
@@ -48,53 +43,22 @@ def _nothing_is_left():
     assert set(multiprocessing.active_children()) <= before
 
 
-class Odd(Exception):
-    def __init__(self, *, count: int) -> None:
-        super().__init__("it is odd")
-        self.count = count
-
-
 class Failing(Counter):
+    """Counts for ever, and calls what the options of its reset have for its seed, after decisions and unwinding."""
+
     def __init__(self) -> None:
         self.process = os.getpid()
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        super().reset(seed, options)
-        self.goal = 100
-        self.how = (options or {}).get(seed)
 
     def run(self) -> Any:
         try:
             while True:
                 self.count += self.decide()
-                self.fail()
+                self.call("decided")
         finally:
-            self.unwind()
+            self.call("unwinding")
 
-    def fail(self) -> None:
-        if self.how == "odd":
-            raise Odd(count=self.count)
-        if self.how == "kill":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if self.how in (1, 7):
-            os._exit(self.how)
-        if self.how == "system exit":
-            raise SystemExit(3)
-        if self.how == "reward":
-            self.count = 7  # for which nothing is paid that were a number
-        if self.how == "interrupt":
-            time.sleep(0.1)
-            os.kill(self.options["process"], signal.SIGALRM)
-            time.sleep(0.3)
-
-    def unwind(self) -> None:
-        if self.how == "stubborn":
-            raise LookupError("it would not go") from None
-        if self.how == "hanging":
-            time.sleep(60)
-        if isinstance(self.how, Path):
-            time.sleep(0.3)
-            self.how.touch()
+    def call(self, when: str) -> None:
+        (self.options or {}).get(when, {}).get(self.seed, int)()
 
 
 ONES = np.ones(4, np.int64)
@@ -105,22 +69,6 @@ def goes_on(envs: Any, seed: int = 0) -> None:
     envs.reset(seed=seed)
     assert [simulation.seed for simulation in envs.get_attr("simulation")] == [seed + place for place in range(4)]
     assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
-
-
-@pytest.mark.parametrize(
-    ("kind", "mode", "context"),
-    [
-        *[("masked", AutoresetMode.NEXT_STEP, context) for context in multiprocessing.get_all_start_methods()],
-        *[(kind, mode, FORK) for kind in VARIETY for mode in MODES],
-    ],
-)
-def test_workers_return_the_same_as_one_process(kind, mode, context):
-    model, decision = VARIETY[kind]
-    with_workers = workers(model, decision, num_envs=5, autoreset_mode=mode, context=context)
-    without = vector_env(model, {POINT: decision}, num_envs=5, autoreset_mode=mode)
-    assert with_workers.metadata == without.metadata
-    agree(with_workers, without, 25, np.random.default_rng(1))
-    assert same(with_workers.np_random_seed, without.np_random_seed)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -135,15 +83,6 @@ def test_gymnasiums_processes_of_single_views_tell_the_same(kind, context, mode)
     theirs.close()
 
 
-@given(designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.integers(1, 5))
-@settings(max_examples=15)
-def test_workers_tell_the_same_of_random_worlds(design, seed, mode, number, processes):
-    alone = made(design, number, mode)
-    if alone is not None:
-        with_workers = made(design, number, mode, workers=processes, context=FORK)
-        agree(with_workers, alone, 12, np.random.default_rng(seed))
-
-
 def processes_of(envs: Any) -> list[int]:
     return [simulation.process for simulation in envs.get_attr("simulation")]
 
@@ -155,11 +94,12 @@ def test_simulations_are_spread_evenly_and_there_are_no_more_workers_than_simula
         assert os.getpid() not in there
 
 
-def test_models_and_mappings_that_no_module_holds_are_sent_along():
+@pytest.mark.parametrize("context", multiprocessing.get_all_start_methods())
+def test_models_and_mappings_that_no_module_holds_are_sent_along(context):
     class Local(Counter):
         decide = definition(reward_mapping=lambda self: float(self.seed + self.count))(lambda self: 0)
 
-    envs = vector_env(Local, Local.decide, num_envs=3, workers=2, context="spawn")
+    envs = vector_env(Local, Local.decide, num_envs=3, workers=2, context=context)
     assert envs.reset(seed=4)[0][:, 0].tolist() == [0, 0, 0]
     observations, rewards, *_ = envs.step([1, 2, 3])
     assert observations[:, 0].tolist() == [1, 2, 3]
@@ -172,45 +112,28 @@ def test_objects_that_cannot_be_pickled_are_refused():
         vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
 
 
-def test_errors_come_back_as_themselves_and_the_next_reset_works():
-    envs = workers(Failing, definition(reward_mapping=lambda self: float("nan") if self.count == 7 else 0.0))
-    for how, kind, message in (
-        ("odd", Odd, "it is odd"),
-        ("system exit", SystemExit, "3"),
-        ("reward", RewardError, "not finite"),
-    ):
-        envs.reset(seed=0, options={2: how})
-        with pytest.raises(kind, match=message) as caught:
-            envs.step(ONES)
-        assert "sub-environment 2" in notes(caught.value)
-        assert "seed 2" in notes(caught.value)
-        assert how == "reward" or "in run" in str(caught.value.__cause__)
-        if how == "odd":
-            assert caught.value.count == 1
-        with pytest.raises(EpisodeOverError, match="begin the next ones"):
-            envs.step(ONES)
-        with pytest.raises(EpisodeOverError, match="without a reset_mask"):
-            envs.reset(options={"reset_mask": np.array([0, 0, 1, 0], bool)})
-        goes_on(envs)
-
-
-class Breaking:
-    """A factory that works in one process alone, and in others raises or ends them."""
-
-    def __init__(self, process: int, *, ends: bool = False) -> None:
-        self.process, self.ends = process, ends
-
-    def __call__(self) -> Any:
-        if os.getpid() == self.process:
-            return Counter()
-        return os._exit(3) if self.ends else 1 / 0
+def test_an_error_says_of_which_simulation_and_the_next_reset_works():
+    envs = workers(
+        Failing, definition(reward_mapping=lambda self: float("nan") if self.options == {"poor": self.seed} else 0.0)
+    )
+    envs.reset(seed=0, options={"poor": 2})
+    with pytest.raises(RewardError, match="not finite") as caught:
+        envs.step(ONES)
+    assert "sub-environment 2" in notes(caught.value)
+    assert "seed 2" in notes(caught.value)
+    with pytest.raises(EpisodeOverError, match="begin the next ones"):
+        envs.step(ONES)
+    with pytest.raises(EpisodeOverError, match="without a reset_mask"):
+        envs.reset(options={"reset_mask": np.array([0, 0, 1, 0], bool)})
+    goes_on(envs)
 
 
 @KILLED
-@pytest.mark.parametrize(("how", "code"), [("kill", -9), (7, 7), (1, 1)])
-def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, code):
+@pytest.mark.parametrize("code", [-9, 7, 1])
+def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(code):
     envs = workers(Failing)
-    envs.reset(seed=0, options={3: how})
+    end = (lambda: os.kill(os.getpid(), 9)) if code == -9 else (lambda: os._exit(code))
+    envs.reset(seed=0, options={"decided": {3: end}})
     with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* died with exit code {code}") as caught:
         envs.step(ONES)
     assert ("__main__" in str(caught.value)) == (code == 1)  # with which an error in a script ends it
@@ -242,15 +165,19 @@ def test_workers_that_are_killed_between_steps_are_noticed(use):
 
 def test_errors_while_closing_surface_and_the_workers_end():
     envs = workers(Failing, context=multiprocessing.get_context(FORK))
-    envs.reset(seed=0, options=dict.fromkeys(range(4), "stubborn"))
-    with pytest.raises(LookupError, match="it would not go"):
+    envs.reset(seed=0, options={"unwinding": dict.fromkeys(range(4), lambda: {}["it would not go"])})
+    with pytest.raises(KeyError, match="it would not go"):
         envs.close()
     assert envs.closed
 
 
 def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
+    def finish(path: Path) -> None:
+        time.sleep(0.3)
+        path.touch()
+
     envs = workers(Failing)
-    envs.reset(seed=0, options={seed: tmp_path / str(seed) for seed in range(4)})
+    envs.reset(seed=0, options={"unwinding": {seed: partial(finish, tmp_path / str(seed)) for seed in range(4)}})
     there = set(processes_of(envs))
     del envs
     gc.collect()
@@ -261,7 +188,7 @@ def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
 def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
     monkeypatch.setattr("simenv_marl.many.parallel.SECONDS_TO_CLOSE", 0.5)
     envs = workers(Failing)
-    envs.reset(seed=0, options={0: "hanging"})
+    envs.reset(seed=0, options={"unwinding": {0: partial(time.sleep, 60)}})
     with pytest.warns(ResourceWarning, match="did not close"):
         envs.close()
     assert envs.closed
@@ -269,12 +196,18 @@ def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monk
 
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="there is no SIGALRM")
 def test_an_interrupted_step_leaves_the_environment_in_step():
-    envs = workers(Failing)
-    envs.reset(seed=0, options={"process": os.getpid(), 0: "interrupt"})
+    home = os.getpid()
 
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
+    def alarm() -> None:
+        time.sleep(0.1)
+        os.kill(home, signal.SIGALRM)
+        time.sleep(0.3)
+
+    envs = workers(Failing)
+    envs.reset(seed=0, options={"decided": {0: alarm}})
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
         with pytest.raises(KeyboardInterrupt):
@@ -288,28 +221,20 @@ def test_an_interrupted_step_leaves_the_environment_in_step():
 
 SCRIPT = """
 import os
-import numpy as np
-from gymnasium import spaces
-from simenv_marl import make_step, vector_env
+from simenv_marl import vector_env
+from tests.worlds.counters import Counter
 
-class Model:
-    def reset(self): self.count = 0
+class Model(Counter):
     def run(self):
         try:
-            while True: self.count += self.decide()
+            super().run()
         finally:
             print("unwound", flush=True)
 
-    @make_step(
-        observation_space=spaces.Box(0, 9, (1,), np.int64), observation_space_mapping=lambda self: [self.count],
-        action_space=spaces.Discrete(2), action_space_mapping=int, reward_mapping=lambda self: 1.0,
-    )
-    def decide(self): return 0
-
 if __name__ == "__main__":
-    envs = vector_env(Model, Model.decide, num_envs=2, workers=2, context={context!r})
+    envs = vector_env(Model, Counter.decide, num_envs=2, workers=2, context={context!r})
     envs.reset(seed=0)
-    print(envs.step([1, 0])[0].tolist(), flush=True)
+    print(envs.step([1, 2])[0][:, 0].tolist(), flush=True)
     {end}
 """
 
@@ -327,7 +252,7 @@ def run_script(path: Path, text: str, *options: str) -> Any:
 def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
     strict = ["-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev"]
     done = run_script(tmp_path / "script.py", SCRIPT.format(context=context, end=end), *strict)
-    assert done.stdout.splitlines()[0] == "[[1], [0]]"
+    assert done.stdout.splitlines()[0] == "[1.0, 2.0]"
     assert done.stdout.count("unwound") == 2
     if not end:
         assert done.stderr == ""
@@ -360,20 +285,24 @@ def test_a_worker_that_cannot_be_started_leaves_no_descriptors(error):
 
 
 def start_in_vain(error: str) -> None:
-    context = multiprocessing.get_context(FORK)
+    context, home = multiprocessing.get_context(FORK), os.getpid()
+    start, started = context.Process.start, []
+
+    def start_once(process):
+        if started:
+            raise OSError("no more")
+        started.append(process)
+        start(process)
+
+    def model():
+        if os.getpid() == home:
+            return Counter()
+        return os._exit(3) if error == "WorkerError" else 1 / 0
+
     workers().close()  # multiprocessing keeps its shared memory for the next time
     gc.collect()
     before = descriptors()
-    model = Breaking(os.getpid(), ends=error == "WorkerError")
     if error == "OSError":
-        start, started = context.Process.start, []
-
-        def start_once(process):
-            if started:
-                raise OSError("no more")
-            started.append(process)
-            start(process)
-
         context.Process.start = start_once
     with pytest.raises(Exception) as raised:
         workers(model, context=context)

@@ -73,14 +73,13 @@ WRAPPERS = {
 }
 
 
-@pytest.fixture
-def wrap(tmp_path, monkeypatch):
-    """Puts an environment into a wrapper, and tells what that tells."""
+@pytest.mark.parametrize(("name", "case"), WRAPPERS.items(), ids=WRAPPERS)
+def test_wrappers_tell_what_they_tell_around_an_environment_written_by_hand(name, case, tmp_path, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    packages = {package: pytest.importorskip(package) for package in case.needs}
 
-    def story(name: str, case: Case, make: Any) -> list[Any]:
+    def told_by(make: Any) -> list[Any]:
         env = wrappers.TimeLimit(make(case.seen, render_mode=case.render_mode), 9)
-        packages = {package: pytest.importorskip(package) for package in case.needs}
         special = packages | {"numpy": np, "a folder": str(tmp_path / type(env.unwrapped).__name__)}
         arguments = {
             key: special.get(value, value) if isinstance(value, str) else value for key, value in case.arguments.items()
@@ -101,9 +100,4 @@ def wrap(tmp_path, monkeypatch):
         wrapped.close()
         return told
 
-    return story
-
-
-@pytest.mark.parametrize(("name", "case"), WRAPPERS.items(), ids=WRAPPERS)
-def test_wrappers_tell_what_they_tell_around_an_environment_written_by_hand(name, case, wrap):
-    assert alike(wrap(name, case, dial_env), wrap(name, case, DialEnv))
+    assert alike(told_by(dial_env), told_by(DialEnv))

@@ -29,7 +29,7 @@ from simenv_marl.plugins import ChangedResult
 from simenv_marl.testing import CheckReport, Finding, check_simulation, inspect_simulation
 from simenv_marl.testing.fingerprint import MOST_PARTS, differences, fingerprint
 from simenv_marl.testing.report import order_of
-from tests.contract.test_mesa import Meadow, Prison, herd, prisoners
+from tests.contract.test_mesa import Meadow, herd
 from tests.worlds import many_worlds, worlds
 from tests.worlds.models import define, script
 
@@ -123,9 +123,8 @@ COLONY = many_worlds.Design(initial=4, most=10, ticks=6, overseen="before")
         (GreenhouseSim, None),
         (lambda: many_worlds.Announcing(COLONY), many_worlds.colony_points(overseen=True)),
         (Meadow, herd()),
-        (Prison, prisoners()),
     ],
-    ids=["greenhouse", "colony", "meadow", "prison"],
+    ids=["greenhouse", "colony", "meadow"],
 )
 def test_models_whose_agents_come_and_go_are_clean(simulation, points):
     report = clean(check_simulation(simulation, points, episodes=2, max_steps=300, seeds=[5]))

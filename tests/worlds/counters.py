@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from simenv_marl import RULE, TRUNCATED, joint_env, make_step, single_env, vector_env
-from tests.worlds.worlds import FuseError, World, advised, agent_of, points_of
+from tests.worlds.worlds import World, advised, agent_of, points_of
 
 MODES = list(AutoresetMode)
 
@@ -52,7 +52,7 @@ class Counter:
             while self.count < self.goal:
                 self.count += self.decide()
                 if self.failing:
-                    raise FuseError
+                    raise ZeroDivisionError
         finally:
             self.unwound = True
         return TRUNCATED if self.goal % 2 else None
@@ -213,18 +213,11 @@ def made(design: Any, number: int, mode: AutoresetMode, *, sync: bool = False, *
     single = len(design.active) == 1 and not entities
     if not single and any(design.kinds[point] == "choices" for point in design.active):
         return None  # what is legal for one may be illegal by its turn
-    source = Source(design, points)
+
+    def source() -> World:
+        return World(design, points)
+
     if not sync:
         return vector_env(source, points, num_envs=number, autoreset_mode=mode, **options)
     make = single_env if single else joint_env
     return SyncVectorEnv([lambda: make(source, points, **options)] * number, autoreset_mode=mode)
-
-
-class Source:
-    """Makes worlds of a design."""
-
-    def __init__(self, design: Any, points: Any) -> None:
-        self.design, self.points = design, points
-
-    def __call__(self) -> World:
-        return World(self.design, self.points)

@@ -113,22 +113,8 @@ class Entity:
         self.world, self.number = world, number
 
 
-class FuseError(Exception):
-    """What a world raises when its fuse has burnt down."""
-
-
 class World:
     """A simulation of a design."""
-
-    fuse: int | None = None
-    """At how many more calls of its rules and mappings it fails; None: never."""
-
-    def burn(self) -> None:
-        """Count a call of a rule or of a mapping."""
-        if self.fuse is not None:
-            self.fuse -= 1
-            if self.fuse == 0:
-                raise FuseError
 
     def __init__(self, design: Design, points: list[Callable[..., Any]]) -> None:
         self.design, self.points = design, points
@@ -139,14 +125,11 @@ class World:
         self.entities = [Entity(self, number) for number in range(3)]
 
     def run(self) -> Any:
-        try:
-            for point, entity in self.design.program:
-                value = self.call(point, entity)
-                self.calls += 1
-                self.level = (self.level * 3 + value + self.random.randrange(4)) % 101
-                self.trace.append((point, value, self.level))
-        finally:
-            self.trace.append("over")
+        for point, entity in self.design.program:
+            value = self.call(point, entity)
+            self.calls += 1
+            self.level = (self.level * 3 + value + self.random.randrange(4)) % 101
+            self.trace.append((point, value, self.level))
         return TRUNCATED if self.design.truncates else None
 
     def call(self, point: int, entity: int) -> int:
@@ -160,7 +143,6 @@ class World:
         return function(self)
 
     def rule(self, point: int) -> int:
-        self.burn()
         value = self.random.randrange(7)
         if self.design.kinds[point] == "nested" and point > 0:
             value += self.call(point - 1, value % 3)
@@ -180,9 +162,7 @@ def points_of(design: Design) -> list[Callable[..., Any]]:
 
 def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
     def world_of(thing: Any) -> World:
-        world = thing.world if isinstance(thing, Entity) else thing
-        world.burn()
-        return world
+        return thing.world if isinstance(thing, Entity) else thing
 
     changes: dict[str, Any] = {
         "agent": f"point_{point}",

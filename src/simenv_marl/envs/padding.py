@@ -86,14 +86,18 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
 class PaddedAECEnv(BaseWrapper[str, Any, Any]):
     """An AEC environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``.
 
-    Agents that are not present are not selected before the end of the episode. A step takes time for each possible
-    agent.
+    Absent agents are not selected before the end of the episode. A step takes time for each possible agent.
     """
+
+    @property
+    def agents(self) -> list[str]:
+        """All possible agents, but for those that have been stepped over at the end of the episode."""
+        return self._left if self.unwrapped.agents else []
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Reset the environment."""
         super().reset(seed=seed, options=options)
-        self.agents = list(self.possible_agents)
+        self._left = list(self.possible_agents)
         self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
         self._update()
 
@@ -103,11 +107,7 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
         if self.agents and (self.terminations[selected] or self.truncations[selected]):
             self._was_dead_step(action)
             return
-        try:
-            super().step(action)
-        finally:
-            if not self.unwrapped.agents:  # an error has ended the episode
-                self.agents = []
+        super().step(action)
         self._cumulative_rewards[selected] = 0.0
         self._update()
 

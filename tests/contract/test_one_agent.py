@@ -1,5 +1,7 @@
 """The single view of one named agent among many, and what it asks that agent."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -77,30 +79,15 @@ class Forced(Game):
     offers = (1, 1)
 
 
-def watch(player, moves):
-    return [player.coins]
-
-
-def offered(player, moves):
-    return moves
-
-
-def pay(player, moves):
-    return player.coins
-
-
-def name(player, moves):
-    return player.name
-
-
 def definition(**changes):
+    """A definition for moves or bets, whose choices are what is offered."""
     given = {
         "observation_space": spaces.Box(0, 100, (1,), np.float64),
-        "observation_space_mapping": watch,
+        "observation_space_mapping": lambda player, moves: [player.coins],
         "action_space": spaces.Discrete(3),
-        "choices": offered,
-        "reward_mapping": pay,
-        "agent": name,
+        "choices": lambda player, moves: moves,
+        "reward_mapping": lambda player, moves: player.coins,
+        "agent": lambda player, moves: player.name,
     }
     return make_step(**given | changes)
 
@@ -345,12 +332,10 @@ CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 
 
 
 def flown(make, space, action, *, clip_actions=True):
-    """What reaches the mapping of an agent called ``pilot``."""
+    """What reaches the mapping of an agent called ``pilot``, of the last one where there are several."""
     taken = []
-    made = definition(
-        action_space=space, choices=None, action_space_mapping=lambda given: taken.append(given) or 0, agent="pilot"
-    )
-    env = make(Game, {f"{PLACE}.move": made}, clip_actions=clip_actions)
+    fly = decision(agent="pilot", action_space=space, action_space_mapping=taken.append)
+    env = make(calling(fly), fly, clip_actions=clip_actions)
     env.reset(seed=0)
     try:
         env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
@@ -359,12 +344,7 @@ def flown(make, space, action, *, clip_actions=True):
         raise
     finally:
         env.close()
-    return taken[0] if make is not two else taken[1]
-
-
-def two(*given, **options):
-    """A vector of two environments."""
-    return vector_env(*given, num_envs=2, **options)
+    return taken[-1]
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
@@ -397,12 +377,13 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(make, space, ac
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
 )
-def test_invalid_actions_are_refused_before_a_forced_move_too(space, wrong) -> None:
+def test_actions_that_cannot_be_clipped_are_refused(space, wrong) -> None:
     with pytest.raises(InvalidActionError):
         flown(single_env, space, wrong)
 
 
 def test_the_vector_view_clips_as_the_single_view_does() -> None:
+    two = partial(vector_env, num_envs=2)
     action = np.array([-7.5, 1e30], np.float32)
     assert same(flown(two, BOX, np.stack([np.zeros(2, np.float32), action])), flown(single_env, BOX, action))
     with pytest.raises(InvalidActionError):

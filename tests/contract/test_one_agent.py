@@ -9,7 +9,6 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
-    SimulationInterface,
     aec_env,
     generate_env,
     joint_env,
@@ -32,6 +31,8 @@ from simenv_marl.errors import (
     ViewError,
 )
 from tests.worlds.counters import same
+from tests.worlds.lives import life
+from tests.worlds.many_worlds import beings
 from tests.worlds.models import calling, decision, play
 
 NAMES = ("player_red", "player_blue")
@@ -169,13 +170,10 @@ def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> N
 
 
 def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did() -> None:
-    class Nothing(Game):
-        offers = ()
-
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
     with pytest.raises(NoDecisionError):
-        single_env(Nothing, MOVE, agent="player_red", skip_forced=True).reset()
+        single_env(life("0 whole 1"), beings(), agent="being_0", skip_forced=True).reset()
 
 
 ANT, BEE = decision(agent="ant_0"), decision(agent="bee_0")
@@ -393,54 +391,41 @@ def test_the_vector_view_clips_as_the_single_view_does() -> None:
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-class Seats(Game, SimulationInterface):
-    """Red has no choice and is out before blue is asked; blue plays on."""
-
-    def run(self):
-        red, blue = self.players
-        for _ in range(2):
-            red.coins += red.move([1])
-        self.end_agent("player_red")
-        for _ in range(3):
-            blue.coins += blue.move([1, 2])
-
-
-class Endless(Game, SimulationInterface):
-    """Red is out after its first move, and the others go on for ever."""
-
-    def run(self):
-        self.players[0].coins += self.players[0].move([1, 2])
-        self.end_agent("player_red")
-        while True:
-            self.players[1].move([1, 2])
-
-
 def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round() -> None:
-    env = parallel_env(Seats, MOVE, **ROSTER)
+    """The first being has no choice and is out before the second one is asked."""
+    program = (
+        "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2, 1 acts, 1 health 3"
+    )
+    points = beings(choices=lambda being: [1] if being.number == 0 else [1, 2])
+    one = {"agent": "being_0", "skip_forced": True}
+    both = {"possible_agents": ["being_0", "being_1"], "skip_forced": True}
+    env = parallel_env(life(program), points, **both)
     env.reset(seed=1)
-    assert sorted(env.agents) == sorted(NAMES)
-    _, rewards, terminations, _, _ = env.step(zeros())
-    assert rewards == {"player_red": 2.0, "player_blue": 1.0}
-    assert terminations == {"player_red": True, "player_blue": False}
-    assert env.agents == ["player_blue"]
-    joint = joint_env(Seats, MOVE, **ROSTER)
+    assert sorted(env.agents) == ["being_0", "being_1"]
+    _, rewards, terminations, _, _ = env.step({"being_0": 0, "being_1": 0})
+    assert rewards == {"being_0": 2.0, "being_1": 1.0}
+    assert terminations == {"being_0": True, "being_1": False}
+    assert env.agents == ["being_1"]
+    joint = joint_env(life(program), points, **both)
     joint.reset(seed=1)
-    assert joint.step(zeros())[1] == 3.0
-    single = single_env(Seats, MOVE, agent="player_red", skip_forced=True)
+    assert joint.step({"being_0": 0, "being_1": 0})[1] == 3.0
+    single = single_env(life(program), points, **one)
     single.reset(seed=1)
     assert single.step(0)[1:4] == (3.0, True, False)
-    vector = vector_env(Seats, MOVE, agent="player_red", skip_forced=True, num_envs=2)
+    vector = vector_env(life(program), points, num_envs=2, **one)
     vector.reset(seed=1)
     _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
     assert (rewards.tolist(), terminations.tolist()) == ([3.0, 3.0], [True, True])
     vector.close()
 
 
-@pytest.mark.parametrize("policies", [None, {"player_blue": lambda observation: 0}])
+@pytest.mark.parametrize("policies", [None, {"being_1": lambda observation: 0}])
 def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies) -> None:
-    env = single_env(Endless, MOVE, agent="player_red", policies=policies)
+    program = life("0 acts, 0 health 2, 0 leaves, 1 acts, 1 acts")
+    env = single_env(program, beings(), agent="being_0", policies=policies)
     for _ in range(2):
         env.reset(seed=1)
         assert env.step(1)[1:4] == (2.0, True, False)
+        assert env.simulation.log == [1]  # the others might go on for ever
         with pytest.raises(EpisodeOverError):
             env.step(0)

@@ -47,11 +47,6 @@ class Pump:
     def weakest(cls) -> int:
         return -cls.power
 
-    @define()
-    @staticmethod
-    def named(*, amount: int = 1) -> int:
-        return amount
-
 
 class BigPump(Pump):
     power = 30
@@ -163,7 +158,6 @@ def test_only_functions_can_be_decided(function):
         ("halved", lambda pump: pump.halved(1), (1,), {}),
         ("strongest", lambda pump: type(pump).strongest(), ("class",), {"factor": 1}),
         ("weakest", lambda pump: pump.weakest(), ("class",), {}),
-        ("named", lambda pump: pump.named(amount=2), (), {"amount": 2}),
     ],
 )
 def test_mappings_of_static_and_class_methods_receive_the_arguments_bound_to_the_signature(name, call, args, kwargs):

@@ -139,7 +139,7 @@ def recording(reset_of: Any) -> Any:
 
 
 def reset_seed(self, seed=None):
-    self.got.append({"seed": seed})
+    self.got.append(seed)
 
 
 SIZE = {"size": 3}
@@ -164,7 +164,7 @@ def test_reset_gets_what_it_takes(reset, given, expected):
 
 
 def seeds_of(env):
-    return [got["seed"] for got in env.unwrapped.simulation.got]
+    return env.unwrapped.simulation.got
 
 
 def test_seeds_are_integers_drawn_until_one_is_given_and_following_from_the_last_in_every_view():

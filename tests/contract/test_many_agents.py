@@ -476,8 +476,8 @@ class Forgetting(lives.Announcing):
 def test_choices_keep_no_entity_alive(make, announced):
     """What somebody may choose from is not held until it does."""
 
-    def living(being):
-        return list(env.simulation.beings.values())
+    def living(being, *, _simulation):
+        return list(_simulation.beings.values())
 
     points = beings(choices=living, removed_by=())
     program = "0 acts, 1 acts, 2 forgotten, 0 acts, 3 forgotten, 1 acts, 4 forgotten"

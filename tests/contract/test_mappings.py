@@ -22,6 +22,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.data import collect_episodes
+from tests.worlds.models import play
 
 DEAL = f"{__name__}.Dealer.deal"
 LEAVE = f"{__name__}.Dealer.leave"
@@ -82,10 +83,6 @@ def name(dealer, offers=(), *, _simulation):
     return f"{_simulation.name}_{dealer.number}"
 
 
-def gone(dealer, *, _simulation):
-    return name(dealer, _simulation=_simulation)
-
-
 def points(**changes):
     given = {
         "observation_space": spaces.Box(0, 1e6, (2,), np.float64),
@@ -95,20 +92,14 @@ def points(**changes):
         "apply": take,
         "reward_mapping": pay,
         "agent": name,
-        "removed_by": {LEAVE: gone},
+        "removed_by": {LEAVE: name},
     }
     return {DEAL: make_step(**given | changes)}
 
 
-def played(env, seed=5):
-    """What an AEC environment tells when the last choice is taken, and what the model got."""
-    told = []
-    env.reset(seed=seed)
-    for agent in env.agent_iter():
-        observation, reward, terminated, truncated, info = env.last()
-        told.append((agent, observation.tolist(), reward, terminated))
-        env.step(None if terminated or truncated else int(info["action_mask"].sum()) - 1)
-    return told, env.unwrapped.simulation.log
+def last_choice(agent, env):
+    """The last action that is legal for an agent."""
+    return int(env.infos[agent]["action_mask"].sum()) - 1
 
 
 @pytest.mark.parametrize(
@@ -117,12 +108,13 @@ def played(env, seed=5):
 def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay, earned) -> None:
     other = aec_env(Market("elsewhere"), points())
     other.reset()
-    told, log = played(aec_env(Market(title), points(reward_mapping=pay)))
-    assert [agent for agent, *_ in told] == [f"{title}_0", f"{title}_1"] * 3 + [f"{title}_1", f"{title}_0"]
-    mine = [(observation, reward) for agent, observation, reward, _ in told if agent == f"{title}_0"]
+    env = aec_env(Market(title), points(reward_mapping=pay))
+    turns = play(env, last_choice, seed=5)
+    assert [turn.agent for turn in turns] == [f"{title}_0", f"{title}_1"] * 3 + [f"{title}_1", f"{title}_0"]
+    mine = [(turn.observation.tolist(), turn.reward) for turn in turns if turn.agent == f"{title}_0"]
     assert mine == list(zip([[0, 5], [1, 5], [2, 5], [2, 5]], earned, strict=True))
-    assert [ended for *_, ended in told] == [False] * 6 + [True] * 2
-    assert log == [(title, "low")] * 2 + [(title, "high")] * 4
+    assert [turn.terminated for turn in turns] == [False] * 6 + [True] * 2
+    assert env.unwrapped.simulation.log == [(title, "low")] * 2 + [(title, "high")] * 4
     other.step(0)
     assert other.unwrapped.simulation.log == [("elsewhere", "low")]
 
@@ -180,7 +172,7 @@ def test_mappings_of_a_copy_get_its_own_simulation() -> None:
     env.reset()
     env.close()
     again = pickle.loads(pickle.dumps(env))
-    assert played(again) == played(env)
+    assert str(play(again, last_choice, seed=5)) == str(play(env, last_choice, seed=5))
 
 
 @pytest.mark.parametrize("episodes", [0, 1, 2])

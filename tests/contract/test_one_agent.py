@@ -1,5 +1,7 @@
 """The single view of one named agent among many, and what it asks that agent."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -7,7 +9,6 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
-    SimulationInterface,
     aec_env,
     generate_env,
     joint_env,
@@ -30,6 +31,8 @@ from simenv_marl.errors import (
     ViewError,
 )
 from tests.worlds.counters import same
+from tests.worlds.lives import life
+from tests.worlds.many_worlds import beings
 from tests.worlds.models import calling, decision, play
 
 NAMES = ("player_red", "player_blue")
@@ -77,30 +80,15 @@ class Forced(Game):
     offers = (1, 1)
 
 
-def watch(player, moves):
-    return [player.coins]
-
-
-def offered(player, moves):
-    return moves
-
-
-def pay(player, moves):
-    return player.coins
-
-
-def name(player, moves):
-    return player.name
-
-
 def definition(**changes):
+    """A definition for moves or bets, whose choices are what is offered."""
     given = {
         "observation_space": spaces.Box(0, 100, (1,), np.float64),
-        "observation_space_mapping": watch,
+        "observation_space_mapping": lambda player, moves: [player.coins],
         "action_space": spaces.Discrete(3),
-        "choices": offered,
-        "reward_mapping": pay,
-        "agent": name,
+        "choices": lambda player, moves: moves,
+        "reward_mapping": lambda player, moves: player.coins,
+        "agent": lambda player, moves: player.name,
     }
     return make_step(**given | changes)
 
@@ -182,13 +170,10 @@ def test_a_roster_says_to_which_of_several_naming_points_an_agent_belongs() -> N
 
 
 def test_an_episode_without_a_decision_of_the_agent_is_an_error_that_lists_who_did() -> None:
-    class Nothing(Game):
-        offers = ()
-
     with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
         single_env(Game, MOVE, agent="player_green").reset()
     with pytest.raises(NoDecisionError):
-        single_env(Nothing, MOVE, agent="player_red", skip_forced=True).reset()
+        single_env(life("0 whole 1"), beings(), agent="being_0", skip_forced=True).reset()
 
 
 ANT, BEE = decision(agent="ant_0"), decision(agent="bee_0")
@@ -345,12 +330,10 @@ CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 
 
 
 def flown(make, space, action, *, clip_actions=True):
-    """What reaches the mapping of an agent called ``pilot``."""
+    """What reaches the mapping of an agent called ``pilot``, of the last one where there are several."""
     taken = []
-    made = definition(
-        action_space=space, choices=None, action_space_mapping=lambda given: taken.append(given) or 0, agent="pilot"
-    )
-    env = make(Game, {f"{PLACE}.move": made}, clip_actions=clip_actions)
+    fly = decision(agent="pilot", action_space=space, action_space_mapping=taken.append)
+    env = make(calling(fly), fly, clip_actions=clip_actions)
     env.reset(seed=0)
     try:
         env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
@@ -359,12 +342,7 @@ def flown(make, space, action, *, clip_actions=True):
         raise
     finally:
         env.close()
-    return taken[0] if make is not two else taken[1]
-
-
-def two(*given, **options):
-    """A vector of two environments."""
-    return vector_env(*given, num_envs=2, **options)
+    return taken[-1]
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
@@ -397,12 +375,13 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(make, space, ac
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
 )
-def test_invalid_actions_are_refused_before_a_forced_move_too(space, wrong) -> None:
+def test_actions_that_cannot_be_clipped_are_refused(space, wrong) -> None:
     with pytest.raises(InvalidActionError):
         flown(single_env, space, wrong)
 
 
 def test_the_vector_view_clips_as_the_single_view_does() -> None:
+    two = partial(vector_env, num_envs=2)
     action = np.array([-7.5, 1e30], np.float32)
     assert same(flown(two, BOX, np.stack([np.zeros(2, np.float32), action])), flown(single_env, BOX, action))
     with pytest.raises(InvalidActionError):
@@ -412,54 +391,41 @@ def test_the_vector_view_clips_as_the_single_view_does() -> None:
 # -- forced moves and ends ------------------------------------------------------------------------
 
 
-class Seats(Game, SimulationInterface):
-    """Red has no choice and is out before blue is asked; blue plays on."""
-
-    def run(self):
-        red, blue = self.players
-        for _ in range(2):
-            red.coins += red.move([1])
-        self.end_agent("player_red")
-        for _ in range(3):
-            blue.coins += blue.move([1, 2])
-
-
-class Endless(Game, SimulationInterface):
-    """Red is out after its first move, and the others go on for ever."""
-
-    def run(self):
-        self.players[0].coins += self.players[0].move([1, 2])
-        self.end_agent("player_red")
-        while True:
-            self.players[1].move([1, 2])
-
-
 def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round() -> None:
-    env = parallel_env(Seats, MOVE, **ROSTER)
+    """The first being has no choice and is out before the second one is asked."""
+    program = (
+        "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2, 1 acts, 1 health 3"
+    )
+    points = beings(choices=lambda being: [1] if being.number == 0 else [1, 2])
+    one = {"agent": "being_0", "skip_forced": True}
+    both = {"possible_agents": ["being_0", "being_1"], "skip_forced": True}
+    env = parallel_env(life(program), points, **both)
     env.reset(seed=1)
-    assert sorted(env.agents) == sorted(NAMES)
-    _, rewards, terminations, _, _ = env.step(zeros())
-    assert rewards == {"player_red": 2.0, "player_blue": 1.0}
-    assert terminations == {"player_red": True, "player_blue": False}
-    assert env.agents == ["player_blue"]
-    joint = joint_env(Seats, MOVE, **ROSTER)
+    assert sorted(env.agents) == ["being_0", "being_1"]
+    _, rewards, terminations, _, _ = env.step({"being_0": 0, "being_1": 0})
+    assert rewards == {"being_0": 2.0, "being_1": 1.0}
+    assert terminations == {"being_0": True, "being_1": False}
+    assert env.agents == ["being_1"]
+    joint = joint_env(life(program), points, **both)
     joint.reset(seed=1)
-    assert joint.step(zeros())[1] == 3.0
-    single = single_env(Seats, MOVE, agent="player_red", skip_forced=True)
+    assert joint.step({"being_0": 0, "being_1": 0})[1] == 3.0
+    single = single_env(life(program), points, **one)
     single.reset(seed=1)
     assert single.step(0)[1:4] == (3.0, True, False)
-    vector = vector_env(Seats, MOVE, agent="player_red", skip_forced=True, num_envs=2)
+    vector = vector_env(life(program), points, num_envs=2, **one)
     vector.reset(seed=1)
     _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
     assert (rewards.tolist(), terminations.tolist()) == ([3.0, 3.0], [True, True])
     vector.close()
 
 
-@pytest.mark.parametrize("policies", [None, {"player_blue": lambda observation: 0}])
+@pytest.mark.parametrize("policies", [None, {"being_1": lambda observation: 0}])
 def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do(policies) -> None:
-    env = single_env(Endless, MOVE, agent="player_red", policies=policies)
+    program = life("0 acts, 0 health 2, 0 leaves, 1 acts, 1 acts")
+    env = single_env(program, beings(), agent="being_0", policies=policies)
     for _ in range(2):
         env.reset(seed=1)
         assert env.step(1)[1:4] == (2.0, True, False)
+        assert env.simulation.log == [1]  # the others might go on for ever
         with pytest.raises(EpisodeOverError):
             env.step(0)

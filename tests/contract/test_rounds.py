@@ -20,23 +20,8 @@ from simenv_marl.errors import (
     UnknownAgentError,
 )
 from tests.worlds.lives import life
-from tests.worlds.many_worlds import (
-    Announcing,
-    Answered,
-    Being,
-    Colony,
-    answer,
-    beings,
-    colony,
-    designs,
-    seeds,
-)
-from tests.worlds.models import Script, calling, decision, define, notes, script
-
-
-def points(number=2, **changes):
-    """Decision functions of so many agents, ``ant_0``, ``bee_0`` and so on."""
-    return [decision(agent=f"{name}_0", **changes) for name in ("ant", "bee", "cat", "dog")[:number]]
+from tests.worlds.many_worlds import Announcing, Answered, Colony, answer, beings, colony, designs, seeds
+from tests.worlds.models import calling, decision, define, notes, script
 
 
 def flags(results):
@@ -54,25 +39,13 @@ def acted(results):
 
 
 def test_observations_do_not_show_the_moves_of_the_same_round():
-    class Announced(Script):
-        def expected_calls(self, point):
-            return [()]
-
-    def look():
-        return [0, len(env.simulation.log)]
-
-    def main(simulation):
-        simulation.log += [ant()]
-        simulation.log += [bee()]
-
-    ant, bee = points(observation_space_mapping=look)
-    env = parallel_env(lambda: Announced(main), [ant, bee])
+    env = parallel_env(life("0 acts, 1 health 5, 1 acts, 0 health 6", announced=[0, 1]), beings())
     observations, _ = env.reset()
-    assert [observation.tolist() for observation in observations.values()] == [[0, 0], [0, 0]]
-    observations["ant_0"][:] = 7  # the user's own
+    assert {agent: seen.tolist() for agent, seen in observations.items()} == {"being_0": [0, 0], "being_1": [1, 0]}
+    observations["being_0"][:] = 7  # the user's own
     env.agents.append("me")
-    observations, *_ = env.step({"ant_0": 1, "bee_0": 2})
-    assert [observation.tolist() for observation in observations.values()] == [[0, 2], [0, 2]]
+    observations, *_ = env.step({"being_0": 1, "being_1": 2})
+    assert {agent: seen.tolist() for agent, seen in observations.items()} == {"being_0": [0, 6], "being_1": [1, 5]}
     assert env.agents == []
 
 
@@ -104,7 +77,7 @@ def play_rounds(env, share, rounds=10):
 
 @pytest.mark.filterwarnings("error")
 def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
-    ant, bee = points()
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def main(simulation):
         for _ in range(10):
@@ -136,7 +109,7 @@ def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
 )
 def test_actions_that_are_refused_move_nothing(actions, error, match):
     calls = []
-    ant, bee = points(reward_mapping=lambda: calls.append(0) or 1.0)
+    ant, bee = (decision(agent=name, reward_mapping=lambda: calls.append(0) or 1.0) for name in ("ant_0", "bee_0"))
     env = parallel_env(calling(ant, bee, ant), [ant, bee])
     env.reset()
     del calls[:]
@@ -172,9 +145,6 @@ def test_a_step_without_actions_after_the_end_brings_nothing(padded):
     assert env.agents == []
 
 
-# -- rewards --------------------------------------------------------------------------------------
-
-
 def test_choices_may_be_used_up_at_the_end():
     left = ["axe", "bow"]
     ant = decision(agent="ant_0", choices=lambda: left, action_space=spaces.Discrete(2))
@@ -193,68 +163,7 @@ def test_choices_may_be_used_up_at_the_end():
     assert infos["ant_0"]["action_mask"].tolist() == [1, 1]
 
 
-def test_rewards_are_asked_for_once_for_everybody_at_every_return():
-    asked = []
-
-    def paid(name):
-        return decision(agent=name, reward_mapping=lambda: asked.append(name) or float(len(asked)))
-
-    ant, bee = paid("ant_0"), paid("bee_0")
-    env = parallel_env(calling(ant, bee, ant, bee, ant), [ant, bee])
-    env.reset()
-    assert asked == ["ant_0"]  # joining; nobody has seen the other
-    results = env.step({"ant_0": 1})
-    assert asked == ["ant_0", "ant_0", "bee_0"]
-    assert results[1] == {"ant_0": 2.0, "bee_0": 0.0}  # joining is not paid for
-    for actions, rewards in (
-        ({"bee_0": 1, "ant_0": 1}, {"ant_0": 4.0, "bee_0": 5.0}),
-        ({}, {"ant_0": 6.0, "bee_0": 7.0}),
-        ({"bee_0": 1, "ant_0": 1}, {"ant_0": 8.0, "bee_0": 9.0}),
-    ):
-        results = env.step(actions)
-        assert asked[-2:] == ["ant_0", "bee_0"]
-        assert results[1] == rewards
-    assert env.agents == []
-
-
 # -- births and deaths ----------------------------------------------------------------------------
-
-
-class Hive:
-    """In each round everybody acts who lives; who is born is known before it acts."""
-
-    def reset(self, seed=None):
-        self.beings, self.tick, self.log = [Being(0), Being(1)], 0, []
-
-    def run(self):
-        for self.tick in range(4):
-            for being in list(self.beings):
-                if being.whole:
-                    being.health += 1
-                    self.log.append((self.tick, being.number, being.act()))
-            self.beings.append(Being(len(self.beings)))
-            self.beings[self.tick].leave()
-
-    def expected_calls(self, point):
-        return [(being,) for being in self.beings if being.whole]
-
-
-def test_with_announced_calls_each_tick_is_one_round():
-    env = parallel_env(Hive, beings())
-    env.reset()
-    for tick in range(4):
-        assert env.agents == [f"being_{number}" for number in range(tick, tick + 2)]
-        results = env.step(dict.fromkeys(env.agents, tick))
-        assert acted(results) == {f"being_{number}" for number in range(tick, tick + 2)}
-        over = tick == 3
-        assert flags(results)[f"being_{tick}"] == (True, False)
-        assert flags(results)[f"being_{tick + 1}"] == (over, False)
-        # The reward of a being is its health; whoever decides next has grown again; the newborn only joins.
-        assert results[1][f"being_{tick}"] == (1.0 if tick == 0 else 2.0)
-        assert results[1][f"being_{tick + 1}"] == (1.0 if over else 2.0)
-        assert over or results[1][f"being_{tick + 2}"] == 0.0
-    assert env.agents == []
-    assert env.simulation.log == [(tick, number, tick) for tick in range(4) for number in (tick, tick + 1)]
 
 
 def test_the_dead_are_dropped_from_agents_in_the_same_step():
@@ -305,14 +214,12 @@ def test_errors_in_mappings_say_whose_they_were(mapping, good):
 # -- the rule once more, literally ----------------------------------------------------------------
 
 
-LETTERS = ("ant", "bee", "cat", "dog")
-AGENTS = [f"{letter}_0" for letter in LETTERS]
-MASKED = {1, 3}
+AGENTS = ["ant_0", "bee_0", "cat_0", "dog_0"]
 
 
-def allowed(level, number):
-    """Whether an action is legal for those who are masked."""
-    return (level + number) % 3 != 0
+def allowed(level, number, action):
+    """Whether an action is legal: for every second agent it depends on the level."""
+    return number % 2 == 0 or (level + action) % 3 != 0
 
 
 class World:
@@ -325,12 +232,20 @@ class World:
         self.level, self.calls = (seed or 0) % 17, 0
 
     def run(self):
-        for agent in self.program:
-            value = getattr(self, LETTERS[agent])()
+        for number in self.program:
+            value = self.decide(number)
             self.calls += 1
             self.level = (self.level * 3 + value + 1) % 17
 
-    ant, bee, cat, dog = (decision(lambda self: self.level % 4) for _ in LETTERS)
+    @define(
+        agent=lambda world, number: AGENTS[number],
+        observation_space_mapping=lambda world, number: [world.level, world.calls],
+        reward_mapping=lambda world, number: float(world.level),
+        action_space=spaces.Discrete(4),
+        action_mask_mapping=lambda world, number: [allowed(world.level, number, action) for action in range(4)],
+    )
+    def decide(self, number):
+        return self.level % 4
 
 
 class Rounds:
@@ -343,7 +258,7 @@ class Rounds:
         self.over = self.truncated = False
 
     def legal(self, agent, action):
-        return action is RULE or agent not in MASKED or allowed(self.level, action)
+        return action is RULE or allowed(self.level, agent, action)
 
     def step(self, actions):
         """Returns who has acted and who is paid, or None where the actions are refused."""
@@ -371,25 +286,10 @@ class Rounds:
         return used, paid
 
 
-def allowed_now(world):
-    """The mask of those who are masked."""
-    return [allowed(world.level, number) for number in range(4)]
-
-
 @cache
 def world_env(max_steps):
     """An environment of a world, whose program may be changed."""
-    definitions = {
-        vars(World)[letter]: define(
-            agent=f"{letter}_0",
-            observation_space_mapping=lambda world: [world.level, world.calls],
-            reward_mapping=lambda world: float(world.level),
-            action_space=spaces.Discrete(4),
-            action_mask_mapping=allowed_now if number in MASKED else None,
-        )
-        for number, letter in enumerate(LETTERS)
-    }
-    return parallel_env(World, definitions, max_steps=max_steps)
+    return parallel_env(World, World.decide, possible_agents=AGENTS, max_steps=max_steps)
 
 
 @given(
@@ -399,6 +299,7 @@ def world_env(max_steps):
     data=st.data(),
 )
 @settings(max_examples=250)
+@pytest.mark.filterwarnings("ignore:.*agents that did not appear")
 def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
     env = world_env(max_steps)
     env.simulation.program = program
@@ -427,12 +328,11 @@ def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
         assert {agent for agent in AGENTS if infos[agent]["acted"]} == {AGENTS[agent] for agent in used}
         assert rewards == {name: float(reference.level) if n in paid else 0.0 for n, name in enumerate(AGENTS)}
         for number, name in enumerate(AGENTS):
-            seen = [reference.level, reference.calls] if number in reference.joined else [0, 0]
-            assert observations[name].tolist() == seen
-            if number in MASKED and number in reference.joined:
-                mask = [allowed(reference.level, action) for action in range(4)]
-                assert infos[name]["action_mask"].tolist() == mask
-        assert len({id(info["action_mask"]) for info in infos.values() if "action_mask" in info}) == len(MASKED)
+            joined = number in reference.joined
+            assert observations[name].tolist() == ([reference.level, reference.calls] if joined else [0, 0])
+            mask = [not joined or allowed(reference.level, number, action) for action in range(4)]
+            assert infos[name]["action_mask"].tolist() == mask
+        assert len({id(info["action_mask"]) for info in infos.values()}) == 4
         assert set(terminated.values()) == {reference.over and not reference.truncated}
         assert set(truncated.values()) == {reference.truncated}
         assert env.agents == ([] if reference.over else AGENTS)
@@ -443,14 +343,14 @@ def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
 # -- colonies -------------------------------------------------------------------------------------
 
 
-def played(env, seed, choose):
-    """Play a colony in rounds; returns the totals, and the fortune at which everybody joined."""
-    observations, infos = env.reset(seed=seed)
+def played(env, seed, in_turns):
+    """Play a colony in rounds; returns the totals, the fortune at which everybody joined, and the ends."""
+    _, infos = env.reset(seed=seed)
     used, totals, joined, ended = Counter(), Counter(), {}, {}
     for _ in range(2000):
         for agent in env.agents:
             joined.setdefault(agent, env.simulation.fortune)
-        agents = choose(env.agents, infos)
+        agents = [agent for agent in env.agents if infos[agent]["deciding"] or not in_turns]
         actions = {agent: answer(seed, agent, used[agent]) for agent in agents}
         observations, rewards, terminated, truncated, infos = env.step(actions)
         assert set(observations) == set(rewards) == set(terminated) == set(truncated) == set(infos)
@@ -470,31 +370,23 @@ def played(env, seed, choose):
     return totals, joined, ended
 
 
-def everybody(agents, infos):
-    return agents
-
-
-def whose_turn_it_is(agents, infos):
-    return [agent for agent in agents if infos[agent]["deciding"]]
-
-
 @given(designs, seeds)
 @settings(max_examples=60)
 def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
     plain = Answered(design, seed)
     died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}
-    for simulation, roster, choose in (
-        (Colony, False, everybody),
-        (Colony, True, everybody),
-        (Announcing, False, everybody),
-        (Announcing, False, whose_turn_it_is),
+    for simulation, roster, in_turns in (
+        (Colony, False, False),
+        (Colony, True, False),
+        (Announcing, False, False),
+        (Announcing, False, True),
     ):
         env = colony(parallel_env, design, simulation, roster=roster)
         if not plain.decisions:
             with pytest.raises(NoDecisionError):
                 env.reset(seed=seed)
             continue
-        totals, joined, ended = played(env, seed, choose)
+        totals, joined, ended = played(env, seed, in_turns)
         assert env.simulation.trace == plain.trace
         assert env.simulation.random.getstate() == plain.random.getstate()
         for agent in plain.first:

@@ -8,9 +8,7 @@ come of it.
 from __future__ import annotations
 
 import random
-import weakref
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,6 @@ class Being:
 
     def __init__(self, number: int) -> None:
         self.number, self.health, self.whole = number, 0, True
-        self.hunt: Any = None
 
     def act(self) -> Any:
         return "rule"
@@ -86,38 +83,6 @@ def beings(**changes: Any) -> dict[Any, Any]:
 def others(**changes: Any) -> dict[Any, Any]:
     """The point of the others."""
     return {Other.act: define(**{"agent": other_of, "removed_by": f"{HERE}.Other.leave"} | changes)}
-
-
-class Hunt:
-    """Each being picks one of the living; whoever is let go of before its turn picks no more."""
-
-    def reset(self, seed: int | None = None) -> None:
-        self.beings = {number: Being(number) for number in range(4)}
-        self.weakly, self.log = weakref.WeakSet(self.beings.values()), list[Any]()
-        for being in self.beings.values():
-            being.hunt = weakref.proxy(self)
-
-    def run(self) -> None:
-        for tick in range(2):
-            for number in range(4):
-                for being in [being for being in self.weakly if being.number == number]:
-                    picked = being.act()
-                    self.log.append((tick, number, getattr(picked, "number", picked)))
-                    del being, picked
-                if (tick, number) == (0, 1):
-                    del self.beings[2]
-
-
-class AnnouncedHunt(Hunt):
-    def expected_calls(self, point: str) -> list[tuple[Any]]:
-        return [(being,) for being in self.beings.values()]
-
-
-def hunters() -> dict[Any, Any]:
-    """The point of the beings of a hunt."""
-    return beings(
-        choices=lambda being: list(being.hunt.beings.values()), action_space=spaces.Discrete(4), removed_by=()
-    )
 
 
 @dataclass(frozen=True)
@@ -335,14 +300,3 @@ def advised(observation: Any, seed: int) -> Any:
     """The answer of whoever makes that observation."""
     number, decided = int(observation[0]), int(observation[1])
     return answer(seed, f"creature_{number}" if number >= 0 else "overseer_0", decided)
-
-
-@dataclass
-class Played:
-    """What came of playing an environment of a colony."""
-
-    simulation: Any
-    decisions: list[str] = field(default_factory=list)
-    totals: Counter[str] = field(default_factory=Counter)
-    ends: dict[str, tuple[bool, bool]] = field(default_factory=dict)
-    joined: dict[str, int] = field(default_factory=dict)

@@ -6,7 +6,6 @@ import random
 import socket
 from functools import cache, partial
 from itertools import count
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,8 +24,8 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.data import collect_episodes, compare_with_rule, record_dataset
-from simenv_marl.errors import ClosedError, CopyError, InvalidActionError, OptionValueError, ReentrancyError
+from simenv_marl.data import collect_episodes, compare_with_rule
+from simenv_marl.errors import ClosedError, CopyError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, tree
 from tests.conftest import DRIVERS
 from tests.planning.test_action_values import GRAZING, METHODS, Herd, begun, greedy, made
@@ -60,9 +59,10 @@ def known(answers):
 
 
 @cache
-def by_hand(seed=5):
+def by_hand(seed=5, down=False):
     """What a planner does in a single view whose user asks it: its actions, and what the model has come to."""
-    env = begun(single_env(Duel, tame(), agent="left"), seed)
+    policies = {"right": lambda observation: 2} if down else None
+    env = begun(single_env(Duel, tame(), agent="left", policies=policies), seed)
     actions, over = [], False
     while not over:
         actions.append(planner(method="replay").choose(env).best)
@@ -120,20 +120,6 @@ def test_candidates_of_a_round_meet_the_same_futures(wide):
     assert told.returns[0].tolist() == told.returns[1].tolist()
     assert told.returns[2, :4].tolist() == told.returns[0, :4].tolist()
     assert told.returns[0, :4].tolist() == action_values(wide, [2], futures=4).returns[0].tolist()
-    told = RolloutPolicy([3]).choose(wide)  # one alone is not tried
-    assert (told.best, told.counts.tolist()) == (3, [0])
-    assert np.isnan(told.means).all()
-
-
-def test_masked_candidates_are_left_out():
-    given = points(action_mask_mapping=lambda duel: [duel.turn % 2, 1, 1])
-    env = begun(single_env(Duel, {LEFT: given[LEFT]}))
-    told = RolloutPolicy([0, 1], futures=2).choose(env)
-    assert told.actions == (1,)
-    with pytest.raises(InvalidActionError, match="all candidates"):
-        RolloutPolicy([0]).choose(env)
-    with pytest.raises(InvalidActionError, match="not in"):
-        RolloutPolicy([0, 5]).choose(env)
 
 
 @METHODS
@@ -156,36 +142,23 @@ def test_planners_decide_in_environments_as_by_hand(make, method):
     assert noted.answers == by_hand()[0]
 
 
-@pytest.mark.parametrize("batch_size", [1, 8])
-@pytest.mark.parametrize("policies", [{}, {"right": lambda observations: np.ones(len(observations), int)}])
-def test_many_episodes_ask_row_by_row(batch_size, policies):
+@pytest.mark.parametrize(
+    ("down", "method", "batch_size"), [(False, "replay", 1), (True, "replay", 8), (True, "fork", 8)]
+)
+def test_many_episodes_ask_row_by_row(down, method, batch_size):
+    """Beside policies that are asked in batches, also in branches."""
     given = {"points": tame(), "seeds": [5, 6], "batch_size": batch_size, "collect": lambda duel: duel.value}
-    policies = {"left": planner(method="replay"), **policies}
+    policies = {"left": planner(method=method)}
+    if down:
+        policies["right"] = lambda observations, infos, identities: np.full(len(observations), 2)
     found = collect_episodes(Duel, policies, **given)
     assert simulate_many(Duel, policies, **given) == list(found["left"].collected)
     for place, seed in enumerate([5, 6]):
         own = found["left"].actions[found["left"].episodes == place].tolist()
-        answers, value = by_hand(seed)
+        answers, value = by_hand(seed, down)
         assert (own, found["left"].collected[place]) == (known(answers), value)
         assert found["left"].by_rule[found["left"].episodes == place].tolist() == [a is RULE for a in answers]
     assert all(len(of_agent) == 12 for of_agent in found.values())
-
-
-@METHODS
-def test_batch_policies_of_others_go_on_in_branches(method):
-    def downwards(observations, infos, identities):
-        return np.full(len(observations), 2)
-
-    def alone(observation):
-        return 2
-
-    policies = {"left": planner(method=method), "right": downwards}
-    told = simulate_many(Duel, policies, points=tame(), seeds=[5, 5], collect=lambda duel: duel.value)
-    assert (
-        told[0]
-        == told[1]
-        == simulate(Duel, {"left": planner(method="replay"), "right": alone}, points=tame(), seed=5).value
-    )
 
 
 def test_planners_can_be_compared_with_the_rule():
@@ -199,14 +172,6 @@ def test_planners_can_be_compared_with_the_rule():
             env.step(RULE)
     assert told.policy_actions.tolist() == known(wanted)
     assert told.trajectories.actions.tolist() == [1] * 12
-
-
-def test_data_sets_are_recorded_of_planners(monkeypatch):
-    saved = Mock()
-    monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
-    monkeypatch.setattr("simenv_marl.data.demonstrations.save_dataset", saved)
-    record_dataset("duels-v0", Duel, {"left": planner()}, points=tame(), seeds=[5])
-    assert saved.call_args.args[1].actions.tolist() == known(by_hand()[0])
 
 
 def test_planners_decide_in_vector_environments():
@@ -447,7 +412,13 @@ def test_candidates_meet_the_same_futures():
 
 @pytest.mark.parametrize(
     ("option", "values"),
-    [("depth", [0, 1.5]), ("exploration", [-1, float("inf")]), ("budget", [0, 1.5]), ("horizon", [0])],
+    [
+        ("depth", [0, 1.5]),
+        ("exploration", [-1, float("inf")]),
+        ("budget", [0, 1.5]),
+        ("horizon", [0]),
+        ("margin", [-1, float("nan"), None]),
+    ],
 )
 def test_invalid_options_are_refused(option, values):
     for value in values:

@@ -30,7 +30,7 @@ from simenv_marl.errors import (
     WrongThreadError,
 )
 from tests.core.test_global_rng import world
-from tests.processes import ROOT, alone, descriptors, runs
+from tests.processes import ROOT, alone, descriptors, gone
 from tests.test_branch import METHODS, ahead, children
 from tests.worlds import random_worlds
 from tests.worlds.counters import FORKS
@@ -50,14 +50,6 @@ OPTIONS = {
 
 def number_of(twin):
     return twin.unwrapped.call(lambda env: os.getpid())
-
-
-def ended(*numbers):
-    """Whether processes end within a second, which is longer on a machine that is busy."""
-    for _ in range(100):
-        if any(map(runs, numbers)):
-            time.sleep(0.01)
-    return not any(map(runs, numbers))
 
 
 @METHODS
@@ -106,11 +98,11 @@ def test_clones_have_many_generations_and_end_when_they_are_collected():
     for _ in range(150):
         numbers.append(number_of(twin))
         twin = clone(twin, method="fork")
-    assert ended(*numbers)
-    numbers = [number_of(twin)]
+    assert all(map(gone, numbers))
+    number = number_of(twin)
     assert future(twin) == future(trip())
     del twin
-    assert ended(*numbers)
+    assert gone(number)
 
 
 def test_a_clones_process_has_no_descriptors_that_it_does_not_need():
@@ -332,7 +324,7 @@ def test_no_clone_outlives_its_users_process_and_interrupts_reach_that_alone(end
                 os.killpg(process.pid, signal.SIGINT)
                 assert process.stdout.readline() == "well\n"
             process.wait(60)
-            assert ended(*map(int, numbers))
+            assert all(gone(int(number)) for number in numbers)
             assert (len({*numbers}), error in told.read_text()) == (24, True)
         finally:
             with suppress(ProcessLookupError):
@@ -351,7 +343,7 @@ def test_a_clone_that_dies_says_so_and_others_go_on():
     number = number_of(late)
     with pytest.raises(BranchError, match=r"longer than 0\.3 s"):
         late.call(lambda env: time.sleep(600))
-    assert ended(number)
+    assert gone(number)
     assert future(other) == future(env)
 
 
@@ -361,7 +353,7 @@ def test_the_number_of_a_clones_clone_that_has_ended_is_not_killed(monkeypatch):
     deeper = clone(twin, method="fork")
     number, killed = number_of(deeper), []
     os.kill(number, signal.SIGKILL)
-    assert ended(number)
+    assert gone(number)
     monkeypatch.setattr(os, "kill", lambda *given: killed.append(given[0]))
     with pytest.raises(BranchError):
         deeper.step(None)

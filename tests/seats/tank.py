@@ -70,9 +70,9 @@ def log_of(tank):
     return tank.log
 
 
-def levels(policy, seeds=range(6), **options):
+def levels(policy, seeds=range(6), points=POINTS, **options):
     """Return the levels of many episodes in which a policy fills the tank."""
-    return simulate_many(Tank, {"filler": policy}, seeds=seeds, points=POINTS, collect=log_of, **options)
+    return simulate_many(Tank, {"filler": policy}, seeds=seeds, points=points, collect=log_of, **options)
 
 
 def experiment(contenders, store, **options):

@@ -86,25 +86,20 @@ def test_what_may_pass_is_tried_again(answers, monkeypatch):
     assert waited == [0.01]  # LONGEST_WAIT in these tests
 
 
-@pytest.mark.parametrize("answer", [fails(500), "<html>down</html>", says(None, refusal="no")])
-def test_what_does_not_pass_is_an_error_and_a_fallback_answers(answer):
+@pytest.mark.parametrize(("answer", "kind", "error", "match"), [
+    (fails(500), "failed", LanguageModelError, "fake gave no answer"),
+    ("<html>down</html>", "failed", LanguageModelError, "fake gave no answer"),
+    (says(None, refusal="no"), "failed", LanguageModelError, "fake gave no answer"),
+    (says("ajar"), "illegal", InvalidActionError, "'ajar' names no legal action"),
+], ids=["500", "HTML", "refusal", "wrong"])  # fmt: skip
+def test_what_does_not_pass_is_an_error_and_a_fallback_answers(answer, kind, error, match):
     with endpoint([answer]) as (address, requests):
-        with pytest.raises(LanguageModelError, match="fake gave no answer"):
-            played(model(address, retries=0))
-        guarded = FallbackPolicy(model(address, retries=0))
+        with pytest.raises(error, match=match):
+            played(model(address, retries=1))
+        guarded = FallbackPolicy(model(address, retries=1))
         assert played(guarded) == played(RULE)
-    assert guarded.counts["failed"] == 5
-    assert len(requests) == 6
-
-
-def test_a_model_that_stays_wrong_is_an_illegal_answer():
-    with endpoint([says("ajar")]) as (address, requests):
-        with pytest.raises(InvalidActionError, match="'ajar' names no legal action"):
-            played(model(address, retries=2))
-        assert len(requests) == 3
-        guarded = FallbackPolicy(model(address, retries=0))
-        played(guarded)
-    assert guarded.counts["illegal"] == 5
+    assert guarded.counts[kind] == guarded.counts["fallbacks"] == 5
+    assert len(requests) == 12
 
 
 def test_a_missing_key_is_told_of_and_a_refused_one_is_not_tried_again(monkeypatch):

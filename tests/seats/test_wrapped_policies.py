@@ -184,8 +184,8 @@ def test_tables_without_a_fallback_have_no_column_for_it():
     assert "fallbacks" not in found.summary()
 
 
-async def once(observation, *, _decision):
-    assert _decision.number == 1
+async def two_outside_clones(observation, *, _decision):
+    assert not _decision.in_clone
     return 2
 
 
@@ -196,7 +196,11 @@ def then_the_rule(observation, *, _decision):
 @pytest.mark.parametrize("method", ["fork", "replay"])
 @pytest.mark.parametrize(
     ("policy", "plain"),
-    [(once, then_the_rule), (FallbackPolicy(illegal, two), two), (FallbackPolicy(illegal_later, two), two)],
+    [
+        (two_outside_clones, then_the_rule),
+        (FallbackPolicy(illegal, two), two),
+        (FallbackPolicy(illegal_later, two), two),
+    ],
 )
 def test_in_clones_and_branches_nobody_waits_and_nothing_is_counted(policy, plain, method):
     def begun(policy):
@@ -213,6 +217,7 @@ def test_in_clones_and_branches_nobody_waits_and_nothing_is_counted(policy, plai
     assert [rest(twin)] == branch(env, rest, method=method) == [rest(begun(plain))]
     assert getattr(policy, "counts", None) == before
     twin.close()
+    assert rest(env) == rest(begun(two))
 
 
 def test_copies_and_pickles_count_together():

@@ -9,8 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from unittest.mock import AsyncMock
 from urllib.error import HTTPError
@@ -19,6 +18,7 @@ from urllib.request import Request, urlopen
 import pytest
 
 from simenv_marl.__main__ import main
+from tests.processes import ROOT, gone
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
@@ -27,7 +27,6 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
 from simenv_marl.seats.play.server import Table  # noqa: E402
 
-ROOT = Path(__file__).parents[3]
 SHOP = "tests.seats.play.worlds:Shop"
 
 
@@ -65,12 +64,6 @@ class Server:
         return self.process.returncode, out, err
 
 
-def is_alive(process):
-    with suppress(FileNotFoundError, ProcessLookupError):
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return False
-
-
 class Page:
     """A page without a browser."""
 
@@ -105,8 +98,8 @@ def server():
     assert server.end()[0] == 0
 
 
-@contextmanager
-def pages_of(server):
+@pytest.fixture
+def page(server):
     """Make pages that are closed in the end."""
     pages = []
 
@@ -120,12 +113,6 @@ def pages_of(server):
 
 
 @pytest.fixture
-def page(server):
-    with pages_of(server) as make:
-        yield make
-
-
-@pytest.fixture
 def buyer(page):
     buyer = page("buyer")
     buyer.send(do="restart", n=5)
@@ -133,18 +120,8 @@ def buyer(page):
     return buyer
 
 
-@pytest.fixture
-def new_page():
-    """Pages of a server that nobody else has used."""
-    server = Server("--seed", "5")
-    with pages_of(server) as make:
-        yield make
-    assert server.end()[0] == 0
-
-
-def test_two_people_play_and_a_spectator_sees_it(new_page):
-    page = new_page
-    buyer, seller, spectator = page("buyer"), page("seller"), page()
+def test_two_people_play_and_a_spectator_sees_it(page, buyer):
+    seller, spectator = page("seller"), page()
     everybody = {"type": "people", "taken": {"buyer": 1, "seller": 1}, "spectators": 1}
     spectator.wait("people", lambda people: people == everybody)
     buyer.send(do="act", turn=0, action=2)
@@ -263,10 +240,7 @@ def test_the_end_leaves_no_process(tmp_path):
     assert (code, err) == (0, "")
     assert out.startswith("It is closed.\nThe returns: buyer")
     buyer.wait_for_the_end()
-    deadline = time.monotonic() + 30
-    while living := [child for child in children if is_alive(child)]:
-        assert time.monotonic() < deadline, living
-        time.sleep(0.05)
+    assert all(map(gone, children))
     assert (tmp_path / "game.jsonl").read_text().count("\n") == 1
 
 

@@ -82,9 +82,6 @@ class FixedShop(Shop):
     reseed = None
 
 
-FixedShop.points = {Shop.order: ORDER}
-
-
 class ClosedShop(Shop):
     """It takes some time to close."""
 
@@ -99,9 +96,6 @@ class EndlessShop(Shop):
     def run(self):
         self.order()
         time.sleep(600)
-
-
-EndlessShop.points = {Shop.order: ORDER}
 
 
 class BrokenShop(Shop):
@@ -126,9 +120,6 @@ class BreakingShop(Shop):
             if self.order() == 3:
                 raise ZeroDivisionError("the till is broken")
             self.day += 1
-
-
-BreakingShop.points = {Shop.order: ORDER}
 
 
 def labels(shop):

@@ -198,6 +198,7 @@ def test_the_same_seed_is_the_same_future_of_clones_and_branches_and_nothing_els
     assert found[1] != found[0] == found[2] == future(again)
     *branched, third = branch(env, ahead, 3, method=method, seeds=np.array([5, 6, 2**70], object))
     assert branched == found[:2] == branch(threaded, ahead, 2, seeds=[5, 6])
+    threaded.close()
     assert third not in found
     with pytest.raises(ZeroDivisionError):
         branch(env, lambda twin, number: 1 / 0, method=method, seeds=[1])

@@ -114,16 +114,6 @@ def test_policy_and_fallback_may_be_whatever_decides(arguments, plain, faults):
     assert (guarded.last_error is None) == (not faults)
 
 
-def test_a_decision_that_cannot_be_passed_is_refused_at_once():
-    with pytest.raises(DefinitionError, match="keyword-only"):
-        FallbackPolicy(lambda observation, _decision: 1)
-
-
-def test_a_recording_without_its_folder_is_refused_at_once(tmp_path):
-    with pytest.raises(OptionValueError, match="no folder"):
-        RecordedPolicy(raises, tmp_path / "missing" / "answers")
-
-
 def test_an_illegal_answer_of_the_fallback_is_an_error():
     with pytest.raises(InvalidActionError, match="action 9"):
         played(FallbackPolicy(raises, illegal))
@@ -132,9 +122,13 @@ def test_an_illegal_answer_of_the_fallback_is_an_error():
 @pytest.mark.parametrize("arguments", [
     {"policy": 3}, {"fallback": 3}, {"timeout": 0}, {"timeout": "1"}, {"retries": -1}, {"retries": True},
 ])  # fmt: skip
-def test_arguments_that_cannot_be_used_are_refused(arguments):
+def test_what_cannot_be_used_is_refused_at_once(arguments, tmp_path):
     with pytest.raises(OptionValueError, match=next(iter(arguments))):
         FallbackPolicy(**{"policy": raises, **arguments})
+    with pytest.raises(DefinitionError, match="keyword-only"):
+        FallbackPolicy(lambda observation, _decision: 1)
+    with pytest.raises(OptionValueError, match="no folder"):
+        RecordedPolicy(raises, tmp_path / "missing" / "answers")
 
 
 # -- in tables ------------------------------------------------------------------------------------
@@ -159,16 +153,11 @@ def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
         frame = experiment(contenders, tmp_path, seeds=seeds, workers=many)
         team = frame[(frame["agent"] == "team") & (frame["contender"] == "guarded")]
         assert team["fallbacks"].tolist() == [0, 1, 0, 1]
-    assert guarded.counts == counted(asked=40, failed=4, fallbacks=4)
+    levels(guarded, seeds, workers=workers)
+    assert guarded.counts == counted(asked=60, failed=6, fallbacks=6)
 
 
-def test_workers_of_simulate_many_add_their_counts():
-    guarded = FallbackPolicy(sometimes)
-    levels(guarded, workers=2)
-    assert guarded.counts == counted(asked=30, failed=3, fallbacks=3)
-
-
-def test_contenders_with_many_fallbacks_are_marked():
+def test_contenders_with_many_fallbacks_are_marked_and_tables_without_one_have_no_column_for_it():
     contenders = {"bad": {"filler": FallbackPolicy(raises)}, "good": {"filler": FallbackPolicy(one)}}
     found = evaluate(Tank, contenders, seeds=range(3), points={Tank.fill: FILL})
     summary = found.summary()
@@ -176,9 +165,6 @@ def test_contenders_with_many_fallbacks_are_marked():
     assert summary["note"].tolist() == ["100% of decisions by a fallback", ""]
     assert [label.get_text() for label in found.plot().axes[0].get_xticklabels()] == ["bad\n100% fallbacks", "good"]
     assert "fallbacks" in str(found)
-
-
-def test_tables_without_a_fallback_have_no_column_for_it():
     found = evaluate(Tank, {"plain": {"filler": one}}, seeds=range(2), points=POINTS)
     assert "fallbacks" not in found.frame
     assert "fallbacks" not in found.summary()
@@ -261,29 +247,22 @@ def test_the_same_seeds_run_again_without_one_call(kind, tmp_path):
     assert second.times == 5  # those of the new seed
 
 
-def test_a_recording_can_be_used_after_a_crash(tmp_path):
+def test_what_a_crash_has_left_of_a_recording_and_answers_to_other_observations(tmp_path):
     path = tmp_path / "answers.jsonl"
-    played(RecordedPolicy(Asked(), path))
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-9])  # the last line was not finished
-    second = Asked()
-    assert played(RecordedPolicy(second, path)) == played(Asked())
-    assert second.times == 1
-    third = Asked()
+
+    def asked_again():
+        policy = Asked()
+        assert played(RecordedPolicy(policy, path)) == played(Asked())
+        return policy.times
+
+    assert asked_again() == 5
+    whole = path.read_text()
+    path.write_text(whole[:-9])  # the last line was not finished
+    assert asked_again() == 1
     with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
-        played(RecordedPolicy(third, path))
-    assert third.times == 0
-
-
-def test_an_answer_to_another_observation_is_not_repeated(tmp_path):
-    path = tmp_path / "answers.jsonl"
-    played(RecordedPolicy(Asked(), path))
-    lines = path.read_text().splitlines()
-    entry = json.loads(lines[0])
-    path.write_text("\n".join([json.dumps({**entry, "observation": "other"}), *lines[1:]]) + "\n")
-    again = Asked()
-    played(RecordedPolicy(again, path))
-    assert again.times == 1
+        assert asked_again() == 0
+    path.write_text(whole.replace(json.loads(whole.splitlines()[0])["observation"], "other"))
+    assert asked_again() == 1
 
 
 def test_illegal_answers_are_not_recorded(tmp_path):
@@ -309,12 +288,7 @@ PARTS = {
 def test_actions_of_any_space_are_repeated_exactly(kind, tmp_path):
     space, action = PARTS[kind]
     seen = []
-    observed = {
-        "observation_space": spaces.Dict({"level": spaces.Box(-50, 50, (1,)), "day": spaces.Discrete(9)}),
-        "observation_space_mapping": lambda tank: {"level": [tank.level], "day": tank.day},
-        "observation_labels": None,
-    }
-    points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0, **observed)}
+    points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0)}
     for policy in (lambda observation: action, raises):
         played(RecordedPolicy(policy, tmp_path / "answers"), points=points)
     assert len(seen) == 10

@@ -146,6 +146,8 @@ def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer
         assert stranger.wait("error")
     stranger.socket.send(b"\xff\xfe")
     assert stranger.wait("error")
+    stranger.socket.send("x" * 100_000)  # which is too long, and ends its connection alone
+    stranger.wait_for_the_end()
     assert page().wait("state")["turn"] == 0
 
 
@@ -168,10 +170,9 @@ def test_an_illegal_action_comes_back_as_text(buyer):
     [{"Host": "evil.example"}, {"Host": "evil.example:80", "Origin": "http://evil.example:80"}, {"Host": "[::1"}],
 )
 def test_another_host_is_refused(server, headers):
-    with pytest.raises(HTTPError) as caught:
-        urlopen(Request(f"{server.base}", headers=headers), timeout=60)
-    with caught.value as answer:
-        assert answer.code == 403
+    with pytest.raises(HTTPError, match="403") as caught:
+        urlopen(Request(server.base, headers=headers), timeout=60)
+    caught.value.close()
 
 
 def test_a_page_of_another_site_is_refused_and_all_pages_are_served_here(server):
@@ -190,14 +191,6 @@ def test_a_flood_from_one_page_does_not_keep_another_from_playing(page, buyer):
     with suppress(TimeoutError, ConnectionClosed):  # nobody reads so fast
         for _ in range(200_000):
             flood.send(do="horizon", n=1000, more="x" * 1000)
-    buyer.send(do="act", turn=0, action=1)
-    buyer.wait_for_turn(1)
-
-
-def test_a_message_that_is_too_long_ends_only_its_connection(page, buyer):
-    other = page()
-    other.socket.send("x" * 100_000)
-    other.wait_for_the_end()
     buyer.send(do="act", turn=0, action=1)
     buyer.wait_for_turn(1)
 

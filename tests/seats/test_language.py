@@ -114,12 +114,7 @@ def test_a_missing_key_is_told_of_and_a_refused_one_is_not_tried_again(monkeypat
 
 
 def test_an_endpoint_without_structured_output_is_asked_without():
-    def answer(request):
-        if "response_format" in request:
-            return fails(400, "response_format is not supported")
-        return OPEN
-
-    with endpoint(answer) as (address, requests):
+    with endpoint([fails(400, "response_format is not supported"), OPEN]) as (address, requests):
         assert played(model(address)) == played(lambda observation: 2)
     assert ["response_format" in request for request in requests] == [True] + [False] * 5
 

@@ -328,40 +328,27 @@ def test_rewards_of_forced_moves_add_up_in_the_pending_decision():
 # -- in clones ------------------------------------------------------------------------------------
 
 
-def test_planners_leave_the_decisions_of_coroutines_to_the_rule():
+def test_bases_that_wait_are_the_rule_and_those_that_ask_get_the_decision():
     async def never(observation):
         raise AssertionError("it is asked in a branch")
 
-    env = aec_env(Tank, POINTS)
-    env.reset(seed=1)
-    one = action_values(env, base={"drainer": never}, futures=3, horizon=2)
-    other = action_values(env, futures=3, horizon=2)
-    np.testing.assert_array_equal(one.means, other.means)
-
-
-def test_a_base_that_asks_for_the_decision_gets_it_in_branches():
-    def base(observation, *, _decision):
+    def alternating(observation, *, _decision):
         assert _decision.in_clone
-        assert _decision.agent == "drainer"
+        agents.add(_decision.agent)
         return _decision.number % 2
 
-    env = single_env(Tank, POINTS, agent="drainer")
-    env.reset(seed=1)
-    plain = action_values(env, base=lambda observation: 1, futures=2, horizon=2, method="replay")
-    found = action_values(env, base=base, futures=2, horizon=2, method="replay")
-    assert found.means[0] > plain.means[0]  # the second decision of the base is 0
+    def values(env, base):
+        env.reset(seed=1)
+        return action_values(env, base=base, futures=3, horizon=3, method="replay").means.tolist()
 
-
-def test_a_base_of_another_agent_that_waits_is_the_rule_and_one_that_asks_gets_the_decision():
-    async def never(observation):
-        raise AssertionError("it is asked in a branch")
-
-    def odd(observation, *, _decision):
-        return 2 * (_decision.number % 2)
-
-    def plan(base):
+    def planned(base):
         planner = RolloutPolicy(base={"filler": base}, futures=2, horizon=3, margin=0.0, method="replay")
         return simulate(Tank, {"drainer": planner}, points=POINTS, seed=4).log
 
-    assert plan(never) == plan(RULE)
-    assert len(plan(odd)) == Tank.days
+    agents, single, turns = set(), single_env(Tank, POINTS, agent="drainer"), aec_env(Tank, POINTS)
+    assert values(turns, {"drainer": never}) == values(turns, RULE)
+    assert values(single, never) == values(single, RULE)
+    assert planned(never) == planned(RULE)
+    assert values(single, alternating)[0] > values(single, lambda observation: 1)[0]  # its second decision is 0
+    assert len(planned(alternating)) == Tank.days
+    assert agents == {"filler", "drainer"}

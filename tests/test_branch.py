@@ -267,8 +267,8 @@ def test_actions_are_replayed_as_they_were_given():
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 def test_branches_and_clones_of_random_worlds_are_exact():
     """Also of files and of global generators. For a larger number: ``python -m tests.worlds.exactness 10000``."""
-    differ, number = exactness.differing(200)
-    assert (differ, number >= 200) == (0, True)
+    differ, number = exactness.differing(300)
+    assert (differ, number >= 300) == (0, True)
 
 
 # -- what forks share -----------------------------------------------------------------------------

@@ -16,10 +16,8 @@ from contextlib import suppress
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 
-from simenv_marl import aec_env, branch, clone, parallel_env
+from simenv_marl import branch, clone
 from simenv_marl.core.forks import Fork
 from simenv_marl.errors import (
     BranchError,
@@ -32,7 +30,6 @@ from simenv_marl.errors import (
 from tests.core.test_global_rng import world
 from tests.processes import ROOT, alone, descriptors, gone
 from tests.test_branch import METHODS, ahead, children
-from tests.worlds import random_worlds
 from tests.worlds.counters import FORKS
 from tests.worlds.models import notes
 from tests.worlds.trips import VIEWS, Free, Lucky, Trip, future, move, outcome, trip
@@ -69,17 +66,6 @@ def test_clones_and_branches_do_what_the_environment_does_and_none_sees_another(
         assert another == future(other) != found == future(env)
         assert branched == [(found, type(env))] * 2
         assert (future(deeper), type(deeper), type(deeper.unwrapped)) == (found, type(env), type(env.unwrapped))
-
-
-@given(random_worlds.designs, random_worlds.seeds, st.integers(0, 12), st.sampled_from([aec_env, parallel_env]))
-@settings(max_examples=60)
-def test_clones_of_random_worlds_are_exact_where_agents_join_and_leave(design, seed, taken, make):
-    env = make(lambda: random_worlds.Yard(design), random_worlds.POINTS)
-    env.reset(seed=seed)
-    assume(not any(move(env)[1] for _ in range(taken)) and env.unwrapped.episode.pending is not None)
-    twins = [clone(env, method=method) for method in ("fork", "replay")]
-    found = [future(each, lambda env: random_worlds.outcome(env.unwrapped.simulation)) for each in (*twins, env)]
-    assert found[0] == found[1] == found[2]
 
 
 @METHODS

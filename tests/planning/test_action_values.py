@@ -16,7 +16,7 @@ from pettingzoo.utils.wrappers import (
     TerminateIllegalWrapper,
 )
 
-from simenv_marl import RULE, aec_env, difference, joint_env, parallel_env, single_env, vector_env
+from simenv_marl import RULE, aec_env, difference, joint_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
@@ -24,15 +24,14 @@ from simenv_marl.errors import (
     InvalidActionError,
     OptionValueError,
     UnknownAgentError,
-    ViewError,
 )
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.planning.rollouts import Rollouts
 from tests.conftest import DRIVERS
+from tests.test_branch import METHODS
 from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
 from tests.worlds.models import define
 
-METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
 VIEWS = ("aec", "parallel", "single", "agent")
 
 
@@ -48,8 +47,8 @@ def made(view, model=Duel, **options):
     return begun(make(model, given, **options, **{"agent": "left"} if view == "agent" else {}))
 
 
-def futures_of(env, number, seed=None):
-    return Rollouts(env, RolloutPolicy([RULE], seed=seed)).seeds(number)
+def futures_of(env, number):
+    return Rollouts(env, RolloutPolicy([RULE])).seeds(number)
 
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):
@@ -277,12 +276,6 @@ def test_one_exact_future_and_a_warning(view, method):
     assert told.returns == pytest.approx(np.array([[worth("left", action, None)] for action in range(3)]))
 
 
-class Doubled(BaseParallelWrapper):
-    def step(self, actions):
-        observations, rewards, *rest = self.env.step(dict(actions))
-        return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
-
-
 def test_samples_that_wrappers_get_for_the_rule_are_not_drawn_from_the_environment():
     space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(3)})
     env = begun(TransformAction(made("joint"), lambda action: action, space))
@@ -308,14 +301,25 @@ def test_wrappers_of_single_views_take_part():
     assert told.returns == pytest.approx(10 * expected(env, "left", (1,), horizon=3, bases=bases))
 
 
+class Doubled(BaseParallelWrapper):
+    def step(self, actions):
+        observations, rewards, *rest = self.env.step(dict(actions))
+        return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
+
+
 @METHODS
-def test_wrappers_of_pettingzoo_take_part(method):
+def test_wrappers_of_pettingzoo_take_part_and_see_legal_actions(method):
     env = begun(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec"))))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(expected(env, "left"))
     env = begun(Doubled(made("parallel")))
     told = action_values(env, [RULE, 2], futures=3, method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
+    masked = {"action_space": spaces.Discrete(6), "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0]}
+    given = {name: replace(point, **masked) for name, point in points().items()}
+    env, wrapped = aec_env(Duel, given), TerminateIllegalWrapper(aec_env(Duel, given), -1)
+    told, plain = (action_values(begun(each), futures=2, method=method).returns.tolist() for each in (wrapped, env))
+    assert told == plain
 
 
 WRONG = [
@@ -354,12 +358,6 @@ def test_an_agent_that_has_ended_must_step_before_another_one_plans():
         action_values(env)
     env.step(None)
     assert action_values(env, futures=2).best == 2
-
-
-def test_an_environment_of_one_simulation_is_needed():
-    for other in (vector_env(Duel, {LEFT: points()[LEFT]}, num_envs=2), Duel()):
-        with pytest.raises(ViewError, match="one simulation"):
-            action_values(other)
 
 
 def test_candidates_must_be_listed_unless_they_are_discrete():
@@ -422,16 +420,6 @@ def test_rounds_without_the_agent_belong_to_its_decision(wrapper):
     assert action_values(env, futures=3, horizon=2, discount=0.5).returns == pytest.approx(table)
     planner = RolloutPolicy((number for number in range(3)), futures=1, horizon=1)
     assert [planner.choose(env).best for _ in range(2)] == [2, 2]
-
-
-def test_wrappers_that_look_at_masks_see_legal_actions():
-    given = {
-        name: replace(point, action_space=spaces.Discrete(6), action_mask_mapping=lambda duel: [0, 1, 0, 1, 0, 0])
-        for name, point in points().items()
-    }
-    env = begun(aec_env(Duel, given))
-    wrapped = begun(TerminateIllegalWrapper(aec_env(Duel, given), -1))
-    assert action_values(wrapped, futures=2).returns.tolist() == action_values(env, futures=2).returns.tolist()
 
 
 def high(observation):

@@ -28,7 +28,8 @@ from simenv_marl.data import collect_episodes, compare_with_rule
 from simenv_marl.errors import ClosedError, CopyError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, tree
 from tests.conftest import DRIVERS
-from tests.planning.test_action_values import GRAZING, METHODS, Herd, begun, greedy, made
+from tests.planning.test_action_values import GRAZING, Herd, begun, greedy, made
+from tests.test_branch import METHODS
 from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
 from tests.worlds.models import define, step
 
@@ -172,8 +173,7 @@ def test_planners_decide_in_vector_environments():
     envs.close()
 
 
-@pytest.mark.parametrize("alone", [False, True])
-def test_max_steps_ends_the_branch_of_an_agent_only_if_no_other_takes_steps(alone):
+def test_max_steps_do_not_end_the_branch_of_an_agent_beside_whom_others_take_steps():
     def to_the_end(twin, number):
         taken = 1
         while not any(over := twin.step(1)[2:4]):
@@ -184,13 +184,9 @@ def test_max_steps_ends_the_branch_of_an_agent_only_if_no_other_takes_steps(alon
         seen.append(branch(_environment, to_the_end, 1, method="replay")[0])
         return 1
 
-    seen, named = [], points()
-    if alone:
-        named = {name: point for name, point in named.items() if "left" in str(name)}
-    evaluate(Duel, {"planner": {"left": left}}, points=named, seeds=[5], max_steps=4)
-    assert seen == (
-        [(taken, (False, True)) for taken in (4, 3, 2, 1)] if alone else [(6, (True, False)), (5, (True, False))]
-    )
+    seen = []
+    evaluate(Duel, {"planner": {"left": left}}, points=points(), seeds=[5], max_steps=4)
+    assert seen == [(6, (True, False)), (5, (True, False))]
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -240,15 +236,6 @@ def test_entities_plan_each_for_itself():
     point = f"{Herd.__module__}.Herd.graze"
     told = simulate(Herd, {point: RolloutPolicy(futures=1)}, points=GRAZING, seed=1)
     assert told.sum == 6 * 9
-    base = {"one": lambda observation: 2, "other": lambda observation: 5}
-    values = []
-
-    def one(observation, info, *, _environment):
-        values.append(action_values(_environment, [0], base=base, futures=1))
-        return 0
-
-    simulate(Herd, {"one": one}, points=GRAZING, seed=1)
-    assert values[0].means.tolist() == [5 + 2 + 5 + 2 + 5]
 
 
 @METHODS

@@ -47,6 +47,13 @@ def collected(policy):
     return [found.actions.tolist(), found.observations.tolist(), found.rewards.tolist()]
 
 
+def in_a_notebook(policy):
+    async def notebook():  # where an event loop runs already
+        return levels(policy, concurrency=3)
+
+    return asyncio.run(notebook())
+
+
 def compared(policy):
     found = compare_with_rule(Tank, {"filler": policy}, seeds=range(3), points={Tank.fill: FILL})["filler"]
     return found.policy_actions.tolist()
@@ -61,6 +68,7 @@ def compared(policy):
         *[(partial(levels, concurrency=number), batched) for number in (1, 3, 64)],
         (collected, batched),
         (compared, batched),
+        (in_a_notebook, batched),
     ],
 )
 def test_a_coroutine_function_answers_as_a_function_does(run, plain):
@@ -180,13 +188,6 @@ def test_ctrl_c_cancels_the_coroutines_and_unwinds_the_simulations():
             play(endless)
         thread.join()
     assert sorted(cancelled) == [0, 1, 2, 3]
-
-
-def test_it_works_where_an_event_loop_runs_already():
-    async def notebook():
-        return levels(slow, concurrency=3)
-
-    assert asyncio.run(notebook()) == levels(slow)
 
 
 def test_clients_keep_their_event_loop_from_call_to_call():

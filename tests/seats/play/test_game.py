@@ -15,6 +15,7 @@ from simenv_marl.seats.play import replay
 from simenv_marl.seats.play.forms import action_of
 from simenv_marl.seats.play.game import Game
 from tests.seats.play.worlds import ORDER, BreakingShop, FixedShop, Shop
+from tests.worlds import models
 
 
 @pytest.fixture
@@ -71,18 +72,10 @@ class Connection:
         self.sent.append(message)
 
 
-def as_by_hand(actions, seed=5):
+def as_by_hand(actions):
+    """Play the same episode without the page; return its turns, and the profit."""
     env = aec_env(Shop)
-    env.reset(seed=seed)
-    found = []
-    for agent in env.agent_iter():
-        observation, reward, terminated, truncated, _ = env.last()
-        found.append((agent, str(observation), reward))
-        if terminated or truncated:
-            env.step(None)
-        else:
-            env.step(actions.pop(0) if agent == "buyer" else RULE)
-    return found, env.simulation.profit
+    return models.play(env, {"buyer": iter(actions), "seller": RULE}, seed=5), env.simulation.profit
 
 
 def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_game):
@@ -96,12 +89,12 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ga
     assert (state["turn"], state["pending"]["agent"], state["pending"]["time"]) == (2, "buyer", 1.0)
     assert state["pending"]["mask"] == [int(game.env.simulation.stock + amount < 7) for amount in range(4)]
     state = play(game, actions[1:])
-    by_hand, profit = as_by_hand(actions.copy())
+    turns, profit = as_by_hand(actions)
     assert state["over"] == "terminated"
-    assert state["returns"]["buyer"] == profit == sum(reward for agent, _, reward in by_hand if agent == "buyer")
-    assert state["returns"]["seller"] == sum(reward for agent, _, reward in by_hand if agent == "seller")
+    assert state["returns"]["buyer"] == profit == sum(models.rewards_of(turns, "buyer"))
+    assert state["returns"]["seller"] == sum(models.rewards_of(turns, "seller"))
     rewards = [row["reward"] for row in game.line if row["agent"] == "buyer"]
-    assert rewards == [reward for agent, _, reward in by_hand if agent == "buyer"][1:]
+    assert rewards == models.rewards_of(turns, "buyer")
     game.handle("buyer", {"do": "undo"})
     assert (game.turn, game.over, game.now["agent"]) == (14, "", "buyer")
     assert settle(game)["seats"] == ["buyer"]
@@ -178,16 +171,6 @@ def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(m
     assert not game.root.agents  # it is closed in the end
 
 
-def test_actions_of_several_parts_reach_the_model_as_arrays(make_game):
-    game = make_game(seats=())
-    settle(game)
-    game.decide(1, "person")
-    state = settle(game)
-    assert state["pending"]["space"] == {"kind": "grid", "sizes": [2, 3], "starts": [0, 0]}
-    game.decide([1, 2], "person")
-    assert game.env.simulation.switches == (1, 2)
-
-
 def test_futures_are_tried_out_without_moving_the_game(make_game):
     game = make_game()
     settle(game)
@@ -249,7 +232,8 @@ def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_game):
     game = make_game(seats=())
     settle(game)
     game.handle("buyer", {"do": "delegate", "n": 2})
-    assert settle(game)["pending"]["agent"] == "seller"
+    pending = settle(game)["pending"]
+    assert (pending["agent"], pending["space"]) == ("seller", {"kind": "grid", "sizes": [2, 3], "starts": [0, 0]})
     game.handle("seller", {"do": "skip"})
     state = settle(game)
     assert (state["turn"], state["pending"]["agent"]) == (1, "seller")  # it is its turn

@@ -121,7 +121,7 @@ def test_wrappers_keep_count(method):
     assert last.unwrapped.call(lambda env: env._elapsed_steps) == 2
 
 
-def test_functions_are_called_where_the_clone_is():
+def test_functions_are_called_where_the_clone_is_which_goes_on_to_its_end():
     twin, factor = clone(trip(), method="fork"), 2
     assert number_of(twin) != os.getpid() == number_of(clone(twin, method="replay"))
     assert twin.call(lambda env, by: (factor * by, env.step(1)[4]["time"]), 4) == (8, 3.0)
@@ -131,6 +131,10 @@ def test_functions_are_called_where_the_clone_is():
         _ = twin.simulation
     with pytest.raises(TypeError, match="pickle"):
         twin.call(lambda env: env.simulation.held)
+    while not twin.step(1)[2]:
+        pass
+    with pytest.raises(EpisodeOverError):
+        twin.step(1)
 
 
 @METHODS
@@ -149,14 +153,6 @@ def test_errors_surface_as_themselves(view, method):
     assert method == "replay" or "in <lambda>\n" in notes(caught.value)
     twin.reset(seed=3)
     assert twin.unwrapped.call(outcome) == before
-
-
-def test_a_clone_whose_episode_is_over_says_so():
-    twin = clone(trip("single"), method="fork")
-    while not twin.step(twin.action_space.sample())[2]:
-        pass
-    with pytest.raises(EpisodeOverError):
-        twin.unwrapped.step(0)
 
 
 def test_infos_lose_what_cannot_be_pickled():

@@ -42,8 +42,8 @@ class World:
         return 0
 
 
-def world(base=World, **given):
-    return type("SomeWorld", (base,), given)
+def world(**given):
+    return type("SomeWorld", (World,), given)
 
 
 def made(model, **options):

@@ -44,10 +44,9 @@ def test_a_language_model_decides_by_labels():
     schema = requests[0]["response_format"]["json_schema"]["schema"]
     assert schema["properties"]["action"] == {"type": "string", "enum": ["closed", "half", "open"]}
     assert json.dumps(schema) in system["content"]  # for endpoints that do not enforce it
-    assert policy.usage["requests"] == 5
-    assert policy.usage["prompt_tokens"] == 50
-    assert policy.usage["completion_tokens"] == 15
-    assert policy.usage["seconds"] > 0
+    seconds = policy.usage["seconds"]
+    assert seconds > 0
+    assert policy.usage == {"requests": 5, "prompt_tokens": 50, "completion_tokens": 15, "seconds": seconds}
 
 
 def test_numbers_are_checked_against_their_bounds_here_as_well():
@@ -67,20 +66,14 @@ def test_a_wrong_answer_is_corrected_in_the_conversation_and_plain_text_is_parse
     assert "- closed\n- half\n- open" in correction["content"]
 
 
-@pytest.mark.parametrize("answers", [
-    [fails(500), OPEN],
-    [fails(503), OPEN],
-    [fails(429, retry_after="0"), OPEN],
-    ["<html>busy</html>", OPEN],
-    [says(None, refusal="I would rather not"), OPEN],
-    [says("  "), OPEN],
-    [{"object": "something else"}, OPEN],
-    [2.0, OPEN],
+@pytest.mark.parametrize("answer", [
+    fails(500), fails(503), fails(429, retry_after="0"), "<html>busy</html>",
+    says(None, refusal="I would rather not"), says("  "), {"object": "something else"}, 2.0,
 ], ids=["500", "503", "429", "HTML", "refusal", "nothing", "garbage", "late"])  # fmt: skip
-def test_what_may_pass_is_tried_again(answers, monkeypatch):
+def test_what_may_pass_is_tried_again(answer, monkeypatch):
     waited, sleep = [], asyncio.sleep
     monkeypatch.setattr(asyncio, "sleep", lambda seconds: (waited.append(seconds), sleep(0))[1])
-    with endpoint(answers) as (address, requests):
+    with endpoint([answer, OPEN]) as (address, requests):
         assert played(model(address, timeout=1.0))[0] == played(lambda observation: 2)[0]
     assert len(requests) == 6
     assert waited == [0.01]  # LONGEST_WAIT in these tests

@@ -120,8 +120,9 @@ def buyer(page):
     return buyer
 
 
-def test_two_people_play_and_a_spectator_sees_it(page, buyer):
-    seller, spectator = page("seller"), page()
+def test_two_people_play_and_a_spectator_sees_it():
+    server = Server("--seed", "5")  # which nobody else has used
+    buyer, seller, spectator = server.page("buyer"), server.page("seller"), server.page()
     everybody = {"type": "people", "taken": {"buyer": 1, "seller": 1}, "spectators": 1}
     spectator.wait("people", lambda people: people == everybody)
     buyer.send(do="act", turn=0, action=2)
@@ -132,8 +133,11 @@ def test_two_people_play_and_a_spectator_sees_it(page, buyer):
     assert [(row["agent"], row["action"]) for row in state["history"][:2]] == [("buyer", 2), ("seller", [1, 1])]
     fan = buyer.wait("fan", lambda fan: fan["turn"] == 2 and fan["candidates"][-1]["n"] > 1)
     assert fan["candidates"][0]["action"] is None
-    again = page("buyer")  # as after a reload
+    again = server.page("buyer")  # as after a reload
     assert again.wait("state")["turn"] == 2
+    for one in (buyer, seller, spectator, again):
+        one.socket.close()
+    assert server.end()[0] == 0
 
 
 def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer):

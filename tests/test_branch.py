@@ -1,4 +1,7 @@
-"""Branches: exact continuations of an episode that is going on; with ``seeds=``, the chance ahead is drawn anew."""
+"""Branches: what functions return from them, what forks share, and the chance ahead that ``seeds=`` draws anew.
+
+That branches do what the environment would have done is asserted beside the same of clones, in ``test_clone.py``.
+"""
 
 import asyncio
 import os
@@ -12,15 +15,14 @@ import threading
 import time
 import types
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.wrappers import TimeLimit
-from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from simenv_marl import aec_env, branch, difference, joint_env, parallel_env, single_env
+from simenv_marl import RULE, branch, clone, single_env
 from simenv_marl.core import run
 from simenv_marl.core.separation import loops_on
 from simenv_marl.errors import (
@@ -33,114 +35,65 @@ from simenv_marl.errors import (
     ViewError,
 )
 from tests.core.test_global_rng import world
+from tests.processes import ROOT, gone
 from tests.worlds import exactness, filing
-from tests.worlds.copied import Walk
-from tests.worlds.models import decision, define, notes, script
+from tests.worlds.models import define, notes
+from tests.worlds.trips import POINTS, Lucky, Trip, future, move, trip
 
-ROOT = Path(__file__).parent.parent
 METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
-POINTS = {
-    Walk.choose: None,
-    f"{Walk.__module__}.Walk.drift": define(
-        agent="wind_0",
-        observation_space=spaces.Box(-99, 99, (1,), np.float32),
-        observation_space_mapping=lambda walk: [walk.place],
-        reward_mapping=difference(lambda walk: walk.place),
-    ),
-}
-VIEWS = pytest.mark.parametrize(
-    ("make", "points"), [(aec_env, POINTS), (parallel_env, POINTS), (single_env, Walk.choose), (joint_env, POINTS)]
-)
 
 
-def begun(env, seed=3):
-    env.reset(seed=seed)
-    return env
+def ahead(twin, number):
+    return future(twin)
 
 
-def move(env, number=0):
-    if hasattr(env.unwrapped, "agent_iter"):
-        observation, *rest = env.last()
-        agent = env.agent_selection
-        env.step(None if rest[1] or rest[2] else (env.action_space(agent).sample() + number) % 3)
-        return repr((agent, observation, rest, env.rewards, env.infos, env.agents))
-    if hasattr(env.unwrapped, "agents"):
-        return repr(env.step({agent: (env.action_space(agent).sample() + number) % 3 for agent in env.agents}))
-    return repr(env.step(env.action_space.sample()))
-
-
-def rest_of(env, number=0):
-    told = []
-    while getattr(env.unwrapped, "agents", True) and not (told and "True" in told[-1] and not hasattr(env, "agents")):
-        told.append(move(env, number))
-    simulation = env.unwrapped.simulation
-    return told, simulation.steps, simulation.place, simulation.random.random()
-
-
-@METHODS
-@VIEWS
-def test_branches_are_what_the_environment_would_have_done(make, points, method):
-    for taken in range(5):
-        env = begun(make(lambda: Walk(6), points))
-        for _ in range(taken):
-            move(env)
-        same, other, different = branch(env, lambda twin, number: rest_of(twin, max(0, number - 1)), 3, method=method)
-        assert same == other == rest_of(env)
-        assert different != same or make in (single_env, joint_env)  # whose moves are all alike
-
-
-@METHODS
-def test_branches_can_be_branched(method):
-    def plan(twin, number):
-        twin.step(number)
-        return branch(twin, lambda deeper, second: (deeper.step(second)[0].tolist(), number, second), 2, method=method)
-
-    found = branch(going_on(steps=0), plan, 2, method=method)
-    assert [[entry[1:] for entry in each] for each in found] == [[(0, 0), (0, 1)], [(1, 0), (1, 1)]]
-    assert len({repr(entry[0]) for each in found for entry in each}) > 2
-
-
-@METHODS
-def test_wrappers_come_along(method):
-    env = begun(TimeLimit(going_on(steps=0, length=9), 4), 1)
-    env.step(1)
-
-    def count(twin, number):
-        steps = 1
-        while not twin.step(1)[3]:
-            steps += 1
-        return type(twin), steps
-
-    assert branch(env, count, 2, method=method) == [(TimeLimit, 3)] * 2
-    assert env.step(1)[3] is False
-    wrapped = begun(OrderEnforcingWrapper(aec_env(lambda: Walk(3), Walk.choose)), 1)
-    assert branch(wrapped, lambda twin, number: (type(twin), twin.step(1)), 1, method=method) == [(type(wrapped), None)]
-
-
-def going_on(model=Walk, length=6, steps=1, **options):
-    env = begun(single_env(lambda: model(length), Walk.choose, **options))
-    for _ in range(steps):
-        env.step(1)
-    return env
-
-
-def short(env, number=0):
-    return rest_of(env)
-
-
-@pytest.mark.parametrize("options", [{"global_rng": True}, {"driver": "thread"}, {"max_steps": 3}])
-def test_options_hold_in_branches(options):
-    class Drawing(Walk):
-        def drift(self):
-            return random.random() if options.get("global_rng") else 0.0
-
-    env = going_on(Drawing, **options)
-    found = branch(env, short, 2)
-    assert found[0] == found[1] == branch(env, short, 1, method="replay")[0] == rest_of(env)
+def never(twin, number):
+    raise AssertionError("there is no branch")
 
 
 def children():
     return {line for path in Path("/proc/self/task").glob("*/children") for line in path.read_text().split()}
+
+
+@METHODS
+def test_branches_can_be_branched_a_few_times(method):
+    def plan(twin, number):
+        twin.step(number)
+        return branch(twin, lambda deeper, second: (repr(deeper.step(second)), number, second), 2, method=method)
+
+    def deeper(twin, number):
+        return branch(twin, deeper, 1, method=method)
+
+    env = trip(taken=0)
+    found = branch(env, plan, 2, method=method)
+    assert [[entry[1:] for entry in each] for each in found] == [[(0, 0), (0, 1)], [(1, 0), (1, 1)]]
+    assert len({entry[0] for each in found for entry in each}) > 2
+    with pytest.raises(BranchError, match="nested 4 deep"):
+        branch(env, deeper, 1, method=method)
+
+
+@METHODS
+def test_errors_in_a_branch_surface_as_themselves_and_end_it(method):
+    env = trip(simulation=type("Failing", (Trip,), {"reseed": lambda trip, seed: 1 / seed}))
+    before, twins = world(), []
+
+    def fail(twin, number):
+        twins.append(twin)
+        return 1 / (1 - number)
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        branch(env, fail, 3, method=method)
+    assert "in branch 1" in notes(caught.value)
+    with pytest.raises(ZeroDivisionError) as caught:
+        branch(env, lambda twin, number: twins.append(twin), 2, method=method, seeds=[1, 0])
+    assert "reseeded; seed 0" in notes(caught.value)
+    assert "in branch 1" in notes(caught.value)
+    assert world() == before
+    assert len(twins) == (3 if method == "replay" else 0)
+    for twin in twins:
+        with pytest.raises(ClosedError, match="call reset"):
+            twin.step(1)
+    env.step(1)
 
 
 class Unpicklable(Exception):
@@ -148,35 +101,21 @@ class Unpicklable(Exception):
         super().__init__(one)
 
 
-@METHODS
-def test_an_error_in_a_branch_surfaces_as_itself(method):
-    def fail(twin, number):
-        twin.step(1)
-        return 1 / (1 - number)
-
-    env = going_on()
-    with pytest.raises(ZeroDivisionError) as caught:
-        branch(env, fail, 3, method=method)
-    assert "in branch 1" in "\n".join(caught.value.__notes__)
-    with pytest.raises(ValueError, match="action"):
-        branch(env, lambda twin, number: twin.step(99), 1, method=method)
-    env.step(1)
-
-
 @pytest.mark.parametrize(
-    ("function", "message"),
+    ("function", "limit", "message"),
     [
-        (lambda twin, number: os.kill(os.getpid(), signal.SIGKILL), r"branch [01] has died.*signal 9"),
-        (lambda twin, number: os._exit(3), r"branch [01] has died.*exit code 3"),
-        (lambda twin, number: sys.exit(4), r"branch [01] has raised[\s\S]*SystemExit: 4"),
-        (lambda twin, number: (yield), "cannot be pickled"),
-        (lambda twin, number: Unpicklable(1, 2), "cannot be pickled"),
+        (lambda twin, number: os.kill(os.getpid(), signal.SIGKILL), 60, r"branch [01] has died.*signal 9"),
+        (lambda twin, number: os._exit(3), 60, r"branch [01] has died.*exit code 3"),
+        (lambda twin, number: sys.exit(4), float("inf"), r"branch [01] has raised[\s\S]*SystemExit: 4"),
+        (lambda twin, number: (yield), 60, "cannot be pickled"),
+        (lambda twin, number: Unpicklable(1, 2), 60, "cannot be pickled"),
+        (lambda twin, number: time.sleep(600), 0.3, "longer than"),
     ],
 )
-def test_a_branch_that_dies_says_so_and_leaves_the_environment_whole(function, message):
-    env, before = going_on(), children()
+def test_a_branch_that_dies_says_so_and_leaves_the_environment_whole(function, limit, message):
+    env, before = trip(), children()
     with pytest.raises(BranchError, match=message):
-        branch(env, function, 2, method="fork")
+        branch(env, function, 2, method="fork", time_limit=limit)
     assert env.step(1)[2] is False
     assert children() == before
 
@@ -188,121 +127,102 @@ def test_an_error_that_cannot_be_pickled_is_named():
         raise error
 
     with pytest.raises(BranchError, match="cannot be pickled: Unpicklable: 1") as caught:
-        branch(going_on(), fail, 1, method="fork")
+        branch(trip(), fail, 1, method="fork")
     assert "in fail" in str(caught.value.__cause__)
 
 
-def test_a_branch_that_takes_too_long_is_ended():
-    env, before = going_on(), children()
-    with pytest.raises(BranchError, match="longer than"):
-        branch(env, lambda twin, number: time.sleep(600), 2, method="fork", time_limit=0.3)
-    assert children() == before
-    env.step(1)
-    assert branch(env, lambda twin, number: number, 2, method="fork", time_limit=float("inf")) == [0, 1]
+@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say")
+def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
+    def slow(twin, number):
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(600)
+
+    for limit in (0.5, 2.0, 8.0, 32.0):  # until the branch in the branch begins within it
+        with pytest.raises(BranchError, match="longer than"):
+            branch(trip(), lambda twin, _: branch(twin, slow, 1, method="fork"), 1, method="fork", time_limit=limit)
+        if inner := [int(path.name) for path in tmp_path.iterdir()]:
+            break
+    assert inner
+    assert all(map(gone, inner))
 
 
-def test_simulations_that_are_random_for_themselves():
-    class Dice(Walk):
-        def reset(self, seed=None):
-            super().reset()
+def test_a_model_that_does_not_repeat_itself_can_only_be_forked(tmp_path):
+    dice = type("Dice", (Trip,), {"reset": lambda trip, seed=None: Trip.reset(trip)})
+    env = trip(simulation=lambda: dice(tmp_path / "diary"))
+    for copied in (partial(branch, env, never), partial(clone, env)):
+        with pytest.raises(BranchError, match=r"the same seed and the same actions[\s\S]*fork"):
+            copied(method="replay")
+    told = (tmp_path / "diary").read_text().split(" None\n")
+    assert told == ["reset", *["reset", "unwound", "closed"] * 2, ""]
 
-        def run(self):
-            try:
-                super().run()
-            finally:
-                ended.append(self)
+    def moves(env, number=0):
+        return [move(env) for _ in range(4)]
 
-    ended = []
-    env = going_on(Dice)
-    with pytest.raises(BranchError, match=r"the same seed and the same actions[\s\S]*fork") as caught:
-        branch(env, short, 1, method="replay")
-    assert (len(ended), ended[0] is env.unwrapped.simulation) == (1, False), caught  # which keeps the replay
-    found = branch(env, short, 2, method="fork")
-    assert found[0] == found[1] == rest_of(env)
+    twin, found = clone(env, method="fork"), branch(env, moves, 2, method="fork")
+    assert found[0] == found[1] == moves(twin) == moves(env)
 
 
-@pytest.mark.parametrize("make", [single_env, parallel_env])
-def test_too_many_decisions_to_be_kept(make, monkeypatch):
+@pytest.mark.parametrize("view", ["single", "parallel"])
+def test_too_many_decisions_to_be_kept(view, monkeypatch):
     monkeypatch.setattr(run, "LONGEST_TAPE", 3)
-    env = make(lambda: Walk(9), Walk.choose)
+    env = trip(view, taken=0)
     for _ in range(2):
         env.reset(seed=3)
-        for number in range(5):
-            if number <= 3:
-                assert branch(env, short, 1, method="replay") == branch(env, short, 1)
+        for _ in range(4):
+            assert branch(env, ahead, method="replay") == branch(env, ahead)
             move(env)
         with pytest.raises(BranchError, match="fork"):
-            branch(env, short, 1, method="replay")
-        found = branch(env, short, 1)
-    assert found == [rest_of(env)]
-    env = going_on(length=9, steps=0, max_steps=4)
+            branch(env, ahead, method="replay")
+    assert branch(env, ahead) == [future(env)]
+    env = trip(taken=0, max_steps=4)
     assert [env.step(1)[3] for _ in range(4)] == [False, False, False, True]
 
 
 @METHODS
 def test_environments_without_a_pending_decision_cannot_be_branched(method):
-    env, called = single_env(lambda: Walk(1), Walk.choose), []
-
-    def calls(twin, number):
-        called.append(number)
-
+    env = single_env(Trip, POINTS, agent="walker_0", max_steps=1)
     with pytest.raises(NotResetError, match="no episode yet"):
-        branch(env, calls, method=method)
+        branch(env, never, method=method)
     env.reset()
-    for wrong in (-1, 2.0, True, None):
-        with pytest.raises(OptionValueError, match="n must be a non-negative integer"):
-            branch(env, calls, wrong, method=method)
-    for limit in (0, float("nan"), "1"):
-        with pytest.raises(OptionValueError, match="time_limit"):
-            branch(env, calls, method=method, time_limit=limit)
-    with pytest.raises(OptionValueError, match="method"):
-        branch(env, calls, method="clone")
-    with pytest.raises(OptionValueError, match=r'needs .* driver="greenlet"[\s\S]*"replay"'):
-        branch(going_on(driver="thread"), calls, method="fork")
-    assert branch(env, calls, 0, method=method) == []
+    assert branch(env, never, 0, method=method) == branch(env, never, 0, method=method, seeds=[]) == []
     env.step(1)
     with pytest.raises(EpisodeOverError, match="begin the next one"):
-        branch(env, calls, method=method)
+        branch(env, never, method=method, seeds=[1])
     with pytest.raises(ViewError, match="branch needs an environment of one simulation"):
-        branch("env", calls, method=method)
-    assert called == []
+        branch("env", never, method=method)
 
 
-def test_not_from_inside_its_own_mappings():
-    envs = []
+WRONG_SEEDS = [[], [1], [1, 2, 3], [1, True], [1, -1], [1, 2.0], [1, None], [1, "2"], "12", 1, {1, 2}, iter([1, 2])]
 
-    def observe():
-        if envs:
-            branch(envs[0], short)
-        return [0, 0]
 
-    ant = decision(agent="ant_0", observation_space_mapping=observe)
-    env = begun(aec_env(script(lambda simulation: [ant(), ant()]), ant))
-    envs.append(env)
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        *[({"n": n}, "n must be a non-negative integer") for n in (-1, 2.0, True, None)],
+        *[({"time_limit": limit}, "time_limit") for limit in (0, float("nan"), "1")],
+        *[({"n": 2, "seeds": seeds}, "seeds must be n = 2 non-negative integers") for seeds in WRONG_SEEDS],
+        ({"method": "clone"}, "method must be"),
+    ],
+)
+def test_invalid_arguments_are_refused(given, message):
+    with pytest.raises(OptionValueError, match=message):
+        branch(trip(), never, **given)
+
+
+def test_threads_cannot_be_forked():
+    with pytest.raises(OptionValueError, match=r'needs .* driver="greenlet"[\s\S]*"replay"'):
+        branch(trip(driver="thread"), never, method="fork")
+
+
+def test_not_from_inside_its_own_policies():
+    env = trip(taken=0, policies={"guide_0": lambda observation: branch(env, never)})
     with pytest.raises(ReentrancyError, match="was used from"):
         env.step(1)
-    envs.clear()
-
-
-def test_branches_are_closed_when_their_function_has_returned():
-    env, twins = going_on(), []
-
-    def keep(twin, number):
-        twins.append(twin.unwrapped)
-        if number:
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        branch(env, keep, 2, method="replay")
-    for twin in twins:
-        with pytest.raises(ClosedError, match="call reset"):
-            twin.step(1)
-    env.step(1)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the number of cores cannot be set")
 def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
-    env = going_on()
+    env = trip()
 
     def alone(twin, number):
         (tmp_path / str(number)).touch()
@@ -320,25 +240,24 @@ def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
 
 
 def test_actions_are_replayed_as_they_were_given():
-    """Actions of the user and of a policy, who change them later; and nobody is asked again for what he has said."""
-    amount = {
-        "action_space": spaces.Box(-9, 9, (1,), np.float32),
-        "action_space_mapping": lambda action: -action.__imul__(-1).item(),
-        "reward_mapping": lambda walk: 0.0,
-    }
-    buffer, action, asked = np.zeros(1, np.float32), np.zeros(1, np.float32), []
+    """Also if the user, a policy or the mapping changes them later; and nobody is asked again for what he has said."""
+    walk, buffer, asked = next(iter(POINTS)), np.zeros(1, np.float32), []
+    amount = define(
+        agent="walker_0",
+        action_space=spaces.Box(-9, 9, (1,), np.float32),
+        action_space_mapping=lambda action: -action.__imul__(-1).item(),
+    )
 
-    def policy(observation):
+    def answer(observation=None):
         asked.append(1)
         buffer[0] += 0.25
         return buffer
 
-    for policies, own in (({"wind_0": policy}, 1), (None, action)):
-        points = {f"{Walk.__module__}.Walk.drift": define(agent="wind_0", **amount)}
-        env = begun(aec_env(lambda: Walk(6), points | ({Walk.choose: None} if policies else {}), policies=policies))
+    for agent, policies in (("guide_0", {"walker_0": answer}), ("walker_0", None)):
+        env = single_env(Trip, POINTS | {walk: amount}, agent=agent, policies=policies)
+        env.reset(seed=3)
         for _ in range(3):
-            action[0] += 0.5
-            env.step(own)
+            env.step(RULE if policies else answer())
         before = len(asked)
         places = branch(env, lambda twin, number: twin.simulation.place, 2, method="replay")
         assert places == [env.simulation.place] * 2
@@ -346,10 +265,13 @@ def test_actions_are_replayed_as_they_were_given():
 
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
-def test_branches_of_random_worlds_are_exact():
+def test_branches_and_clones_of_random_worlds_are_exact():
     """Also of files and of global generators. For a larger number: ``python -m tests.worlds.exactness 10000``."""
-    differ, number = exactness.differing(200)
-    assert (differ, number >= 200) == (0, True)
+    differ, number = exactness.differing(300)
+    assert (differ, number >= 300) == (0, True)
+
+
+# -- what forks share -----------------------------------------------------------------------------
 
 
 class Holding:
@@ -385,22 +307,32 @@ def a_thread(model):
     thread.join()
 
 
+def held_by(model):
+    """An environment of a model that decides while it holds something."""
+    env = single_env(model, filing.choose)
+    env.reset(seed=4)
+    return env
+
+
 @pytest.mark.parametrize(
-    ("held", "name"),
-    [(a_socket, "a socket"), (a_child, "a child process"), (a_thread, "a thread")],
+    ("held", "name"), [(a_socket, "a socket"), (a_child, "a child process"), (a_thread, "a thread")]
 )
-def test_resources_that_forks_cannot_share_are_replayed_or_named(held, name):
-    env = begun(single_env(type("Model", (Holding,), {"open": held}), filing.choose), 4)
+def test_what_cannot_be_forked_is_replayed_or_named(held, name):
+    env = held_by(type("Model", (Holding,), {"open": held}))
     env.step(1)
-    with pytest.raises(BranchError, match=f"{name}.*replay"):
-        branch(env, filing.left, method="fork")
-    found = branch(env, filing.left, 2)
-    assert found[0] == found[1] == filing.left(env)
-    env.close()
+    for copied in (partial(branch, env, never), partial(clone, env)):
+        with pytest.raises(BranchError, match=f"{name}.*replay"):
+            copied(method="fork")
+    found, twin = branch(env, filing.left, 2), clone(env)
+    deeper = clone(twin)
+    assert deeper.call(lambda env: os.getpid()) == os.getpid()
+    for each in (deeper, twin, env):  # to its end, or its thread stays
+        found.append(filing.left(each))
+    assert found == [found[0]] * 5
 
 
 def test_resources_of_the_user_do_not_keep_a_branch_from_forking():
-    env, (one, other) = going_on(), socket.socketpair()
+    env, (one, other) = trip(), socket.socketpair()
     with one, other, subprocess.Popen(["cat"], stdin=subprocess.PIPE):
         assert branch(env, lambda twin, number: os.getpid(), method="fork") != [os.getpid()]
 
@@ -423,7 +355,7 @@ class Listening(Holding):
 
 
 def test_event_loops_of_asyncio_go_on_in_a_fork(monkeypatch):
-    env = begun(single_env(Listening, filing.choose))
+    env = held_by(Listening)
     env.step(1)
     assert branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
     monkeypatch.delitem(sys.modules, "asyncio.selector_events")  # as where asyncio is not imported
@@ -447,7 +379,7 @@ class Polling(Holding):
 
 @pytest.mark.skipif(not hasattr(select, "epoll"), reason="only Linux has epoll")
 def test_selectors_of_branches_take_no_events_from_the_environment():
-    env = begun(single_env(Polling, filing.choose))
+    env = held_by(Polling)
     assert branch(env, filing.left, 2, method="fork") == [[1, 0]] * 2
     assert filing.left(env) == [1, 0]
 
@@ -455,12 +387,10 @@ def test_selectors_of_branches_take_no_events_from_the_environment():
 @pytest.mark.parametrize("flush", [False, True])
 def test_output_of_a_branch_is_printed_once(flush):
     code = f"""if True:
-        from simenv_marl import branch, single_env
-        from tests.worlds.models import calling, decision
+        from simenv_marl import branch
+        from tests.worlds.trips import trip
 
-        choose = decision()
-        env = single_env(calling(choose, choose), choose)
-        env.reset()
+        env = trip()
         print("before", flush={flush})
         branch(env, lambda env, number: print("in", number, flush={flush}), method="fork")
         print("after", flush={flush})
@@ -471,32 +401,24 @@ def test_output_of_a_branch_is_printed_once(flush):
     assert ran.stderr == ""
 
 
-class Reseeded(Walk):
-    """A walk whose chance can be drawn anew."""
-
-    def reseed(self, seed):
-        self.random.seed(seed)
-        self.place += 1000  # seen by those who look whether it was called
-        self.chosen = self.choose()
+# -- chance that is drawn anew --------------------------------------------------------------------
 
 
-class Gambling(Walk):
-    """One that draws from the global generators."""
+@METHODS
+def test_a_reseed_changes_nothing_of_the_present_and_decides_by_the_rule(method):
+    class Reseeded(Trip):
+        def reseed(self, seed):
+            super().reseed(seed)
+            self.place += 1000
+            self.chosen = self.walk()
 
-    def drift(self):
-        return random.random() + np.random.standard_normal()
+    def present(twin, number):
+        return repr(twin.episode.pending.observation), twin.simulation.place, twin.simulation.chosen
 
-
-class Both(Gambling):
-    def reseed(self, seed):
-        self.random.seed(seed)
-
-
-def reseedable(make=single_env, points=Walk.choose, simulation=Reseeded, **options):
-    env = make(lambda: simulation(6), points, **options)
-    env.reset(seed=3)
-    move(env)
-    return env
+    env = trip(simulation=Reseeded)
+    seen, place = repr(env.episode.pending.observation), env.simulation.place + 1000
+    expected = [(seen, place, random.Random(seed).choice([-1, 1])) for seed in range(8)]
+    assert branch(env, present, 8, method=method, seeds=range(8)) == expected
 
 
 def drawn(env, number):
@@ -504,60 +426,15 @@ def drawn(env, number):
     return random.random(), random.gauss(0, 1), np.random.random(), np.random.standard_normal()
 
 
-@pytest.mark.parametrize(("simulation", "options"), [(Reseeded, {}), (Gambling, {"global_rng": True})])
-@VIEWS
-def test_the_same_seeds_are_the_same_futures(make, points, simulation, options):
-    """By either method and driver, and whatever has been drawn before; other seeds are other futures."""
-    env = reseedable(make, points, simulation, **options)
-    threaded = reseedable(make, points, simulation, driver="thread", **options)
-    seeds = [5, 6, 5, 2**70]
-    forked, replayed = (branch(env, short, 4, method=method, seeds=seeds) for method in ("fork", "replay"))
-    random.random()
-    assert forked == replayed == branch(env, short, 4, seeds=np.array(seeds, object))
-    assert forked == branch(threaded, short, 4, seeds=seeds)
-    assert forked[0] == forked[2]
-    assert len({repr(each) for each in forked}) == 3
-    assert branch(env, short, 1, seeds=[6]) == forked[1:2]
-    threaded.close()
-
-
-@METHODS
-@VIEWS
-def test_the_present_stays_what_it_is(make, points, method):
-    env = reseedable(make, points)
-
-    def present(twin, number):
-        pending, simulation = twin.unwrapped._session.episode.pending, twin.unwrapped.simulation
-        return pending.name, pending.observation.tolist(), simulation.steps, simulation.place
-
-    *seen, place = present(env, 0)
-    assert branch(env, present, 2, method=method, seeds=[1, 2]) == [(*seen, place + 1000)] * 2
-
-
-@METHODS
-@pytest.mark.parametrize(("simulation", "options"), [(Reseeded, {}), (Both, {"global_rng": True})])
-@VIEWS
-def test_neither_the_environment_nor_the_generators_of_its_user_move(make, points, simulation, options, method):
-    env = reseedable(make, points, simulation, **options)
-    random.gauss(0, 1)
-    np.random.standard_normal()
-    (ahead,), before = branch(env, short, 1, method=method), world()
-    branch(env, short, 2, method=method, seeds=[1, 2])
-    with pytest.raises(ZeroDivisionError):
-        branch(env, lambda twin, number: 1 / 0, 1, method=method, seeds=[1])
-    assert world() == before
-    assert rest_of(env) == ahead
-
-
 @METHODS
 def test_the_generators_of_the_process_are_seeded_for_each_future(method):
     """Those of a base policy: alike for the same seeds, and not with the simulation's numbers."""
-    env, own = reseedable(simulation=Both, global_rng=True), []
+    env = trip(simulation=Lucky, global_rng=True)
 
     def base(twin, number):
         with twin._session.context():
-            own.append(drawn(twin, number))
-        return drawn(twin, number), own[-1], twin.simulation.random.random()
+            own = drawn(twin, number)
+        return drawn(twin, number), own, twin.simulation.random.random()
 
     found = branch(env, base, 3, method=method, seeds=[7, 8, 7])
     assert found[0] == found[2] != found[1]
@@ -573,7 +450,7 @@ def test_the_generators_of_the_process_are_seeded_for_each_future(method):
 @METHODS
 def test_another_kind_of_generator_behind_numpys_functions(method):
     """It is seeded whatever its kind, and put back as it was."""
-    env, kept, mine = reseedable(), np.random.get_bit_generator(), np.random.PCG64(5)
+    env, kept, mine = trip(), np.random.get_bit_generator(), np.random.PCG64(5)
     try:
         np.random.set_bit_generator(mine)
         state, sequence = mine.state, mine.seed_seq
@@ -594,53 +471,16 @@ def test_torchs_generator_is_seeded_too_and_forks_use_none_of_its_threads(monkey
     torch = types.ModuleType("torch")
     torch.set_num_threads, torch.default_generator = threads.append, generator
     monkeypatch.setitem(sys.modules, "torch", torch)
-    found = branch(reseedable(), lambda *_: (generator.state, threads), 3, method=method, seeds=[1, 2, 1])
+    found = branch(trip(), lambda *_: (generator.state, threads), 3, method=method, seeds=[1, 2, 1])
     assert 0 != found[0][0] == found[2][0] != found[1][0] != 0
     assert found[0][1] == ([1] if method == "fork" else [])
     assert (generator.state, threads) == (0, [])
 
 
 @METHODS
-def test_decisions_of_reseed_are_the_rules(method):
-    env = reseedable()
-    found = branch(env, lambda twin, number: twin.simulation.chosen, 8, method=method, seeds=range(8))
-    assert found == [random.Random(seed).choice([-1, 1]) for seed in range(8)]
-
-
-@METHODS
 def test_seeds_without_a_reseed_raise_an_error_with_the_remedy(monkeypatch, method):
-    env = reseedable(simulation=Walk)
     monkeypatch.setattr(os, "fork", None)
-    with pytest.raises(BranchError, match=r"Walk[\s\S]*reseed\(seed\)[\s\S]*global_rng=True"):
-        branch(env, short, 2, method=method, seeds=[1, 2])
-    env.simulation.reseed = None
-    with pytest.raises(BranchError, match="reseed"):
-        branch(env, short, 1, method=method, seeds=[1])
-    env.step(1)
-
-
-@pytest.mark.parametrize(
-    "seeds", [[], [1], [1, 2, 3], [1, True], [1, -1], [1, 2.0], [1, None], [1, "2"], "12", 1, {1, 2}, iter([1, 2])]
-)
-def test_seeds_are_one_integer_for_each_branch(seeds):
-    with pytest.raises(OptionValueError, match="seeds must be n = 2 non-negative integers"):
-        branch(reseedable(), short, 2, seeds=seeds)
-    assert branch(reseedable(), short, 0, seeds=[]) == []
-    with pytest.raises(NotResetError):
-        branch(single_env(lambda: Reseeded(6), Walk.choose), short, 1, seeds=[1])
-
-
-class Failing(Walk):
-    def reseed(self, seed):
-        return 1 / (1 - seed)
-
-
-@METHODS
-def test_an_error_of_reseed_surfaces_as_itself(method):
-    env, before = reseedable(simulation=Failing), random.getstate()
-    with pytest.raises(ZeroDivisionError) as caught:
-        branch(env, short, 2, method=method, seeds=[0, 1])
-    assert "reseeded; seed 1" in notes(caught.value)
-    assert "in branch 1" in notes(caught.value)
-    assert random.getstate() == before
-    env.step(1)
+    for env in (held_by(Polling), trip(simulation=type("Fixed", (Trip,), {"reseed": None}))):
+        with pytest.raises(BranchError, match=r"reseed\(seed\)[\s\S]*global_rng=True"):
+            branch(env, never, 2, method=method, seeds=[1, 2])
+        env.step(1)

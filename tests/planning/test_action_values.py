@@ -1,20 +1,14 @@
 """What candidate actions are worth: the same as by a reference that goes through the model by itself."""
 
 import copy
-import os
 import random
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.wrappers import (
-    OrderEnforcing,
-    PassiveEnvChecker,
-    TimeLimit,
-    TransformAction,
-    TransformReward,
-)
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformReward
 from pettingzoo.utils.wrappers import (
     AssertOutOfBoundsWrapper,
     BaseParallelWrapper,
@@ -22,35 +16,22 @@ from pettingzoo.utils.wrappers import (
     TerminateIllegalWrapper,
 )
 
-from simenv_marl import (
-    RULE,
-    SimulationInterface,
-    aec_env,
-    branch,
-    difference,
-    joint_env,
-    parallel_env,
-    single_env,
-    vector_env,
-)
+from simenv_marl import RULE, aec_env, difference, joint_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
     EpisodeOverError,
     InvalidActionError,
-    NotResetError,
     OptionValueError,
     UnknownAgentError,
-    ViewError,
 )
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.planning.rollouts import Rollouts
 from tests.conftest import DRIVERS
-from tests.processes import gone
-from tests.worlds.duels import LEFT, RIGHT, SPACE, Duel, Unseeded, observe, points, worth
+from tests.test_branch import METHODS
+from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
 from tests.worlds.models import define
 
-METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
 VIEWS = ("aec", "parallel", "single", "agent")
 
 
@@ -66,8 +47,8 @@ def made(view, model=Duel, **options):
     return begun(make(model, given, **options, **{"agent": "left"} if view == "agent" else {}))
 
 
-def futures_of(env, number, seed=None):
-    return Rollouts(env, RolloutPolicy([RULE], seed=seed)).seeds(number)
+def futures_of(env, number):
+    return Rollouts(env, RolloutPolicy([RULE])).seeds(number)
 
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):
@@ -129,7 +110,7 @@ def test_values_in_mid_episode_are_those_of_the_pending_decision(view):
 def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, told):
     env, joint = made(view), view == "joint"
     actions = [{"left": action, "right": 1} for action in range(3)] if joint else None
-    value = {"terminal_value": lambda env: 10 + env.unwrapped.simulation.value}
+    value = {"terminal_value": lambda env: np.array([10 + env.unwrapped.simulation.value])}
     found = action_values(env, actions, futures=3, **given, **value)
     reference = {name: given[name] for name in ("horizon", "discount") if name in given} | told
     terminal = None if given.get("discount") == 0 else lambda value: 10 + value
@@ -181,7 +162,7 @@ def test_policies_of_the_environment_stay():
 
 
 class Herd:
-    """Two beings that count up together, each in its turn."""
+    """Two beings that count up together, each in its turn; the other one joins when it first decides."""
 
     def reset(self, seed=None):
         self.sum, self.moves = 0, 0
@@ -207,16 +188,22 @@ GRAZING = {
 
 
 @METHODS
-def test_others_of_a_single_view_follow_the_base_by_agent(method):
-    env = begun(single_env(Herd, GRAZING, agent="one"), 1)
+@pytest.mark.parametrize(("make", "others"), [(single_env, 1 + 3 + 5), (aec_env, 1 + 3 + 5), (parallel_env, 1 + 2 + 4)])
+def test_others_at_the_same_point_follow_the_base_by_agent(make, others, method):
+    """In a round by what they saw before it; in that in which they join, by the rule."""
+    options = {"agent": "one"} if make is single_env else {}
+    env = begun(make(Herd, GRAZING, **options), 1)
     assert action_values(env, [0, 3], futures=1, method=method).means.tolist() == [5.0, 8.0]
     told = action_values(env, [0, 3], futures=1, method=method, base={"other": lambda seen: int(seen[0])})
-    assert told.means.tolist() == [2 + 1 + 3 + 5, 2 + 4 + 3 + 5]
+    assert told.means.tolist() == [2 + others, 5 + others]
     with pytest.raises(UnknownAgentError, match="'right'"):  # at a point that is not the environment's
         action_values(made("agent"), base={"right": RULE})
-    declared = begun(single_env(Herd, GRAZING, agent="one", possible_agents=["one", "other"]), 1)
+    declared = begun(make(Herd, GRAZING, possible_agents=["one", "other"], **options), 1)
     with pytest.raises(UnknownAgentError, match="'third'"):
         action_values(declared, base={"third": RULE})
+    for given in ({"discount_by": "time"}, {"horizon_by": "time", "horizon": 1}):
+        with pytest.raises(OptionValueError, match=r"time\(\)"):  # which it has not
+            action_values(env, **given)
 
 
 class Mortal(Duel):
@@ -224,22 +211,18 @@ class Mortal(Duel):
 
 
 @METHODS
+@pytest.mark.parametrize("padded", [False, True])
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
-def test_agents_that_die_on_the_way(view, method):
+def test_agents_that_die_on_the_way(view, padded, method):
     env, given = made(view, Mortal), {"futures": 8, "base": lambda observation: 2, "terminal_value": lambda env: 1e6}
+    if padded and view != "single":
+        env = begun(pad_agents(env))
     table, endless = (
         expected(env, "left", number=8, model=model, bases={"left": lambda seen: 2}) for model in (Mortal, Duel)
     )
     assert action_values(env, **given, method=method).returns == pytest.approx(table)
     assert not np.allclose(table, endless)  # the last reward counts, and none after it
     assert action_values(env, **given, horizon=5).means.max() < 1e3
-
-
-@pytest.mark.parametrize("view", ["aec", "parallel"])
-def test_agents_that_die_and_stay_for_the_learner(view):
-    env = begun(pad_agents(made(view, Mortal)))
-    told = action_values(env, futures=8, base=lambda observation: 2)
-    assert told.returns == pytest.approx(expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2}))
 
 
 def test_futures_are_those_of_the_decision():
@@ -293,12 +276,6 @@ def test_one_exact_future_and_a_warning(view, method):
     assert told.returns == pytest.approx(np.array([[worth("left", action, None)] for action in range(3)]))
 
 
-class Doubled(BaseParallelWrapper):
-    def step(self, actions):
-        observations, rewards, *rest = self.env.step(dict(actions))
-        return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
-
-
 def test_samples_that_wrappers_get_for_the_rule_are_not_drawn_from_the_environment():
     space = spaces.Dict({"left": spaces.Discrete(2), "right": spaces.Discrete(3)})
     env = begun(TransformAction(made("joint"), lambda action: action, space))
@@ -324,14 +301,25 @@ def test_wrappers_of_single_views_take_part():
     assert told.returns == pytest.approx(10 * expected(env, "left", (1,), horizon=3, bases=bases))
 
 
+class Doubled(BaseParallelWrapper):
+    def step(self, actions):
+        observations, rewards, *rest = self.env.step(dict(actions))
+        return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
+
+
 @METHODS
-def test_wrappers_of_pettingzoo_take_part(method):
+def test_wrappers_of_pettingzoo_take_part_and_see_legal_actions(method):
     env = begun(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec"))))
     told = action_values(env, futures=3, method=method)
     assert told.returns == pytest.approx(expected(env, "left"))
     env = begun(Doubled(made("parallel")))
     told = action_values(env, [RULE, 2], futures=3, method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
+    masked = {"action_space": spaces.Discrete(6), "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0]}
+    given = {name: replace(point, **masked) for name, point in points().items()}
+    env, wrapped = aec_env(Duel, given), TerminateIllegalWrapper(aec_env(Duel, given), -1)
+    told, plain = (action_values(begun(each), futures=2, method=method).returns.tolist() for each in (wrapped, env))
+    assert told == plain
 
 
 WRONG = [
@@ -362,15 +350,7 @@ def test_invalid_arguments_are_refused(view, given, error, match):
     assert action_values(env, futures=1).best == 2  # nothing has come of it
 
 
-def test_no_decision_is_pending():
-    env = single_env(Duel, {LEFT: points()[LEFT]})
-    with pytest.raises(NotResetError):
-        action_values(env)
-    env.reset(seed=1)
-    while not env.step(1)[2]:
-        pass
-    with pytest.raises(EpisodeOverError):
-        action_values(env)
+def test_an_agent_that_has_ended_must_step_before_another_one_plans():
     env = made("aec", Mortal)
     while env.agent_selection == "right" or not env.terminations["left"]:
         env.step(2)
@@ -378,9 +358,6 @@ def test_no_decision_is_pending():
         action_values(env)
     env.step(None)
     assert action_values(env, futures=2).best == 2
-    for other in (vector_env(Duel, {LEFT: points()[LEFT]}, num_envs=2), Duel()):
-        with pytest.raises(ViewError, match="one simulation"):
-            action_values(other)
 
 
 def test_candidates_must_be_listed_unless_they_are_discrete():
@@ -390,6 +367,8 @@ def test_candidates_must_be_listed_unless_they_are_discrete():
         with pytest.raises(OptionValueError, match="Discrete"):
             action_values(other)
     assert action_values(env, np.array([[0.0], [2.0], [1.0]]), futures=2).best.tolist() == [2.0]
+    env = begun(single_env(Duel, {LEFT: points(action_space=spaces.Discrete(2, start=1))[LEFT]}))
+    assert action_values(env, futures=3).actions == (1, 2)
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, lambda env: TransformReward(env, float)])
@@ -399,25 +378,12 @@ def test_masked_candidates_are_left_out(wrapper):
     assert action_values(env, futures=2).actions == (0, 1)
     with pytest.raises(InvalidActionError, match="masked"):
         action_values(env, [1, 2])
-
-
-class Timeless(Duel):
-    time = None
-
-    def run(self):
-        for self.turn in range(3):
-            self.value += self.left()
-
-
-def test_time_needs_a_clock():
-    point = points(action_space=spaces.Discrete(3, start=1))[LEFT]
-    env = begun(single_env(Timeless, {LEFT: point}), 1)
-    told = action_values(env, futures=2)
-    assert told.actions == (1, 2, 3)
-    assert told.means.tolist() == [3.0, 4.0, 5.0]
-    for given in ({"discount_by": "time"}, {"horizon_by": "time", "horizon": 1}):
-        with pytest.raises(OptionValueError, match=r"time\(\)"):
-            action_values(env, **given)
+    told = RolloutPolicy([1, 2]).choose(env)  # one alone is not tried
+    assert (told.actions, told.best, told.counts.tolist()) == ((1,), 1, [0])
+    assert np.isnan(told.means).all()
+    for actions, match in (([2], "all candidates"), ([2, 5], "not in")):
+        with pytest.raises(InvalidActionError, match=match):
+            RolloutPolicy(actions).choose(env)
 
 
 def test_a_time_limit_ends_branches_that_hang():
@@ -443,73 +409,17 @@ def test_branches_are_not_shown():
     assert told.means[0] == pytest.approx(worth("left", 1, futures_of(env, 1)[0], horizon=3) + 1)
 
 
-class Births(SimulationInterface):
-    """One decides; a second one is born in the first round and decides at once; both are paid at its end."""
-
-    def reset(self, seed=None):
-        self.earned, self.turn = {0: 0.0}, 0
-
-    def reseed(self, seed):
-        pass
-
-    def run(self):
-        while self.turn < 4:
-            actions = {number: self.act(number) for number in list(self.earned)}
-            if self.turn == 0:
-                self.earned[1] = 0.0
-                actions[1] = self.act(1)
-            for number, action in actions.items():
-                self.earned[number] += action
-            self.turn += 1
-
-    @define(
-        action_space=spaces.Discrete(3),
-        reward_mapping=difference(lambda births, number: births.earned[number]),
-        agent=lambda births, number: f"born_{number}",
-    )
-    def act(self, number):
-        return 1
-
-
-@pytest.mark.parametrize("view", [aec_env, parallel_env])
-def test_the_value_of_an_action_reaches_to_the_next_decision(view):
-    env = begun(view(Births, [Births.act]))
-    turn = {"horizon": 1, "terminal_value": lambda env: 100 * env.unwrapped.simulation.turn}
-    for given, means in (
-        ({"horizon": 1}, [0, 1, 2]),
-        ({"horizon": 2}, [1, 2, 3]),
-        ({}, [3, 4, 5]),
-        ({"discount": 0.5}, [0.875, 1.875, 2.875]),
-        (turn, [100, 101, 102]),
-        (turn | {"terminal_value": lambda env: np.array([7.0])}, [7, 8, 9]),
-    ):
-        assert action_values(env, futures=1, **given).means.tolist() == means
-
-
 @pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
-def test_the_first_of_padded_rounds_can_be_planned(wrapper):
+def test_rounds_without_the_agent_belong_to_its_decision(wrapper):
     class Unannounced(Duel):
         def expected_calls(self, point):
             return []
 
     env = begun(wrapper(parallel_env(Unannounced, points(), possible_agents=["left", "right"])))
-    assert action_values(env, futures=3, horizon=1).returns == pytest.approx(expected(env, "left", horizon=1))
+    table = expected(env, "left", horizon=2, discount=0.5)
+    assert action_values(env, futures=3, horizon=2, discount=0.5).returns == pytest.approx(table)
     planner = RolloutPolicy((number for number in range(3)), futures=1, horizon=1)
     assert [planner.choose(env).best for _ in range(2)] == [2, 2]
-
-
-def test_wrappers_that_look_at_masks_see_legal_actions():
-    masked = {
-        "observation_space": spaces.Dict(observation=SPACE, action_mask=spaces.Box(0, 1, (6,), np.int8)),
-        "observation_space_mapping": lambda duel: {"observation": observe(duel)},
-        "action_space": spaces.Discrete(6),
-        "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0],
-        "reward_mapping": difference(lambda duel: duel.value),
-    }
-    given = {LEFT: define(**masked, agent="left"), RIGHT: define(**masked, agent="right")}
-    env = begun(aec_env(Duel, given))
-    wrapped = begun(TerminateIllegalWrapper(aec_env(Duel, given), -1))
-    assert action_values(wrapped, futures=2).returns.tolist() == action_values(env, futures=2).returns.tolist()
 
 
 def high(observation):
@@ -525,30 +435,6 @@ def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
         for base in (high, RolloutPolicy(base=high))
     )
     assert plain == planned
-
-
-def test_branches_are_not_nested_for_ever():
-    def deeper(twin, number):
-        return branch(twin, deeper, 1)
-
-    with pytest.raises(BranchError, match="nested 4 deep"):
-        branch(made("single"), deeper, 1)
-
-
-@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say")
-def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
-    def slow(twin, number):
-        (tmp_path / str(os.getpid())).touch()
-        time.sleep(600)
-
-    env = made("single")
-    for limit in (0.5, 2.0, 8.0, 32.0):  # until the branch in the branch begins within it
-        with pytest.raises(BranchError, match="longer than"):
-            branch(env, lambda twin, number: branch(twin, slow, 1, method="fork"), 1, method="fork", time_limit=limit)
-        if inner := [int(path.name) for path in tmp_path.iterdir()]:
-            break
-    assert inner
-    assert all(map(gone, inner))
 
 
 @METHODS

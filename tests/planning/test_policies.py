@@ -6,7 +6,6 @@ import random
 import socket
 from functools import cache, partial
 from itertools import count
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,23 +24,14 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.data import collect_episodes, compare_with_rule, record_dataset
-from simenv_marl.errors import ClosedError, CopyError, InvalidActionError, OptionValueError, ReentrancyError
+from simenv_marl.data import collect_episodes, compare_with_rule
+from simenv_marl.errors import ClosedError, CopyError, OptionValueError, ReentrancyError
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy, action_values, tree
 from tests.conftest import DRIVERS
-from tests.planning.test_action_values import GRAZING, METHODS, Herd, begun, greedy, made
+from tests.planning.test_action_values import GRAZING, Herd, begun, greedy, made
+from tests.test_branch import METHODS
 from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
-from tests.worlds.inventory import Shop, best_values, state
 from tests.worlds.models import define, step
-
-
-class Noted:
-    def __init__(self, policy):
-        self.policy, self.answers, self.base = policy, [], policy.base
-
-    def __call__(self, observation, info, *, _environment):
-        self.answers.append(self.policy(observation, info, _environment=_environment))
-        return self.answers[-1]
 
 
 def planner(**given):
@@ -60,9 +50,10 @@ def known(answers):
 
 
 @cache
-def by_hand(seed=5):
+def by_hand(seed=5, down=False):
     """What a planner does in a single view whose user asks it: its actions, and what the model has come to."""
-    env = begun(single_env(Duel, tame(), agent="left"), seed)
+    policies = {"right": lambda observation: 2} if down else None
+    env = begun(single_env(Duel, tame(), agent="left", policies=policies), seed)
     actions, over = [], False
     while not over:
         actions.append(planner(method="replay").choose(env).best)
@@ -120,72 +111,45 @@ def test_candidates_of_a_round_meet_the_same_futures(wide):
     assert told.returns[0].tolist() == told.returns[1].tolist()
     assert told.returns[2, :4].tolist() == told.returns[0, :4].tolist()
     assert told.returns[0, :4].tolist() == action_values(wide, [2], futures=4).returns[0].tolist()
-    told = RolloutPolicy([3]).choose(wide)  # one alone is not tried
-    assert (told.best, told.counts.tolist()) == (3, [0])
-    assert np.isnan(told.means).all()
-
-
-def test_masked_candidates_are_left_out():
-    given = points(action_mask_mapping=lambda duel: [duel.turn % 2, 1, 1])
-    env = begun(single_env(Duel, {LEFT: given[LEFT]}))
-    told = RolloutPolicy([0, 1], futures=2).choose(env)
-    assert told.actions == (1,)
-    with pytest.raises(InvalidActionError, match="all candidates"):
-        RolloutPolicy([0]).choose(env)
-    with pytest.raises(InvalidActionError, match="not in"):
-        RolloutPolicy([0, 5]).choose(env)
 
 
 @METHODS
 @pytest.mark.parametrize("key", ["left", LEFT])
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_planners_decide_in_simulate_as_by_hand(driver, key, method):
-    noted = Noted(planner(method=None if driver == "thread" and method == "fork" else method))
-    found = simulate(Duel, {key: noted}, points=tame(), seed=5, driver=driver)
-    assert (noted.answers, found.value) == by_hand()
-    assert len(set(noted.answers)) > 1
+    policy = planner(method=None if driver == "thread" and method == "fork" else method)
+    found = simulate(Duel, {key: policy}, points=tame(), seed=5, driver=driver)
+    answers, value = by_hand()
+    assert found.value == value
+    assert len(set(answers)) > 1
 
 
 @METHODS
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
 def test_planners_decide_in_environments_as_by_hand(make, method):
-    noted = Noted(planner(method=method))
-    env = begun(make(Duel, tame(), policies={"left": noted}))
+    env = begun(make(Duel, tame(), policies={"left": planner(method=method)}))
     while not step(env, 1, "right"):
         pass
-    assert noted.answers == by_hand()[0]
+    assert env.unwrapped.simulation.value == by_hand()[1]
 
 
-@pytest.mark.parametrize("batch_size", [1, 8])
-@pytest.mark.parametrize("policies", [{}, {"right": lambda observations: np.ones(len(observations), int)}])
-def test_many_episodes_ask_row_by_row(batch_size, policies):
+@pytest.mark.parametrize(
+    ("down", "method", "batch_size"), [(False, "replay", 1), (True, "replay", 8), (True, "fork", 8)]
+)
+def test_many_episodes_ask_row_by_row(down, method, batch_size):
+    """Beside policies that are asked in batches, also in branches."""
     given = {"points": tame(), "seeds": [5, 6], "batch_size": batch_size, "collect": lambda duel: duel.value}
-    policies = {"left": planner(method="replay"), **policies}
+    policies = {"left": planner(method=method)}
+    if down:
+        policies["right"] = lambda observations, infos, identities: np.full(len(observations), 2)
     found = collect_episodes(Duel, policies, **given)
     assert simulate_many(Duel, policies, **given) == list(found["left"].collected)
     for place, seed in enumerate([5, 6]):
         own = found["left"].actions[found["left"].episodes == place].tolist()
-        answers, value = by_hand(seed)
+        answers, value = by_hand(seed, down)
         assert (own, found["left"].collected[place]) == (known(answers), value)
         assert found["left"].by_rule[found["left"].episodes == place].tolist() == [a is RULE for a in answers]
     assert all(len(of_agent) == 12 for of_agent in found.values())
-
-
-@METHODS
-def test_batch_policies_of_others_go_on_in_branches(method):
-    def downwards(observations, infos, identities):
-        return np.full(len(observations), 2)
-
-    def alone(observation):
-        return 2
-
-    policies = {"left": planner(method=method), "right": downwards}
-    told = simulate_many(Duel, policies, points=tame(), seeds=[5, 5], collect=lambda duel: duel.value)
-    assert (
-        told[0]
-        == told[1]
-        == simulate(Duel, {"left": planner(method="replay"), "right": alone}, points=tame(), seed=5).value
-    )
 
 
 def test_planners_can_be_compared_with_the_rule():
@@ -201,14 +165,6 @@ def test_planners_can_be_compared_with_the_rule():
     assert told.trajectories.actions.tolist() == [1] * 12
 
 
-def test_data_sets_are_recorded_of_planners(monkeypatch):
-    saved = Mock()
-    monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
-    monkeypatch.setattr("simenv_marl.data.demonstrations.save_dataset", saved)
-    record_dataset("duels-v0", Duel, {"left": planner()}, points=tame(), seeds=[5])
-    assert saved.call_args.args[1].actions.tolist() == known(by_hand()[0])
-
-
 def test_planners_decide_in_vector_environments():
     envs = begun(vector_env(Duel, tame(), num_envs=2, policies={"right": planner()}))
     for _ in range(3):
@@ -217,8 +173,7 @@ def test_planners_decide_in_vector_environments():
     envs.close()
 
 
-@pytest.mark.parametrize("alone", [False, True])
-def test_max_steps_ends_the_branch_of_an_agent_only_if_no_other_takes_steps(alone):
+def test_max_steps_do_not_end_the_branch_of_an_agent_beside_whom_others_take_steps():
     def to_the_end(twin, number):
         taken = 1
         while not any(over := twin.step(1)[2:4]):
@@ -229,13 +184,9 @@ def test_max_steps_ends_the_branch_of_an_agent_only_if_no_other_takes_steps(alon
         seen.append(branch(_environment, to_the_end, 1, method="replay")[0])
         return 1
 
-    seen, named = [], points()
-    if alone:
-        named = {name: point for name, point in named.items() if "left" in str(name)}
-    evaluate(Duel, {"planner": {"left": left}}, points=named, seeds=[5], max_steps=4)
-    assert seen == (
-        [(taken, (False, True)) for taken in (4, 3, 2, 1)] if alone else [(6, (True, False)), (5, (True, False))]
-    )
+    seen = []
+    evaluate(Duel, {"planner": {"left": left}}, points=points(), seeds=[5], max_steps=4)
+    assert seen == [(6, (True, False)), (5, (True, False))]
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -285,15 +236,6 @@ def test_entities_plan_each_for_itself():
     point = f"{Herd.__module__}.Herd.graze"
     told = simulate(Herd, {point: RolloutPolicy(futures=1)}, points=GRAZING, seed=1)
     assert told.sum == 6 * 9
-    base = {"one": lambda observation: 2, "other": lambda observation: 5}
-    values = []
-
-    def one(observation, info, *, _environment):
-        values.append(action_values(_environment, [0], base=base, futures=1))
-        return 0
-
-    simulate(Herd, {"one": one}, points=GRAZING, seed=1)
-    assert values[0].means.tolist() == [5 + 2 + 5 + 2 + 5]
 
 
 @METHODS
@@ -447,7 +389,13 @@ def test_candidates_meet_the_same_futures():
 
 @pytest.mark.parametrize(
     ("option", "values"),
-    [("depth", [0, 1.5]), ("exploration", [-1, float("inf")]), ("budget", [0, 1.5]), ("horizon", [0])],
+    [
+        ("depth", [0, 1.5]),
+        ("exploration", [-1, float("inf")]),
+        ("budget", [0, 1.5]),
+        ("horizon", [0]),
+        ("margin", [-1, float("nan"), None]),
+    ],
 )
 def test_invalid_options_are_refused(option, values):
     for value in values:
@@ -455,33 +403,3 @@ def test_invalid_options_are_refused(option, values):
             TreeSearchPolicy(**{option: value})
     with pytest.raises(OptionValueError, match="4 candidates once"):
         RolloutPolicy(budget=3).choose(made("single"))
-
-
-VALUES = best_values()
-BEST = VALUES[0, 4, 2].max()
-
-
-def share(policy, seeds):
-    """What a policy is worth, as a share of the optimum.
-
-    What it loses is added up decision by decision: what the best order was worth, and what its own was. That is free of
-    most of the chance that is in profits.
-    """
-    lost = []
-
-    def watched(observation, info, *, _environment):
-        order = policy(_environment)
-        here = VALUES[state(observation)]
-        lost.append(here.max() - here[1 if order is RULE else order])
-        return order
-
-    for seed in seeds:
-        simulate(Shop, {"buyer": watched}, points=Shop.order, seed=seed)
-    return 1 - sum(lost) / len(seeds) / BEST
-
-
-def test_plans_are_better_than_a_poor_rule():
-    """Beside the optimum of a model that can be solved."""
-    planner = RolloutPolicy(futures=16, horizon=3, method="replay")
-    assert share(lambda env: 1, range(40)) < 0.75
-    assert share(lambda env: planner.choose(env).best, [1, 2]) >= 0.95

@@ -33,7 +33,10 @@ class _Handler(BaseHTTPRequestHandler):
         request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         request["key"] = self.headers.get("Authorization")
         self.server.requests.append(request)
-        answer = self.server.answer(request)
+        answer = self.server.answers.pop(0) if len(self.server.answers) > 1 else self.server.answers[0]
+        if isinstance(answer, float):
+            time.sleep(answer)
+            answer = says('{"action": "open"}')
         status, body, headers = answer if isinstance(answer, tuple) else (200, answer, {})
         text = body if isinstance(body, str) else json.dumps(body)
         self.send_response(status)
@@ -49,23 +52,11 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def endpoint(answer):
-    """Serve answers: a list, one for each request, the last for all others; or a function of the request."""
-    listed = list(answer) if isinstance(answer, list) else None
+def endpoint(answers):
+    """Serve answers, one for each request, and the last one for all others; a number of seconds is a late one."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
     server.daemon_threads = True
-    server.requests = []
-
-    def next_answer(request):
-        if listed is None:
-            return answer(request)
-        found = listed.pop(0) if len(listed) > 1 else listed[0]
-        if isinstance(found, float):
-            time.sleep(found)
-            found = says('{"action": "open"}')
-        return found
-
-    server.answer = next_answer
+    server.answers, server.requests = [*answers], []
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     try:

@@ -1,13 +1,13 @@
 """A model with two decisions a day, for policies that are slow, fail or read."""
 
 import random
+from dataclasses import replace
 
 import numpy as np
 from gymnasium import spaces
 
-from simenv_marl import make_step
-
-LEVEL = spaces.Box(-50, 50, (1,), np.float32)
+from simenv_marl import make_step, simulate, simulate_many
+from simenv_marl.experiments import run_experiment
 
 
 class Tank:
@@ -39,27 +39,44 @@ class Tank:
         return 0.5
 
 
-def definition(decisions, **more):
-    """Define a decision among some numbers, rewarded by the level."""
-    return make_step(
-        **{
-            "observation_space": LEVEL,
-            "observation_space_mapping": lambda tank: [tank.level],
-            "action_space": spaces.Discrete(len(decisions)),
-            "action_space_mapping": dict(enumerate(decisions)),
-            "reward_mapping": lambda tank: tank.level,
-        }
-        | more
-    )
-
-
-FILL = definition(
-    [0.0, 1.0, 2.0], agent="filler", action_labels=["closed", "half", "open"], observation_labels=["level"]
+FILL = make_step(
+    agent="filler",
+    observation_space=spaces.Box(-50, 50, (1,), np.float32),
+    observation_space_mapping=lambda tank: [tank.level],
+    action_space=spaces.Discrete(3),
+    action_space_mapping={0: 0.0, 1: 1.0, 2: 2.0},
+    reward_mapping=lambda tank: tank.level,
+    action_labels=["closed", "half", "open"],
+    observation_labels=["level"],
 )
-DRAIN = definition([0.5, 1.5], agent="drainer")
+
+
+def filling(space, mapping=lambda action: 1.0, **more):
+    """Define the first decision with actions of another space."""
+    return replace(FILL, **{"action_space": space, "action_space_mapping": mapping, "action_labels": None} | more)
+
+
+DRAIN = filling(spaces.Discrete(2), {0: 0.5, 1: 1.5}, agent="drainer")
 POINTS = {Tank.fill: FILL, Tank.drain: DRAIN}
 
 
-def level_of(tank):
-    """Return what happened in an episode."""
-    return tuple(tank.log)
+def played(policy, seed=3, points=POINTS, **options):
+    """Return the levels of an episode in which a policy fills the tank."""
+    return simulate(Tank, {"filler": policy}, points=points, seed=seed, **options).log
+
+
+def log_of(tank):
+    """Return the levels of an episode."""
+    return tank.log
+
+
+def levels(policy, seeds=range(6), points=POINTS, **options):
+    """Return the levels of many episodes in which a policy fills the tank."""
+    return simulate_many(Tank, {"filler": policy}, seeds=seeds, points=points, collect=log_of, **options)
+
+
+def experiment(contenders, store, **options):
+    """Run an experiment of one row, and return its table."""
+    return run_experiment(
+        lambda days: Tank(), [{"days": 5}], contenders=contenders, points=POINTS, store=store, **options
+    )

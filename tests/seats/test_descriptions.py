@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, aec_env, clone, joint_env, make_step, parallel_env, simulate, single_env
+from simenv_marl import RULE, aec_env, clone, joint_env, parallel_env, single_env
 from simenv_marl.data import collect_episodes, plot_timeline
 from simenv_marl.errors import DefinitionError, InvalidActionError, NotResetError, SimEnvError, ViewError
 from simenv_marl.seats import describe, parse
 
-from .tank import FILL, POINTS, Tank
+from .tank import FILL, POINTS, Tank, filling, played
 
 
-def env_of(definition=FILL, seed=1, view=single_env):
-    env = view(Tank, {Tank.fill: definition})
-    env.reset(seed=seed)
+def env_of(definition=FILL):
+    env = single_env(Tank, {Tank.fill: definition})
+    env.reset(seed=1)
     return env
 
 
@@ -53,8 +53,11 @@ def test_it_is_described_as_json():
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
 def test_every_view_and_its_clones_are_described_alike(view):
-    env = env_of(view=view)
-    words = describe(env_of())
+    env, words = view(Tank, {Tank.fill: FILL}), describe(env_of())
+    for use in (describe, lambda env: parse(env, "open")):
+        with pytest.raises(NotResetError):
+            use(env)
+    env.reset(seed=1)
     assert describe(env) == words
     assert parse(env, "open") == 2
     for method in ("fork", "replay"):
@@ -72,34 +75,49 @@ def test_what_a_policy_gets_is_described_as_the_environment_is():
         said.append(describe(_decision))
         return parse(_decision, "closed")
 
-    simulate(Tank, {"filler": policy}, points=POINTS, seed=1)
+    played(policy, seed=1)
     assert said[0] == describe(env_of())
 
 
-def test_without_a_pending_decision_there_is_nothing_to_describe():
-    env = single_env(Tank, {Tank.fill: FILL})
-    for use in (describe, lambda env: parse(env, "open")):
-        with pytest.raises(NotResetError):
-            use(env)
+SAID = {
+    ("closed", "half", "open"): {
+        **dict.fromkeys(["open", " Open ", '"open"', '{"action": "open"}', "2", '{"action": 2}'], 2),
+        **dict.fromkeys(["ajar", "3", "-1", "", "{}", '{"action": null}', "[1]", "true", "1.5", "open closed"]),
+    },
+    ("1", "2", "3"): {"1": 0, "2": 1, '{"action": "3"}': 2, '{"action": 2.0}': 1, "0": 0, "4": None},
+    ("R", "R'", "U"): {"R'": 1},
+    ("bxc3", "Bxc3", "a"): {"bxc3": 0, "Bxc3": 1},
+    (" open", "shut", "ajar"): {" open": 0},
+    ("1.5", "2", "3"): {"1.50": 0},
+    ("open", "half open", "shut"): {
+        "I choose half open; half open is safe.": 1,
+        "<think>shut or open?</think> open": None,
+        '```json\n{"action": "shut"}\n```': 2,
+        'Perhaps {"action": "open"}, or rather {"action": "shut"}.': 2,
+    },
+    ("OPEN", "open", "shut"): {"Open": None},
+}
 
 
-@pytest.mark.parametrize("text", ["open", " Open ", '"open"', '{"action": "open"}', "2", '{"action": 2}'])
-def test_an_action_is_named_by_label_or_value(text):
-    assert parse(env_of(), text) == 2
-
-
-@pytest.mark.parametrize("text", ["ajar", "3", "-1", "", "{}", '{"action": null}', "[1]", "true", "1.5", "open closed"])
-def test_what_names_no_legal_action_is_an_error_that_lists_them(text):
-    env = env_of()
-    with pytest.raises(InvalidActionError, match=r"'filler'; these are legal:\n- closed\n- half\n- open"):
-        parse(env, text)
+@pytest.mark.parametrize(("labels", "said"), [(labels, said) for labels in SAID for said in SAID[labels]])
+def test_an_action_is_named_by_label_or_value_or_an_error_lists_the_legal_ones(labels, said):
+    env = env_of(replace(FILL, action_labels=dict(enumerate(labels))))
+    if SAID[labels][said] is None:
+        legal = "\n".join(f"- {label}" for label in labels)
+        with pytest.raises(InvalidActionError, match=f"'filler'; these are legal:\n{legal}"):
+            parse(env, said)
+    else:
+        assert parse(env, said) == SAID[labels][said]
 
 
 def test_masked_actions_are_neither_listed_nor_taken():
+    env = env_of(replace(FILL, action_labels=["1", "2", "3"], action_mask_mapping=lambda tank: [1, 0, 1]))
+    with pytest.raises(InvalidActionError):
+        parse(env, "2")
     env = env_of(replace(FILL, action_mask_mapping=lambda tank: [1, 0, 1]))
     assert "half" not in describe(env)
     assert describe(env, as_json=True)["actions"] == {"type": "string", "enum": ["closed", "open"]}
-    for text in ("half", "1"):
+    for text in ("half", "1"):  # which are not taken for another action
         with pytest.raises(InvalidActionError, match=r"legal:\n- closed\n- open$"):
             parse(env, text)
 
@@ -111,41 +129,6 @@ def test_choices_and_decisions_are_labels_where_none_are_given():
     env = env_of(moves)
     assert describe(env, as_json=True)["actions"] == {"type": "string", "enum": ["3.0", "4.0 (1)", "4.0 (2)"]}
     assert (parse(env, "3.0"), parse(env, "4.0 (2)")) == (0, 2)
-
-
-def test_a_label_that_looks_like_another_action_is_the_label():
-    env = env_of(replace(FILL, action_labels={0: "1", 1: "2", 2: "3"}))
-    assert [parse(env, text) for text in ("1", "2", '{"action": "3"}')] == [0, 1, 2]
-
-
-@pytest.mark.parametrize(("labels", "said", "action"), [
-    (["R", "R'", "U"], "R'", 1),
-    (["bxc3", "Bxc3", "a"], "bxc3", 0),
-    (["bxc3", "Bxc3", "a"], "Bxc3", 1),
-    ([" open", "shut", "ajar"], " open", 0),
-    (["1.5", "2", "3"], "1.50", 0),
-    (["1", "2", "3"], '{"action": 2.0}', 1),
-    (["open", "half open", "shut"], "I choose half open; half open is safe.", 1),
-    (["open", "half open", "shut"], "<think>shut or open?</think> open", None),
-    (["open", "half open", "shut"], '```json\n{"action": "shut"}\n```', 2),
-    (["open", "half open", "shut"], 'Perhaps {"action": "open"}, or rather {"action": "shut"}.', 2),
-    (["1", "2", "3"], "0", 0),
-    (["1", "2", "3"], "4", None),
-    (["OPEN", "open", "shut"], "Open", None),
-])  # fmt: skip
-def test_labels_are_found_exactly_or_not_at_all(labels, said, action):
-    env = env_of(replace(FILL, action_labels=labels))
-    if action is None:
-        with pytest.raises(InvalidActionError):
-            parse(env, said)
-    else:
-        assert parse(env, said) == action
-
-
-def test_the_label_of_a_masked_action_is_not_taken_for_another_one():
-    env = env_of(replace(FILL, action_labels=["1", "2", "3"], action_mask_mapping=lambda tank: [1, 0, 1]))
-    with pytest.raises(InvalidActionError):
-        parse(env, "2")
 
 
 def test_labels_may_be_made_for_each_call():
@@ -171,66 +154,36 @@ SPACES = {
 }  # fmt: skip
 
 
-def of_space(space, labels):
-    return make_step(
-        observation_space=spaces.Box(-50, 50, (1,)),
-        observation_space_mapping=lambda tank: [tank.level],
-        action_space=space,
-        action_space_mapping=lambda action: 1.0,
-        reward_mapping=lambda tank: 0.0,
-        action_labels=labels,
-    )
-
-
 @pytest.mark.parametrize("kind", SPACES)
-def test_actions_of_other_spaces_are_said_as_json(kind):
+def test_actions_of_other_spaces_are_said_as_json_and_wrong_components_are_illegal(kind):
     space, labels, texts, action = SPACES[kind]
-    env = env_of(of_space(space, labels))
+    env = env_of(filling(space, action_labels=labels))
     for text in texts:
         found = parse(env, text)
         assert space.contains(found)
-        np.testing.assert_equal(spaces.flatten(space, found), spaces.flatten(space, _member(space, action)))
+        np.testing.assert_equal(found, action)
+    for text in ("[9, 9, 9]", '{"valve": 1}', "many", "[77, 77]", "{}"):
+        with pytest.raises(InvalidActionError, match="these are legal"):
+            parse(env, text)
     for name in labels or ():
         assert (labels[name] if isinstance(labels, dict) else name) in describe(env)
 
 
-def _member(space, action):
-    if isinstance(space, spaces.Dict):
-        return {key: _member(part, action[key]) for key, part in space.spaces.items()}
-    return action if isinstance(space, (spaces.Discrete, spaces.Tuple)) else np.asarray(action, space.dtype)
+def test_the_schema_of_numbers_has_their_bounds_and_labels():
+    def schema(space, **labels):
+        return describe(env_of(filling(space, **labels)), as_json=True)["actions"]
 
-
-@pytest.mark.parametrize("kind", SPACES)
-@pytest.mark.parametrize("text", ["[9, 9, 9]", '{"valve": 1}', "many", "[77, 77]", "{}"])
-def test_wrong_components_are_illegal(kind, text):
-    env = env_of(of_space(*SPACES[kind][:2]))
-    with pytest.raises(InvalidActionError, match="these are legal"):
-        parse(env, text)
-
-
-def test_the_schema_of_numbers_has_their_bounds():
-    space = spaces.Dict(
-        {"a": spaces.Box(0, 2, (1,)), "b": spaces.Box(-np.inf, 1, (2,)), "c": spaces.Discrete(3, start=1)}
-    )
-    schema = describe(env_of(of_space(space, None)), as_json=True)["actions"]
-    assert schema["required"] == ["a", "b", "c"]
-    assert schema["additionalProperties"] is False
-    assert schema["properties"]["a"] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
-    assert schema["properties"]["b"]["properties"]["1"] == {"type": "number", "maximum": 1.0}
-    assert schema["properties"]["c"] == {"type": "integer", "minimum": 1, "maximum": 3}
-
-
-def test_a_single_number_has_its_label():
-    env = env_of(of_space(spaces.Box(0, 2, (1,)), ["litres"]))
-    assert describe(env).endswith("\n- litres: a number from 0 to 2")
-    schema = {"type": "number", "minimum": 0.0, "maximum": 2.0, "description": "litres"}
-    assert describe(env, as_json=True)["actions"] == schema
-
-
-def test_actions_without_names_and_numbers_cannot_be_put_into_words():
-    env = env_of(of_space(spaces.Box(0, 1, (2, 2)), None))
+    amount = spaces.Box(0, 2, (1,))
+    found = schema(spaces.Dict({"a": amount, "b": spaces.Box(-np.inf, 1, (2,)), "c": spaces.Discrete(3, start=1)}))
+    assert found["required"] == ["a", "b", "c"]
+    assert found["additionalProperties"] is False
+    assert found["properties"]["a"] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
+    assert found["properties"]["b"]["properties"]["1"] == {"type": "number", "maximum": 1.0}
+    assert found["properties"]["c"] == {"type": "integer", "minimum": 1, "maximum": 3}
+    assert schema(amount, action_labels=["litres"]) == found["properties"]["a"] | {"description": "litres"}
+    assert describe(env_of(filling(amount, action_labels=["litres"]))).endswith("\n- litres: a number from 0 to 2")
     with pytest.raises(ViewError, match="cannot be put into words"):
-        describe(env, as_json=True)
+        schema(spaces.Box(0, 1, (2, 2)))
 
 
 def test_parts_of_an_observation_have_their_labels():
@@ -250,13 +203,8 @@ def test_timelines_name_actions_by_their_labels():
 
 
 @pytest.mark.parametrize("labels", [
-    {"action_labels": ["a", "b"]},
-    {"action_labels": {0: "a", 1: "b"}},
-    {"action_labels": "abc"},
-    {"action_labels": [1, 2, 3]},
-    {"action_labels": ["a", "b", 3]},
-    {"observation_labels": ["a", "b"]},
-    {"observation_labels": {"level": "a"}},
+    *[{"action_labels": labels} for labels in (["a", "b"], {0: "a", 1: "b"}, "abc", ["a", "b", 3])],
+    *[{"observation_labels": labels} for labels in (["a", "b"], {"level": "a"})],
     {"observation_labels": ["a", "a"], "observation_space": spaces.Box(0, 1, (2,))},
 ])  # fmt: skip
 def test_labels_that_do_not_fit_their_space_are_refused(labels):

@@ -4,17 +4,17 @@ import asyncio
 import json
 import pickle
 import sys
+from types import SimpleNamespace
 
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, clone, simulate, simulate_many, single_env
+from simenv_marl import RULE, single_env
 from simenv_marl.errors import InvalidActionError, LanguageModelError, MissingExtraError, OptionValueError
 from simenv_marl.seats import FallbackPolicy, LanguageModelPolicy, describe
 
 from .endpoint import endpoint, fails, says
-from .tank import FILL, POINTS, Tank, level_of
-from .test_descriptions import of_space
+from .tank import FILL, Tank, filling, levels, played
 
 pytest.importorskip("openai")
 
@@ -31,10 +31,6 @@ def model(address, **options):
     return LanguageModelPolicy("fake", base_url=address, api_key="a key", **options)
 
 
-def played(policy, seed=3):
-    return simulate(Tank, {"filler": policy}, points=POINTS, seed=seed).log
-
-
 def test_a_language_model_decides_by_labels():
     with endpoint([OPEN]) as (address, requests):
         policy = model(address, temperature=0.0)
@@ -48,28 +44,21 @@ def test_a_language_model_decides_by_labels():
     schema = requests[0]["response_format"]["json_schema"]["schema"]
     assert schema["properties"]["action"] == {"type": "string", "enum": ["closed", "half", "open"]}
     assert json.dumps(schema) in system["content"]  # for endpoints that do not enforce it
-    assert policy.usage["requests"] == 5
-    assert policy.usage["prompt_tokens"] == 50
-    assert policy.usage["completion_tokens"] == 15
-    assert policy.usage["seconds"] > 0
-
-
-@pytest.mark.parametrize("text", ["open", "Open", '"open"', "2", '{"action": 2}'])
-def test_an_answer_in_plain_text_is_parsed(text):
-    with endpoint([says(text)]) as (address, _):
-        assert played(model(address)) == played(lambda observation: 2)
+    seconds = policy.usage["seconds"]
+    assert seconds > 0
+    assert policy.usage == {"requests": 5, "prompt_tokens": 50, "completion_tokens": 15, "seconds": seconds}
 
 
 def test_numbers_are_checked_against_their_bounds_here_as_well():
-    points = {Tank.fill: of_space(spaces.Box(0, 2, (1,)), None)}
+    points = {Tank.fill: filling(spaces.Box(0, 2, (1,)))}
     with endpoint([says('{"action": 7}'), says('{"action": 1.5}')]) as (address, requests):
-        simulate(Tank, {"fill_0": model(address)}, points=points, seed=1)
+        played(model(address), points=points)
     assert requests[0]["response_format"]["json_schema"]["schema"]["properties"]["action"]["maximum"] == 2.0
     assert "number from 0 to 2" in requests[1]["messages"][-1]["content"]
 
 
-def test_a_wrong_answer_is_corrected_in_the_conversation():
-    with endpoint([says("ajar"), OPEN]) as (address, requests):
+def test_a_wrong_answer_is_corrected_in_the_conversation_and_plain_text_is_parsed():
+    with endpoint([says("ajar"), says("Open")]) as (address, requests):
         assert played(model(address))[0] == played(lambda observation: 2)[0]
     answer, correction = requests[1]["messages"][-2:]
     assert answer == {"role": "assistant", "content": "ajar"}
@@ -77,47 +66,39 @@ def test_a_wrong_answer_is_corrected_in_the_conversation():
     assert "- closed\n- half\n- open" in correction["content"]
 
 
-@pytest.mark.parametrize("answers", [
-    [fails(500), OPEN],
-    [fails(503), OPEN],
-    [fails(429, retry_after="0"), OPEN],
-    ["<html>busy</html>", OPEN],
-    [says(None, refusal="I would rather not"), OPEN],
-    [says("  "), OPEN],
-    [{"object": "something else"}, OPEN],
-    [2.0, OPEN],
+@pytest.mark.parametrize("answer", [
+    fails(500), fails(503), fails(429, retry_after="0"), "<html>busy</html>",
+    says(None, refusal="I would rather not"), says("  "), {"object": "something else"}, 2.0,
 ], ids=["500", "503", "429", "HTML", "refusal", "nothing", "garbage", "late"])  # fmt: skip
-def test_what_may_pass_is_tried_again(answers, monkeypatch):
+def test_what_may_pass_is_tried_again(answer, monkeypatch):
     waited, sleep = [], asyncio.sleep
     monkeypatch.setattr(asyncio, "sleep", lambda seconds: (waited.append(seconds), sleep(0))[1])
-    with endpoint(answers) as (address, requests):
+    with endpoint([answer, OPEN]) as (address, requests):
         assert played(model(address, timeout=1.0))[0] == played(lambda observation: 2)[0]
     assert len(requests) == 6
     assert waited == [0.01]  # LONGEST_WAIT in these tests
 
 
-@pytest.mark.parametrize("answer", [fails(500), "<html>down</html>", says(None, refusal="no")])
-def test_what_does_not_pass_is_an_error_and_a_fallback_answers(answer):
+@pytest.mark.parametrize(("answer", "kind", "error", "match"), [
+    (fails(500), "failed", LanguageModelError, "fake gave no answer"),
+    ("<html>down</html>", "failed", LanguageModelError, "fake gave no answer"),
+    (says(None, refusal="no"), "failed", LanguageModelError, "fake gave no answer"),
+    (says("ajar"), "illegal", InvalidActionError, "'ajar' names no legal action"),
+], ids=["500", "HTML", "refusal", "wrong"])  # fmt: skip
+def test_what_does_not_pass_is_an_error_and_a_fallback_answers(answer, kind, error, match):
     with endpoint([answer]) as (address, requests):
-        with pytest.raises(LanguageModelError, match="fake gave no answer"):
-            played(model(address, retries=0))
-        guarded = FallbackPolicy(model(address, retries=0))
+        with pytest.raises(error, match=match):
+            played(model(address, retries=1))
+        guarded = FallbackPolicy(model(address, retries=1))
         assert played(guarded) == played(RULE)
-    assert guarded.counts["failed"] == 5
-    assert len(requests) == 6
+    assert guarded.counts[kind] == guarded.counts["fallbacks"] == 5
+    assert len(requests) == 12
 
 
-def test_a_model_that_stays_wrong_is_an_illegal_answer():
-    with endpoint([says("ajar")]) as (address, requests):
-        with pytest.raises(InvalidActionError, match="'ajar' names no legal action"):
-            played(model(address, retries=2))
-        assert len(requests) == 3
-        guarded = FallbackPolicy(model(address, retries=0))
-        played(guarded)
-    assert guarded.counts["illegal"] == 5
-
-
-def test_a_refused_key_is_not_tried_again():
+def test_a_missing_key_is_told_of_and_a_refused_one_is_not_tried_again(monkeypatch):
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    with pytest.raises(LanguageModelError, match="api_key"):
+        played(LanguageModelPolicy("fake", base_url="http://127.0.0.1:9/v1"))
     with endpoint([fails(401, "unknown key")]) as (address, requests):
         policy = model(address)
         with pytest.raises(LanguageModelError, match=r"refuses to ask fake: .*unknown key"):
@@ -125,19 +106,8 @@ def test_a_refused_key_is_not_tried_again():
     assert len(requests) == 1
 
 
-def test_a_missing_key_is_told_of(monkeypatch):
-    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
-    with pytest.raises(LanguageModelError, match="api_key"):
-        played(LanguageModelPolicy("fake", base_url="http://127.0.0.1:9/v1"))
-
-
 def test_an_endpoint_without_structured_output_is_asked_without():
-    def answer(request):
-        if "response_format" in request:
-            return fails(400, "response_format is not supported")
-        return OPEN
-
-    with endpoint(answer) as (address, requests):
+    with endpoint([fails(400, "response_format is not supported"), OPEN]) as (address, requests):
         assert played(model(address)) == played(lambda observation: 2)
     assert ["response_format" in request for request in requests] == [True] + [False] * 5
 
@@ -154,17 +124,8 @@ def test_requests_contain_the_latest_decisions_of_the_agent():
 
 def test_episodes_of_one_seed_have_a_history_each():
     with endpoint([OPEN]) as (address, requests):
-        simulate_many(Tank, {"filler": model(address, history=9)}, seeds=[7, 7], points=POINTS)
+        levels(model(address, history=9), seeds=[7, 7])
     assert sorted(len(request["messages"]) for request in requests) == [2, 2, 4, 4, 6, 6, 8, 8, 10, 10]
-
-
-def test_many_simulations_are_decided_at_once():
-    with endpoint([OPEN]) as (address, requests):
-        found = simulate_many(
-            Tank, {"filler": model(address)}, seeds=range(6), points=POINTS, collect=level_of, concurrency=3
-        )
-    assert found == [tuple(played(lambda observation: 2, seed)) for seed in range(6)]
-    assert len(requests) == 30
 
 
 def test_a_policy_that_is_sent_to_another_process_decides_there():
@@ -174,8 +135,6 @@ def test_a_policy_that_is_sent_to_another_process_decides_there():
 
 
 def test_a_client_of_the_user_and_own_words_are_taken():
-    from types import SimpleNamespace
-
     asked = []
 
     async def create(**request):
@@ -198,18 +157,6 @@ def test_the_prompt_of_a_pending_decision_is_shown():
     assert found.startswith("You decide for 'filler'")
     assert "Be quick." in found
     assert found.endswith(describe(env))
-
-
-def test_in_clones_no_request_is_sent():
-    with endpoint([OPEN]) as (address, requests):
-        env = single_env(Tank, POINTS, agent="drainer", policies={"filler": model(address)})
-        env.reset(seed=1)
-        number = len(requests)
-        for method in ("fork", "replay"):
-            twin = clone(env, method=method)
-            twin.step(0)
-            twin.close()
-        assert len(requests) == number
 
 
 def test_without_the_package_the_error_names_the_extra(monkeypatch):

@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, clone, evaluate, make_step, simulate, simulate_many, single_env
+from simenv_marl import RULE, branch, clone, evaluate, single_env
 from simenv_marl.errors import DefinitionError, InvalidActionError, OptionValueError
-from simenv_marl.experiments import run_experiment
 from simenv_marl.seats import FallbackPolicy, RecordedPolicy
 
-from .tank import POINTS, Tank, level_of
-
-
-def played(policy, seed=3):
-    return simulate(Tank, {"filler": policy}, points=POINTS, seed=seed).log
+from .tank import FILL, POINTS, Tank, experiment, filling, levels, played
 
 
 def counted(**numbers):
@@ -52,6 +47,14 @@ async def illegal_later(observation):
     return 9
 
 
+def one(observation):
+    return 1
+
+
+def two(observation):
+    return 2
+
+
 @pytest.mark.parametrize("retries", [0, 2])
 @pytest.mark.parametrize(("policy", "kind"), [
     (raises, "failed"), (raises_later, "failed"), (late, "late"), (never, "late"), (illegal, "illegal"),
@@ -59,25 +62,11 @@ async def illegal_later(observation):
 ])  # fmt: skip
 def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, retries):
     timeout = 0.002 if kind == "late" else None  # others may be late, too, on a busy machine
-    guarded = FallbackPolicy(policy, lambda observation: 1, timeout=timeout, retries=retries)
-    assert played(guarded) == played(lambda observation: 1)
+    guarded = FallbackPolicy(policy, one, timeout=timeout, retries=retries)
+    assert played(guarded) == played(one)
     tries = Tank.days * (1 + retries)
     assert guarded.counts == counted(asked=5, fallbacks=5, retried=tries - 5, **{kind: tries})
     assert guarded.last_error is not None
-
-
-def test_without_faults_the_policy_itself_answers():
-    guarded = FallbackPolicy(lambda observation, info: 2, timeout=60)
-    assert played(guarded) == played(lambda observation: 2)
-    assert guarded.counts == counted(asked=5)
-    assert guarded.last_error is None
-
-
-def test_the_rule_is_the_default_fallback_and_a_legal_answer():
-    assert played(FallbackPolicy(raises)) == played(RULE)
-    guarded = FallbackPolicy(lambda observation: RULE)
-    assert played(guarded) == played(RULE)
-    assert guarded.counts["fallbacks"] == 0
 
 
 def test_an_answer_after_a_retry_is_used():
@@ -90,43 +79,39 @@ def test_an_answer_after_a_retry_is_used():
         return 2
 
     guarded = FallbackPolicy(second, retries=1)
-    assert played(guarded) == played(lambda observation: 2)
+    assert played(guarded) == played(two)
     assert guarded.counts == counted(asked=5, retried=5, failed=5)
 
 
-def test_the_fallback_may_ask_for_the_decision_and_wait():
-    async def fallback(observation, *, _decision):
-        await asyncio.sleep(0)
-        return _decision.number % 3
-
-    def expected(observation, *, _decision):
-        return _decision.number % 3
-
-    assert played(FallbackPolicy(raises, fallback)) == played(expected)
+def by_number(observation, *, _decision):
+    return _decision.number % 3
 
 
-def test_a_planner_can_be_guarded():
-    def planner(observation, *, _environment):
-        return int(_environment.unwrapped.simulation.level < 5) * 2
-
-    guarded = FallbackPolicy(planner)
-    assert played(guarded) == played(lambda observation: int(observation[0] < 5) * 2)
-    assert guarded.counts == counted(asked=5)
+async def by_number_later(observation, *, _decision):
+    await asyncio.sleep(0)
+    return _decision.number % 3
 
 
-def test_the_fallback_may_be_a_planner():
-    guarded = FallbackPolicy(illegal, lambda observation, *, _environment: 1)
-    assert played(guarded) == played(lambda observation: 1)
+def planner(observation, *, _environment):
+    return 2 * (_environment.unwrapped.simulation.level < 5)
 
 
-def test_a_decision_that_cannot_be_passed_is_refused_at_once():
-    with pytest.raises(DefinitionError, match="keyword-only"):
-        FallbackPolicy(lambda observation, _decision: 1)
-
-
-def test_a_recording_without_its_folder_is_refused_at_once(tmp_path):
-    with pytest.raises(OptionValueError, match="no folder"):
-        RecordedPolicy(raises, tmp_path / "missing" / "answers")
+@pytest.mark.parametrize(
+    ("arguments", "plain", "faults"),
+    [
+        ((lambda observation, info: 2,), two, {}),
+        ((lambda observation: RULE,), RULE, {}),
+        ((planner,), lambda observation: 2 * (observation[0] < 5), {}),
+        ((raises,), RULE, {"failed": 5, "fallbacks": 5}),
+        ((raises, by_number_later), by_number, {"failed": 5, "fallbacks": 5}),
+        ((illegal, lambda observation, *, _environment: 1), one, {"illegal": 5, "fallbacks": 5}),
+    ],
+)
+def test_policy_and_fallback_may_be_whatever_decides(arguments, plain, faults):
+    guarded = FallbackPolicy(*arguments, timeout=60)
+    assert played(guarded) == played(plain)
+    assert guarded.counts == counted(asked=5, **faults)
+    assert (guarded.last_error is None) == (not faults)
 
 
 def test_an_illegal_answer_of_the_fallback_is_an_error():
@@ -137,9 +122,13 @@ def test_an_illegal_answer_of_the_fallback_is_an_error():
 @pytest.mark.parametrize("arguments", [
     {"policy": 3}, {"fallback": 3}, {"timeout": 0}, {"timeout": "1"}, {"retries": -1}, {"retries": True},
 ])  # fmt: skip
-def test_arguments_that_cannot_be_used_are_refused(arguments):
+def test_what_cannot_be_used_is_refused_at_once(arguments, tmp_path):
     with pytest.raises(OptionValueError, match=next(iter(arguments))):
         FallbackPolicy(**{"policy": raises, **arguments})
+    with pytest.raises(DefinitionError, match="keyword-only"):
+        FallbackPolicy(lambda observation, _decision: 1)
+    with pytest.raises(OptionValueError, match="no folder"):
+        RecordedPolicy(raises, tmp_path / "missing" / "answers")
 
 
 # -- in tables ------------------------------------------------------------------------------------
@@ -153,65 +142,68 @@ async def sometimes(observation, *, _decision):
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
-    guarded = FallbackPolicy(sometimes)
-    contenders = {"guarded": {"filler": guarded}, "plain": {"filler": lambda observation: 1}}
-    found = evaluate(Tank, contenders, seeds=range(4), points=POINTS, workers=workers)
+    guarded, seeds = FallbackPolicy(sometimes), range(4)
+    contenders = {"guarded": {"filler": guarded}, "plain": {"filler": one}}
+    found = evaluate(Tank, contenders, seeds=seeds, points=POINTS, workers=workers)
     own = found.frame[(found.frame["contender"] == "guarded")]
     for agent, expected in (("filler", [0, 1, 0, 1]), ("drainer", [0] * 4), ("team", [0, 1, 0, 1])):
         assert own[own["agent"] == agent].sort_values("seed")["fallbacks"].tolist() == expected
     assert guarded.counts == counted(asked=20, failed=2, fallbacks=2)
-    table = run_experiment(
-        lambda days: Tank(),
-        [{"days": 5}],
-        contenders=contenders,
-        seeds=range(4),
-        points=POINTS,
-        store=tmp_path,
-        workers=workers,
-    )
-    again = run_experiment(
-        lambda days: Tank(), [{"days": 5}], contenders=contenders, seeds=range(4), points=POINTS, store=tmp_path
-    )
-    for frame in (table, again):
+    for many in (workers, 0):  # the second time nothing is run
+        frame = experiment(contenders, tmp_path, seeds=seeds, workers=many)
         team = frame[(frame["agent"] == "team") & (frame["contender"] == "guarded")]
         assert team["fallbacks"].tolist() == [0, 1, 0, 1]
-    assert guarded.counts == counted(asked=40, failed=4, fallbacks=4)
+    levels(guarded, seeds, workers=workers)
+    assert guarded.counts == counted(asked=60, failed=6, fallbacks=6)
 
 
-def test_workers_of_simulate_many_add_their_counts():
-    guarded = FallbackPolicy(sometimes)
-    simulate_many(Tank, {"filler": guarded}, seeds=range(6), points=POINTS, collect=level_of, workers=2)
-    assert guarded.counts == counted(asked=30, failed=3, fallbacks=3)
-
-
-def test_contenders_with_many_fallbacks_are_marked():
-    contenders = {"bad": {"filler": FallbackPolicy(raises)}, "good": {"filler": FallbackPolicy(lambda observation: 1)}}
-    found = evaluate(Tank, contenders, seeds=range(3), points={Tank.fill: POINTS[Tank.fill]})
+def test_contenders_with_many_fallbacks_are_marked_and_tables_without_one_have_no_column_for_it():
+    contenders = {"bad": {"filler": FallbackPolicy(raises)}, "good": {"filler": FallbackPolicy(one)}}
+    found = evaluate(Tank, contenders, seeds=range(3), points={Tank.fill: FILL})
     summary = found.summary()
     assert summary["fallbacks"].tolist() == [1.0, 0.0]
     assert summary["note"].tolist() == ["100% of decisions by a fallback", ""]
     assert [label.get_text() for label in found.plot().axes[0].get_xticklabels()] == ["bad\n100% fallbacks", "good"]
     assert "fallbacks" in str(found)
-
-
-def test_tables_without_a_fallback_have_no_column_for_it():
-    found = evaluate(Tank, {"plain": {"filler": lambda observation: 1}}, seeds=range(2), points=POINTS)
+    found = evaluate(Tank, {"plain": {"filler": one}}, seeds=range(2), points=POINTS)
     assert "fallbacks" not in found.frame
     assert "fallbacks" not in found.summary()
 
 
+async def two_outside_clones(observation, *, _decision):
+    assert not _decision.in_clone
+    return 2
+
+
+def then_the_rule(observation, *, _decision):
+    return 2 if _decision.number == 1 else RULE
+
+
 @pytest.mark.parametrize("method", ["fork", "replay"])
-@pytest.mark.parametrize("policy", [lambda observation: 9, illegal_later])
-def test_in_clones_nothing_is_counted(policy, method):
-    guarded = FallbackPolicy(policy, lambda observation: 2)
-    env = single_env(Tank, POINTS, agent="drainer", policies={"filler": guarded})
-    env.reset(seed=1)
-    before = guarded.counts
+@pytest.mark.parametrize(
+    ("policy", "plain"),
+    [
+        (two_outside_clones, then_the_rule),
+        (FallbackPolicy(illegal, two), two),
+        (FallbackPolicy(illegal_later, two), two),
+    ],
+)
+def test_in_clones_and_branches_nobody_waits_and_nothing_is_counted(policy, plain, method):
+    def begun(policy):
+        env = single_env(Tank, POINTS, agent="drainer", policies={"filler": policy})
+        env.reset(seed=1)
+        return env
+
+    def rest(env, number=0):
+        return [float(env.step(0)[1]) for _ in range(Tank.days)]
+
+    env = begun(policy)
+    before = getattr(policy, "counts", None)
     twin = clone(env, method=method)
-    levels = [float(twin.step(0)[0][0]) for _ in range(3)]
-    assert guarded.counts == before
+    assert [rest(twin)] == branch(env, rest, method=method) == [rest(begun(plain))]
+    assert getattr(policy, "counts", None) == before
     twin.close()
-    assert levels == [float(env.step(0)[0][0]) for _ in range(3)]
+    assert rest(env) == rest(begun(two))
 
 
 def test_copies_and_pickles_count_together():
@@ -244,44 +236,33 @@ class Waiting(Asked):
 @pytest.mark.parametrize("kind", [Asked, Waiting])
 def test_the_same_seeds_run_again_without_one_call(kind, tmp_path):
     first, path = kind(), tmp_path / "answers.jsonl"
-    recorded = simulate_many(
-        Tank, {"filler": RecordedPolicy(first, path)}, seeds=range(4), points=POINTS, collect=level_of
-    )
+    recorded = levels(RecordedPolicy(first, path), range(4))
     assert first.times == 20
     assert len(path.read_text().splitlines()) == 20
     entry = json.loads(path.read_text().splitlines()[0])
     assert entry.keys() == {"seed", "agent", "number", "observation", "answer"}
     assert entry["agent"] == "filler"
     second = kind()
-    policy = RecordedPolicy(second, path)
-    assert simulate_many(Tank, {"filler": policy}, seeds=range(5), points=POINTS, collect=level_of)[:4] == recorded
+    assert levels(RecordedPolicy(second, path), range(5))[:4] == recorded == levels(kind(), range(4))
     assert second.times == 5  # those of the new seed
-    assert recorded == simulate_many(Tank, {"filler": kind()}, seeds=range(4), points=POINTS, collect=level_of)
 
 
-def test_a_recording_can_be_used_after_a_crash(tmp_path):
+def test_what_a_crash_has_left_of_a_recording_and_answers_to_other_observations(tmp_path):
     path = tmp_path / "answers.jsonl"
-    played(RecordedPolicy(Asked(), path))
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-9])  # the last line was not finished
-    second = Asked()
-    assert played(RecordedPolicy(second, path)) == played(Asked())
-    assert second.times == 1
-    third = Asked()
+
+    def asked_again():
+        policy = Asked()
+        assert played(RecordedPolicy(policy, path)) == played(Asked())
+        return policy.times
+
+    assert asked_again() == 5
+    whole = path.read_text()
+    path.write_text(whole[:-9])  # the last line was not finished
+    assert asked_again() == 1
     with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
-        played(RecordedPolicy(third, path))
-    assert third.times == 0
-
-
-def test_an_answer_to_another_observation_is_not_repeated(tmp_path):
-    path = tmp_path / "answers.jsonl"
-    played(RecordedPolicy(Asked(), path))
-    lines = path.read_text().splitlines()
-    entry = json.loads(lines[0])
-    path.write_text("\n".join([json.dumps({**entry, "observation": "other"}), *lines[1:]]) + "\n")
-    again = Asked()
-    played(RecordedPolicy(again, path))
-    assert again.times == 1
+        assert asked_again() == 0
+    path.write_text(whole.replace(json.loads(whole.splitlines()[0])["observation"], "other"))
+    assert asked_again() == 1
 
 
 def test_illegal_answers_are_not_recorded(tmp_path):
@@ -307,27 +288,10 @@ PARTS = {
 def test_actions_of_any_space_are_repeated_exactly(kind, tmp_path):
     space, action = PARTS[kind]
     seen = []
-    points = {
-        Tank.fill: make_step(
-            observation_space=spaces.Dict({"level": spaces.Box(-50, 50, (1,)), "day": spaces.Discrete(9)}),
-            observation_space_mapping=lambda tank: {"level": [tank.level], "day": tank.day},
-            action_space=space,
-            action_space_mapping=lambda action: seen.append(action) or 1.0,
-            reward_mapping=lambda tank: 0.0,
-        )
-    }
+    points = {Tank.fill: filling(space, lambda action: seen.append(action) or 1.0)}
     for policy in (lambda observation: action, raises):
-        simulate(Tank, {"fill_0": RecordedPolicy(policy, tmp_path / "answers")}, points=points, seed=1)
+        played(RecordedPolicy(policy, tmp_path / "answers"), points=points)
     assert len(seen) == 10
-    for one, other in zip(seen[:5], seen[5:], strict=True):
-        assert space.contains(other)
-        np.testing.assert_equal(spaces.flatten(space, other), spaces.flatten(space, _full(space, one)))
-
-
-def _full(space, action):
-    """Return an action with scalars in place of one-element boxes as a member of its space."""
-    if isinstance(space, spaces.Dict):
-        return {key: _full(part, action[key]) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(_full(part, action[place]) for place, part in enumerate(space.spaces))
-    return np.asarray(action, space.dtype).reshape(space.shape)
+    for given, repeated in zip(seen[:5], seen[5:], strict=True):
+        assert space.contains(repeated)
+        np.testing.assert_equal(repeated, given)

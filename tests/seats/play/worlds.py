@@ -82,9 +82,6 @@ class FixedShop(Shop):
     reseed = None
 
 
-FixedShop.points = {Shop.order: ORDER}
-
-
 class ClosedShop(Shop):
     """It takes some time to close."""
 
@@ -101,9 +98,6 @@ class EndlessShop(Shop):
         time.sleep(600)
 
 
-EndlessShop.points = {Shop.order: ORDER}
-
-
 class BrokenShop(Shop):
     """It cannot begin."""
 
@@ -118,25 +112,18 @@ class LeavingShop(Shop):
         os._exit(3)
 
 
+def labels(shop):
+    """Name the actions, on the first three days."""
+    return [f"order {amount} of {3 // (3 - shop.day)}" for amount in range(4)]
+
+
 class BreakingShop(Shop):
-    """It breaks on the day after three pieces were ordered."""
+    """It breaks on the day after three pieces were ordered; its labels fail on the fourth day."""
+
+    points = {Shop.order: replace(ORDER, action_labels=labels)}  # noqa: RUF012
 
     def run(self):
         while self.day < self.days:
             if self.order() == 3:
                 raise ZeroDivisionError("the till is broken")
             self.day += 1
-
-
-BreakingShop.points = {Shop.order: ORDER}
-
-
-def labels(shop):
-    """Name the actions, on the first two days."""
-    return [f"order {amount} of {2 // (2 - shop.day)}" for amount in range(4)]
-
-
-class MislabelledShop(Shop):
-    """Its labels fail on the third day."""
-
-    points = {Shop.order: replace(ORDER, action_labels=labels)}  # noqa: RUF012

@@ -1,4 +1,4 @@
-"""What simulators in other processes tell besides their calls: the decisions of their rules, and births."""
+"""The frames of simulators in other processes: invalid ones, the decisions of their rules, and births."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, make_step, parallel_env, simulate
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
-from simenv_marl.errors import DefinitionError, SimulationError, WireError
+from simenv_marl.errors import DefinitionError, RemoteError, SimulationError, WireError
 from simenv_marl.remote import ProcessSimulation
 from tests.outside.reservoirs import BOTH, BOTH_HERE, PRICE, Here, by_its_rule, child, reservoirs
 from tests.processes import runs
@@ -101,6 +101,8 @@ for frame in sys.argv[1:]:
 """
 HELLO = {"hello": 1, "points": ["sheep.graze"], "can": ["decided", "expect"]}
 CALL = {"decide": 1, "point": "sheep.graze", "entity": "a", "args": {"hunger": 1}}
+NEXT = {**CALL, "decide": 2}
+DECIDED = {"decided": 1, "value": 3}
 GRAZE = make_step(
     observation_space=spaces.Box(0, 9, (1,), np.float32),
     observation_space_mapping=lambda call: [call.hunger],
@@ -117,36 +119,69 @@ def speaking(*frames) -> ProcessSimulation:
 
 
 @pytest.mark.parametrize(
-    ("frames", "text"),
+    ("frames", "kind", "text"),
     [
-        ([{**CALL, "decide": 2}], r"has sent .*'decide': 2.* where \{\"decided\": 1, \"value\": \.\.\.\} was due"),
-        ([{"end": {}}], r"'end'.* where \{\"decided\": 1"),
-        ([{"decided": 2, "value": 3}], r"'decided': 2.* where \{\"decided\": 1"),
-        ([{"decided": True, "value": 3}], r"'decided': True.* where \{\"decided\": 1"),
-        ([{"decided": 1}], r"\{'decided': 1\} where \{\"decided\": 1"),
-        ([{"decided": 1, "value": 3}, {"decided": 1, "value": 3}], "'decided'.* which is not due"),
-        ([{"decided": 1, "value": 3}, {"expect": {"entity": "b"}}], '"expect" with .*must be a list of objects'),
-        ([{"decided": 1, "value": 3}, {"expect": [{**CALL}]}], '"expect" with .*must be a list of objects'),
-        ([{"decided": 1, "value": 3}, {"expect": [{"point": "moon", "entity": "b"}]}], "the point 'moon'"),
-        ([{"decided": 1, "value": 3}, {"end": {"truncated": "yes"}}], r"'yes'.*\"truncated\" \(true or false\)"),
-        ([{"decided": 1, "value": 3}, {**CALL, "end": {}}], "decide and end in one frame"),
-        (
-            [{"decided": 1, "value": 3}, {"update": "a", "point": "sheep.graze", "args": {"time": 3}}],
-            r"an argument 'time' for sheep\.graze",
-        ),
-        (
-            [{"decided": 1, "value": 3}, {"expect": [{"point": "sheep.graze", "args": {"entity": 3}}]}],
-            r"an argument 'entity' for sheep\.graze",
-        ),
+        ([CALL], WireError, "began with .*decide.*, not with a hello"),
+        ([{**HELLO, "hello": 2}], WireError, "speaks version 2 of the wire; this is version 1"),
+        ([{**HELLO, "hello": True}], WireError, "speaks version True"),
+        ([{**HELLO, "points": "sheep.graze"}], WireError, "must be lists of strings"),
+        ([{"error": {"type": "Drought", "text": "no water"}}], RemoteError, "has raised Drought: no water"),
     ],
     ids=str,
 )
-def test_frames_that_are_not_due_are_errors_that_name_them(frames, text):
+def test_a_hello_that_is_invalid_is_an_error(frames, kind, text):
+    with pytest.raises(kind, match=text):
+        simulate(speaking(*frames), seed=1)
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        (NEXT, "'decide': 2"),
+        ({"end": {}}, "'end'"),
+        ({**DECIDED, "decided": 2}, "'decided': 2"),
+        ({**DECIDED, "decided": True}, "'decided': True"),
+        ({"decided": 1}, r"\{'decided': 1\}"),
+    ],
+    ids=str,
+)
+def test_a_frame_in_place_of_the_decision_of_the_rule_is_an_error_that_names_it(frame, text):
+    with pytest.raises(WireError, match=rf'has sent .*{text}.* where \{{"decided": 1, "value": \.\.\.\}} was due'):
+        simulate(speaking(HELLO, CALL, frame), seed=1)
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        ({"desire": 4}, "desire.*not a frame of the wire"),
+        ({"error": "a dam broke"}, "a dam broke.*not a frame of the wire"),
+        (DECIDED, "'decided'.* which is not due"),
+        ({**NEXT, "decide": 7}, "call 7 where call 2 was due"),
+        ({**NEXT, "decide": "2"}, "call '2' where call 2"),
+        ({**NEXT, "point": "moon"}, "the point 'moon', which is not in its hello"),
+        ({**NEXT, "point": ["a"]}, r"named the point \['a'\]"),
+        ({**NEXT, "entity": ["a"]}, r"\['a'\] for sheep\.graze; an entity must be"),
+        ({**NEXT, "args": [1]}, r"args .* not an object: \[1\]"),
+        ({**NEXT, "time": "now"}, "the time 'now'"),
+        ({**NEXT, "time": 10**400}, "the time 1000"),
+        ({**NEXT, "end": {}}, "decide and end in one frame"),
+        ({"end": True}, "the end True"),
+        ({"end": {"truncated": "yes"}}, r"'yes'.*\"truncated\" \(true or false\)"),
+        ({"remove": "a", "point": "moon"}, "the point 'moon'"),
+        ({"update": "a", "point": "sheep.graze", "args": {"time": 3}}, r"an argument 'time' for sheep\.graze"),
+        ({"expect": {"entity": "b"}}, '"expect" with .*must be a list of objects'),
+        ({"expect": [CALL]}, '"expect" with .*must be a list of objects'),
+        ({"expect": [{"point": "moon"}]}, "the point 'moon'"),
+        ({"expect": [{"point": "sheep.graze", "args": {"entity": 3}}]}, r"an argument 'entity' for sheep\.graze"),
+    ],
+    ids=str,
+)
+def test_a_frame_that_is_invalid_or_not_due_is_an_error_that_names_it(frame, text):
     with pytest.raises(WireError, match=f"(?s){text}"):
-        simulate(speaking(HELLO, CALL, *frames), seed=1)
+        simulate(speaking(HELLO, CALL, DECIDED, frame), seed=1)
 
 
-@pytest.mark.parametrize("frame", [{"decided": 1, "value": 3}, {"expect": []}])
+@pytest.mark.parametrize("frame", [DECIDED, {"expect": []}])
 def test_frames_that_were_not_announced_are_errors(frame):
     with pytest.raises(WireError, match=r"not in the \"can\" of its hello"):
         simulate(speaking({**HELLO, "can": []}, CALL, frame), seed=1)
@@ -168,9 +203,9 @@ def rounds(env, **options):
 
 def test_expected_calls_join_and_act_in_one_round(make_env):
     env = make_env(parallel_env, flock())
-    born, number, eaten = rounds(env, sheep=1000, days=1)
-    assert (born, number) == (1, 1000)
-    assert rounds(env, sheep=1000, days=1, expects=True) == (1000, 1, eaten)
+    born, number, eaten = rounds(env, sheep=100, days=1)
+    assert (born, number) == (1, 100)
+    assert rounds(env, sheep=100, days=1, expects=True) == (100, 1, eaten)
     assert rounds(env, sheep=100, days=3, expects=True)[:2] == (100, 3), "also those that are born in mid-episode"
 
 
@@ -185,9 +220,9 @@ def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
 
 
 def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_env):
-    one, decided, again = {"point": "sheep.graze", "entity": "b"}, {"decided": 1, "value": 3}, {**CALL, "decide": 2}
+    expected = {"expect": [{"point": "sheep.graze", "entity": "b"}]}
     removed = [{"remove": name, "point": "sheep.graze"} for name in "ab"]
-    frames = CALL, decided, {"expect": [one]}, *removed, again, {**decided, "decided": 2}, {"end": {}}
+    frames = CALL, DECIDED, expected, *removed, NEXT, {**DECIDED, "decided": 2}, {"end": {}}
     names = {}
     named = replace(GRAZE, agent=lambda call: names.setdefault(call, f"sheep_{len(names)}"))
     env = make_env(aec_env, speaking(HELLO, *frames), {"sheep.graze": named})
@@ -200,7 +235,7 @@ def test_an_error_here_ends_a_process_that_is_not_waiting(make_env):
     rewards = [0.0]
     once = {"sheep.graze": replace(GRAZE, reward_mapping=lambda call: rewards.pop())}
     removed = {"remove": "a", "point": "sheep.graze"}
-    env = make_env(aec_env, speaking(HELLO, CALL, {"decided": 1, "value": 3}, removed, {"end": {}}), once)
+    env = make_env(aec_env, speaking(HELLO, CALL, DECIDED, removed, {"end": {}}), once)
     env.reset(seed=1)
     number = child(env)
     with pytest.raises(IndexError):
@@ -208,8 +243,8 @@ def test_an_error_here_ends_a_process_that_is_not_waiting(make_env):
     assert not runs(number)
 
 
-def test_a_process_that_does_not_expect_has_no_expected_calls(make_env):
-    env = make_env(aec_env, reservoirs())
-    assert not hasattr(env.unwrapped.simulation, "expected_calls")
-    env.reset(seed=1)
-    assert not hasattr(env.unwrapped.simulation, "expected_calls")
+def test_a_process_that_does_not_expect_has_no_expected_calls():
+    simulation = reservoirs()
+    assert not hasattr(simulation, "expected_calls")
+    simulation.reset(seed=1)
+    assert not hasattr(simulation, "expected_calls")

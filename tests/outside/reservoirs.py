@@ -53,16 +53,6 @@ import outside
 outside.main()
 """
 
-EXITS_AFTER_STOP = """
-decide = outside.Wire.decide
-def exits(*call):
-    try:
-        return decide(*call)
-    except outside.Stopped:
-        sys.exit({code})
-outside.Wire.decide = exits
-"""
-
 
 def changed(folder: Path, change: str) -> list[str]:
     """What starts the model with some change to it or to its end of the wire."""

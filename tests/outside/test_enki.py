@@ -1,47 +1,16 @@
 """Robots in Enki, which come and leave in mid-episode: a model in C++, by the client's header."""
 
-import json
-import subprocess
-
 import numpy as np
 import pytest
 from examples.enki_robots import env as robots
 
 from simenv_marl import RULE, evaluate
 from simenv_marl.remote.check import check_wire
-from tests.outside.reservoirs import child
-from tests.worlds.models import follow_the_rule, play
 
 pytestmark = [
     pytest.mark.skipif(bool(robots.missing()), reason=robots.missing()),
     pytest.mark.filterwarnings("ignore::UserWarning"),  # what PettingZoo says where no roster is declared
 ]
-
-
-def plain(seed, **options):
-    """What the program prints by itself."""
-    command = [robots.program(), str(seed), json.dumps(options)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
-
-
-def test_by_the_rule_each_episode_is_the_plain_program(make_env):
-    env = make_env(robots.raw_env)
-    for seed, options in ((7, {}), (8, {"seconds": 30.0}), (2**30, {"seconds": 30.0}), (7, {})):  # in one process
-        env.reset(seed=seed, options=options)
-        play(env, reset=False)
-        assert repr(env.simulation.result) == repr(plain(seed, **options))
-
-
-def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(make_env):
-    env = make_env(robots.raw_env)
-    for steps in (0, 1, 300):
-        env.reset(seed=3)
-        for _ in range(steps):
-            over = env.terminations[env.agent_selection]
-            env.step(None if over else env.action_space(env.agent_selection).sample())
-        number = child(env)
-        assert repr(follow_the_rule(env, 4).result) == repr(plain(4))
-        assert child(env) == number, "the model unwinds, and its process plays on"
 
 
 def test_robots_join_in_pairs_and_leave_one_by_one(make_env):

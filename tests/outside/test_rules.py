@@ -12,38 +12,32 @@ from simenv_marl import RULE, aec_env, make_step, parallel_env, simulate
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
 from simenv_marl.errors import DefinitionError, RemoteError, SimulationError, WireError
 from simenv_marl.remote import ProcessSimulation
-from tests.outside.reservoirs import BOTH, BOTH_HERE, PRICE, Here, by_its_rule, child, reservoirs
+from tests.outside.reservoirs import PRICE, TELLING, Here, by_its_rule, child, reservoirs
 from tests.processes import runs
 from tests.worlds import by_client
+from tests.worlds.counters import alike
 from tests.worlds.models import play
 
 pytestmark = pytest.mark.greenlet("the rule's decision comes back within the simulation, whatever runs it")
 
 
-def with_actions(points):
-    """The definitions, in which the rule's decisions are actions."""
-    return {
-        name: replace(definition, rule_action_mapping=mapping)
-        for (name, definition), mapping in zip(
-            points.items(), [lambda decision: [decision], lambda decision: min(2, int(decision))], strict=True
-        )
-    }
-
-
-def telling(points=BOTH) -> ProcessSimulation:
+def telling(points=TELLING) -> ProcessSimulation:
     """The reservoirs in a process that tells what its rules decide."""
     return ProcessSimulation([sys.executable, by_client.__file__, "reservoirs"], points)
 
 
-def test_infos_have_the_action_of_the_rule(make_env):
-    told = make_env(aec_env, telling(with_actions(BOTH)))
-    here = make_env(aec_env, Here, with_actions(BOTH_HERE))
-    turns = [
-        [(turn.agent, turn.info.get("rule_action"), turn.reward) for turn in play(env, seed=1)] for env in (told, here)
-    ]
-    assert str(turns[0]) == str(turns[1])
-    assert any(action is not None for _, action, _ in turns[0])
-    assert told.unwrapped.simulation.result == by_its_rule(1)
+def sampled(agent, env):
+    return env.action_space(agent).sample()
+
+
+@pytest.mark.parametrize("choose", [RULE, sampled], ids=["rule", "sampled"])
+def test_an_episode_is_the_one_of_the_same_model_in_this_process(make_env, choose):
+    envs = make_env(aec_env, telling()), make_env(aec_env, Here)
+    for seed in range(3):
+        theirs, ours = (play(env, choose, seed=seed) for env in envs)
+        assert alike(theirs, ours)
+        assert len({turn.agent for turn in ours}) > 3  # some are born
+        assert any(turn.info.get("rule_action") is not None for turn in ours) == (choose is RULE)
 
 
 def _closes(observations):
@@ -51,13 +45,12 @@ def _closes(observations):
 
 
 def test_the_rule_can_be_recorded_and_compared_with_policies():
-    here = type("There", (Here,), {"points": with_actions(BOTH_HERE)})
     found = [
         compare_with_rule(simulation, {name: _closes}, seeds=range(3), tolerance=0.5)[name]
-        for simulation, name in ((telling(with_actions(BOTH)), "reservoir.inflow"), (here, next(iter(BOTH_HERE))))
+        for simulation, name in ((telling(), "reservoir.inflow"), (Here, next(iter(Here.points))))
     ]
     assert 0 < found[0].agreement == found[1].agreement < 1
-    mixed = collect_episodes(telling(with_actions(BOTH)), {"reservoir.inflow": Mixture({RULE: 1.0})}, seeds=[1])
+    mixed = collect_episodes(telling(), {"reservoir.inflow": Mixture({RULE: 1.0})}, seeds=[1])
     assert mixed["reservoir.inflow"].known.all()
 
 
@@ -68,18 +61,15 @@ def test_actions_of_a_process_that_tells_nothing_stay_unknown():
 
 
 def test_apply_may_ask_the_rule_and_leave_it_at_that():
-    asked = []
+    asked, late = [], []
 
     def apply(action, call, *, _rule):
         asked.append(_rule(call))
         late.append((_rule, call))
         return asked[-1]
 
-    late = []
-    definition = replace(PRICE, action_space_mapping=None, apply=apply)
-    assert simulate(telling({"broker.price": definition}), {"broker.price": lambda _: 0}, seed=1).result == by_its_rule(
-        1
-    )
+    simulation = telling({"broker.price": replace(PRICE, action_space_mapping=None, apply=apply)})
+    assert simulate(simulation, {"broker.price": lambda _: 0}, seed=1).result == by_its_rule(1)
     assert asked[0] == pytest.approx(1.1)
     assert [rule(call) for rule, call in late] == [RULE] * len(asked), "no decision is due any more"
 

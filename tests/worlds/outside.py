@@ -10,7 +10,7 @@ import os
 import random
 import sys
 from collections.abc import Callable
-from math import inf, isfinite
+from math import inf
 from typing import Any
 
 
@@ -45,7 +45,7 @@ class Reservoirs:
                     lambda level=level: round(max(0.0, 5.0 - level), 3),
                 )
                 self.levels[name] = level + inflow - self.random.uniform(0.2, 5.5)
-                self.log.append((hour, name, self.levels[name]))
+                self.log.append([hour, name, self.levels[name]])
                 if not 0 < self.levels[name] < 9:
                     level = self.levels.pop(name)
                     update("reservoir.inflow", name, {"level": level, "queue-length": hour, "price": self.price})
@@ -61,12 +61,10 @@ class Reservoirs:
         """What came of it."""
         return {"levels": self.levels, "price": self.price, "log": self.log}
 
-
-def finite(value: Any) -> Any:
-    """Numbers that are not finite, as they travel."""
-    if isinstance(value, float) and not isfinite(value):
-        return {"float": "nan" if value != value else "inf" if value == inf else "-inf"}
-    return value
+    def by_its_rule(self) -> dict[str, Any]:
+        """What comes of it by its own rule."""
+        self.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
+        return self.result()
 
 
 class Wire:
@@ -142,9 +140,7 @@ def main() -> None:
     if "SIMENV_MARL_FDS" in os.environ:
         Wire().play(Reservoirs, POINTS, float(sys.argv[1]) if len(sys.argv) > 1 else inf)
         return
-    model = Reservoirs(int(sys.argv[1]), {})
-    model.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
-    print(json.dumps(model.result()))
+    print(json.dumps(Reservoirs(int(sys.argv[1]), {}).by_its_rule()))
 
 
 if __name__ == "__main__":

@@ -52,9 +52,9 @@ def reservoirs(points=BOTH, **options) -> ProcessSimulation:
     return ProcessSimulation(command(), points, **options)
 
 
-def broken(when: str, what: str, timeout: float = 20.0) -> ProcessSimulation:
-    """A simulator that does something wrong."""
-    return ProcessSimulation([sys.executable, faulty.__file__, when, what], BOTH, timeout=timeout)
+def broken(what: str) -> ProcessSimulation:
+    """A simulator that does something wrong in mid-episode."""
+    return ProcessSimulation([sys.executable, faulty.__file__, what], BOTH, timeout=20.0)
 
 
 CHANGED = """

@@ -42,14 +42,6 @@ IN_MID_EPISODE = {
     "error": (RemoteError, "has raised Flood: a dam broke\ndam.cpp:12"),
 }
 
-AT_ONCE = {
-    "silence": (ProcessTimeoutError, "sent nothing"),
-    "exit 3": (ProcessDiedError, "exited with code 3"),
-    "garbage": (WireError, "Welcome to the simulator"),
-    "no start": (WireError, "has sent .*decide.* before the start of an episode"),
-    "error, no start": (RemoteError, "has raised Drought: no water"),
-}
-
 
 def patience(what: str) -> float:
     """For how long to wait for a simulator, in seconds: not long where no more comes."""
@@ -60,7 +52,7 @@ def patience(what: str) -> float:
 
 def before_its_fault(what, make_env=lambda kind, *arguments: kind(*arguments)):
     """An environment whose simulator is about to do something wrong in mid-episode."""
-    env = make_env(aec_env, broken("in mid-episode", what), "reservoir.inflow")
+    env = make_env(aec_env, broken(what), "reservoir.inflow")
     env.reset(seed=1)
     env.step(RULE)
     env.step(RULE)
@@ -85,28 +77,22 @@ def test_faults_in_mid_episode_are_errors(make_env, what):
     assert env.terminations == {"a": True}
 
 
-@pytest.mark.parametrize("what", AT_ONCE)
-def test_faults_before_the_first_episode_are_errors(make_env, what):
-    kind, text = AT_ONCE[what]
-    env = make_env(aec_env, broken("at once", what, timeout=patience(what)), "reservoir.inflow")
-    for _ in range(2):
-        with pytest.raises(kind, match=f"(?s){text}"):
-            env.reset(seed=1)
-        left = env.unwrapped.simulation._child
-        assert left is None or not left.usable
-
-
 @pytest.mark.parametrize(
-    ("command", "text"),
+    ("command", "kind", "text"),
     [
-        (["/nowhere/at/all"], "'/nowhere/at/all' cannot be started: FileNotFoundError"),
-        ([__file__], "PermissionError"),
-        ("", "cannot be started"),
+        (["sleep", "600"], ProcessTimeoutError, "still runs; it has sent nothing for 0.5 s"),
+        (["sh", "-c", "exit 3"], ProcessDiedError, "exited with code 3"),
+        (["/nowhere/at/all"], ProcessDiedError, "'/nowhere/at/all' cannot be started: FileNotFoundError"),
+        ([__file__], ProcessDiedError, "PermissionError"),
+        ("", ProcessDiedError, "cannot be started"),
     ],
 )
-def test_a_command_that_does_not_exist_is_an_error_with_the_reason(command, text):
-    with pytest.raises(ProcessDiedError, match=text):
-        aec_env(ProcessSimulation(command, BOTH)).reset()
+def test_a_command_that_starts_no_simulator_is_an_error_with_the_reason(make_env, command, kind, text):
+    env = make_env(aec_env, ProcessSimulation(command, BOTH, timeout=0.5))
+    for _ in range(2):
+        with pytest.raises(kind, match=text):
+            env.reset()
+        assert child(env) is None
 
 
 @pytest.mark.parametrize("when", ["waiting", "between episodes"])
@@ -151,7 +137,7 @@ def test_long_lines_cross_in_both_directions(make_env):
 def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
     monkeypatch.setattr(Child, "_read_stderr", lambda process: True)  # so that there is always more
     with pytest.raises(ProcessTimeoutError, match="sent nothing"):
-        broken("at once", "silence", timeout=1.0).reset()
+        ProcessSimulation(["sleep", "600"], BOTH, timeout=1.0).reset()
 
 
 def in_a_fork(check) -> None:
@@ -201,9 +187,9 @@ def fail_many_times() -> None:
             env.step(RULE)
         env.close()
     for _ in range(3):
-        for simulation in (broken("at once", "exit 3"), ProcessSimulation("/nowhere", BOTH)):
+        for command in ("false", "/nowhere"):
             with pytest.raises(ProcessDiedError):
-                aec_env(simulation).reset()
+                ProcessSimulation(command, BOTH).reset()
     assert descriptors() == before
 
 

@@ -12,7 +12,7 @@ from simenv_marl import RULE, aec_env, make_step, parallel_env, simulate
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
 from simenv_marl.errors import DefinitionError, RemoteError, SimulationError, WireError
 from simenv_marl.remote import ProcessSimulation
-from tests.outside.reservoirs import PRICE, TELLING, Here, by_its_rule, child, reservoirs
+from tests.outside.reservoirs import PRICE, TELLING, Here, by_its_rule, child, command, reservoirs
 from tests.processes import runs
 from tests.worlds import by_client
 from tests.worlds.counters import alike
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.greenlet("the rule's decision comes back within the sim
 
 def telling(points=TELLING) -> ProcessSimulation:
     """The reservoirs in a process that tells what its rules decide."""
-    return ProcessSimulation([sys.executable, by_client.__file__, "reservoirs"], points)
+    return ProcessSimulation(command("tells"), points)
 
 
 def sampled(agent, env):
@@ -92,6 +92,7 @@ for frame in sys.argv[1:]:
 HELLO = {"hello": 1, "points": ["sheep.graze"], "can": ["decided", "expect"]}
 CALL = {"decide": 1, "point": "sheep.graze", "entity": "a", "args": {"hunger": 1}}
 NEXT = {**CALL, "decide": 2}
+DROUGHT = {"error": {"type": "Drought", "text": "no water"}}
 DECIDED = {"decided": 1, "value": 3}
 GRAZE = make_step(
     observation_space=spaces.Box(0, 9, (1,), np.float32),
@@ -103,23 +104,35 @@ GRAZE = make_step(
 )
 
 
+def line(frame) -> str:
+    return frame if isinstance(frame, str) else json.dumps(frame)
+
+
+def both(*frames) -> str:
+    """Frames that are sent together."""
+    return "\n".join(map(line, frames))
+
+
 def speaking(*frames) -> ProcessSimulation:
-    """A simulator that sends some frames, whatever it receives."""
-    return ProcessSimulation([sys.executable, "-c", SPEAKS, *map(json.dumps, frames)], {"sheep.graze": GRAZE})
+    """A simulator that sends some frames or lines, whatever it receives."""
+    return ProcessSimulation([sys.executable, "-c", SPEAKS, *map(line, frames)], {"sheep.graze": GRAZE})
 
 
 @pytest.mark.parametrize(
     ("frames", "kind", "text"),
     [
+        (["Welcome to the simulator!"], WireError, "Welcome to the simulator"),
         ([CALL], WireError, "began with .*decide.*, not with a hello"),
         ([{**HELLO, "hello": 2}], WireError, "speaks version 2 of the wire; this is version 1"),
         ([{**HELLO, "hello": True}], WireError, "speaks version True"),
         ([{**HELLO, "points": "sheep.graze"}], WireError, "must be lists of strings"),
-        ([{"error": {"type": "Drought", "text": "no water"}}], RemoteError, "has raised Drought: no water"),
+        ([DROUGHT], RemoteError, "has raised Drought: no water"),
+        ([both(HELLO, DROUGHT)], RemoteError, "has raised Drought: no water"),
+        ([both(HELLO, CALL)], WireError, "has sent .*decide.* before the start of an episode"),
     ],
     ids=str,
 )
-def test_a_hello_that_is_invalid_is_an_error(frames, kind, text):
+def test_what_is_wrong_before_the_start_of_an_episode_is_an_error(frames, kind, text):
     with pytest.raises(kind, match=text):
         simulate(speaking(*frames), seed=1)
 
@@ -178,7 +191,7 @@ def test_frames_that_were_not_announced_are_errors(frame):
 
 
 def flock() -> ProcessSimulation:
-    return ProcessSimulation([sys.executable, by_client.__file__, "flock"], {"sheep.graze": GRAZE})
+    return ProcessSimulation([sys.executable, by_client.__file__], {"sheep.graze": GRAZE})
 
 
 def rounds(env, **options):

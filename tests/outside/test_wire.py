@@ -116,8 +116,7 @@ def test_an_episode_that_does_not_end_is_broken_off():
 SENDS = """
 send = outside.Wire.send
 def sends(self, frame):
-    {}
-    send(self, frame)
+    send(self, {{**frame, **{}.get(next(iter(frame)), {{}})}})
 outside.Wire.send = sends
 """
 SEEDS = """
@@ -187,46 +186,28 @@ STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "oth
             'the decisions 0, 1, 100 lead to the same episode: continue with the "value" of "act"',
         ),
         (
-            DECIDES.format("return rule()")  # its rule's decisions are strings, and are known to be legal
-            + SENDS.format("frame = {**frame, 'can': ['reseed', 'decided']} if 'hello' in frame else frame")
-            + RECEIVES.format(
-                "if answer.get('rule'): send(self, {'decided': self.number, 'value': 'abc'[self.number % 3]})"
-            ),
+            "sys.argv.append('tells')\n"
+            + DECIDES.format("return rule()")  # its rule's decisions are strings, and are known to be legal
+            + SENDS.format("{'decided': {'value': 'abc'[self.number % 3]}}"),
             VALUE + "reservoir.inflow",
             "the decisions '[abc]', '[abc]' lead to the same episode",
         ),
         (SEEDS.format("seed % 2**16"), SEED, "1 to 4 lead to the same episodes as .*: keep all 31 bits"),
-        (
-            SEEDS.format("seed & ~127 if seed > 2**24 else seed"),
-            SEED,
-            "1073741825 to .* lead to the same episode:",
-        ),
+        (SEEDS.format("seed & ~127 if seed > 2**24 else seed"), SEED, "1073741825 to .* lead to the same episode:"),
         (SEEDS.format("7"), SEED, 'though "reseed" changes it: seed the generators with the seed of "start"'),
         (
             "from time import time_ns\nsys.argv.append('1')\n" + SEEDS.format("time_ns()"),
             TWO,
             r"frame \d is .*, and in a new process it was .*; seed all generators",
         ),
+        (SENDS.format({"decide": {"argz": {}}}), EPISODE, "the key 'argz' of .* does not exist; did you mean args"),
         (
-            SENDS.format("frame = {**frame, 'argz': {}} if 'decide' in frame else frame"),
+            SENDS.format({"end": {"end": {"score": 3}}}),
             EPISODE,
-            "the key 'argz' of .* does not exist; did you mean args",
+            "'score' of .* does not exist; an argument belongs into",
         ),
-        (
-            SENDS.format("frame = {'end': {'score': 3}} if 'end' in frame else frame"),
-            EPISODE,
-            "the key 'score' of .* does not exist; an argument belongs into args, another result into result",
-        ),
-        (
-            SENDS.format("frame = {**frame, 'name': 'dam'} if 'hello' in frame else frame"),
-            HELLO,
-            "the key 'name' of .* does not exist",
-        ),
-        (
-            SENDS.format("frame = {**frame, 'can': ['reseeds']} if 'hello' in frame else frame"),
-            HELLO,
-            "the \"can\" of its hello lists 'reseeds', which does not exist; did you mean reseed",
-        ),
+        (SENDS.format({"hello": {"name": "dam"}}), HELLO, "the key 'name' of .* does not exist"),
+        (SENDS.format({"hello": {"can": ["reseeds"]}}), HELLO, "'reseeds', which does not exist; did you mean reseed"),
     ],
     ids=range(18),
 )

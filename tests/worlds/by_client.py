@@ -1,31 +1,16 @@
-"""Models of a process of their own, on the client for Python: ``python by_client.py reservoirs`` or ``flock``."""
+"""A model of a process of its own, on the client for Python: a flock of sheep."""
 
 import random
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "clients" / "python"))
 from simenv_marl_client import Client
 
-import outside
-
-client = Client(["reservoir.inflow", "broker.price", "sheep.graze"])
+client = Client(["sheep.graze"])
 
 
-def reservoirs(episode):
-    """The reservoirs of ``outside.py``."""
-    model = outside.Reservoirs(episode.seed, episode.options)
-    client.on_reseed(model.random.seed)
-    model.run(
-        lambda point, entity, time, args, rule: client.decide(point, entity, rule=rule, time=time, **args),
-        client.remove,
-        lambda point, entity, args: client.update(point, entity, **args),
-    )
-    client.end(model.result(), episode.options.get("truncated", False))
-
-
-def flock(episode):
+def graze(episode):
     """Sheep that graze each day; those that were born the night before have not decided yet."""
     chance, options = random.Random(episode.seed), episode.options
     flock, eaten = {}, 0
@@ -44,6 +29,4 @@ def flock(episode):
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "reservoirs":
-        client.on_reseed(lambda seed: None)  # each episode sets its own
-    client.run({"reservoirs": reservoirs, "flock": flock}[sys.argv[1]])
+    client.run(graze)

@@ -1,6 +1,5 @@
-"""A simulator that does something wrong: ``python faulty.py WHAT``, one of ``FAULTS``, or of ``AT_ONCE``."""
+"""A simulator that does something wrong: ``python faulty.py WHAT``, one of ``FAULTS``."""
 
-import json
 import os
 import subprocess
 import sys
@@ -50,18 +49,6 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
 """What goes wrong in mid-episode, after three decisions."""
 
 
-_HELLO = json.dumps({"hello": 1, "points": outside.POINTS}).encode() + b"\n"
-
-AT_ONCE: dict[str, Callable[[Any], Any]] = {
-    "silence": lambda wire: time.sleep(600),
-    "exit 3": lambda wire: os._exit(3),
-    "garbage": lambda wire: wire.raw(b"Welcome to the simulator!\n"),
-    "no start": lambda wire: wire.raw(_HELLO + b'{"decide": 1, "point": "reservoir.inflow"}\n'),
-    "error, no start": lambda wire: wire.raw(_HELLO + b'{"error": {"type": "Drought", "text": "no water"}}\n'),
-}
-"""What goes wrong in place of the hello."""
-
-
 class Faulty:
     """A model that does it."""
 
@@ -89,9 +76,6 @@ class Faulty:
 
 
 if __name__ == "__main__":
-    Faulty.wire, when, Faulty.what = outside.Wire(), *sys.argv[1:]
+    Faulty.wire, Faulty.what = outside.Wire(), sys.argv[1]
     print("there are many words", file=sys.stderr)
-    if when == "at once":
-        AT_ONCE[Faulty.what](Faulty.wire)
-        time.sleep(600)
     Faulty.wire.play(Faulty, outside.POINTS)

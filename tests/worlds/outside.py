@@ -1,8 +1,8 @@
 """A model of its own process, which speaks the wire: reservoirs that are filled, leak, are given up and come anew.
 
-``python outside.py`` plays it to an environment, or by its own rule where there is none. It needs nothing but Python,
-and nothing of the library, as a simulator in another language would not have it. The tests run the same model in
-their own process, too.
+``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its rule decides; where
+there is none, ``python outside.py SEED`` plays by its own rule. It needs nothing but Python, and nothing of the library,
+as a simulator in another language would not have it. The tests run the same model in their own process, too.
 """
 
 import json
@@ -75,6 +75,7 @@ class Wire:
         self.lines = open(reading, encoding="utf-8")  # noqa: SIM115
         self.writing = writing
         self.number = 0
+        self.tells = "tells" in sys.argv  # what the rule decides
         self.model: Any = None
 
     def send(self, frame: dict[str, Any]) -> None:
@@ -106,7 +107,12 @@ class Wire:
         if "stop" in answer:
             raise Stopped
         assert answer["act"] == self.number
-        return rule() if answer.get("rule") else answer["value"]
+        if not answer.get("rule"):
+            return answer["value"]
+        value = rule()
+        if self.tells:
+            self.send({"decided": self.number, "value": value})
+        return value
 
     def remove(self, point: str, entity: str) -> None:
         """Say that an entity is gone."""
@@ -118,7 +124,7 @@ class Wire:
 
     def play(self, make: Callable[[int, dict[str, Any]], Any], points: list[str], episodes: float = inf) -> None:
         """Play so many episodes."""
-        self.send({"hello": 1, "points": points, "can": ["reseed"]})
+        self.send({"hello": 1, "points": points, "can": ["reseed", *(["decided"] if self.tells else [])]})
         played = 0
         while played < episodes:
             start = self.receive()["start"]
@@ -137,10 +143,11 @@ POINTS = ["reservoir.inflow", "broker.price"]
 
 def main() -> None:
     """Play to an environment, or by the model's own rule: the result stands on the standard output then."""
+    numbers = [int(word) for word in sys.argv[1:] if word.isdecimal()]
     if "SIMENV_MARL_FDS" in os.environ:
-        Wire().play(Reservoirs, POINTS, float(sys.argv[1]) if len(sys.argv) > 1 else inf)
-        return
-    print(json.dumps(Reservoirs(int(sys.argv[1]), {}).by_its_rule()))
+        Wire().play(Reservoirs, POINTS, *numbers)
+    else:
+        print(json.dumps(Reservoirs(numbers[0], {}).by_its_rule()))
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ public final class Probe {
             case "reports" -> reports();
             case "count" -> count(times);
             case "deaf" -> deaf(times);
-            case "fail" -> throw new java.io.IOException("the mill \u2603 burnt down");
+            case "fail" -> throw new java.io.IOException("the pump is broken \u2603");
             case "silent" -> throw new RuntimeException((String) null);
             case "seed" -> seed;
             case "reseed" -> SimEnv.decideLong("a", "x", a -> {}, () -> seeded);

@@ -55,8 +55,16 @@ def cpp_probe(tmp_path_factory):
 
 @pytest.fixture(params=["C++", "Java", "Python"])
 def client(request):
-    if request.param == "Python":
-        return Client("Python", [sys.executable, HERE / "probe.py"])
+    name, _, version = request.param.partition(" ")
+    if name == "Python":
+        found = (
+            sorted((Path.home() / ".pyenv" / "versions").glob(f"{version}.*/bin/python"))
+            if version
+            else [sys.executable]
+        )
+        if not found:
+            pytest.skip(f"there is no {request.param}")
+        return Client(name, [found[-1], HERE / "probe.py"])
     if request.param == "Java":
         return Client("Java", request.getfixturevalue("java_probe"))
     return Client("C++", request.getfixturevalue("cpp_probe"), "unwound by rule 7\n")
@@ -370,7 +378,7 @@ FAILURES = {
         "huge": ("std::length_error", "a line of more than 16 MiB", ""),
     },
     "Java": {
-        "fail": ("java.io.IOException", "the mill \u2603 burnt down", "java.io.IOException"),
+        "fail": ("java.io.IOException", "the pump is broken \u2603", "java.io.IOException"),
         "silent": ("java.lang.RuntimeException", "", "java.lang.RuntimeException"),
         "huge": (JAVA_REFUSES, "16777273 bytes are to be sent, and 16 MiB is the most", JAVA_REFUSES),
         "bad rule": (JAVA_REFUSES, "the rule's decision of call 1 cannot be sent: a java.lang.Object.*", JAVA_REFUSES),
@@ -420,10 +428,8 @@ def test_the_longest_lines_go_both_ways(child):
 # What is no answer, and what Java says of it; None: it takes that for an answer.
 ANSWERS = {
     b'{"act": 2, "value": 0}': "call 1 waits for its answer, and this came: ",
-    b'{"act": "1", "value": 0}': "call 1 waits for its answer",
     b'{"act": true, "value": 0}': "call 1 waits for its answer",
     b'{"act": 1}': "an answer to call 1 was expected",
-    b'{"rule": true}': "an answer to call 1 was expected",
     b'{"pause": 1}': 'an answer to call 1 was expected, and this came: {"pause":1}',
     b'{"stop": false}': None,
     b'{"reseed": "x"}': None,
@@ -432,7 +438,6 @@ ANSWERS = {
     b"": "more was expected",
     b'{"act": 1, "value": "x': "a string does not end",
     b'{"act": 1 "value": 0}': "a comma or } was expected, near",
-    b'{"act": 1, "value": [1,]}': "a value was expected",
     b'{"act": 1, "value": NaN}': "a value was expected",
     b'{"act": 1, "value": 18446744073709551616}': None,
     b'{"act": 1, "value": 1e999}': None,
@@ -513,7 +518,7 @@ def test_outside_an_environment_the_model_runs_once_on_its_rule(client):
     assert (done.stdout, done.stderr) == ("5\n", "unwound by rule 7\n")
     failed = plain(client, "fail")
     assert failed.returncode == (-signal.SIGABRT if client.name == "C++" else 1)
-    assert ("burnt down" if client.name == "Java" else "the pump is broken") in failed.stderr
+    assert "the pump is broken" in failed.stderr
     assert client.name == "Java" or plain(client, "echo", '[1, 2.0, "ü"]').stdout == '[1,2.0,"ü"]\n'
 
 
@@ -544,18 +549,13 @@ def test_the_client_in_python_keeps_to_the_syntax_of_its_oldest_version():
     ast.parse(PYTHON_CLIENT.read_text(encoding="utf-8"), feature_version=(3, 8))
 
 
-@pytest.mark.parametrize("version", ["3.8", "3.9", "3.10", "3.13"])
-def test_the_client_in_python_plays_with_other_pythons(version):
-    found = sorted((Path.home() / ".pyenv" / "versions").glob(f"{version}.*/bin/python"))
-    if not found:
-        pytest.skip(f"there is no Python {version}")
-    with Child(found[-1], HERE / "probe.py") as child:
-        assert sorted(child.receive()["can"]) == HELLO["can"]
-        for value in VALUES:
-            assert child.begin(value=value)["args"] == {"value": value}
-            assert repr(child.act(1, value)) == repr(ended(value))
-        child.begin(play="count", times=1)
-        child.send(stop=True)
-        assert child.begin(play="fail")["error"]["type"] == "RuntimeError"
-        child.out.close()
-        assert child.ended() == (0, "", "unwound by Stop\n")
+@pytest.mark.parametrize("client", [f"Python 3.{minor}" for minor in (8, 9, 10, 13)], indirect=True)
+def test_the_client_in_python_plays_with_other_pythons(child):
+    for value in VALUES:
+        assert child.begin(value=value)["args"] == {"value": value}
+        assert repr(child.act(1, value)) == repr(ended(value))
+    child.begin(play="count", times=1)
+    child.send(stop=True)
+    assert child.begin(play="fail")["error"]["type"] == "RuntimeError"
+    child.out.close()
+    assert child.ended() == (0, "", "unwound by Stop\n")

@@ -27,9 +27,6 @@ from tests.outside.conftest import COMPILER, compiled
 from tests.outside.reservoirs import child
 from tests.worlds.models import play
 
-EMPTY = 2
-"""The seed of a town in which there is no shop any more after some weeks."""
-
 BRIEF = {"seconds": 5.0}
 
 
@@ -72,7 +69,7 @@ def of_a_program(example: Any, *episodes: tuple[int, dict[str, Any]]) -> Model:
 
 
 MODELS = {
-    "town": Model(no_java(), town.raw_env, plain_town, [(seed, {}) for seed in (3, 4, 5, EMPTY)]),
+    "town": Model(no_java(), town.raw_env, plain_town, [(seed, {}) for seed in (3, 4, 5, 2)]),
     "network": of_a_program(network, (7, {}), (8, {"hosts": 3}), (2**40, BRIEF), (7, {})),
     "robots": of_a_program(robots, (8, BRIEF), (2**30, BRIEF), (4, {}), (8, BRIEF)),
 }
@@ -103,18 +100,6 @@ def test_by_its_rule_each_episode_is_the_plain_model_though_others_are_given_up(
     assert len(processes) == 1, "the model unwinds, and its process plays on"
 
 
-@needs("town")
-def test_lives_begin_and_end_in_mid_episode(make_env):
-    env = make_env(town.raw_env)
-    ends = {turn.agent: (turn.terminated, turn.truncated) for turn in play(env, seed=3)}
-    result = env.simulation.result
-    assert {f"farm_{number}" for number in range(1, 9)} | {f"shop_{number}" for number in range(9, 15)} < set(ends)
-    assert len(ends) == result["founded"]
-    assert sum(terminated for terminated, _ in ends.values()) == result["closed"] < len(ends)
-    assert all(terminated != truncated for terminated, truncated in ends.values())
-    assert not any(turn.truncated for turn in play(env, seed=EMPTY))
-
-
 @needs("network")
 def test_the_code_of_the_page_runs(capsys):
     (code,) = blocks("ns3.md")
@@ -122,9 +107,12 @@ def test_the_code_of_the_page_runs(capsys):
     assert capsys.readouterr().out == f"{MODELS['network'].plain(7, seconds=10)}\n"
 
 
-def shown(page: str, language: str) -> list[str]:
+PAGE = "clients-outside.md"
+
+
+def shown(language: str) -> list[str]:
     """The page's blocks in another language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / page).read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / PAGE).read_text("utf-8"), re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture
@@ -134,13 +122,10 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-PAGE = "clients-outside.md"
-
-
 def environment(command: list[str]) -> dict[str, Any]:
     """Runs the page's environment with a command, and returns its names."""
     names = {"__name__": "page"}
-    shown_code = shown(PAGE, "python")[1]
+    shown_code = shown("python")[1]
     assert 'command = ["./ferries"]' in shown_code
     exec(shown_code.replace('["./ferries"]', json.dumps(command), 1), names)
     return names
@@ -149,13 +134,13 @@ def environment(command: list[str]) -> dict[str, Any]:
 @pytest.mark.greenlet("the page takes the driver as it is")
 @needs("town")
 def test_the_code_of_the_page_on_java(here, capsys):
-    (here / "Ferries.java").write_text(shown(PAGE, "java")[0])
+    (here / "Ferries.java").write_text(shown("java")[0])
     shutil.copy(building.CLIENT, here)
-    commands = shown(PAGE, "sh")[1]
+    commands = shown("sh")[1]
     plain = subprocess.run(["sh", "-e"], input=commands, capture_output=True, text=True, timeout=120)
     assert plain.stderr == ""
     command = ["java", "-cp", "out", "Ferries"]
-    assert f"Java: {json.dumps(command)}" in shown(PAGE, "python")[1]
+    assert f"Java: {json.dumps(command)}" in shown("python")[1]
     environment(command)
     assert capsys.readouterr().out == plain.stdout == printed(*command, "7")
     assert check_wire(command).ok
@@ -175,7 +160,7 @@ def test_the_code_of_the_page_on_the_town(capsys):
 
 @pytest.mark.greenlet("the page takes the driver as it is")
 def test_the_code_of_the_page_on_python(here, capsys):
-    (here / "ferries.py").write_text(shown(PAGE, "python")[0], encoding="utf-8")
+    (here / "ferries.py").write_text(shown("python")[0], encoding="utf-8")
     shutil.copy(DOCS.parent / "clients" / "python" / "simenv_marl_client.py", here)
     command = [sys.executable, "ferries.py"]
     environment(command)
@@ -186,7 +171,7 @@ def test_the_code_of_the_page_on_python(here, capsys):
 
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed")
 def test_the_code_of_the_page_on_cpp(here, capsys):
-    whole, own_loop, *_ = shown(PAGE, "cpp")
+    whole, own_loop, *_ = shown("cpp")
     (here / "ferries.cpp").write_text(whole, encoding="utf-8")
     program = str(compiled(here / "ferries.cpp", here))
     names = environment([program])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from examples.ros_follower import env as ros
 
-from simenv_marl import evaluate
 from tests.outside.reservoirs import child
 from tests.worlds.models import follow_the_rule
 
@@ -40,13 +39,3 @@ def test_a_policy_decides_and_all_nodes_end_with_the_environment(make_env):
     env.close()
     with pytest.raises(ProcessLookupError):
         os.killpg(group, 0)
-
-
-@pytest.mark.greenlet("the driver makes no difference to policies")
-def test_a_policy_that_keeps_closer_earns_more_than_the_rule():
-    def closer(sight):
-        ahead, left = sight.tolist()
-        return np.clip([0.5 + ahead - 1.0, np.arctan2(left, ahead)], [0, -1], [1, 1]).astype(np.float32)
-
-    values = evaluate(ros.follower, {"rule": {}, "closer": {"follower_0": closer}}, seeds=range(3)).values()
-    assert (values["closer"] > values["rule"]).all()

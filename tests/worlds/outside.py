@@ -1,8 +1,8 @@
 """A model of its own process, which speaks the wire: reservoirs that are filled, leak, are given up and come anew.
 
-``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its rule decides; where
-there is none, ``python outside.py SEED`` plays by its own rule. It needs nothing but Python, and nothing of the library,
-as a simulator in another language would not have it. The tests run the same model in their own process, too.
+``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its rule decides.
+``python outside.py SEED`` plays it by its own rule. It needs nothing but Python, and nothing of the library, as a
+simulator in another language would not have it. The tests run the same model in their own process, too.
 """
 
 import json

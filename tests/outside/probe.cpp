@@ -110,7 +110,7 @@ int main(int argc, char** argv) {
     Json result;
     const auto model = [&](const Episode& episode) -> Json {
         const std::string play = episode.option("play", "echo");
-        if (play == "echo") return result = echo(client, episode);
+        if (play == "echo") return echo(client, episode);
         if (play == "types") return types(client);
         if (play == "arguments") arguments(client);
         if (play == "reports") reports(client);
@@ -133,9 +133,7 @@ int main(int argc, char** argv) {
         if (play == "leave") std::exit(episode.option("status", 0));
         return nullptr;
     };
-    Json::Object options{{"play", argc > 1 ? argv[1] : "echo"}};
-    if (argc > 2) options.emplace_back("value", Json::parse(argv[2]));
-    const int status = client.run(model, 7, options);
+    const int status = client.run(model, 7, Json::Object{{"play", argc > 1 ? argv[1] : "echo"}});
     if (!client.connected()) std::cout << result.text() << std::endl;
     return status;
 }

@@ -1,6 +1,5 @@
 """Plays what the option "play" names; probe.cpp plays the same in C++, and Probe.java in Java. Python 3.8 runs it."""
 
-import json
 import os
 import sys
 import threading
@@ -125,7 +124,6 @@ def model(episode):
 
 
 if __name__ == "__main__":
-    play, value = sys.argv[1:] or ["echo", "null"]
-    result = client.run(model, 7, {"play": play, "value": json.loads(value)})
+    result = client.run(model, 7, {"play": sys.argv[1]} if len(sys.argv) > 1 else {})
     if not client.connected:
-        print(json.dumps(result, separators=(",", ":"), ensure_ascii=False))
+        print(result)

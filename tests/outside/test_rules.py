@@ -14,7 +14,6 @@ from simenv_marl.errors import DefinitionError, RemoteError, SimulationError, Wi
 from simenv_marl.remote import ProcessSimulation
 from tests.outside.reservoirs import PRICE, TELLING, Here, by_its_rule, child, command, reservoirs
 from tests.processes import runs
-from tests.worlds import by_client
 from tests.worlds.counters import alike
 from tests.worlds.models import play
 
@@ -90,8 +89,17 @@ for frame in sys.argv[1:]:
         lines.readline()
 """
 HELLO = {"hello": 1, "points": ["sheep.graze"], "can": ["decided", "expect"]}
-CALL = {"decide": 1, "point": "sheep.graze", "entity": "a", "args": {"hunger": 1}}
-NEXT = {**CALL, "decide": 2}
+
+
+def call(number, name):
+    return {"decide": number, "point": "sheep.graze", "entity": name, "args": {"hunger": 1}}
+
+
+def expected(*names):
+    return {"expect": [{"point": "sheep.graze", "entity": name, "args": {"hunger": 1}, "time": 0.5} for name in names]}
+
+
+CALL, NEXT = call(1, "a"), call(2, "a")
 DROUGHT = {"error": {"type": "Drought", "text": "no water"}}
 DECIDED = {"decided": 1, "value": 3}
 GRAZE = make_step(
@@ -190,42 +198,41 @@ def test_frames_that_were_not_announced_are_errors(frame):
         simulate(speaking({**HELLO, "can": []}, CALL, frame), seed=1)
 
 
-def flock() -> ProcessSimulation:
-    return ProcessSimulation([sys.executable, by_client.__file__], {"sheep.graze": GRAZE})
-
-
-def rounds(env, **options):
-    """Play an episode by its rule; return the number of agents after the reset, the number of rounds and the result."""
-    env.reset(seed=1, options=options)
-    born, number = len(env.agents), 0
-    while env.agents:
+@pytest.mark.parametrize(
+    ("frames", "born", "rounds"),
+    [
+        ([call(1, "a"), call(2, "b"), call(3, "c")], 1, 3),
+        ([expected("a", "b", "c"), call(1, "a"), call(2, "b"), call(3, "c")], 3, 1),
+        ([expected("a", "b"), call(1, "a"), call(2, "b"), expected("c", "d"), call(3, "c"), call(4, "d")], 2, 2),
+    ],
+    ids=["one by one", "together", "in mid-episode"],
+)
+def test_expected_calls_join_and_act_in_one_round(make_env, frames, born, rounds):
+    env = make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *frames, {"end": {}}))
+    env.reset(seed=1)
+    assert len(env.agents) == born
+    for _ in range(rounds):
+        assert env.agents
         env.step(dict.fromkeys(env.agents, RULE))
-        number += 1
-    return born, number, env.unwrapped.simulation.result
-
-
-def test_expected_calls_join_and_act_in_one_round(make_env):
-    env = make_env(parallel_env, flock())
-    born, number, eaten = rounds(env, sheep=100, days=1)
-    assert (born, number) == (1, 100)
-    assert rounds(env, sheep=100, days=1, expects=True) == (100, 1, eaten)
-    assert rounds(env, sheep=100, days=3, expects=True)[:2] == (100, 3), "also those that are born in mid-episode"
+    assert not env.agents
 
 
 def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
-    env = make_env(parallel_env, flock())
-    observations, _ = env.reset(seed=1, options={"sheep": 2, "expects": True, "culled": True})
-    assert list(observations) == ["0.0", "0.1"]
+    first_day = [expected("a", "b"), call(1, "a"), call(2, "b"), {"remove": "a", "point": "sheep.graze"}]
+    second_day = [expected("b", "c", "d"), call(3, "b"), call(4, "c"), call(5, "d"), {"end": {}}]
+    env = make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *first_day, *second_day))
+    observations, _ = env.reset(seed=1)
+    assert list(observations) == ["a", "b"]
     observations, _, terminations, *_ = env.step(dict.fromkeys(env.agents, 3))
-    assert terminations == {"0.0": True, "0.1": False, "1.0": False, "1.1": False}
+    assert observations.keys() == terminations.keys()
+    assert terminations == {"a": True, "b": False, "c": False, "d": False}
     calls = env.unwrapped.simulation.expected_calls("sheep.graze")
-    assert [(call.entity, call.time) for (call,) in calls] == [("1.0", 1.0), ("1.1", 1.0)], "one decides now"
+    assert [(call.entity, call.time) for (call,) in calls] == [("c", 0.5), ("d", 0.5)], "one decides now"
 
 
 def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_env):
-    expected = {"expect": [{"point": "sheep.graze", "entity": "b"}]}
     removed = [{"remove": name, "point": "sheep.graze"} for name in "ab"]
-    frames = CALL, DECIDED, expected, *removed, NEXT, {**DECIDED, "decided": 2}, {"end": {}}
+    frames = CALL, DECIDED, expected("b"), *removed, NEXT, {**DECIDED, "decided": 2}, {"end": {}}
     names = {}
     named = replace(GRAZE, agent=lambda call: names.setdefault(call, f"sheep_{len(names)}"))
     env = make_env(aec_env, speaking(HELLO, *frames), {"sheep.graze": named})

@@ -16,19 +16,16 @@ pytestmark = [
 def test_robots_join_in_pairs_and_leave_one_by_one(make_env):
     env = make_env(robots.parallel_env)
     env.reset(seed=7)
-    assert env.agents == ["robot_0", "robot_1"]
-    born, gone, truncated, rounds = [(0, tuple(env.agents))], set(), set(), 0
+    born, gone, truncated, rounds = dict.fromkeys(env.agents, 0), set(), set(), 0
     while env.agents:
-        before = set(env.agents)
         _, _, terminations, truncations, _ = env.step(dict.fromkeys(env.agents, RULE))
         rounds += 1
-        if new := tuple(agent for agent in terminations if agent not in before):
-            born.append((rounds, new))
+        born = {**dict.fromkeys(terminations, rounds), **born}
         gone |= {agent for agent, over in terminations.items() if over}
         truncated |= {agent for agent, over in truncations.items() if over}
-    assert born == [(40 * pair, (f"robot_{2 * pair}", f"robot_{2 * pair + 1}")) for pair in range(6)]
+    assert born == {f"robot_{number}": 40 * (number // 2) for number in range(12)}
     assert len(gone) > 4
-    assert gone | truncated == {f"robot_{number}" for number in range(12)}
+    assert gone | truncated == born.keys()
     assert not gone & truncated
     assert rounds == 240, "one for each half second"
 

@@ -33,11 +33,9 @@ UPDATE = {"update": "a", "point": "reservoir.inflow", "args": {}}
 FAULTS: dict[str, Callable[[Any], Any]] = {
     "garbage": lambda wire: wire.raw(b"hello?\n"),
     "half a line": lambda wire: (wire.raw(b'{"decide": 4'), os._exit(0)),
-    "half a line, silent": lambda wire: (wire.raw(b'{"decide": 4'), time.sleep(600)),
     "drop by drop": lambda wire: [(wire.raw(b"{"), time.sleep(0.05)) for _ in range(12_000)],
     "silence": lambda wire: time.sleep(600),
-    "exit": lambda wire: os._exit(0),
-    "exit 3": lambda wire: os._exit(3),
+    "exit": lambda wire: os._exit(3),
     "crash": _flood,
     "closed": _close,
     "grandchild": _grandchild,

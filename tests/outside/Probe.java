@@ -18,11 +18,8 @@ public final class Probe {
 
     public static void main(String[] arguments) throws Exception {
         boolean plain = arguments.length > 0;
-        if (SimEnv.inside() == plain) {
-            throw new IllegalStateException("it should know where it is");
-        }
-        if (SimEnv.decideInt("a", null, a -> {}, () -> 4) != 4) {
-            throw new IllegalStateException("there is no episode yet: its rule decides");
+        if (SimEnv.inside() == plain || SimEnv.decideInt("a", null, a -> {}, () -> 4) != 4) {
+            throw new IllegalStateException("it should know where it is, and decide by its rule before an episode");
         }
         SimEnv.reportRules(System.getenv("NESTED") == null);
         SimEnv.run(List.of("a", "b"), Probe::episode, Probe::reseed);
@@ -38,7 +35,6 @@ public final class Probe {
     }
 
     static Object episode(long seed, Map<String, Object> options) throws Exception {
-        int times = ((Number) options.getOrDefault("times", 5)).intValue();
         Object value = options.get("value");
         return switch (String.valueOf(options.getOrDefault("play", "echo"))) {
             case "echo" -> SimEnv.decide(
@@ -46,8 +42,8 @@ public final class Probe {
             case "types" -> guarded(Probe::types);
             case "arguments" -> arguments();
             case "reports" -> reports();
-            case "count" -> count(times);
-            case "deaf" -> deaf(times);
+            case "count" -> count();
+            case "deaf" -> deaf();
             case "fail" -> throw new java.io.IOException("the pump is broken \u2603");
             case "silent" -> throw new RuntimeException((String) null);
             case "seed" -> seed;
@@ -108,10 +104,10 @@ public final class Probe {
     }
 
     /** Catches each exception, and decides again on its way out. */
-    static Object count(int times) {
+    static Object count() {
         int sum = 0;
         try {
-            for (int i = 0; i < times; i++) {
+            for (int i = 0; i < 5; i++) {
                 int now = sum;
                 try {
                     sum += SimEnv.decideInt("a", "x", a -> a.put("sum", now), () -> 1);
@@ -133,14 +129,11 @@ public final class Probe {
         return sum;
     }
 
-    static Object deaf(int times) throws Exception {
-        for (int heard = 0; ; ) {
+    static Object deaf() throws Exception {
+        while (true) {
             try {
                 any(a -> {});
             } catch (SimEnv.Stop stop) {
-                if (++heard == times) {
-                    throw stop;
-                }
                 Thread.sleep(10);
             }
         }

@@ -26,10 +26,10 @@ class Array:
         return [1, 0.5, float("nan")]
 
 
-def count(times):
+def count():
     total = 0
     try:
-        for _ in range(times):
+        for _ in range(5):
             try:
                 total += client.decide("a", "x", rule=lambda: 1, sum=total)
             except Exception:
@@ -45,15 +45,10 @@ def count(times):
     return total
 
 
-def deaf(times):
-    heard = 0
+def deaf():
     while True:
-        try:
+        with suppress(Stop):
             client.decide("a", "x", rule=lambda: 0)
-        except Stop:
-            heard += 1
-            if heard == times:
-                raise
 
 
 def careless():
@@ -98,7 +93,7 @@ def model(episode):
     def decide(rule, value=None):
         return client.decide("a", "x", rule=rule, value=value)
 
-    times, value = episode.options.get("times", 5), episode.options.get("value")
+    value = episode.options.get("value")
     plays = {
         "echo": lambda: client.decide("a", "ä", time=0.25, value=value, rule=lambda: value),
         "arguments": lambda: client.decide("a", rule=lambda: 0, value=[(1, 2), Array(), float("inf"), {"x": 0.5}]),
@@ -113,8 +108,8 @@ def model(episode):
         "shell": lambda: os.system(episode.options["command"]),
         "seed": lambda: episode.seed,
         "decorated": lambda: decorated("x", 3),
-        "count": lambda: count(times),
-        "deaf": lambda: deaf(times),
+        "count": count,
+        "deaf": deaf,
         "careless": careless,
         "fail": fail,
         "reports": reports,

@@ -1,11 +1,13 @@
 import java.math.BigDecimal;
 import java.math.BigInteger;
 import java.util.ArrayList;
-import java.util.Arrays;
 import java.util.List;
 import java.util.Map;
+import java.util.concurrent.Callable;
 import java.util.concurrent.atomic.AtomicLong;
+import java.util.function.Consumer;
 import java.util.function.Function;
+import java.util.stream.IntStream;
 import simenv.SimEnv;
 
 /** Plays what the option "play" names; probe.cpp plays the same in C++. */
@@ -15,12 +17,10 @@ public final class Probe {
     static long seeded;
 
     public static void main(String[] arguments) throws Exception {
-        System.out.println("standard output is the model's");
         boolean plain = arguments.length > 0;
-        if (SimEnv.inside() == plain) {
-            throw new IllegalStateException("it should know where it is");
+        if (SimEnv.inside() == plain || SimEnv.decideInt("a", null, a -> {}, () -> 4) != 4) {
+            throw new IllegalStateException("it should know where it is, and decide by its rule before an episode");
         }
-        System.out.println(SimEnv.decideInt("a", null, a -> {}, () -> 4)); // no episode yet: its rule
         SimEnv.reportRules(System.getenv("NESTED") == null);
         SimEnv.run(List.of("a", "b"), Probe::episode, Probe::reseed);
         System.out.println(SimEnv.json(episode(7, Map.of("play", arguments[0]))));
@@ -30,71 +30,67 @@ public final class Probe {
         seeded = seed + SimEnv.decideLong("a", null, a -> {}, () -> 1000); // within an exchange: its rule
     }
 
-    static Object any(Object value) {
-        return SimEnv.decide("a", "x", a -> a.put("value", value), () -> "rule", Function.identity());
+    static Object any(Consumer<SimEnv.Arguments> arguments) {
+        return SimEnv.decide("a", "x", arguments, () -> "rule", Function.identity());
     }
 
     static Object episode(long seed, Map<String, Object> options) throws Exception {
-        int times = ((Number) options.getOrDefault("times", 5)).intValue();
-        switch (String.valueOf(options.getOrDefault("play", "echo"))) {
-            case "echo":
-                Object value = options.get("value");
-                return SimEnv.decide(
-                        "a", "ä", a -> a.time(0.25).put("value", value), () -> value, Function.identity());
-            case "types":
-                try {
-                    return types();
-                } catch (Exception error) {
-                    return "swallowed";
-                }
-            case "arguments":
-                BigInteger big = new BigInteger("123456789012345678901234567890");
-                return any(new Object[] {
-                    new int[] {1, 2}, new double[] {0.5, Double.NaN}, new boolean[0], Mood.GLAD, 'c', 1.5f, (byte) 3,
-                    List.of(Map.of(1, "one")), new AtomicLong(7), new BigDecimal("0.5"), big, null
-                });
-            case "reports":
-                SimEnv.remove("a", "x");
-                SimEnv.update("a", "y", a -> a.time(3).put("level", 0.5).put("full", true).put("mark", 'm'));
-                SimEnv.update("a", null, a -> {});
-                SimEnv.remove("a", "\"b\"");
-                SimEnv.expect("a", "y", a -> a.time(3).put("level", 0.5));
-                SimEnv.expect("b", null, a -> {});
-                return null;
-            case "count":
-                return count(times);
-            case "deaf":
-                return deaf(times);
-            case "fail":
-                throw new java.io.IOException("the mill \u2603 burnt down");
-            case "silent":
-                throw new RuntimeException((String) null);
-            case "seed":
-                return seed;
-            case "reseed":
-                return SimEnv.decideLong("a", "x", a -> {}, () -> seeded);
-            case "nested":
-                return SimEnv.decideInt("a", "x", a -> {}, () -> 10 * SimEnv.decideInt("b", "y", b -> {}, () -> 1));
-            case "careless":
-                return careless();
-            case "bad rule":
-                return SimEnv.decide("a", "x", a -> {}, Object::new, Function.identity()).hashCode();
-            case "bad arguments":
-                return guarded(new Object());
-            case "bad result":
-                return new Object();
-            case "huge":
-                return guarded("x".repeat(16 << 20));
-            case "truncated":
-                return new SimEnv.End(Map.of("reached", 3), true);
-            case "threads":
-                return threads();
-            case "leave":
+        Object value = options.get("value");
+        return switch (String.valueOf(options.getOrDefault("play", "echo"))) {
+            case "echo" -> SimEnv.decide(
+                    "a", "ä", a -> a.time(0.25).put("value", value), () -> value, Function.identity());
+            case "types" -> guarded(Probe::types);
+            case "arguments" -> arguments();
+            case "reports" -> reports();
+            case "count" -> count();
+            case "deaf" -> deaf();
+            case "fail" -> throw new java.io.IOException("the pump is broken \u2603");
+            case "silent" -> throw new RuntimeException((String) null);
+            case "seed" -> seed;
+            case "reseed" -> SimEnv.decideLong("a", "x", a -> {}, () -> seeded);
+            case "nested" -> SimEnv.decideInt(
+                    "a", "x", a -> {}, () -> 10 * SimEnv.decideInt("b", "y", b -> {}, () -> 1));
+            case "careless" -> careless();
+            case "bad rule" -> SimEnv.decide("a", "x", a -> {}, Object::new, Function.identity()).hashCode();
+            case "bad arguments" -> guarded(() -> any(a -> a.put("value", new Object())));
+            case "bad result" -> new Object();
+            case "huge" -> guarded(() -> any(a -> a.put("value", "x".repeat(16 << 20))));
+            case "truncated" -> new SimEnv.End(Map.of("reached", 3), true);
+            case "threads" -> threads();
+            case "leave" -> {
                 System.exit(((Number) options.get("status")).intValue());
-                return null;
-            default:
-                return null;
+                yield null;
+            }
+            default -> null;
+        };
+    }
+
+    /** Catches what a model may catch. */
+    static Object guarded(Callable<Object> play) {
+        try {
+            return play.call();
+        } catch (Exception error) {
+            return "swallowed";
         }
+    }
+
+    static Object arguments() {
+        BigInteger big = new BigInteger("123456789012345678901234567890");
+        Object[] objects = {
+            new int[] {1, 2}, new double[] {0.5, Double.NaN}, new boolean[0], Mood.GLAD, 'c', 1.5f, (byte) 3,
+            List.of(Map.of(1, "one")), new AtomicLong(7), new BigDecimal("0.5"), big, null
+        };
+        return any(a -> a.put("value", objects).put("full", true).put("mark", 'm'));
+    }
+
+    static Object reports() {
+        SimEnv.update("a", "12", a -> a.time(1.5).put("level", 0.5));
+        SimEnv.remove("a", "12");
+        SimEnv.remove("a", "\"b\"");
+        SimEnv.update("a", null, a -> a.put("level", 1));
+        SimEnv.expect("a", "12", a -> a.time(1.5).put("level", 0.5));
+        SimEnv.expect("b", null, a -> {});
+        return null;
     }
 
     static Object types() {
@@ -108,10 +104,10 @@ public final class Probe {
     }
 
     /** Catches each exception, and decides again on its way out. */
-    static Object count(int times) {
+    static Object count() {
         int sum = 0;
         try {
-            for (int i = 0; i < times; i++) {
+            for (int i = 0; i < 5; i++) {
                 int now = sum;
                 try {
                     sum += SimEnv.decideInt("a", "x", a -> a.put("sum", now), () -> 1);
@@ -133,14 +129,11 @@ public final class Probe {
         return sum;
     }
 
-    static Object deaf(int times) throws Exception {
-        for (int heard = 0; ; ) {
+    static Object deaf() throws Exception {
+        while (true) {
             try {
-                any(0);
+                any(a -> {});
             } catch (SimEnv.Stop stop) {
-                if (++heard == times) {
-                    throw stop;
-                }
                 Thread.sleep(10);
             }
         }
@@ -153,34 +146,16 @@ public final class Probe {
                 throw new IllegalStateException("no rule");
             });
         } catch (IllegalStateException error) {
-            System.err.println("swallowed");
+            // as if nothing had happened
         }
         return SimEnv.decideInt("a", "x", a -> {}, () -> 1);
     }
 
-    static Object guarded(Object value) {
-        try {
-            return any(value);
-        } catch (Exception error) {
-            return "swallowed";
-        }
+    static Object threads() {
+        return IntStream.range(0, 4).parallel().map(Probe::sum).boxed().toList();
     }
 
-    static Object threads() throws Exception {
-        int[] sums = new int[4];
-        Thread[] workers = new Thread[sums.length];
-        for (int n = 0; n < workers.length; n++) {
-            int number = n;
-            workers[n] = new Thread(() -> {
-                for (int i = 0; i < 50; i++) {
-                    sums[number] += SimEnv.decideInt("a", "w" + number, a -> a.put("n", number), () -> number);
-                }
-            });
-            workers[n].start();
-        }
-        for (Thread worker : workers) {
-            worker.join();
-        }
-        return Arrays.stream(sums).boxed().toList();
+    static int sum(int n) {
+        return IntStream.range(0, 50).map(i -> SimEnv.decideInt("a", "w" + n, a -> a.put("n", n), () -> n)).sum();
     }
 }

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import DRIVERS
+from tests.contract.conftest import pytest_generate_tests
+
+__all__ = ["pytest_generate_tests"]  # with every driver
 
 HERE = Path(__file__).parent
 COMPILER = shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++")
@@ -21,13 +23,6 @@ def compiled(source: Path, folder: Path) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[:4000]
     return program
-
-
-def pytest_generate_tests(metafunc) -> None:
-    chosen = metafunc.config.getoption("--driver")
-    alone = metafunc.definition.get_closest_marker("greenlet") is not None
-    drivers = ["greenlet"] if alone else DRIVERS if chosen == "both" else [chosen]
-    metafunc.parametrize("_driver", drivers, indirect=True)
 
 
 @pytest.fixture

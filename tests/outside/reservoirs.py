@@ -1,16 +1,27 @@
 """The reservoirs of ``tests/worlds/outside.py`` as a simulation: in a process of its own, and in this one."""
 
 import sys
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from gymnasium import spaces
 
-from simenv_marl import TRUNCATED, SimulationInterface, difference, make_step
+from simenv_marl import SimulationInterface, difference, make_step
 from simenv_marl.remote import ProcessSimulation
 from tests.worlds import faulty, outside
 from tests.worlds.models import play
+
+
+def total(call):
+    return [call.total]
+
+
+def cost(call):
+    return -call.total
+
 
 INFLOW = make_step(
     observation_space=spaces.Box(-50, 50, (2,), np.float64),
@@ -20,12 +31,13 @@ INFLOW = make_step(
     reward_mapping=difference(lambda call: call.level),
     agent=lambda call: call.entity,
 )
+# Can be pickled.
 PRICE = make_step(
     observation_space=spaces.Box(-500, 500, (1,), np.float64),
-    observation_space_mapping=lambda call: [call.total],
+    observation_space_mapping=total,
     action_space=spaces.Discrete(3),
     action_space_mapping={0: 0.5, 1: 1.0, 2: 2.0},
-    reward_mapping=lambda call: -call.total,
+    reward_mapping=cost,
 )
 BOTH = {"reservoir.inflow": INFLOW, "broker.price": PRICE}
 
@@ -40,9 +52,9 @@ def reservoirs(points=BOTH, **options) -> ProcessSimulation:
     return ProcessSimulation(command(), points, **options)
 
 
-def broken(when: str, what: str, timeout: float = 20.0, points=BOTH) -> ProcessSimulation:
-    """A simulator that does something wrong."""
-    return ProcessSimulation([sys.executable, faulty.__file__, when, what], points, timeout=timeout)
+def broken(what: str) -> ProcessSimulation:
+    """A simulator that does something wrong in mid-episode."""
+    return ProcessSimulation([sys.executable, faulty.__file__, what], BOTH, timeout=20.0)
 
 
 CHANGED = """
@@ -51,16 +63,6 @@ sys.path.insert(0, {folder!r})
 import outside
 {change}
 outside.main()
-"""
-
-EXITS_AFTER_STOP = """
-decide = outside.Wire.decide
-def exits(*call):
-    try:
-        return decide(*call)
-    except outside.Stopped:
-        sys.exit({code})
-outside.Wire.decide = exits
 """
 
 
@@ -73,14 +75,7 @@ def changed(folder: Path, change: str) -> list[str]:
 
 def by_its_rule(seed: int, **options) -> dict:
     """What comes of the model by its own rule, in this process."""
-    model = outside.Reservoirs(seed, options)
-    model.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
-    return told(model.result())
-
-
-def told(result: dict) -> dict:
-    """A result as it arrives."""
-    return {**result, "log": [list(row) for row in result["log"]]}
+    return outside.Reservoirs(seed, options).by_its_rule()
 
 
 def child(env):
@@ -94,37 +89,6 @@ def plays_by_its_rule(env, seed=1, **options) -> bool:
     env.reset(seed=seed, options=options)
     play(env, reset=False)
     return env.unwrapped.simulation.result == by_its_rule(seed, **options)
-
-
-class Here(SimulationInterface):
-    """The model in this process: what its process is to be indistinguishable from."""
-
-    def __init__(self) -> None:
-        self.calls: dict = {}
-
-    def reset(self, seed=None, options=None) -> None:
-        self.options = options or {}
-        self.calls = {}
-        self.model = outside.Reservoirs(seed, self.options)
-
-    def run(self):
-        self.model.run(self._decide, self._remove, self._update)
-        return TRUNCATED if self.options.get("truncated") else None
-
-    def time(self) -> float:
-        return self.model.time
-
-    def _decide(self, point, entity, time, arguments, rule):
-        function = {"reservoir.inflow": inflow, "broker.price": price}[point]
-        call = self.calls.setdefault((point, entity), Call())
-        vars(call).update(arguments, entity=entity, rule=rule)
-        return function(call)
-
-    def _update(self, point, entity, arguments) -> None:
-        vars(self.calls[point, entity]).update(arguments)
-
-    def _remove(self, point, entity) -> None:
-        removed(self.calls.pop((point, entity)))
 
 
 class Call:
@@ -146,8 +110,36 @@ def removed(call) -> None:
     """It is gone."""
 
 
-HERE = f"{__name__}."
-BOTH_HERE = {
-    f"{HERE}inflow": replace(INFLOW, removed_by=f"{HERE}removed"),
-    f"{HERE}price": PRICE,
+TELLING = {
+    "reservoir.inflow": replace(INFLOW, rule_action_mapping=lambda decision: [decision]),
+    "broker.price": replace(PRICE, rule_action_mapping=lambda decision: min(2, int(decision))),
 }
+"""For where it is known what the rule decides."""
+
+
+class Here(SimulationInterface):
+    """The model in this process: what its process is to be indistinguishable from."""
+
+    points: ClassVar = {
+        f"{__name__}.inflow": replace(TELLING["reservoir.inflow"], removed_by=f"{__name__}.removed"),
+        f"{__name__}.price": TELLING["broker.price"],
+    }
+
+    def reset(self, seed=None, options=None) -> None:
+        self.model = outside.Reservoirs(seed, options or {})
+        self.calls = defaultdict(Call)
+
+    def run(self) -> None:
+        self.model.run(
+            self._decide,
+            lambda point, entity: removed(self.calls.pop((point, entity))),
+            lambda point, entity, arguments: vars(self.calls[point, entity]).update(arguments),
+        )
+
+    def time(self) -> float:
+        return self.model.time
+
+    def _decide(self, point, entity, time, arguments, rule):
+        call = self.calls[point, entity]
+        vars(call).update(arguments, entity=entity, rule=rule)
+        return price(call) if entity is None else inflow(call)

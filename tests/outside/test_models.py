@@ -1,4 +1,4 @@
-"""Models outside Python in environments: a town in Java, a network in ns-3, and what the pages on clients show."""
+"""Models outside Python: a town in Java, a network in ns-3, robots in Enki, and what the pages on clients show."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import closing
-from functools import cache
-from typing import Any, NamedTuple
+from itertools import islice
+from typing import Any
 
 import pytest
+from examples.enki_robots import env as robots
 from examples.jvm_market import build as building
 from examples.jvm_market import compare as town_policies
 from examples.jvm_market import env as town
@@ -23,25 +23,23 @@ from simenv_marl.remote.check import check_wire
 from tests.clients.page import DOCS, blocks
 from tests.outside.conftest import COMPILER, compiled
 from tests.outside.reservoirs import child
-from tests.outside.wire import exactly
-from tests.worlds.models import follow_the_rule, play
-
-EMPTY = 2
-"""The seed of a town in which there is no shop any more after some weeks."""
+from tests.worlds.models import play
 
 BRIEF = {"seconds": 5.0}
 
 
-@cache
-def plain_town(seed: int) -> Any:
-    """What the town tells by itself."""
-    return town.plain(seed)["result"]
+def printed(*command: Any) -> str:
+    """What a program prints without an environment."""
+    output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+    assert output, "no result"
+    return output
 
 
-def plain_network(seed: int, **options: Any) -> Any:
-    """What the network tells by itself."""
-    command = [network.program(), str(seed), json.dumps(options)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
+def plain(example: Any, seed: int, **options: Any) -> Any:
+    """What a model tells by itself."""
+    if example is town:
+        return town.plain(seed)["result"]
+    return json.loads(printed(example.program(), str(seed), json.dumps(options)))
 
 
 def no_java() -> str:
@@ -53,81 +51,52 @@ def no_java() -> str:
     return ""
 
 
-class Model(NamedTuple):
-    """One of the two."""
+MODELS = {
+    "town": (no_java(), town, [(seed, {}) for seed in (3, 4, 5, 2)]),  # in the last, no shop stays open
+    "network": (network.missing(), network, [(7, {}), (8, {"hosts": 3}), (2**40, BRIEF), (7, {})]),
+    "robots": (robots.missing(), robots, [(8, BRIEF), (2**30, BRIEF), (4, {}), (8, BRIEF)]),
+}
+"""What a model needs and is not there, its example, and episodes."""
 
-    missing: Callable[[], str]
-    raw_env: Callable[..., Any]
-    plain: Callable[..., Any]
-    episodes: list[tuple[int, dict[str, Any]]]
 
+def needs(name: str) -> pytest.MarkDecorator:
+    """Skips a test without what a model needs."""
+    missing, *_ = MODELS[name]
+    return pytest.mark.skipif(bool(missing), reason=missing)
 
-TOWN = Model(no_java, town.raw_env, plain_town, [(seed, {}) for seed in (3, 4, 5, EMPTY)])
-NETWORK = Model(
-    network.missing,
-    network.raw_env,
-    plain_network,
-    [(7, {}), (8, {"hosts": 3}), (7, BRIEF), (2**40, BRIEF), (7, {})],
-)
-
-of_the_town = pytest.mark.parametrize("model", [TOWN], ids=["town"], indirect=True)
-of_the_network = pytest.mark.parametrize("model", [NETWORK], ids=["network"], indirect=True)
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # what PettingZoo says where no roster is declared
 
 
-@pytest.fixture(params=[TOWN, NETWORK], ids=["town", "network"])
-def model(request):
-    if missing := request.param.missing():
-        pytest.skip(missing)
-    return request.param
-
-
-@pytest.fixture
-def env(model):
-    with closing(model.raw_env()) as env:
-        yield env
-
-
-def test_by_its_rule_each_episode_is_the_plain_model(model, env):
-    for seed, options in model.episodes:  # in one process
-        env.reset(seed=seed, options=options)
-        play(env, reset=False)
-        assert exactly(env.simulation.result) == exactly(model.plain(seed, **options))
-
-
-def test_an_episode_that_is_given_up_leaves_nothing_to_the_next(model, env):
-    for steps in (0, 1, 40):
+@pytest.mark.parametrize("name", [pytest.param(name, marks=needs(name)) for name in MODELS])
+def test_by_its_rule_each_episode_is_the_plain_model_though_others_are_given_up(make_env, name):
+    _, example, episodes = MODELS[name]
+    env, processes = make_env(example.raw_env), set()
+    for steps, (seed, options) in zip((0, 1, 40, 300), episodes, strict=True):
         env.reset(seed=3)
-        for _ in range(steps):
-            agent = env.agent_selection
-            env.step(None if env.terminations[agent] else env.action_space(agent).sample())
-        number = child(env)
-        assert exactly(follow_the_rule(env, 4).result) == exactly(model.plain(4))
-        assert child(env) == number, "the model unwinds, and its process plays on"
+        for agent in islice(env.agent_iter(), steps):
+            over = env.terminations[agent] or env.truncations[agent]
+            env.step(None if over else env.action_space(agent).sample())
+        env.reset(seed=seed, options=options)
+        processes.add(child(env))
+        play(env, reset=False)
+        assert repr(env.simulation.result) == repr(plain(example, seed, **options))
+    assert len(processes) == 1, "the model unwinds, and its process plays on"
 
 
-@of_the_town
-def test_lives_begin_and_end_in_mid_episode(model, env):
-    ends = {turn.agent: (turn.terminated, turn.truncated) for turn in play(env, seed=3)}
-    result = env.simulation.result
-    assert {f"farm_{number}" for number in range(1, 9)} | {f"shop_{number}" for number in range(9, 15)} < set(ends)
-    assert len(ends) == result["founded"]
-    assert sum(terminated for terminated, _ in ends.values()) == result["closed"] < len(ends)
-    assert all(terminated != truncated for terminated, truncated in ends.values())
-    assert not any(turn.truncated for turn in play(env, seed=EMPTY))
-
-
-@of_the_network
-def test_the_code_of_the_page_runs(model, capsys):
+@needs("network")
+def test_the_code_of_the_page_runs(capsys):
     (code,) = blocks("ns3.md")
     exec(code, {"__name__": "page"})
-    assert capsys.readouterr().out == f"{plain_network(7, seconds=10)}\n"
+    assert capsys.readouterr().out == f"{plain(network, 7, seconds=10)}\n"
 
 
-def shown(page: str, language: str) -> list[str]:
+PAGE = "clients-outside.md"
+
+
+def shown(language: str) -> list[str]:
     """The page's blocks in another language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / page).read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / PAGE).read_text("utf-8"), re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture
@@ -137,43 +106,33 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-PAGE = "clients-outside.md"
-
-
 def environment(command: list[str]) -> dict[str, Any]:
     """Runs the page's environment with a command, and returns its names."""
     names = {"__name__": "page"}
-    shown_code = shown(PAGE, "python")[1]
+    shown_code = shown("python")[1]
     assert 'command = ["./ferries"]' in shown_code
     exec(shown_code.replace('["./ferries"]', json.dumps(command), 1), names)
     return names
 
 
-def printed_by(command: list[str]) -> str:
-    """What a model prints without an environment: the page says that it is the same with one."""
-    plain = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20).stdout
-    assert int(plain) > 0
-    return plain
-
-
 @pytest.mark.greenlet("the page takes the driver as it is")
-@pytest.mark.skipif(bool(no_java()), reason="no JDK")
+@needs("town")
 def test_the_code_of_the_page_on_java(here, capsys):
-    (here / "Ferries.java").write_text(shown(PAGE, "java")[0])
+    (here / "Ferries.java").write_text(shown("java")[0])
     shutil.copy(building.CLIENT, here)
-    commands = shown(PAGE, "sh")[1]
+    commands = shown("sh")[1]
     plain = subprocess.run(["sh", "-e"], input=commands, capture_output=True, text=True, timeout=120)
     assert plain.stderr == ""
     command = ["java", "-cp", "out", "Ferries"]
-    assert f"Java: {json.dumps(command)}" in shown(PAGE, "python")[1]
+    assert f"Java: {json.dumps(command)}" in shown("python")[1]
     environment(command)
-    assert capsys.readouterr().out == plain.stdout == printed_by([*command, "7"])
+    assert capsys.readouterr().out == plain.stdout == printed(*command, "7")
     assert check_wire(command).ok
 
 
 @pytest.mark.greenlet("the page takes the driver as it is")
-@of_the_town
-def test_the_code_of_the_page_on_the_town(model, capsys):
+@needs("town")
+def test_the_code_of_the_page_on_the_town(capsys):
     names = {"__name__": "__main__"}
     exec(blocks(PAGE, "Larger models")[0], names)
     earned = names["found"].values()
@@ -185,22 +144,22 @@ def test_the_code_of_the_page_on_the_town(model, capsys):
 
 @pytest.mark.greenlet("the page takes the driver as it is")
 def test_the_code_of_the_page_on_python(here, capsys):
-    (here / "ferries.py").write_text(shown(PAGE, "python")[0], encoding="utf-8")
+    (here / "ferries.py").write_text(shown("python")[0], encoding="utf-8")
     shutil.copy(DOCS.parent / "clients" / "python" / "simenv_marl_client.py", here)
     command = [sys.executable, "ferries.py"]
     environment(command)
-    assert capsys.readouterr().out == printed_by([*command, "7"])
+    assert capsys.readouterr().out == printed(*command, "7")
     report = check_wire(command)
     assert {finding.verdict for finding in report.findings if finding.tried != "reseed"} == {"ok"}, str(report)
 
 
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed")
 def test_the_code_of_the_page_on_cpp(here, capsys):
-    whole, own_loop, *_ = shown(PAGE, "cpp")
+    whole, own_loop, *_ = shown("cpp")
     (here / "ferries.cpp").write_text(whole, encoding="utf-8")
     program = str(compiled(here / "ferries.cpp", here))
     names = environment([program])
-    assert capsys.readouterr().out == printed_by([program, "7"])
+    assert capsys.readouterr().out == printed(program, "7")
     gone = set()
     with closing(parallel_env(names["ferries"])) as env:
         env.reset(seed=7)

@@ -8,37 +8,24 @@ import numpy as np
 import pytest
 from examples.ros_follower import env as ros
 
-from simenv_marl import RULE, evaluate
 from tests.outside.reservoirs import child
+from tests.worlds.models import follow_the_rule
 
 pytestmark = pytest.mark.skipif(bool(ros.missing()), reason=ros.missing())
-
-
-def plain(seed):
-    """What the node prints by itself."""
-    command = [*ros.COMMAND, str(seed)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
-
-
-def by_the_rule(env, seed):
-    """Play an episode by the rule, and return its result."""
-    env.reset(seed=seed)
-    while not env.step(RULE)[3]:
-        pass
-    return env.simulation.result
 
 
 def test_ten_of_ten_episodes_are_the_plain_run_although_others_are_given_up(make_env):
     env, found = make_env(ros.env), []
     for seed in range(5):
         for _ in range(2):
-            found.append(by_the_rule(env, seed))
+            found.append(follow_the_rule(env, seed).result)
             env.reset(seed=9)
             for _ in range(10 * seed):
                 env.step(env.action_space.sample())
+    printed = subprocess.run([*ros.COMMAND, "0"], check=True, capture_output=True, timeout=60).stdout
     assert found[::2] == found[1::2]
     assert len({result["digest"] for result in found}) == 5
-    assert found[0] == plain(0)
+    assert found[0] == json.loads(printed)
 
 
 @pytest.mark.greenlet("the driver makes no difference to the nodes")
@@ -52,13 +39,3 @@ def test_a_policy_decides_and_all_nodes_end_with_the_environment(make_env):
     env.close()
     with pytest.raises(ProcessLookupError):
         os.killpg(group, 0)
-
-
-@pytest.mark.greenlet("the driver makes no difference to policies")
-def test_a_policy_that_keeps_closer_earns_more_than_the_rule():
-    def closer(sight):
-        ahead, left = sight.tolist()
-        return np.clip([0.5 + ahead - 1.0, np.arctan2(left, ahead)], [0, -1], [1, 1]).astype(np.float32)
-
-    values = evaluate(ros.follower, {"rule": {}, "closer": {"follower_0": closer}}, seeds=range(3)).values()
-    assert (values["closer"] > values["rule"]).all()

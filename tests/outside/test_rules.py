@@ -1,4 +1,4 @@
-"""What simulators in other processes tell besides their calls: the decisions of their rules, and births."""
+"""The frames of simulators in other processes: invalid ones, the decisions of their rules, and births."""
 
 import json
 import sys
@@ -10,40 +10,33 @@ from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, make_step, parallel_env, simulate
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule
-from simenv_marl.errors import DefinitionError, SimulationError, WireError
+from simenv_marl.errors import DefinitionError, RemoteError, SimulationError, WireError
 from simenv_marl.remote import ProcessSimulation
-from tests.outside.reservoirs import BOTH, BOTH_HERE, PRICE, Here, by_its_rule, child, reservoirs
+from tests.outside.reservoirs import PRICE, TELLING, Here, by_its_rule, child, command, reservoirs
 from tests.processes import runs
-from tests.worlds import by_client
+from tests.worlds.counters import alike
 from tests.worlds.models import play
 
 pytestmark = pytest.mark.greenlet("the rule's decision comes back within the simulation, whatever runs it")
 
 
-def with_actions(points):
-    """The definitions, in which the rule's decisions are actions."""
-    return {
-        name: replace(definition, rule_action_mapping=mapping)
-        for (name, definition), mapping in zip(
-            points.items(), [lambda decision: [decision], lambda decision: min(2, int(decision))], strict=True
-        )
-    }
-
-
-def telling(points=BOTH) -> ProcessSimulation:
+def telling(points=TELLING) -> ProcessSimulation:
     """The reservoirs in a process that tells what its rules decide."""
-    return ProcessSimulation([sys.executable, by_client.__file__, "reservoirs"], points)
+    return ProcessSimulation(command("tells"), points)
 
 
-def test_infos_have_the_action_of_the_rule(make_env):
-    told = make_env(aec_env, telling(with_actions(BOTH)))
-    here = make_env(aec_env, Here, with_actions(BOTH_HERE))
-    turns = [
-        [(turn.agent, turn.info.get("rule_action"), turn.reward) for turn in play(env, seed=1)] for env in (told, here)
-    ]
-    assert str(turns[0]) == str(turns[1])
-    assert any(action is not None for _, action, _ in turns[0])
-    assert told.unwrapped.simulation.result == by_its_rule(1)
+def sampled(agent, env):
+    return env.action_space(agent).sample()
+
+
+@pytest.mark.parametrize("choose", [RULE, sampled], ids=["rule", "sampled"])
+def test_an_episode_is_the_one_of_the_same_model_in_this_process(make_env, choose):
+    envs = make_env(aec_env, telling()), make_env(aec_env, Here)
+    for seed in range(3):
+        theirs, ours = (play(env, choose, seed=seed) for env in envs)
+        assert alike(theirs, ours)
+        assert len({turn.agent for turn in ours}) > 3  # some are born
+        assert any(turn.info.get("rule_action") is not None for turn in ours) == (choose is RULE)
 
 
 def _closes(observations):
@@ -51,13 +44,12 @@ def _closes(observations):
 
 
 def test_the_rule_can_be_recorded_and_compared_with_policies():
-    here = type("There", (Here,), {"points": with_actions(BOTH_HERE)})
     found = [
         compare_with_rule(simulation, {name: _closes}, seeds=range(3), tolerance=0.5)[name]
-        for simulation, name in ((telling(with_actions(BOTH)), "reservoir.inflow"), (here, next(iter(BOTH_HERE))))
+        for simulation, name in ((telling(), "reservoir.inflow"), (Here, next(iter(Here.points))))
     ]
     assert 0 < found[0].agreement == found[1].agreement < 1
-    mixed = collect_episodes(telling(with_actions(BOTH)), {"reservoir.inflow": Mixture({RULE: 1.0})}, seeds=[1])
+    mixed = collect_episodes(telling(), {"reservoir.inflow": Mixture({RULE: 1.0})}, seeds=[1])
     assert mixed["reservoir.inflow"].known.all()
 
 
@@ -68,18 +60,15 @@ def test_actions_of_a_process_that_tells_nothing_stay_unknown():
 
 
 def test_apply_may_ask_the_rule_and_leave_it_at_that():
-    asked = []
+    asked, late = [], []
 
     def apply(action, call, *, _rule):
         asked.append(_rule(call))
         late.append((_rule, call))
         return asked[-1]
 
-    late = []
-    definition = replace(PRICE, action_space_mapping=None, apply=apply)
-    assert simulate(telling({"broker.price": definition}), {"broker.price": lambda _: 0}, seed=1).result == by_its_rule(
-        1
-    )
+    simulation = telling({"broker.price": replace(PRICE, action_space_mapping=None, apply=apply)})
+    assert simulate(simulation, {"broker.price": lambda _: 0}, seed=1).result == by_its_rule(1)
     assert asked[0] == pytest.approx(1.1)
     assert [rule(call) for rule, call in late] == [RULE] * len(asked), "no decision is due any more"
 
@@ -100,7 +89,19 @@ for frame in sys.argv[1:]:
         lines.readline()
 """
 HELLO = {"hello": 1, "points": ["sheep.graze"], "can": ["decided", "expect"]}
-CALL = {"decide": 1, "point": "sheep.graze", "entity": "a", "args": {"hunger": 1}}
+
+
+def call(number, name):
+    return {"decide": number, "point": "sheep.graze", "entity": name, "args": {"hunger": 1}}
+
+
+def expected(*names):
+    return {"expect": [{"point": "sheep.graze", "entity": name, "args": {"hunger": 1}, "time": 0.5} for name in names]}
+
+
+CALL, NEXT = call(1, "a"), call(2, "a")
+DROUGHT = {"error": {"type": "Drought", "text": "no water"}}
+DECIDED = {"decided": 1, "value": 3}
 GRAZE = make_step(
     observation_space=spaces.Box(0, 9, (1,), np.float32),
     observation_space_mapping=lambda call: [call.hunger],
@@ -111,83 +112,127 @@ GRAZE = make_step(
 )
 
 
+def line(frame) -> str:
+    return frame if isinstance(frame, str) else json.dumps(frame)
+
+
+def both(*frames) -> str:
+    """Frames that are sent together."""
+    return "\n".join(map(line, frames))
+
+
 def speaking(*frames) -> ProcessSimulation:
-    """A simulator that sends some frames, whatever it receives."""
-    return ProcessSimulation([sys.executable, "-c", SPEAKS, *map(json.dumps, frames)], {"sheep.graze": GRAZE})
+    """A simulator that sends some frames or lines, whatever it receives."""
+    return ProcessSimulation([sys.executable, "-c", SPEAKS, *map(line, frames)], {"sheep.graze": GRAZE})
 
 
 @pytest.mark.parametrize(
-    ("frames", "text"),
+    ("frames", "kind", "text"),
     [
-        ([{**CALL, "decide": 2}], r"has sent .*'decide': 2.* where \{\"decided\": 1, \"value\": \.\.\.\} was due"),
-        ([{"end": {}}], r"'end'.* where \{\"decided\": 1"),
-        ([{"decided": 2, "value": 3}], r"'decided': 2.* where \{\"decided\": 1"),
-        ([{"decided": True, "value": 3}], r"'decided': True.* where \{\"decided\": 1"),
-        ([{"decided": 1}], r"\{'decided': 1\} where \{\"decided\": 1"),
-        ([{"decided": 1, "value": 3}, {"decided": 1, "value": 3}], "'decided'.* which is not due"),
-        ([{"decided": 1, "value": 3}, {"expect": {"entity": "b"}}], '"expect" with .*must be a list of objects'),
-        ([{"decided": 1, "value": 3}, {"expect": [{**CALL}]}], '"expect" with .*must be a list of objects'),
-        ([{"decided": 1, "value": 3}, {"expect": [{"point": "moon", "entity": "b"}]}], "the point 'moon'"),
-        ([{"decided": 1, "value": 3}, {"end": {"truncated": "yes"}}], r"'yes'.*\"truncated\" \(true or false\)"),
-        ([{"decided": 1, "value": 3}, {**CALL, "end": {}}], "decide and end in one frame"),
-        (
-            [{"decided": 1, "value": 3}, {"update": "a", "point": "sheep.graze", "args": {"time": 3}}],
-            r"an argument 'time' for sheep\.graze",
-        ),
-        (
-            [{"decided": 1, "value": 3}, {"expect": [{"point": "sheep.graze", "args": {"entity": 3}}]}],
-            r"an argument 'entity' for sheep\.graze",
-        ),
+        (["Welcome to the simulator!"], WireError, "Welcome to the simulator"),
+        ([CALL], WireError, "began with .*decide.*, not with a hello"),
+        ([{**HELLO, "hello": 2}], WireError, "speaks version 2 of the wire; this is version 1"),
+        ([{**HELLO, "hello": True}], WireError, "speaks version True"),
+        ([{**HELLO, "points": "sheep.graze"}], WireError, "must be lists of strings"),
+        ([DROUGHT], RemoteError, "has raised Drought: no water"),
+        ([both(HELLO, DROUGHT)], RemoteError, "has raised Drought: no water"),
+        ([both(HELLO, CALL)], WireError, "has sent .*decide.* before the start of an episode"),
     ],
     ids=str,
 )
-def test_frames_that_are_not_due_are_errors_that_name_them(frames, text):
+def test_what_is_wrong_before_the_start_of_an_episode_is_an_error(frames, kind, text):
+    with pytest.raises(kind, match=text):
+        simulate(speaking(*frames), seed=1)
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        (NEXT, "'decide': 2"),
+        ({"end": {}}, "'end'"),
+        ({**DECIDED, "decided": 2}, "'decided': 2"),
+        ({**DECIDED, "decided": True}, "'decided': True"),
+        ({"decided": 1}, r"\{'decided': 1\}"),
+    ],
+    ids=str,
+)
+def test_a_frame_in_place_of_the_decision_of_the_rule_is_an_error_that_names_it(frame, text):
+    with pytest.raises(WireError, match=rf'has sent .*{text}.* where \{{"decided": 1, "value": \.\.\.\}} was due'):
+        simulate(speaking(HELLO, CALL, frame), seed=1)
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        ({"desire": 4}, "desire.*not a frame of the wire"),
+        ({"error": "a dam broke"}, "a dam broke.*not a frame of the wire"),
+        (DECIDED, "'decided'.* which is not due"),
+        ({**NEXT, "decide": 7}, "call 7 where call 2 was due"),
+        ({**NEXT, "decide": "2"}, "call '2' where call 2"),
+        ({**NEXT, "point": "moon"}, "the point 'moon', which is not in its hello"),
+        ({**NEXT, "point": ["a"]}, r"named the point \['a'\]"),
+        ({**NEXT, "entity": ["a"]}, r"\['a'\] for sheep\.graze; an entity must be"),
+        ({**NEXT, "args": [1]}, r"args .* not an object: \[1\]"),
+        ({**NEXT, "time": "now"}, "the time 'now'"),
+        ({**NEXT, "time": 10**400}, "the time 1000"),
+        ({**NEXT, "end": {}}, "decide and end in one frame"),
+        ({"end": True}, "the end True"),
+        ({"end": {"truncated": "yes"}}, r"'yes'.*\"truncated\" \(true or false\)"),
+        ({"remove": "a", "point": "moon"}, "the point 'moon'"),
+        ({"update": "a", "point": "sheep.graze", "args": {"time": 3}}, r"an argument 'time' for sheep\.graze"),
+        ({"expect": {"entity": "b"}}, '"expect" with .*must be a list of objects'),
+        ({"expect": [CALL]}, '"expect" with .*must be a list of objects'),
+        ({"expect": [{"point": "moon"}]}, "the point 'moon'"),
+        ({"expect": [{"point": "sheep.graze", "args": {"entity": 3}}]}, r"an argument 'entity' for sheep\.graze"),
+    ],
+    ids=str,
+)
+def test_a_frame_that_is_invalid_or_not_due_is_an_error_that_names_it(frame, text):
     with pytest.raises(WireError, match=f"(?s){text}"):
-        simulate(speaking(HELLO, CALL, *frames), seed=1)
+        simulate(speaking(HELLO, CALL, DECIDED, frame), seed=1)
 
 
-@pytest.mark.parametrize("frame", [{"decided": 1, "value": 3}, {"expect": []}])
+@pytest.mark.parametrize("frame", [DECIDED, {"expect": []}])
 def test_frames_that_were_not_announced_are_errors(frame):
     with pytest.raises(WireError, match=r"not in the \"can\" of its hello"):
         simulate(speaking({**HELLO, "can": []}, CALL, frame), seed=1)
 
 
-def flock() -> ProcessSimulation:
-    return ProcessSimulation([sys.executable, by_client.__file__, "flock"], {"sheep.graze": GRAZE})
-
-
-def rounds(env, **options):
-    """Play an episode by its rule; return the number of agents after the reset, the number of rounds and the result."""
-    env.reset(seed=1, options=options)
-    born, number = len(env.agents), 0
-    while env.agents:
+@pytest.mark.parametrize(
+    ("frames", "born", "rounds"),
+    [
+        ([call(1, "a"), call(2, "b"), call(3, "c")], 1, 3),
+        ([expected("a", "b", "c"), call(1, "a"), call(2, "b"), call(3, "c")], 3, 1),
+        ([expected("a", "b"), call(1, "a"), call(2, "b"), expected("c", "d"), call(3, "c"), call(4, "d")], 2, 2),
+    ],
+    ids=["one by one", "together", "in mid-episode"],
+)
+def test_expected_calls_join_and_act_in_one_round(make_env, frames, born, rounds):
+    env = make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *frames, {"end": {}}))
+    env.reset(seed=1)
+    assert len(env.agents) == born
+    for _ in range(rounds):
+        assert env.agents
         env.step(dict.fromkeys(env.agents, RULE))
-        number += 1
-    return born, number, env.unwrapped.simulation.result
-
-
-def test_expected_calls_join_and_act_in_one_round(make_env):
-    env = make_env(parallel_env, flock())
-    born, number, eaten = rounds(env, sheep=1000, days=1)
-    assert (born, number) == (1, 1000)
-    assert rounds(env, sheep=1000, days=1, expects=True) == (1000, 1, eaten)
-    assert rounds(env, sheep=100, days=3, expects=True)[:2] == (100, 3), "also those that are born in mid-episode"
+    assert not env.agents
 
 
 def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
-    env = make_env(parallel_env, flock())
-    observations, _ = env.reset(seed=1, options={"sheep": 2, "expects": True, "culled": True})
-    assert list(observations) == ["0.0", "0.1"]
+    first_day = [expected("a", "b"), call(1, "a"), call(2, "b"), {"remove": "a", "point": "sheep.graze"}]
+    second_day = [expected("b", "c", "d"), call(3, "b"), call(4, "c"), call(5, "d"), {"end": {}}]
+    env = make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *first_day, *second_day))
+    observations, _ = env.reset(seed=1)
+    assert list(observations) == ["a", "b"]
     observations, _, terminations, *_ = env.step(dict.fromkeys(env.agents, 3))
-    assert terminations == {"0.0": True, "0.1": False, "1.0": False, "1.1": False}
+    assert observations.keys() == terminations.keys()
+    assert terminations == {"a": True, "b": False, "c": False, "d": False}
     calls = env.unwrapped.simulation.expected_calls("sheep.graze")
-    assert [(call.entity, call.time) for (call,) in calls] == [("1.0", 1.0), ("1.1", 1.0)], "one decides now"
+    assert [(call.entity, call.time) for (call,) in calls] == [("c", 0.5), ("d", 0.5)], "one decides now"
 
 
 def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_env):
-    one, decided, again = {"point": "sheep.graze", "entity": "b"}, {"decided": 1, "value": 3}, {**CALL, "decide": 2}
     removed = [{"remove": name, "point": "sheep.graze"} for name in "ab"]
-    frames = CALL, decided, {"expect": [one]}, *removed, again, {**decided, "decided": 2}, {"end": {}}
+    frames = CALL, DECIDED, expected("b"), *removed, NEXT, {**DECIDED, "decided": 2}, {"end": {}}
     names = {}
     named = replace(GRAZE, agent=lambda call: names.setdefault(call, f"sheep_{len(names)}"))
     env = make_env(aec_env, speaking(HELLO, *frames), {"sheep.graze": named})
@@ -200,7 +245,7 @@ def test_an_error_here_ends_a_process_that_is_not_waiting(make_env):
     rewards = [0.0]
     once = {"sheep.graze": replace(GRAZE, reward_mapping=lambda call: rewards.pop())}
     removed = {"remove": "a", "point": "sheep.graze"}
-    env = make_env(aec_env, speaking(HELLO, CALL, {"decided": 1, "value": 3}, removed, {"end": {}}), once)
+    env = make_env(aec_env, speaking(HELLO, CALL, DECIDED, removed, {"end": {}}), once)
     env.reset(seed=1)
     number = child(env)
     with pytest.raises(IndexError):
@@ -208,8 +253,8 @@ def test_an_error_here_ends_a_process_that_is_not_waiting(make_env):
     assert not runs(number)
 
 
-def test_a_process_that_does_not_expect_has_no_expected_calls(make_env):
-    env = make_env(aec_env, reservoirs())
-    assert not hasattr(env.unwrapped.simulation, "expected_calls")
-    env.reset(seed=1)
-    assert not hasattr(env.unwrapped.simulation, "expected_calls")
+def test_a_process_that_does_not_expect_has_no_expected_calls():
+    simulation = reservoirs()
+    assert not hasattr(simulation, "expected_calls")
+    simulation.reset(seed=1)
+    assert not hasattr(simulation, "expected_calls")

@@ -1,8 +1,6 @@
-"""A simulator that does something wrong: ``python faulty.py WHAT``, one of ``FAULTS``, or of ``AT_ONCE``."""
+"""A simulator that does something wrong: ``python faulty.py WHAT``, one of ``FAULTS``."""
 
-import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -34,57 +32,19 @@ UPDATE = {"update": "a", "point": "reservoir.inflow", "args": {}}
 
 FAULTS: dict[str, Callable[[Any], Any]] = {
     "garbage": lambda wire: wire.raw(b"hello?\n"),
-    "no object": lambda wire: wire.raw(b"[1]\n"),
-    "no utf-8": lambda wire: wire.raw(b'{"decide": "\xff"}\n'),
-    "deep": lambda wire: wire.raw(b'{"a":' * 100_000 + b"\n"),
-    "nan": lambda wire: wire.raw(b'{"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": NaN}\n'),
-    "unknown frame": lambda wire: wire.send({"desire": 4}),
-    "number": lambda wire: wire.send({"decide": 7, "point": "reservoir.inflow", "entity": "a", "args": {}}),
-    "number text": lambda wire: wire.send({"decide": "4", "point": "reservoir.inflow", "entity": "a", "args": {}}),
-    "point": lambda wire: wire.send({"decide": 4, "point": "moon.phase", "args": {}}),
-    "point, no text": lambda wire: wire.send({"decide": 4, "point": ["a"], "args": {}}),
-    "entity": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": ["a"], "args": {}}),
-    "args": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "args": [1]}),
-    "time": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": "now"}),
-    "large time": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": 10**400}),
-    "removed point": lambda wire: wire.send({"remove": "a", "point": "moon.phase"}),
-    "end": lambda wire: wire.send({"end": True}),
     "half a line": lambda wire: (wire.raw(b'{"decide": 4'), os._exit(0)),
-    "half a line, silent": lambda wire: (wire.raw(b'{"decide": 4'), time.sleep(600)),
     "drop by drop": lambda wire: [(wire.raw(b"{"), time.sleep(0.05)) for _ in range(12_000)],
     "silence": lambda wire: time.sleep(600),
-    "exit": lambda wire: os._exit(0),
-    "exit 3": lambda wire: os._exit(3),
+    "exit": lambda wire: os._exit(3),
     "crash": _flood,
-    "kill": lambda wire: os.kill(os.getpid(), signal.SIGKILL),
     "closed": _close,
     "grandchild": _grandchild,
     "updates": lambda wire: [wire.send(UPDATE) for _ in range(10**6)],
     "slow updates": lambda wire: [(wire.send(UPDATE), time.sleep(0.01)) for _ in range(60_000)],
     "gigabyte": lambda wire: [wire.raw(bytes(1 << 20)) for _ in range(1 << 10)],
     "error": lambda wire: wire.send({"error": {"type": "Flood", "text": "a dam broke", "trace": "dam.cpp:12"}}),
-    "error, no object": lambda wire: wire.send({"error": "a dam broke"}),
 }
 """What goes wrong in mid-episode, after three decisions."""
-
-
-_HELLO = json.dumps({"hello": 1, "points": outside.POINTS}).encode() + b"\n"
-
-AT_ONCE: dict[str, Callable[[Any], Any]] = {
-    "no hello": lambda wire: wire.send({"decide": 1, "point": "reservoir.inflow"}),
-    "version 2": lambda wire: wire.send({"hello": 2, "points": outside.POINTS}),
-    "version true": lambda wire: wire.send({"hello": True, "points": outside.POINTS}),
-    "points": lambda wire: wire.send({"hello": 1, "points": "reservoir.inflow"}),
-    "other points": lambda wire: wire.send({"hello": 1, "points": ["moon.phase"]}),
-    "silence": lambda wire: time.sleep(600),
-    "exit": lambda wire: os._exit(0),
-    "exit 3": lambda wire: os._exit(3),
-    "garbage": lambda wire: wire.raw(b"Welcome to the simulator!\n"),
-    "error": lambda wire: wire.send({"error": {"type": "Drought", "text": "no water"}}),
-    "no start": lambda wire: wire.raw(_HELLO + b'{"decide": 1, "point": "reservoir.inflow"}\n'),
-    "error, no start": lambda wire: wire.raw(_HELLO + b'{"error": {"type": "Drought", "text": "no water"}}\n'),
-}
-"""What goes wrong in place of the hello."""
 
 
 class Faulty:
@@ -114,9 +74,6 @@ class Faulty:
 
 
 if __name__ == "__main__":
-    Faulty.wire, when, Faulty.what = outside.Wire(), *sys.argv[1:]
+    Faulty.wire, Faulty.what = outside.Wire(), sys.argv[1]
     print("there are many words", file=sys.stderr)
-    if when == "at once":
-        AT_ONCE[Faulty.what](Faulty.wire)
-        time.sleep(600)
     Faulty.wire.play(Faulty, outside.POINTS)

@@ -1,8 +1,8 @@
 """A model of its own process, which speaks the wire: reservoirs that are filled, leak, are given up and come anew.
 
-``python outside.py`` plays it to an environment, or by its own rule where there is none. It needs nothing but Python,
-and nothing of the library, as a simulator in another language would not have it. The tests run the same model in
-their own process, too.
+``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its rule decides.
+``python outside.py SEED`` plays it by its own rule. It needs nothing but Python, and nothing of the library, as a
+simulator in another language would not have it. The tests run the same model in their own process, too.
 """
 
 import json
@@ -10,7 +10,7 @@ import os
 import random
 import sys
 from collections.abc import Callable
-from math import inf, isfinite
+from math import inf
 from typing import Any
 
 
@@ -45,7 +45,7 @@ class Reservoirs:
                     lambda level=level: round(max(0.0, 5.0 - level), 3),
                 )
                 self.levels[name] = level + inflow - self.random.uniform(0.2, 5.5)
-                self.log.append((hour, name, self.levels[name]))
+                self.log.append([hour, name, self.levels[name]])
                 if not 0 < self.levels[name] < 9:
                     level = self.levels.pop(name)
                     update("reservoir.inflow", name, {"level": level, "queue-length": hour, "price": self.price})
@@ -61,12 +61,10 @@ class Reservoirs:
         """What came of it."""
         return {"levels": self.levels, "price": self.price, "log": self.log}
 
-
-def finite(value: Any) -> Any:
-    """Numbers that are not finite, as they travel."""
-    if isinstance(value, float) and not isfinite(value):
-        return {"float": "nan" if value != value else "inf" if value == inf else "-inf"}
-    return value
+    def by_its_rule(self) -> dict[str, Any]:
+        """What comes of it by its own rule."""
+        self.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
+        return self.result()
 
 
 class Wire:
@@ -77,6 +75,7 @@ class Wire:
         self.lines = open(reading, encoding="utf-8")  # noqa: SIM115
         self.writing = writing
         self.number = 0
+        self.tells = "tells" in sys.argv  # what the rule decides
         self.model: Any = None
 
     def send(self, frame: dict[str, Any]) -> None:
@@ -108,7 +107,12 @@ class Wire:
         if "stop" in answer:
             raise Stopped
         assert answer["act"] == self.number
-        return rule() if answer.get("rule") else answer["value"]
+        if not answer.get("rule"):
+            return answer["value"]
+        value = rule()
+        if self.tells:
+            self.send({"decided": self.number, "value": value})
+        return value
 
     def remove(self, point: str, entity: str) -> None:
         """Say that an entity is gone."""
@@ -120,7 +124,7 @@ class Wire:
 
     def play(self, make: Callable[[int, dict[str, Any]], Any], points: list[str], episodes: float = inf) -> None:
         """Play so many episodes."""
-        self.send({"hello": 1, "points": points, "can": ["reseed"]})
+        self.send({"hello": 1, "points": points, "can": ["reseed", *(["decided"] if self.tells else [])]})
         played = 0
         while played < episodes:
             start = self.receive()["start"]
@@ -139,12 +143,11 @@ POINTS = ["reservoir.inflow", "broker.price"]
 
 def main() -> None:
     """Play to an environment, or by the model's own rule: the result stands on the standard output then."""
+    numbers = [int(word) for word in sys.argv[1:] if word.isdecimal()]
     if "SIMENV_MARL_FDS" in os.environ:
-        Wire().play(Reservoirs, POINTS, float(sys.argv[1]) if len(sys.argv) > 1 else inf)
-        return
-    model = Reservoirs(int(sys.argv[1]), {})
-    model.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
-    print(json.dumps(model.result()))
+        Wire().play(Reservoirs, POINTS, *numbers)
+    else:
+        print(json.dumps(Reservoirs(numbers[0], {}).by_its_rule()))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ import gc
 import signal
 import threading
 import time
-import warnings
 from contextlib import nullcontext
 
 import pytest
@@ -88,7 +87,7 @@ def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(
 
 
 @VIEWS
-def test_an_environment_may_be_used_from_a_new_thread_each_time(view):
+def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_threads):
     decide = decision(agent="a_0")
     env = view(calling(*[decide] * 3), decide, driver="thread")
     for _ in range(2):
@@ -97,10 +96,11 @@ def test_an_environment_may_be_used_from_a_new_thread_each_time(view):
             in_a_thread(step, env, 1, "a_0")
         assert env.simulation.log == [1, 1, 1]
     in_a_thread(env.reset)
+    assert len(simulation_threads()) == len(older_threads) + 1
     in_a_thread(env.close)
+    assert simulation_threads() == older_threads
     env.reset()
     assert env.simulation.episodes == 4
-    env.close()
 
 
 @VIEWS
@@ -151,28 +151,6 @@ def test_no_other_thread_moves_an_environment_before_the_results_of_a_move_are_r
 # -- what is left behind --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("how", ["end", "close", "collect", "reset", "model error", "never reset"])
-def test_no_thread_is_left_after_any_end(how, older_threads):
-    decide = decision()
-    fail = (lambda: 1 / 0) if how == "model error" else decide
-    env = single_env(calling(decide, fail), decide, driver="thread")
-    assert len(simulation_threads()) == len(older_threads) + 1  # in which the simulation was made
-    if how != "never reset":
-        env.reset()
-        with pytest.raises(ZeroDivisionError) if how == "model error" else nullcontext():
-            env.step(1)
-        if how == "end":
-            env.step(1)
-        for _ in range(5 if how == "reset" else 0):
-            env.reset()
-    assert len(simulation_threads()) == len(older_threads) + 1  # the one in which the next episode is going to run
-    if how in ("collect", "never reset"):
-        del env
-    else:
-        env.close()
-    assert simulation_threads() == older_threads
-
-
 def test_too_many_threads_are_an_error(monkeypatch, older_threads):
     def refuse(*args, **kwargs):
         raise RuntimeError("can't start new thread")
@@ -204,36 +182,12 @@ def interrupt():
 
 
 @needs_signals
-def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_next_decision():
-    log, interrupted = [], threading.Event()
-
-    def main(simulation):
-        try:
-            log.append(decide())
-            if simulation.episodes == 1:
-                interrupt()
-                assert interrupted.wait(10)
-            log.append(decide())
-        finally:
-            log.append("unwound")
-
-    decide = decision()
-    env = single_env(script(main), decide, driver="thread")
-    env.reset()
-    env.simulation.stop = lambda: interrupted.set()  # is called as soon as the interruption has surfaced
-    with pytest.raises(KeyboardInterrupt) as caught:
-        env.step(1)
-    assert log == [1, "unwound"]
-    assert "seed" in notes(caught.value)
-    env.reset()
-    env.step(2)
-    assert env.step(3)[2]
-    assert log == [1, "unwound", 2, 3, "unwound"]
-
-
-@needs_signals
-def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkeypatch, older_threads):
-    monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
+@pytest.mark.parametrize("stops", [True, False])
+def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_or_is_given_up(
+    stops, monkeypatch, older_threads
+):
+    if not stops:
+        monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, log, decide = threading.Event(), [], decision()
 
     def main(simulation):
@@ -248,16 +202,21 @@ def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkey
 
     env = single_env(script(main), decide, driver="thread")
     env.reset()
-    (stuck,) = set(simulation_threads()) - set(older_threads)
-    with pytest.raises(KeyboardInterrupt), pytest.warns(ResourceWarning, match=r"Script.*neither decided"):
+    (interrupted,) = set(simulation_threads()) - set(older_threads)
+    if stops:
+        env.simulation.stop = go_on.set  # is called as soon as the interruption has surfaced
+    warned = nullcontext() if stops else pytest.warns(ResourceWarning, match=r"Script.*neither decided")
+    with pytest.raises(KeyboardInterrupt) as caught, warned:
         env.step(1)
+    assert "seed" in notes(caught.value)
     env.reset()
     env.step(2)
-    go_on.set()  # it was given up, but it is not to go on for ever
-    stuck.join(10)
-    assert log == [1, 2, "unwound"]
-    env.step(3)
-    assert log == [1, 2, "unwound", 3, "unwound"]
+    go_on.set()  # what was given up is not to go on for ever
+    if not stops:
+        interrupted.join(10)
+    assert log == ([1, "unwound", 2] if stops else [1, 2, "unwound"])
+    assert env.step(3)[2]
+    assert log[3:] == [3, "unwound"]
 
 
 @pytest.mark.parametrize("how", ["close", "collect"])
@@ -271,17 +230,11 @@ def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(mon
         finally:
             go_on.wait(10)
 
-    env = single_env(script(main), decide, driver="thread")
-    env.reset()
+    held = [single_env(script(main), decide, driver="thread")]
+    held[0].reset()
     (stuck,) = set(simulation_threads()) - set(older_threads)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        if how == "close":
-            env.close()
-        del env
-        gc.collect()
-    assert [warning.category for warning in caught] == [ResourceWarning]
-    assert "Script" in str(caught[0].message)
-    assert "neither decided" in str(caught[0].message)
+    with pytest.warns(ResourceWarning, match=r"Script.*neither decided") as caught:
+        held[0].close() if how == "close" else held.clear()
+    assert len(caught) == 1
     go_on.set()
     stuck.join(10)

@@ -1,19 +1,15 @@
 """Processes that a simulation forks have no user to ask: what they decide is refused, and the environment goes on."""
 
-import subprocess
 import sys
-from textwrap import dedent
 
 import pytest
 
 from tests.conftest import DRIVERS
+from tests.processes import run_code
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the platform does not fork")
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
-
-LIMIT = 60
-"""Seconds after which a test is given up; its processes have ended themselves by then."""
 
 PREAMBLE = """
     import multiprocessing, os, signal, sys, threading, warnings
@@ -89,9 +85,7 @@ PREAMBLE = """
 
 def run(code, driver):
     """Run code in a process of its own, which no worker leaves as a second one."""
-    source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + "\nprint('end', os.getpid() == user)\n"
-    result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False, timeout=LIMIT)
-    assert (result.returncode, result.stdout, result.stderr) == (0, "end True\n", ""), result.stdout + result.stderr
+    assert run_code(f"driver = {driver!r}", PREAMBLE, code, "print('end', os.getpid() == user)") == "end True\n"
 
 
 KINDS = pytest.mark.parametrize("kind", ["Process", "Pool"])

@@ -168,17 +168,3 @@ def test_greenlets_that_a_model_has_kept_do_not_decide_after_a_close(driver, ste
         assert env.simulation.log == [0, 1, 2]
         env.close()
     assert env.simulation is not simulation
-
-
-@DRIVERS
-def test_a_simulation_without_greenlets_stays_the_same_after_a_close(driver):
-    decide = decision()
-    env = single_env(script(lambda simulation: decide()), decide, driver=driver)
-    simulation = env.simulation
-    for _ in range(2):
-        env.reset()
-        env.close()
-        assert env.simulation is simulation
-
-
-# -- threads that use one environment -------------------------------------------------------------

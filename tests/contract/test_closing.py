@@ -156,12 +156,3 @@ def test_its_error_does_not_take_the_place_of_an_earlier_one():
         env.reset(seed=2)
     assert 2 not in of("reset")
     env.close()
-
-
-def test_branches_end_without_it():
-    env = single_env(Shop, BOOKS, driver="greenlet")
-    env.reset(seed=1)
-    results = branch(env, lambda twin, number: len(of("close")), 2, method="fork")
-    assert results == [0, 0]
-    assert of("close") == []
-    env.close()

@@ -36,8 +36,8 @@ def ended_by(trigger, held):
 @ALL_VIEWS
 @TRIGGERS
 @pytest.mark.parametrize("max_steps", [None, 1])
-def test_an_end_in_mid_episode_or_after_max_steps_unwinds_the_simulation(view, trigger, max_steps):
-    log = []
+def test_an_end_in_mid_episode_or_after_max_steps_unwinds_and_answers_no_decision(view, trigger, max_steps):
+    log, rewarded = [], []
 
     def main(simulation):
         log.append("begun")
@@ -47,46 +47,27 @@ def test_an_end_in_mid_episode_or_after_max_steps_unwinds_the_simulation(view, t
                 decide()
             finally:
                 log.append("inner")
+                log.append(decide())
             log.append("never")
         finally:
             log.append("outer")
+            log.append(other())
+            log.append("still its rule")
 
-    decide = decision(agent="a_0")
-    held = [view(script(main), decide, max_steps=max_steps)]
+    decide = decision(agent="a_0", reward_mapping=lambda: rewarded.append(1) or 0)
+    other = decision(agent="b_0")
+    unasked = view in (single_env, joint_env)
+    policies = {other: RULE} if unasked else None
+    held = [view(script(main), [decide, other], policies=policies, max_steps=max_steps)]
     held[0].reset()
     assert step(held[0], 1, "a_0") is (max_steps == 1)
     assert log == ["begun"]
+    rewarded.clear()
     ended_by(trigger, held)
-    assert log == ["begun", "inner", "outer", *(["begun"] if trigger == "reset" else [])]
-
-
-@VIEWS
-@TRIGGERS
-def test_decisions_while_unwinding_are_not_answered(view, trigger):
-    log, asked = [], []
-
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            log.append("finally")
-            try:
-                log.append(decide())
-            finally:
-                log.append("inner finally")
-                log.append(other())
-                log.append("never")
-
-    decide = decision(lambda: log.append("rule"), agent="a_0", reward_mapping=lambda: asked.append(1) or 0)
-    other = decision(agent="b_0")
-    held = [view(script(main), [decide, other], policies={other: RULE} if view is single_env else None)]
-    held[0].reset()
-    asked.clear()
-    ended_by(trigger, held)
-    expected = ["finally", "inner finally"]
-    # A point that nobody asked for is nothing but its rule.
-    assert log == (expected if view is aec_env else [*expected, "rule", "never"])
-    assert len(asked) == (1 if trigger == "reset" else 0)  # 1: the next episode's
+    last = ["rule", "still its rule"] if unasked else []
+    again = ["begun"] if trigger == "reset" else []
+    assert log == ["begun", "inner", "outer", *last, *again]
+    assert len(rewarded) == len(again)
 
 
 def test_an_exit_in_a_group_is_an_exit_and_what_is_with_it_is_an_error():

@@ -12,10 +12,11 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the platform do
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
 PREAMBLE = """
-    import multiprocessing, os, signal, sys, threading, warnings
+    import multiprocessing, os, signal, warnings
 
     from simenv_marl import single_env
     from simenv_marl.errors import WrongThreadError
+    from tests.core.test_threads import in_a_thread
     from tests.worlds.models import Script, decision, script
 
     signal.alarm(30)  # so that none waits for ever
@@ -59,13 +60,6 @@ PREAMBLE = """
             self.pool.close()
             self.pool.join()
             return told
-
-    def in_a_thread(function):
-        told = []
-        thread = threading.Thread(target=lambda: told.append(function()))
-        thread.start()
-        thread.join(20)
-        return told[0]
 
     def play(between, make=Script):
         def main(simulation):

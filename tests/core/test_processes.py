@@ -1,56 +1,17 @@
 """Errors cross to other processes as they are."""
 
 import os
-import signal
 import sys
-import time
 import traceback
 from dataclasses import dataclass
-from pathlib import Path
 from pickle import PicklingError
 from types import GetSetDescriptorType, MemberDescriptorType
 
 import numpy as np
 import pytest
 
-from simenv_marl.core.forks import Fork
 from simenv_marl.core.packing import RemoteTraceback, pack_error, unpack_error
-from simenv_marl.errors import BranchError, WorkerError, error_text
-from tests.processes import alone
-from tests.worlds.counters import FORKS
-
-# -- their ends ---------------------------------------------------------------------------------------
-
-
-def interrupt(path):
-    time.sleep(0.1)  # until the parent waits
-    os.kill(os.getppid(), signal.SIGINT)
-    time.sleep(1)
-    path.touch()
-
-
-def fork_and_look_for_children(folder: str) -> None:
-    went_on = Path(folder) / "went on"
-    fork = Fork.begin(lambda connection: connection.recv(1), lambda: None, wait=False)
-    fork.connection.send(b"ab")
-    assert os.waitpid(fork.process, 0)[1] == 0
-    assert fork._has_ended()  # also where it has left something unread
-    fork.end()
-    with pytest.raises(BranchError, match="died"):
-        Fork.begin(print, lambda: 1 / 0, wait=True)
-    with pytest.raises(KeyboardInterrupt):
-        Fork.begin(print, lambda: interrupt(went_on), wait=True)
-    assert not went_on.exists()
-    with pytest.raises(ChildProcessError):
-        os.waitpid(-1, os.WNOHANG)
-
-
-@FORKS
-def test_a_fork_ends_with_its_work_or_where_it_cannot_be_separated(tmp_path):
-    alone(fork_and_look_for_children, str(tmp_path))
-
-
-# -- errors of all kinds ------------------------------------------------------------------------------
+from simenv_marl.errors import WorkerError, error_text
 
 
 class Many(ValueError):

@@ -3,8 +3,6 @@
 import gc
 import inspect
 import pickle
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from weakref import ref
 
@@ -130,20 +128,3 @@ def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_n
     assert env.unwrapped.simulation.log == [1, 2]
     env.close()
     assert unwound == [True]
-
-
-def test_threads_with_environments_of_their_own_do_not_meet():
-    decide, barrier = decision(), threading.Barrier(4)
-
-    def work(number):
-        env = single_env(calling(*[decide] * 20), decide)
-        barrier.wait()
-        for _ in range(3):
-            env.reset()
-            while not env.step(number)[2]:
-                assert decide() == in_a_thread(decide) == "rule"
-        assert decide() == "rule"
-        return env.unwrapped.simulation.log
-
-    with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(work, range(4))) == [[number] * 20 for number in range(4)]

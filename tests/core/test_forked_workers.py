@@ -16,7 +16,6 @@ PREAMBLE = """
 
     from simenv_marl import single_env
     from simenv_marl.errors import WrongThreadError
-    from tests.core.test_threads import in_a_thread
     from tests.worlds.models import Script, decision, script
 
     signal.alarm(30)  # so that none waits for ever
@@ -32,31 +31,15 @@ PREAMBLE = """
         except WrongThreadError as error:
             return "refused", "forked" in str(error), other()
 
-    def tell(queue):
-        for _ in range(2):  # the second time as the first
-            queue.put(ask())
-
-    class Process:
-        def __init__(self):
-            self.queue = context.SimpleQueue()
-            self.process = context.Process(target=tell, args=(self.queue,))
-        def begin(self):
-            if not self.process.pid:
-                self.process.start()
-        def ask(self):
-            self.begin()
-            told = {self.queue.get() for _ in range(2)}
-            self.process.join()
-            assert self.process.exitcode == 0
-            return told
+    def ask_twice(_):
+        first, second = ask(), ask()
+        return second if first == second else (first, second)
 
     class Pool:
         def __init__(self):
             self.pool = context.Pool(1, maxtasksperchild=1)  # all but the first are forked in a thread of the pool
-        def begin(self):
-            pass
         def ask(self):
-            told = {self.pool.apply_async(ask).get(20) for _ in range(3)}
+            told = {self.pool.apply_async(ask_twice, [0]).get(20) for _ in range(3)}
             self.pool.close()
             self.pool.join()
             return told
@@ -82,35 +65,28 @@ def run(code, driver):
     assert run_code(f"driver = {driver!r}", PREAMBLE, code, "print('end', os.getpid() == user)") == "end True\n"
 
 
-KINDS = pytest.mark.parametrize("kind", ["Process", "Pool"])
-
-
 @DRIVERS
-@KINDS
-def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(kind, driver):
+def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(driver):
     run(
-        f"""
-        for way in (in_a_thread, lambda function: function()):
-            for _ in range(2):
-                assert play(lambda simulation: way(lambda: {kind}().ask())) == {{REFUSED}}, way
+        """
+        for _ in range(2):
+            assert play(lambda simulation: Pool().ask()) == {REFUSED}
         """,
         driver,
     )
 
 
 @DRIVERS
-@KINDS
-def test_workers_that_were_forked_before_the_model_runs_have_the_rule(kind, driver):
+def test_workers_that_were_forked_before_the_model_runs_have_the_rule(driver):
     run(
-        f"""
+        """
         class Model(Script):
             def reset(self, seed=None, options=None):
                 super().reset(seed, options)
-                self.workers = {kind}()
-                self.workers.begin()
+                self.workers = Pool()
         told = play(lambda simulation: simulation.workers.ask(), Model)
         assert RULED in told
-        assert told <= {{RULED, REFUSED}}
+        assert told <= {RULED, REFUSED}
         """,
         driver,
     )

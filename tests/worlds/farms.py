@@ -110,9 +110,9 @@ class Small(Farm):
 
 
 def at(place: str, value: Any) -> Callable[..., Any]:
-    """A mapping at which something may happen, with that value."""
+    """A mapping or handler at which something may happen, with that value."""
 
-    def mapping(*args: Any) -> Any:
+    def mapping(*args: Any, **_: Any) -> Any:
         args[-1].come_by(place)
         return value(*args) if callable(value) else value
 
@@ -140,7 +140,7 @@ POINTS = {
         agent=at("agent", lambda beast: f"beast_{beast.number}"),
         observation_space_mapping=at("observation", [0, 0]),
         reward_mapping=at("reward", 1.0),
-        removed_by={f"{__name__}.Farm.remove": lambda farm, beast: at("removed_by", f"beast_{beast.number}")(beast)},
+        removed_by={f"{__name__}.Farm.remove": at("removed_by", lambda farm, beast: f"beast_{beast.number}")},
     ),
     PICK: define(
         agent="picker", choices=at("choices", lambda farm: list(range(farm.now + 1))), action_space=spaces.Discrete(5)
@@ -173,14 +173,6 @@ def comes_by(view: Any, place: str) -> bool:
     return view not in OF_ONE or place not in ("agent", "removed_by", "choices", "expected_calls")
 
 
-def handler(place: str) -> Callable[..., int]:
-    def handle(farm: Farm, **_: Any) -> int:
-        farm.come_by(place)
-        return 0  # of which only ``instead`` makes use
-
-    return handle
-
-
 def farm_env(view: Any, place: str | None = None) -> Any:
     """An environment of a farm, which comes by that place, and its farm, for a vector the first one."""
 
@@ -192,7 +184,7 @@ def farm_env(view: Any, place: str | None = None) -> Any:
     points = POINTS | {PLAN: MAPPED_PLANNER if place == "action" else PLANNER}
     options: dict[str, Any] = {"policies": {WORK: policy if place == "policy" else RULE}}
     if place in ("before", "after", "instead"):
-        options["plugins"] = [(handler(place), WORK, place)]
+        options["plugins"] = [(at(place, 0), WORK, place)]
     if place == "render":
         options["render_mode"] = "human"
     if view in OF_ONE:

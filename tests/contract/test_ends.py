@@ -1,9 +1,14 @@
 """Section 5.9 of the contract: what ends in mid-episode is unwound, and nothing of it is left."""
 
+import asyncio
+import ctypes
 import gc
 import random
+import sys
 import weakref
 from contextlib import suppress
+from functools import partial
+from pathlib import Path
 
 import greenlet
 import pytest
@@ -13,6 +18,7 @@ from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core.options import Options
 from simenv_marl.errors import ClosedError, InvalidActionError
 from tests.core.test_threads import in_a_thread
+from tests.processes import alone
 from tests.worlds.models import alive, decision, script, stacks, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
@@ -268,3 +274,96 @@ def test_an_environment_whose_thread_has_ended_can_be_reset_or_dropped():
     del env
     gc.collect()
     assert reference() is None
+
+
+# -- through code of others -----------------------------------------------------------------------
+
+
+def close_through_printing_c_code(path):
+    async def work():
+        sys.modules["__main__"].decide = decide
+        ctypes.pythonapi.PyRun_SimpleString(b"decide()")  # which calls PyErr_Print
+
+    decide = decision()
+    env = single_env(script(lambda simulation: asyncio.run(work())), decide)
+    env.reset()
+    env.close()
+    Path(path).touch()
+
+
+def test_the_exit_does_not_end_a_process_whose_c_code_prints_it(tmp_path):
+    alone(close_through_printing_c_code, str(tmp_path / "closed"))
+    assert (tmp_path / "closed").exists()
+
+
+class EngineError(Exception):
+    """What an engine raises in place of what it has caught."""
+
+
+def wrap(decide, how):
+    """Decide in an engine that raises an error of its own. Only a cleanup that fails is an error of the model."""
+    kept = None
+    try:
+        decide()
+    except BaseException as error:
+        if how == "implicitly":
+            raise EngineError("a process has failed")  # noqa: B904
+        if how == "hidden":
+            raise EngineError("a process has failed") from None
+        if how == "twice":
+            try:
+                raise EngineError("a process has failed")
+            except EngineError:
+                raise EngineError("the engine has failed")  # noqa: B904
+        if how == "exit":
+            sys.exit(3)
+        kept = error
+    if how == "text":
+        raise EngineError(str(kept))
+    raise EngineError("a process has failed", kept)
+
+
+@pytest.mark.parametrize("how", ["implicitly", "hidden", "twice", "exit", "text", "later"])
+@pytest.mark.parametrize("end", ["close", "reset"])
+def test_an_error_that_an_engine_raises_in_place_of_the_exit_is_not_the_models(how, end):
+    decide = decision()
+    env = single_env(script(lambda simulation: wrap(decide, how)), decide)
+    env.reset()
+    getattr(env, end)()
+    env.close()
+
+
+class Engine:
+    """Makes its worker once, for all episodes."""
+
+    def __init__(self, decide):
+        self.worker, self.decide = greenlet.greenlet(self.work), decide
+
+    def reset(self, seed=None):
+        self.log = []
+
+    def work(self):
+        while True:
+            self.log.append(self.decide())
+            greenlet.getcurrent().parent.switch()
+
+    def run(self):
+        for _ in range(3):
+            self.worker.switch()
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3])
+def test_greenlets_that_a_model_has_kept_do_not_decide_after_a_close(steps):
+    decide = decision()
+    env = single_env(partial(Engine, decide), decide)
+    env.reset()
+    simulation = env.simulation
+    for number in range(steps):
+        env.step(number)
+    env.close()
+    for _ in range(2):
+        env.reset()
+        assert [env.step(number)[2] for number in range(3)] == [False, False, True]
+        assert env.simulation.log == [0, 1, 2]
+        env.close()
+    assert env.simulation is not simulation

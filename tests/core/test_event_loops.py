@@ -258,6 +258,56 @@ def test_errors_of_tasks_are_reported_while_others_are_unwound(driver, loud):
     assert isinstance(loud.records[-1].exc_info[1], ValueError)
 
 
+async def numbers(log, cleanup=lambda: None):
+    try:
+        while True:
+            yield await asyncio.sleep(0)
+    finally:
+        cleanup()
+        await asyncio.sleep(0)
+        log.append("generator closed")
+
+
+async def stay(log, cleanup):
+    try:
+        await asyncio.sleep(3600)
+    finally:
+        cleanup()
+        await asyncio.sleep(0)
+        log.append("task cancelled")
+
+
+async def office(simulation, decide, cleanup):
+    """Decide while tasks and asynchronous generators of the model are left, of which some decide in their cleanup."""
+
+    def quietly():
+        cleanup.append("decides")
+        decide()
+
+    generators = [numbers(simulation.log, *args) for args in [(), (quietly,), ()]]
+    for generator in generators:
+        await anext(generator)
+    works = [lambda: None, quietly, lambda: None, quietly, lambda: None]
+    tasks = [asyncio.create_task(stay(simulation.log, work)) for work in works]
+    await asyncio.sleep(0)
+    decide()
+    await asyncio.wait(tasks)
+
+
+@DRIVERS
+@pytest.mark.parametrize("end", ["close", "reset"])
+def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(driver, end):
+    decide, cleanup = decision(), []
+    env = single_env(script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))), decide, driver=driver)
+    env.reset()
+    log = env.simulation.log
+    getattr(env, end)()
+    assert sorted(log) == ["generator closed"] * 2 + ["task cancelled"] * 3
+    assert len(cleanup) == 3
+    env.close()
+    gc.collect()
+
+
 class Lasting(SimulationInterface):
     """Has a loop that outlives its episodes."""
 

@@ -8,10 +8,11 @@ from contextlib import nullcontext
 
 import pytest
 
-from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core import threads
 from simenv_marl.errors import ReentrancyError
-from tests.worlds.models import Script, calling, decision, notes, play, script, step
+from tests.worlds import farms
+from tests.worlds.models import Script, calling, decision, notes, script, step
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
 
@@ -52,35 +53,16 @@ def older_threads():
 # -- where it runs --------------------------------------------------------------------------------
 
 
-def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users():
-    seen = {"simulation": [], "user": []}
-
-    def here(where, value):
-        seen[where].append(threading.get_ident())
-        return value
-
-    def main(simulation):
-        for _ in range(3):
-            for point in (decide, other, applied):
-                here("simulation", point())
-            ruled()
-
-    decide = decision(
-        agent="a_0",
-        observation_space_mapping=lambda: here("user", [0, 0]),
-        reward_mapping=lambda: here("user", 0.0),
-        action_space_mapping=lambda action: here("user", action),
-    )
-    other = decision(agent="b_0")
-    applied = decision(apply=lambda action: here("simulation", action), agent="c_0")
-    ruled = decision(lambda: here("simulation", 0), agent="d_0")
-    policies = {"b_0": lambda observation: here("user", 1), "d_0": RULE}
-    play(aec_env(script(main), [decide, other, applied, ruled], policies=policies, driver="thread"), 1)
-    assert set(seen["user"]) == {threading.get_ident()}
-    assert len(seen["user"]) > 9
-    assert len(seen["simulation"]) == 15
-    assert len(set(seen["simulation"])) == 1
-    assert set(seen["simulation"]).isdisjoint(seen["user"])
+@pytest.mark.parametrize("place", farms.PLACES)
+def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(place, older_threads):
+    env, farm = farms.farm_env(aec_env, place, driver="thread")
+    (own,) = set(simulation_threads()) - set(older_threads)
+    seen = set()
+    for number, play_on in ((1, farms.run), (3, farms.run), (9, farms.run), (1, farms.cut_short)):
+        farm.let(lambda: seen.add(threading.current_thread()), place, number)
+        play_on(env)
+    inside = place in (*farms.IN_THE_MODEL, "reset", "finally", "close")
+    assert seen == {own if inside else threading.current_thread()}
 
 
 # -- from any thread ------------------------------------------------------------------------------

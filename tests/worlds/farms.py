@@ -173,7 +173,7 @@ def comes_by(view: Any, place: str) -> bool:
     return view not in OF_ONE or place not in ("agent", "removed_by", "choices", "expected_calls")
 
 
-def farm_env(view: Any, place: str | None = None) -> Any:
+def farm_env(view: Any, place: str | None = None, **options: Any) -> Any:
     """An environment of a farm, which comes by that place, and its farm, for a vector the first one."""
 
     def policy(observation: Any) -> int:
@@ -182,7 +182,7 @@ def farm_env(view: Any, place: str | None = None) -> Any:
 
     farms: list[Farm] = []
     points = POINTS | {PLAN: MAPPED_PLANNER if place == "action" else PLANNER}
-    options: dict[str, Any] = {"policies": {WORK: policy if place == "policy" else RULE}}
+    options["policies"] = {WORK: policy if place == "policy" else RULE}
     if place in ("before", "after", "instead"):
         options["plugins"] = [(at(place, 0), WORK, place)]
     if place == "render":

@@ -8,11 +8,11 @@ from contextlib import nullcontext
 
 import pytest
 
-from simenv_marl import aec_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core import threads
 from simenv_marl.errors import ReentrancyError
 from tests.worlds import farms
-from tests.worlds.models import Script, calling, decision, notes, script, step
+from tests.worlds.models import calling, decision, notes, script, step
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
 
@@ -87,47 +87,30 @@ def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_thre
 
 @VIEWS
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
-def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what):
+@pytest.mark.parametrize("place", ["rule", "observation", "render"])
+def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what, place):
     inside, go_on = threading.Event(), threading.Event()
 
-    def main(simulation):
-        simulation.log.append(decide())
+    def wait():
         inside.set()
         assert go_on.wait(10)
-        simulation.log.append(decide())
 
-    decide = decision()
-    env = view(script(main), decide, driver="thread")
-    env.reset()
-    stepping = threading.Thread(target=step, args=(env, 1, "choose_0"))
+    (env, farm), (other, undisturbed) = (farms.farm_env(view, place, driver="thread") for _ in range(2))
+    env.reset(seed=11)
+    farm.let(wait, place)
+    stepping = threading.Thread(target=farms.take, args=(env, RULE))
     stepping.start()
     assert inside.wait(10)
     with pytest.raises(ReentrancyError, match="another thread"):
-        step(env, 2, "choose_0") if what == "step" else getattr(env, what)()
+        farms.take(env, 0) if what == "step" else getattr(env, what)()
     go_on.set()
     stepping.join()
-    step(env, 3, "choose_0")
-    assert env.simulation.log == [1, 3]
-    assert env.simulation.episodes == 1
-
-
-@VIEWS
-def test_no_other_thread_moves_an_environment_before_the_results_of_a_move_are_read(view):
-    class Drawn(Script):
-        render_modes = ("human",)
-
-        def render(self, mode):
-            with pytest.raises(ReentrancyError, match="another thread"):
-                in_a_thread(step, env, 2, "choose_0")
-            self.pictures = getattr(self, "pictures", 0) + 1
-
-    decide = decision()
-    main = calling(*[decide] * 3)().main
-    env = view(lambda: Drawn(main), decide, driver="thread", render_mode="human")
-    env.reset()
-    step(env, 1, "choose_0")
-    assert (env.simulation.log, env.simulation.pictures) == ([1], 2)
-    env.close()
+    other.reset(seed=11)
+    farms.take(other, RULE)
+    for _ in range(2):
+        assert farm.log == undisturbed.log
+        farms.take(env, 0)
+        farms.take(other, 0)
 
 
 # -- what is left behind --------------------------------------------------------------------------

@@ -144,6 +144,7 @@ def test_one_note_says_at_which_decision_of_whom_it_was_and_the_seed(view, place
     farm.let(partial(throw, ValueError("told")), place, time)
     with pytest.raises(ValueError, match="told") as caught:
         run(env, seed)
+    env.close()
     [note] = caught.value.__notes__
     assert note.replace(f"{farms.__name__}.", "") == f"simenv_marl: {where}; seed {farm.seed}"
     assert seed in (farm.seed, None)

@@ -9,7 +9,6 @@ pytest.importorskip("gevent")
 PREAMBLE = """
     import gc, signal, sys
     import gevent
-    from gevent.pool import Group
     from simenv_marl import single_env
     from simenv_marl.errors import WrongThreadError
     from tests.worlds.models import decision, script
@@ -119,10 +118,7 @@ def test_greenlets_that_a_model_spawns_on_a_hub_of_its_own_decide():
         """
         def main(simulation):
             simulation.log.append(decide())
-            group = Group()
-            for _ in range(2):
-                group.spawn(ask)
-            group.join()
+            gevent.joinall([gevent.spawn(ask) for _ in range(2)])
             simulation.log.append(decide())
         env = single_env(script(main), decide, driver="thread")
         for _ in range(2):

@@ -170,16 +170,16 @@ def test_an_environment_that_is_used_from_inside_itself_says_so_and_goes_on(view
 
     fresh = run(farm_env(view, place)[0])
     env, farm = farm_env(view, place)
-    for time in [1] if place in farms.ONCE else [1, 3]:
+    for time in [1, 3] if method == "step" and place not in farms.ONCE else [1]:
         used = []
         farm.let(use_in_vain, place, time)
         assert run(env) == fresh
         cut_short(env)
         assert used == [True]
-        farm.let(use, place, time)
-        with pytest.raises((ReentrancyError, NotResetError)):
-            play_and_cut_short(env)
-        assert run(env) == fresh
+    farm.let(use, place, time)
+    with pytest.raises((ReentrancyError, NotResetError)):
+        play_and_cut_short(env)
+    assert run(env) == fresh
     env.close()
 
 

@@ -4,8 +4,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 from simenv_marl.core.options import Options
@@ -28,6 +29,17 @@ Options.__init__.__kwdefaults__["driver"] = {(Options.__init__.__kwdefaults__ or
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def run_code(*parts: str, status: int = 0, options: Iterable[str] = ()) -> str:
+    """Run code in a process of its own, which ends with that status; return what it has printed.
+
+    One that ends well prints no errors; one that hangs is ended.
+    """
+    command = [sys.executable, *options, "-c", "\n".join(map(dedent, parts))]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr if status == 0 else "") == (status, ""), done.stdout + done.stderr
+    return done.stdout
 
 
 def descriptors() -> dict[str, str]:

@@ -236,6 +236,8 @@ def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, handler)
+    with pytest.raises(BranchError, match="died"):
+        Fork.begin(lambda connection: None, lambda: 1 / 0, wait=True)
     assert children() == before
 
 

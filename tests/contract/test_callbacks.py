@@ -59,8 +59,8 @@ def sorting(ask, log, stop=None):
     return script(main)
 
 
-def comparing(**changes):
-    return decision(lambda one, other: one - other, agent="a_0", **changes)
+def comparing():
+    return decision(lambda one, other: one - other, agent="a_0")
 
 
 @pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
@@ -79,17 +79,14 @@ def test_an_end_in_mid_episode_unwinds_past_the_c_code(trigger):
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit, StopIteration])
-@pytest.mark.parametrize("where", ["callback", "reward_mapping"])
-def test_an_error_surfaces_from_step_as_itself(error, where):
-    def fail(place):
-        if armed and place == where:
+def test_an_error_in_a_callback_surfaces_from_step_as_itself(error):
+    def fail(one, other):
+        if decide(one, other):
             raise error("in C")
 
-    log, armed = [], []
-    decide = comparing(reward_mapping=lambda *_: fail("reward_mapping") or 0.0)
-    env = single_env(sorting(lambda one, other: fail("callback") or decide(one, other), log), decide)
+    log, decide = [], comparing()
+    env = single_env(sorting(fail, log), decide)
     env.reset(seed=7)
-    armed.append(True)
     with pytest.raises(error, match="in C") as caught:
         env.step(1)
     assert culprits(caught.value)[-1] == "fail"

@@ -2,212 +2,36 @@
 
 import gc
 import os
-import random
 import sys
 import warnings
 import weakref
 from dataclasses import dataclass
+from functools import partial
 from itertools import count, product
 
 import greenlet
 import pytest
-from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import RULE, aec_env, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl import aec_env, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
 from simenv_marl.core import threads
-from simenv_marl.errors import ResetNeededError
+from simenv_marl.errors import NotResetError, ReentrancyError, ResetNeededError
 from simenv_marl.hooks.stacks import EVALUATING
 from tests.core.test_threads import in_a_thread
 from tests.processes import alone
-from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play, step
+from tests.worlds import farms
+from tests.worlds.farms import PLAN, POINTS, Beast, Farm, Small, cut_short, farm_env, run, take
+from tests.worlds.models import culprits, decision, nobody_is_asked, notes, stacks, step
 
-# -- a model that may fail anywhere ---------------------------------------------------------------
-
-
-class Beast:
-    """One of those that decide one by one."""
-
-    def __init__(self, farm, number):
-        self.farm, self.number = farm, number
-
-    def burn(self, place):
-        self.farm.burn(place)
-
-    def move(self):
-        self.burn("rule")
-        return self.farm.random.randrange(5)
-
-
-class Farm:
-    """A simulation that raises ``error`` at a given place, once it has come by often enough."""
-
-    render_modes = ("human",)
-    rounds = 3
-
-    def __init__(self):
-        self.place, self.fuse, self.error = None, 0, None
-
-    def burn(self, place):
-        if place == self.place:
-            self.fuse -= 1
-            if self.fuse == 0:
-                raise self.error
-
-    def reset(self, seed=None):
-        self.burn("reset")
-        self.random = random.Random(seed)
-        self.now, self.log = 0, []
-        self.herd = [Beast(self, number) for number in range(3)]
-
-    def run(self):
-        try:
-            for _ in range(self.rounds):
-                self.burn("run")
-                self.log.append(self.plan())
-                self.now += 1
-                for beast in list(self.herd):
-                    self.log.append(beast.move())
-                self.log.append(self.pick())
-                self.log.append(self.work())
-                if self.now == self.rounds - 1:
-                    self.remove(self.herd[0])
-        finally:
-            self.burn("finally")
-
-    def plan(self):
-        self.burn("rule")
-        return self.random.randrange(10)
-
-    def pick(self):
-        self.burn("rule")
-        return 0
-
-    def work(self):
-        self.burn("rule")
-        return self.random.randrange(3)
-
-    def remove(self, beast):
-        self.herd.remove(beast)
-
-    def stop(self):
-        self.burn("stop")
-
-    def time(self):
-        self.burn("time")
-        return float(self.now)
-
-    def expected_calls(self, point):
-        self.burn("expected_calls")
-        return [(beast,) for beast in self.herd] if point.endswith("move") else []
-
-    def render(self, mode):
-        self.burn("render")
-
-
-class Small(Farm):
-    """One that is soon over, for those who play it very often."""
-
-    rounds = 1
-
-
+VIEWS = (aec_env, parallel_env, joint_env, single_env)
+EACH_VIEW = pytest.mark.parametrize("view", VIEWS)
 ORIGINALS = [dict(vars(Farm)), dict(vars(Beast))]
 
 
-def at(place, value):
-    """A mapping that may fail, with that value."""
-
-    def mapping(*args):
-        args[-1].burn(place)
-        return value(*args) if callable(value) else value
-
-    return mapping
-
-
-def apply(action, farm):
-    farm.burn("apply")
-    return action + farm.random.randrange(3)
-
-
-PLACE = f"{__name__}.Farm"
-POINTS = {
-    f"{PLACE}.plan": define(
-        agent="planner",
-        observation_space_mapping=at("observation", [0, 0]),
-        reward_mapping=at("reward", 1.0),
-        action_mask_mapping=at("mask", [1] * 10),
-        apply=apply,
-    ),
-    f"{__name__}.Beast.move": define(
-        agent=at("agent", lambda beast: f"beast_{beast.number}"),
-        observation_space_mapping=at("observation", [0, 0]),
-        reward_mapping=at("reward", 1.0),
-        removed_by={f"{PLACE}.remove": lambda farm, beast: at("removed_by", f"beast_{beast.number}")(beast)},
-    ),
-    f"{PLACE}.pick": define(
-        agent="picker", choices=at("choices", lambda farm: list(range(farm.now + 1))), action_space=spaces.Discrete(5)
-    ),
-    f"{PLACE}.work": define(agent="worker", observation_space_mapping=at("observation", [0, 0])),
-}
-PLACES = (
-    "reset", "run", "finally", "rule", "apply", "observation", "reward", "mask", "agent", "removed_by", "choices",
-    "policy", "stop", "time", "expected_calls", "render", "before", "after", "instead",
-)  # fmt: skip
-VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
-
-
-def handler(place):
-    def handle(farm, **_):
-        farm.burn(place)
-        return 0  # of which only ``instead`` makes use
-
-    return handle
-
-
-def farm_env(view, place=None, farm=Farm):
-    """An environment of a farm, in which that place is come by."""
-
-    def policy(observation):
-        farms[0].burn("policy")
-        return 2
-
-    farms, work = [], f"{PLACE}.work"
-    options = {"policies": {work: policy if place == "policy" else RULE}}
-    if place in ("before", "after", "instead"):
-        options["plugins"] = [(handler(place), work, place)]
-    if place == "render":
-        options["render_mode"] = "human"
-    points = POINTS
-    if view is single_env:
-        points = {f"{PLACE}.plan": POINTS[f"{PLACE}.plan"], work: POINTS[work]}
-    elif view is joint_env:
-        options["possible_agents"] = {f"{__name__}.Beast.move": [f"beast_{number}" for number in range(3)]}
-    env = view(farm, points, **options)
-    farms.append(env.unwrapped.simulation)
-    return env
-
-
-def run(env, view, seed=11):
-    """Play an episode, every third decision by its rule; return what it was like."""
-    answers = (RULE if number % 3 == 0 else 0 for number in count())
-    if view is aec_env:
-        told = [turn[:6] for turn in play(env, lambda agent, env: next(answers), seed=seed)]
-    else:
-        told = [env.reset(seed=seed)]
-        while view is parallel_env and env.agents:
-            told.append(env.step({agent: next(answers) for agent in env.agents}))
-        while view is not parallel_env and not any(told[-1][2:4]):
-            action = next(answers)
-            joint = view is joint_env and action is not RULE
-            told.append(env.step(dict.fromkeys(env.action_space, 0) if joint else action))
-    return str(told), list(env.unwrapped.simulation.log)
-
-
-def cut_short(env, view):
-    """Begin an episode, go on a little, and close it."""
-    env.reset(seed=11)
-    env.step(dict.fromkeys(env.agents, RULE) if view is parallel_env else RULE)
-    env.close()
+def everywhere(*views, places=farms.PLACES):
+    """All of the places that an episode comes by, in these views."""
+    there = [(view, place) for view in views for place in places if farms.comes_by(view, place)]
+    return pytest.mark.parametrize(("view", "place"), there)
 
 
 def nothing_is_left():
@@ -248,40 +72,142 @@ ERRORS = {
 }
 
 
-@VIEWS
-@pytest.mark.parametrize("place", PLACES)
+def throw(error):
+    raise error
+
+
+def play_and_cut_short(env):
+    run(env)
+    cut_short(env)
+
+
+@everywhere(*VIEWS)
 def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
-    if view is single_env and place in ("agent", "removed_by", "choices", "expected_calls"):
-        return
-    fresh = run(farm_env(view, place), view)
-    env = farm_env(view, place)
-    farm = env.unwrapped.simulation
+    before = stacks()
+    fresh = run(farm_env(view, place)[0])
+    env, farm = farm_env(view, place)
     kinds = list(ERRORS.items())
-    once = place in ("reset", "finally", "stop", "removed_by", "apply")
-    for fuse, (kind, make) in [*product([1], kinds), *product([3], [] if once else kinds[:6])]:
-        farm.place, farm.fuse, farm.error = place, fuse, make()
-        with pytest.raises(type(farm.error)) as caught:
-            (cut_short if place in ("stop", "finally") else run)(env, view)
-        assert caught.value is farm.error, kind
-        assert "burn" in culprits(farm.error)
-        if place != "render":
-            assert "seed 11" in notes(farm.error), kind
+    for time, (kind, make) in [*product([1], kinds), *product([3], [] if place in farms.ONCE else kinds[:6])]:
+        error = make()
+        cause = error.__cause__
+        farm.let(partial(throw, error), place, time)
+        with pytest.raises(type(error)) as caught:
+            play_and_cut_short(env)
+        assert caught.value is error, kind
+        assert culprits(error)[-1] == "throw"
+        assert error.__cause__ is cause
+        if place != "finally":
+            assert error.__context__ is None
+        if place not in ("render", "close"):
+            assert "seed 11" in notes(error), kind
+        if isinstance(error, Exception):
+            assert farm.caught == (place in farms.IN_THE_MODEL)
+        if place not in ("render", "action"):  # after which the episode goes on
+            with pytest.raises(ResetNeededError, match=r"call reset\(\)"):
+                take(env, 0)
+            assert view is not aec_env or not (env.agents or env.rewards or env.terminations or env.infos)
         env.close()
-        farm.place = farm.error = None
-        del caught
+        del caught, error, cause, farm.happen
         nothing_is_left()
-        assert run(env, view) == fresh, kind
+        assert run(env) == fresh, kind
         env.close()
-    nothing_is_left()
+    farm.let(partial(throw, KeyError()), place)
+    with pytest.raises(KeyError):
+        play_and_cut_short(env)
     gone = weakref.ref(farm)
-    del env, farm
+    del env, farm.happen, farm
     gc.collect()
+    gc.collect()  # the first time only its finalizer runs
     assert gone() is None
+    assert not stacks(before)
+    nothing_is_left()
+
+
+@pytest.mark.parametrize(
+    ("view", "place", "time", "where"),
+    [
+        (aec_env, "reset", 1, "while the simulation was reset"),
+        (aec_env, "run", 1, "before the first decision"),
+        (aec_env, "run", 3, "in the model, after decision 10, of 'picker' at Farm.pick"),
+        (aec_env, "rule", 3, "in the model, after decision 5, of 'picker' at Farm.pick"),
+        (aec_env, "observation", 3, "at decision 1, of 'beast_1' at Beast.move"),
+        (aec_env, "mask", 3, "at decision 11, of 'planner' at Farm.plan"),
+        (aec_env, "action", 1, "at decision 6, of 'planner' at Farm.plan"),
+        (single_env, "apply", 1, "in the model, after decision 2, of 'planner' at Farm.plan"),
+        (single_env, "reward", 3, "at decision 3, of 'planner' at Farm.plan"),
+        (parallel_env, "policy", 1, "at decision 2, of 'worker' at Farm.work"),
+    ],
+)
+@pytest.mark.parametrize("seed", [31, None])  # None: it is drawn
+def test_one_note_says_at_which_decision_of_whom_it_was_and_the_seed(view, place, time, where, seed):
+    env, farm = farm_env(view, place)
+    farm.let(partial(throw, ValueError("told")), place, time)
+    with pytest.raises(ValueError, match="told") as caught:
+        run(env, seed)
+    env.close()
+    [note] = caught.value.__notes__
+    assert note.replace(f"{farms.__name__}.", "") == f"simenv_marl: {where}; seed {farm.seed}"
+    assert seed in (farm.seed, None)
+
+
+# -- uses from inside -----------------------------------------------------------------------------
+
+INSIDE = [place for place in farms.PLACES if place != "render"]  # which comes after the step
+
+
+@everywhere(*VIEWS, farms.vector, farms.vector_of_joint, places=INSIDE)
+@pytest.mark.parametrize("method", ["step", "reset", "close"])
+def test_an_environment_that_is_used_from_inside_itself_says_so_and_goes_on(view, place, method):
+    def use():
+        take(env, 0) if method == "step" else getattr(env, method)()
+
+    def use_in_vain():
+        with pytest.raises((ReentrancyError, NotResetError)) as caught:
+            use()
+        in_reset = not farm.log
+        assert "was used from" in str(caught.value) or in_reset
+        used.append(True)
+
+    fresh = run(farm_env(view, place)[0])
+    env, farm = farm_env(view, place)
+    for time in [1, 3] if method == "step" and place not in farms.ONCE else [1]:
+        used = []
+        farm.let(use_in_vain, place, time)
+        assert run(env) == fresh
+        cut_short(env)
+        assert used == [True]
+    farm.let(use, place, time)
+    with pytest.raises((ReentrancyError, NotResetError)):
+        play_and_cut_short(env)
+    assert run(env) == fresh
+    env.close()
 
 
 # -- interrupts -----------------------------------------------------------------------------------
 
 _PACKAGE = os.path.dirname(simenv_marl.__file__)
+decide = decision()
+
+
+class Model:
+    """Decides twice, and says so in advance."""
+
+    def reset(self, seed=None):
+        self.log = [decide()]
+
+    def expected_calls(self, point):
+        return [()]
+
+    def run(self):
+        try:
+            for _ in range(2):
+                self.log.append(decide())
+        finally:
+            self.log.append("unwound")
+
+
+def act(env):
+    step(env, 3, "choose_0")
 
 
 def interrupt_at(number, function, *args):
@@ -316,7 +242,7 @@ def interrupt_at(number, function, *args):
     return where, raised
 
 
-@VIEWS
+@EACH_VIEW
 def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
     # In a process of its own: where greenlets were interrupted amid a switch, the collector may crash later.
     alone(interrupt_anywhere, view.__name__)
@@ -325,31 +251,18 @@ def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
 def interrupt_anywhere(name):
     """Interrupt a run of a view at each call, one after the other."""
     threads.SECONDS_TO_UNWIND, view = 0.05, globals()[name]
-    decide = decision()
-
-    class Model(Script):
-        def reset(self, seed=None, options=None):
-            super().reset(seed, options)
-            decide()
-
-        def expected_calls(self, point):
-            return [()]
-
-    def main(simulation):
-        for _ in range(2):
-            simulation.log.append(decide())
 
     def whole_run(env):
         env.reset(seed=1)
-        for _ in range(2):
-            step(env, 3, "choose_0")
+        act(env)
+        act(env)
         if view is aec_env:
             env.step(None)
         env.reset(seed=2)
         env.close()
 
     for number in count(1):
-        env = view(lambda: Model(main), decide)
+        env = view(Model, decide)
         where, raised = interrupt_at(number, whole_run, env)
         if where is None:
             assert raised is None
@@ -361,16 +274,16 @@ def interrupt_anywhere(name):
             warnings.simplefilter("ignore", ResourceWarning)  # a thread that was never begun cannot be unwound
             whole_run(env)
             env.reset(seed=1)
-            step(env, 3, "choose_0")
-            assert env.unwrapped.simulation.log == [3], where
+            act(env)
+            assert env.unwrapped.simulation.log == ["rule", 3], where
             env.close()
         assert in_a_thread(env.close) is None, where  # nothing of it is left to this one
     assert number > 100
 
 
 USES = {
-    "aec_env": lambda: cut_short(farm_env(aec_env, "before"), aec_env),
-    "vector_env": lambda: vector_env(Small, {f"{PLACE}.plan": POINTS[f"{PLACE}.plan"]}, num_envs=2).close(),
+    "aec_env": lambda: cut_short(farm_env(aec_env, "before")[0]),
+    "vector_env": lambda: vector_env(Small, {PLAN: POINTS[PLAN]}, num_envs=2).close(),
     "simulate": lambda: simulate(Small, points=POINTS),
     "simulate_many": lambda: simulate_many(Small, {"planner": lambda o: [0] * len(o)}, points=POINTS, seeds=[1, 2]),
 }
@@ -411,31 +324,16 @@ def deep_down(function, room):
     return down(sys.getrecursionlimit() - here - room)
 
 
-class Announced(Script):
-    def expected_calls(self, point):
-        return [()]
-
-
 @pytest.mark.usefixtures("_collected")
-@VIEWS
+@EACH_VIEW
 def test_an_environment_survives_the_end_of_its_users_stack(view):
-    decide = decision()
-
-    def main(simulation):
-        try:
-            for _ in range(3):
-                simulation.log.append(decide())
-        finally:
-            simulation.log.append("unwound")
-
-    env = view(lambda: Announced(main), decide)
-    ends = set()
+    env, ends = view(Model, decide), set()
     for room in range(1, 60):
         env.reset()
         log = env.unwrapped.simulation.log
-        for what in (lambda: step(env, 3, "choose_0"), env.reset, env.close):
+        for use in (partial(act, env), env.reset, env.close):
             try:
-                deep_down(what, room)
+                deep_down(use, room)
                 ends.add("went well")
             except RecursionError:
                 ends.add("came to the end")
@@ -443,8 +341,8 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
                 ends.add("was over")
         env.reset()
         assert log[-1] == "unwound"
-        for _ in range(3):
-            step(env, 3, "choose_0")
-        assert env.unwrapped.simulation.log == [3, 3, 3, "unwound"]
+        act(env)
+        act(env)
+        assert env.unwrapped.simulation.log == ["rule", 3, 3, "unwound"]
         assert nobody_is_asked()
     assert ends >= {"went well", "came to the end"}

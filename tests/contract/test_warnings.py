@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from simenv_marl import RULE, aec_env, parallel_env, simulate, simulate_many, single_env, vector_env
 from simenv_marl.core import rng
 from simenv_marl.errors import UnknownPointError
-from tests.worlds.models import calling, decision, define
+from tests.worlds.models import calling, decision
 from tests.worlds.models import play as play_in_turns
 
 DRAWS = "draws from the global generator"
@@ -135,35 +136,15 @@ def test_draws_of_other_threads_cause_no_warning(heard) -> None:
 # -- agents that never come -----------------------------------------------------------------------
 
 
-class Ant:
-    """Takes a step."""
-
-    def __init__(self, name):
-        self.name = name
-
-    def step(self):
-        return 0
+ant = decision(lambda name: 0, agent=lambda name: name)
 
 
-class Hill:
-    names = ("ant_0", "ant_1")
-
-    def reset(self):
-        self.ants = [Ant(name) for name in self.names]
-
-    def run(self):
-        for _ in range(2):
-            for ant in self.ants:
-                ant.step()
+def hill(*names):
+    """A factory of simulations in which these ants take two steps."""
+    return calling(*[partial(ant, name) for name in names * 2])
 
 
-HILL = {f"{__name__}.Ant.step": define(agent=lambda ant: ant.name)}
-
-
-def through(env):
-    """Play an AEC environment to its end, twice."""
-    for _ in range(2):
-        play_in_turns(env, seed=1)
+ANTS = hill("ant_0", "ant_1")
 
 
 @pytest.mark.parametrize(
@@ -175,7 +156,9 @@ def through(env):
     ids=["policies", "a roster"],
 )
 def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode(heard, options, absent) -> None:
-    through(aec_env(Hill, HILL, **options))
+    env = aec_env(ANTS, ant, **options)
+    for _ in range(2):
+        play_in_turns(env, seed=1)
     (message,) = heard(ABSENT)
     missing, _, those_who_came = message.partition(";")
     assert absent in missing
@@ -185,19 +168,16 @@ def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode
 
 def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
     policies = {"ant_7": lambda observations: np.zeros(len(observations), np.int64)}
-    simulate_many(Hill, policies, seeds=range(5), points=HILL)
+    simulate_many(ANTS, policies, seeds=range(5), points=ant)
     assert len(heard(ABSENT)) == 1
-    simulate(Hill, {"ant_8": lambda observation: 0}, points=HILL)
+    simulate(ANTS, {"ant_8": lambda observation: 0}, points=ant)
     assert len(heard(ABSENT)) == 2
 
 
 def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> None:
-    class Dotted(Hill):
-        names = ("nest.1", "ant_0")
-
-    # A dot makes no path.
-    through(aec_env(Dotted, HILL, possible_agents=["nest.1", "ant_0"], policies={"nest.1": lambda observation: 0}))
-    env = aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1", "ant_9"])
+    names = ["nest.1", "ant_0"]  # a dot makes no path
+    play_in_turns(aec_env(hill(*names), ant, possible_agents=names, policies={"nest.1": lambda observation: 0}))
+    env = aec_env(ANTS, ant, possible_agents=["ant_0", "ant_1", "ant_9"])
     env.reset()
     env.close()
     one, ruled = decision(agent="one_0"), decision(agent="ruled_0")
@@ -207,17 +187,17 @@ def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> N
     assert heard(ABSENT) == []
 
 
-@pytest.mark.parametrize("slip", [f"{__name__}.Ant.setp", f"{__name__}.Nat.step"])
+@pytest.mark.parametrize("slip", ["threading.Thread.strat", f"{__name__}.Missing.step"])
 def test_policies_for_names_without_a_function_are_refused(slip) -> None:
     with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
-        aec_env(Hill, HILL, policies={slip: lambda observation: 0})
+        aec_env(ANTS, ant, policies={slip: lambda observation: 0})
 
 
 # -- rounds that stand still ----------------------------------------------------------------------
 
 
 def test_rounds_without_an_action_for_the_pending_agent_are_warned_of(heard) -> None:
-    env = parallel_env(Hill, HILL, possible_agents=["ant_0", "ant_1"])
+    env = parallel_env(ANTS, ant, possible_agents=["ant_0", "ant_1"])
     env.reset(seed=1)
     for number in range(150):
         env.step({"ant_1": 1} if number % 2 else {})

@@ -4,13 +4,11 @@ import asyncio
 import contextvars
 import gc
 import os
-import subprocess
-import sys
 import threading
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from textwrap import dedent
+from functools import partial
 
 import greenlet
 import pytest
@@ -19,6 +17,7 @@ from simenv_marl import RULE, single_env
 from simenv_marl.errors import WrongThreadError
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
+from tests.processes import run_code
 from tests.worlds.models import Script, calling, culprits, decision, nobody_is_asked, notes, script
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
@@ -94,26 +93,32 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
     env.close()
 
 
-# -- several at once ------------------------------------------------------------------------------
+# -- threads --------------------------------------------------------------------------------------
 
 
 @DRIVERS
-def test_unrelated_threads_run_their_rule_while_a_simulation_is_moving(driver):
-    decide = decision()
+@pytest.mark.parametrize("inner", ["greenlet", "thread"])
+def test_while_a_simulation_moves_other_threads_run_rules_and_environments_of_their_own(driver, inner):
+    decide, other = decision(), decision(lambda: "its rule")
+    deeper = decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
+
+    def use():
+        env = single_env(calling(deeper, deeper), deeper, driver=inner)
+        env.reset()
+        return [env.step(1)[1:3], env.step(2)[1:3], env.simulation.log]
+
     with ThreadPoolExecutor(1) as pool:
-        pool.submit(int).result()  # now its thread is there
-        env = single_env(calling(decide, lambda: pool.submit(decide).result(), decide), decide, driver=driver)
+        pool.submit(int).result()  # now its thread is there, which is none of the simulation's
+        functions = [
+            lambda: pool.submit(decide).result(),
+            lambda: in_a_thread(other),  # which is no point of the environment
+            lambda: in_a_thread(use),
+        ]
+        env = single_env(calling(decide, *functions, decide), decide, driver=driver)
         env.reset()
         env.step(1)
         env.step(2)
-    assert env.simulation.log == [1, "rule", 2]
-
-
-# -- threads that models start --------------------------------------------------------------------
-
-
-def by_thread(function):
-    return in_a_thread(lambda: refused_or(function))
+    assert env.simulation.log == [1, "rule", "its rule", [(1.0, False), (1.0, True), [1, 2]], 2]
 
 
 def by_pool(function):
@@ -121,27 +126,31 @@ def by_pool(function):
         return pool.submit(function).result()
 
 
-WAYS = [
-    in_a_thread,
-    lambda function: in_a_thread(lambda: in_a_thread(function)),
-    by_pool,
-    lambda function: asyncio.run(asyncio.to_thread(function)),
-]
+WAYS = {
+    "thread": in_a_thread,
+    "grandchild": lambda function: in_a_thread(lambda: in_a_thread(function)),
+    "pool": by_pool,
+    "asyncio": lambda function: asyncio.run(asyncio.to_thread(function)),
+}
 
 
 @DRIVERS
 @pytest.mark.parametrize("last", [False, True])
-@pytest.mark.parametrize("way", WAYS, ids=["thread", "grandchild", "pool", "asyncio"])
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 def test_decisions_in_threads_of_the_model_are_refused_and_the_step_says_so(driver, way, last):
+    def work():
+        roots.append(weakref.ref(greenlet.getcurrent()))
+        decide()
+
     def main(simulation):
         simulation.log.append(decide())
         with suppress(WrongThreadError):
-            simulation.log.append(way(decide))
+            simulation.log.append(way(work))
         simulation.log.append("refused")
         if not last:
             simulation.log.append(decide())
 
-    decide = decision()
+    roots, decide = [], decision()
     env = single_env(script(main), decide, driver=driver)
     env.reset(seed=5)
     with pytest.raises(WrongThreadError, match=REFUSED) as caught:
@@ -151,25 +160,7 @@ def test_decisions_in_threads_of_the_model_are_refused_and_the_step_says_so(driv
     assert "refuse" in culprits(caught.value.__cause__)  # which leads to the thread
     env.reset()
     env.close()
-
-
-@DRIVERS
-@pytest.mark.parametrize("way", WAYS, ids=["thread", "grandchild", "pool", "asyncio"])
-def test_a_refusal_that_is_kept_does_not_keep_the_root_of_its_thread(driver, way):
-    """Else greenlet frees that root too early, if the collector runs while the thread ends, and the process crashes."""
-
-    def main(simulation):
-        decide()
-        with suppress(WrongThreadError):
-            way(lambda: (roots.append(weakref.ref(greenlet.getcurrent())), decide()))
-
-    roots, decide = [], decision()
-    env = single_env(script(main), decide, driver=driver)
-    env.reset()
-    with pytest.raises(WrongThreadError) as caught:
-        env.step(1)
-    env.close()
-    assert caught.value.__cause__.__traceback__
+    # Else greenlet frees that root too early, if the collector runs while the thread ends, and the process crashes.
     (root,) = roots
     assert root() is None or not gc.get_referrers(root())
 
@@ -180,59 +171,28 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
         return by_pool(decide)
 
     def followed_by_another():
-        by_thread(decide)
+        with suppress(WrongThreadError):
+            by_pool(decide)
         raise KeyError("nobody has put it there")
 
-    def raised_by(function, kind):
+    decide = decision()
+    for function, kind in ((passed_on, WrongThreadError), (followed_by_another, KeyError)):
         env = single_env(calling(decide, function), decide, driver=driver)
         env.reset()
         with pytest.raises(kind) as caught:
             env.step(1)
         env.close()
-        return caught.value
-
-    decide = decision()
-    error = raised_by(passed_on, WrongThreadError)
-    assert REFUSED in str(error)
-    assert "passed_on" in culprits(error)
-    assert notes(error).count("\n") == 0
-    assert "a decision was refused" in notes(raised_by(followed_by_another, KeyError))
-
-
-def refused_or(function):
-    """What it has returned in this thread, or that it was refused."""
-    with suppress(WrongThreadError):
-        return function()
-    return "refused"
+        assert function.__name__ in culprits(caught.value)
+        if kind is KeyError:
+            assert "a decision was refused" in notes(caught.value)
+        else:
+            assert REFUSED in str(caught.value)
+            assert len(caught.value.__notes__) == 1
 
 
 @DRIVERS
-@pytest.mark.parametrize("how", ["step", "close", "reset"])
-def test_a_thread_that_runs_while_the_simulation_is_suspended_is_refused_too(driver, how):
-    def work():
-        assert ask.wait(10)
-        said.append(refused_or(decide))
-
-    def main(simulation):
-        simulation.thread = threading.Thread(target=work)
-        simulation.thread.start()
-        decide()
-        decide()
-
-    ask, said, decide = threading.Event(), [], decision()
-    env = single_env(script(main), decide, driver=driver)
-    for use in (how, "close"):
-        ask.clear()
-        env.reset()
-        ask.set()
-        env.simulation.thread.join()
-        with pytest.raises(WrongThreadError, match=REFUSED):
-            env.step(1) if use == "step" else getattr(env, use)()
-    assert said == ["refused"] * 2
-
-
-@DRIVERS
-def test_threads_that_are_older_than_the_episode_are_refused_too(driver):
+@pytest.mark.parametrize("how", ["run", "step", "close", "reset"])
+def test_threads_that_are_older_than_the_episode_are_refused_also_while_it_is_suspended(driver, how):
     class Hiring(Script):
         def __init__(self):
             super().__init__(main)
@@ -240,50 +200,28 @@ def test_threads_that_are_older_than_the_episode_are_refused_too(driver):
             self.pool.submit(int).result()  # now its thread is there
 
         def ask(self):
-            return self.pool.submit(refused_or, decide).result()
+            with suppress(WrongThreadError):
+                return self.pool.submit(decide).result()
+            return "refused"
 
     def main(simulation):
         simulation.log.append(decide())
-        simulation.log.append(simulation.ask())
+        if how == "run":
+            simulation.log.append(simulation.ask())
         decide()
 
     decide = decision()
     env = single_env(Hiring, decide, driver=driver)
-    for _ in range(2):
+    for _ in range(1 if how == "close" else 2):  # after a close the threads are those of nobody
         assert env.simulation.ask() == "rule"  # between episodes nobody would be asked anyway
         env.reset()
+        if how != "run":
+            assert env.simulation.ask() == "refused"
         with pytest.raises(WrongThreadError, match=REFUSED):
-            env.step(1)
-        assert env.simulation.log == [1, "refused"]
+            getattr(env, how)() if how in ("close", "reset") else env.step(1)
+        assert how != "run" or env.simulation.log == [1, "refused"]
     env.close()
     env.simulation.pool.shutdown()
-
-
-@DRIVERS
-def test_points_that_are_not_active_run_their_rule_in_threads_of_the_model(driver):
-    active, other = decision(), decision(lambda: "its rule")
-    env = single_env(calling(active, lambda: by_thread(other), active), active, driver=driver)
-    env.reset()
-    env.step(1)
-    env.step(2)
-    assert env.simulation.log == [1, "its rule", 2]
-
-
-@DRIVERS
-@pytest.mark.parametrize("inner", ["greenlet", "thread"])
-def test_threads_of_the_model_may_use_environments_of_their_own(driver, inner):
-    decide, deeper = decision(agent="outer_0"), decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
-
-    def use():
-        env = single_env(calling(deeper, deeper), deeper, driver=inner)
-        env.reset()
-        return [env.step(1)[1:3], env.step(2)[1:3], env.simulation.log]
-
-    env = single_env(calling(decide, lambda: by_thread(use), decide), decide, driver=driver)
-    env.reset()
-    env.step(1)
-    env.step(2)
-    assert env.simulation.log == [1, [(1.0, False), (1.0, True), [1, 2]], 2]
 
 
 # -- forks and ends of the process ----------------------------------------------------------------
@@ -291,27 +229,15 @@ def test_threads_of_the_model_may_use_environments_of_their_own(driver, inner):
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="the platform has no fork")
 
 
-def process(code):
-    """Run code in a process of its own, with warnings as errors; one that hangs is ended."""
-    preamble = """
-        import os, sys, threading
-        from simenv_marl import aec_env, single_env
-        from simenv_marl.errors import WrongThreadError
-        from tests.worlds.models import calling, decision, script
-        decide = decision()
-    """
-    # Python warns of forks where there are other threads; here there are, and that is what is tested.
-    command = [sys.executable, "-W", "error", "-W", "ignore:This process:DeprecationWarning", "-c"]
-    return subprocess.run(
-        [*command, dedent(preamble) + dedent(code)], capture_output=True, text=True, check=False, timeout=60
-    )
-
-
-def run(code):
-    """Run code that ends well in a process of its own; return what it has printed."""
-    result = process(code)
-    assert (result.returncode, result.stderr) == (0, ""), result.stdout + result.stderr
-    return result.stdout
+PREAMBLE = """
+    import os, sys, threading
+    from simenv_marl import aec_env, single_env
+    from simenv_marl.errors import WrongThreadError
+    from tests.worlds.models import calling, decision, script
+    decide = decision()
+"""
+# Python warns of forks where there are other threads; here there are, and that is what is tested.
+run = partial(run_code, PREAMBLE, options=["-W", "error", "-W", "ignore:This process:DeprecationWarning"])
 
 
 @needs_fork
@@ -417,21 +343,21 @@ def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
 
 
 @DRIVERS
-def test_a_model_may_end_the_process(driver):
-    code = f"""
+@pytest.mark.parametrize(("end", "status"), [("sys.exit(3)", 3), ("os._exit(4)", 4)])
+def test_a_model_may_end_the_process(driver, end, status):
+    said = run(
+        f"""
         def main(simulation):
             decide()
-            END
+            {end}
         env = aec_env(script(main), decide, driver={driver!r})
         env.reset()
         env.step(1)
         print("went on")
-    """
-    assert process(code.replace("END", "sys.exit(3)")).returncode == 3
-    assert process(code.replace("END", "os._exit(4)")).returncode == 4
-    said = process(code.replace("END", "raise KeyboardInterrupt"))
-    assert "KeyboardInterrupt" in said.stderr
-    assert "went on" not in said.stdout
+        """,
+        status=status,
+    )
+    assert said == ""
 
 
 def test_starting_threads_is_watched_only_while_there_are_simulations():

@@ -106,9 +106,9 @@ def test_hooks_and_tracking_of_a_user_without_a_loop_stay_what_they_are(driver):
 
 
 @DRIVERS
-@pytest.mark.parametrize("inside", [0, 1, 2, 5])
+@pytest.mark.parametrize("inside", [(), (1, 2, 3, 4, 5), (0, 1), (5,)])
 def test_hooks_and_tracking_of_a_user_with_a_loop_are_those_of_that_loop(driver, inside):
-    """The episode begins inside a loop of the user's, or outside, and goes on in the other; or it is outside all."""
+    """The reset and five steps are made inside a loop of the user's, or outside all."""
 
     async def act(move):
         mine = around()
@@ -125,7 +125,7 @@ def test_hooks_and_tracking_of_a_user_with_a_loop_are_those_of_that_loop(driver,
     moves = [env.reset, *[move] * 5]
     for _ in range(2):
         for number, moved in enumerate(moves):
-            ended = asyncio.run(act(moved)) if (number < inside) == (inside % 2 == 0) else moved()
+            ended = asyncio.run(act(moved)) if number in inside else moved()
             assert around() == NOTHING
         assert ended
         check_tracked(env, NOTHING)
@@ -160,34 +160,29 @@ def deciding(driver, interrupted=False):
     return env
 
 
-def test_an_interrupt_between_steps_is_the_users():
-    env = deciding("thread")
-    for number in range(4):
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        ended = env.step(number)[2]
-    assert ended
-    assert env.simulation.log == [0, 1, 2, 3]
-
-
 @DRIVERS
-def test_a_handler_of_the_users_own_stays_in_force(driver):
+def test_an_interrupt_between_steps_is_the_users_with_a_handler_of_their_own_too(driver):
     caught = []
 
     def handler(number, frame):
         caught.append(number)
 
     env, before = deciding(driver), signal.getsignal(signal.SIGINT)
-    env.step(0)
+    for number in (0, 1):
+        if driver == "thread":
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        env.step(number)
     signal.signal(signal.SIGINT, handler)  # while the model has a loop, which has one of its own
     try:
-        for number in (1, 2, 3):
+        for number in (2, 3):
             signal.raise_signal(signal.SIGINT)
             assert env.step(number)[2] is (number == 3)
             assert signal.getsignal(signal.SIGINT) is handler
-        assert len(caught) == 3
+        assert len(caught) == 2
     finally:
         signal.signal(signal.SIGINT, before)
+    assert env.simulation.log == [0, 1, 2, 3]
 
 
 def test_an_interrupt_while_the_model_computes_is_its_loops():
@@ -261,6 +256,56 @@ def test_errors_of_tasks_are_reported_while_others_are_unwound(driver, loud):
     env.close()
     assert told(loud) == ["Task exception was never retrieved"]
     assert isinstance(loud.records[-1].exc_info[1], ValueError)
+
+
+async def numbers(log, cleanup=lambda: None):
+    try:
+        while True:
+            yield await asyncio.sleep(0)
+    finally:
+        cleanup()
+        await asyncio.sleep(0)
+        log.append("generator closed")
+
+
+async def stay(log, cleanup):
+    try:
+        await asyncio.sleep(3600)
+    finally:
+        cleanup()
+        await asyncio.sleep(0)
+        log.append("task cancelled")
+
+
+async def office(simulation, decide, cleanup):
+    """Decide while tasks and asynchronous generators of the model are left, of which some decide in their cleanup."""
+
+    def quietly():
+        cleanup.append("decides")
+        decide()
+
+    generators = [numbers(simulation.log, *args) for args in [(), (quietly,), ()]]
+    for generator in generators:
+        await anext(generator)
+    works = [lambda: None, quietly, lambda: None, quietly, lambda: None]
+    tasks = [asyncio.create_task(stay(simulation.log, work)) for work in works]
+    await asyncio.sleep(0)
+    decide()
+    await asyncio.wait(tasks)
+
+
+@DRIVERS
+@pytest.mark.parametrize("end", ["close", "reset"])
+def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(driver, end):
+    decide, cleanup = decision(), []
+    env = single_env(script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))), decide, driver=driver)
+    env.reset()
+    log = env.simulation.log
+    getattr(env, end)()
+    assert sorted(log) == ["generator closed"] * 2 + ["task cancelled"] * 3
+    assert len(cleanup) == 3
+    env.close()
+    gc.collect()
 
 
 class Lasting(SimulationInterface):

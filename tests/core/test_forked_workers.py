@@ -1,22 +1,18 @@
 """Processes that a simulation forks have no user to ask: what they decide is refused, and the environment goes on."""
 
-import subprocess
 import sys
-from textwrap import dedent
 
 import pytest
 
 from tests.conftest import DRIVERS
+from tests.processes import run_code
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the platform does not fork")
 
 DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
-LIMIT = 60
-"""Seconds after which a test is given up; its processes have ended themselves by then."""
-
 PREAMBLE = """
-    import multiprocessing, os, signal, sys, threading, warnings
+    import multiprocessing, os, signal, warnings
 
     from simenv_marl import single_env
     from simenv_marl.errors import WrongThreadError
@@ -35,41 +31,18 @@ PREAMBLE = """
         except WrongThreadError as error:
             return "refused", "forked" in str(error), other()
 
-    def tell(queue):
-        for _ in range(2):  # the second time as the first
-            queue.put(ask())
-
-    class Process:
-        def __init__(self):
-            self.queue = context.SimpleQueue()
-            self.process = context.Process(target=tell, args=(self.queue,))
-        def begin(self):
-            if not self.process.pid:
-                self.process.start()
-        def ask(self):
-            self.begin()
-            told = {self.queue.get() for _ in range(2)}
-            self.process.join()
-            assert self.process.exitcode == 0
-            return told
+    def ask_twice(_):
+        first, second = ask(), ask()
+        return second if first == second else (first, second)
 
     class Pool:
         def __init__(self):
             self.pool = context.Pool(1, maxtasksperchild=1)  # all but the first are forked in a thread of the pool
-        def begin(self):
-            pass
         def ask(self):
-            told = {self.pool.apply_async(ask).get(20) for _ in range(3)}
+            told = {self.pool.apply_async(ask_twice, [0]).get(20) for _ in range(3)}
             self.pool.close()
             self.pool.join()
             return told
-
-    def in_a_thread(function):
-        told = []
-        thread = threading.Thread(target=lambda: told.append(function()))
-        thread.start()
-        thread.join(20)
-        return told[0]
 
     def play(between, make=Script):
         def main(simulation):
@@ -89,40 +62,31 @@ PREAMBLE = """
 
 def run(code, driver):
     """Run code in a process of its own, which no worker leaves as a second one."""
-    source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + "\nprint('end', os.getpid() == user)\n"
-    result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False, timeout=LIMIT)
-    assert (result.returncode, result.stdout, result.stderr) == (0, "end True\n", ""), result.stdout + result.stderr
-
-
-KINDS = pytest.mark.parametrize("kind", ["Process", "Pool"])
+    assert run_code(f"driver = {driver!r}", PREAMBLE, code, "print('end', os.getpid() == user)") == "end True\n"
 
 
 @DRIVERS
-@KINDS
-def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(kind, driver):
+def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(driver):
     run(
-        f"""
-        for way in (in_a_thread, lambda function: function()):
-            for _ in range(2):
-                assert play(lambda simulation: way(lambda: {kind}().ask())) == {{REFUSED}}, way
+        """
+        for _ in range(2):
+            assert play(lambda simulation: Pool().ask()) == {REFUSED}
         """,
         driver,
     )
 
 
 @DRIVERS
-@KINDS
-def test_workers_that_were_forked_before_the_model_runs_have_the_rule(kind, driver):
+def test_workers_that_were_forked_before_the_model_runs_have_the_rule(driver):
     run(
-        f"""
+        """
         class Model(Script):
             def reset(self, seed=None, options=None):
                 super().reset(seed, options)
-                self.workers = {kind}()
-                self.workers.begin()
+                self.workers = Pool()
         told = play(lambda simulation: simulation.workers.ask(), Model)
         assert RULED in told
-        assert told <= {{RULED, REFUSED}}
+        assert told <= {RULED, REFUSED}
         """,
         driver,
     )

@@ -1,20 +1,14 @@
 """Models that wait in gevent's hub, which serves all greenlets of a thread: their own, and those of their user."""
 
-import subprocess
-import sys
-from textwrap import dedent
-
 import pytest
 
-pytest.importorskip("gevent")
+from tests.processes import run_code
 
-LIMIT = 60
-"""Seconds after which a test is given up; its process has ended itself by then."""
+pytest.importorskip("gevent")
 
 PREAMBLE = """
     import gc, signal, sys
     import gevent
-    from gevent.pool import Group
     from simenv_marl import single_env
     from simenv_marl.errors import WrongThreadError
     from tests.worlds.models import decision, script
@@ -42,9 +36,7 @@ PREAMBLE = """
 
 def run(code, driver="greenlet"):
     """Run code in a process of its own, whose hub nothing else has used."""
-    source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + dedent(RULED)
-    result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False, timeout=LIMIT)
-    assert (result.returncode, result.stdout, result.stderr) == (0, "end\n", ""), result.stdout + result.stderr
+    assert run_code(f"driver = {driver!r}", PREAMBLE, code, RULED) == "end\n"
 
 
 RULED = """
@@ -126,10 +118,7 @@ def test_greenlets_that_a_model_spawns_on_a_hub_of_its_own_decide():
         """
         def main(simulation):
             simulation.log.append(decide())
-            group = Group()
-            for _ in range(2):
-                group.spawn(ask)
-            group.join()
+            gevent.joinall([gevent.spawn(ask) for _ in range(2)])
             simulation.log.append(decide())
         env = single_env(script(main), decide, driver="thread")
         for _ in range(2):

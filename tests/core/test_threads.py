@@ -4,7 +4,6 @@ import gc
 import signal
 import threading
 import time
-import warnings
 from contextlib import nullcontext
 
 import pytest
@@ -12,7 +11,8 @@ import pytest
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
 from simenv_marl.core import threads
 from simenv_marl.errors import ReentrancyError
-from tests.worlds.models import Script, calling, decision, notes, play, script, step
+from tests.worlds import farms
+from tests.worlds.models import calling, decision, notes, script, step
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
 
@@ -53,42 +53,23 @@ def older_threads():
 # -- where it runs --------------------------------------------------------------------------------
 
 
-def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users():
-    seen = {"simulation": [], "user": []}
-
-    def here(where, value):
-        seen[where].append(threading.get_ident())
-        return value
-
-    def main(simulation):
-        for _ in range(3):
-            for point in (decide, other, applied):
-                here("simulation", point())
-            ruled()
-
-    decide = decision(
-        agent="a_0",
-        observation_space_mapping=lambda: here("user", [0, 0]),
-        reward_mapping=lambda: here("user", 0.0),
-        action_space_mapping=lambda action: here("user", action),
-    )
-    other = decision(agent="b_0")
-    applied = decision(apply=lambda action: here("simulation", action), agent="c_0")
-    ruled = decision(lambda: here("simulation", 0), agent="d_0")
-    policies = {"b_0": lambda observation: here("user", 1), "d_0": RULE}
-    play(aec_env(script(main), [decide, other, applied, ruled], policies=policies, driver="thread"), 1)
-    assert set(seen["user"]) == {threading.get_ident()}
-    assert len(seen["user"]) > 9
-    assert len(seen["simulation"]) == 15
-    assert len(set(seen["simulation"])) == 1
-    assert set(seen["simulation"]).isdisjoint(seen["user"])
+@pytest.mark.parametrize("place", farms.PLACES)
+def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(place, older_threads):
+    env, farm = farms.farm_env(aec_env, place, driver="thread")
+    (own,) = set(simulation_threads()) - set(older_threads)
+    seen = set()
+    for number, play_on in ((1, farms.run), (3, farms.run), (9, farms.run), (1, farms.cut_short)):
+        farm.let(lambda: seen.add(threading.current_thread()), place, number)
+        play_on(env)
+    inside = place in (*farms.IN_THE_MODEL, "reset", "finally", "close")
+    assert seen == {own if inside else threading.current_thread()}
 
 
 # -- from any thread ------------------------------------------------------------------------------
 
 
 @VIEWS
-def test_an_environment_may_be_used_from_a_new_thread_each_time(view):
+def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_threads):
     decide = decision(agent="a_0")
     env = view(calling(*[decide] * 3), decide, driver="thread")
     for _ in range(2):
@@ -97,80 +78,42 @@ def test_an_environment_may_be_used_from_a_new_thread_each_time(view):
             in_a_thread(step, env, 1, "a_0")
         assert env.simulation.log == [1, 1, 1]
     in_a_thread(env.reset)
+    assert len(simulation_threads()) == len(older_threads) + 1
     in_a_thread(env.close)
+    assert simulation_threads() == older_threads
     env.reset()
     assert env.simulation.episodes == 4
-    env.close()
 
 
 @VIEWS
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
-def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what):
+@pytest.mark.parametrize("place", ["rule", "observation", "render"])
+def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what, place):
     inside, go_on = threading.Event(), threading.Event()
 
-    def main(simulation):
-        simulation.log.append(decide())
+    def wait():
         inside.set()
         assert go_on.wait(10)
-        simulation.log.append(decide())
 
-    decide = decision()
-    env = view(script(main), decide, driver="thread")
-    env.reset()
-    stepping = threading.Thread(target=step, args=(env, 1, "choose_0"))
+    (env, farm), (other, undisturbed) = (farms.farm_env(view, place, driver="thread") for _ in range(2))
+    env.reset(seed=11)
+    farm.let(wait, place)
+    stepping = threading.Thread(target=farms.take, args=(env, RULE))
     stepping.start()
     assert inside.wait(10)
     with pytest.raises(ReentrancyError, match="another thread"):
-        step(env, 2, "choose_0") if what == "step" else getattr(env, what)()
+        farms.take(env, 0) if what == "step" else getattr(env, what)()
     go_on.set()
     stepping.join()
-    step(env, 3, "choose_0")
-    assert env.simulation.log == [1, 3]
-    assert env.simulation.episodes == 1
-
-
-@VIEWS
-def test_no_other_thread_moves_an_environment_before_the_results_of_a_move_are_read(view):
-    class Drawn(Script):
-        render_modes = ("human",)
-
-        def render(self, mode):
-            with pytest.raises(ReentrancyError, match="another thread"):
-                in_a_thread(step, env, 2, "choose_0")
-            self.pictures = getattr(self, "pictures", 0) + 1
-
-    decide = decision()
-    main = calling(*[decide] * 3)().main
-    env = view(lambda: Drawn(main), decide, driver="thread", render_mode="human")
-    env.reset()
-    step(env, 1, "choose_0")
-    assert (env.simulation.log, env.simulation.pictures) == ([1], 2)
-    env.close()
+    other.reset(seed=11)
+    farms.take(other, RULE)
+    for _ in range(2):
+        assert farm.log == undisturbed.log
+        farms.take(env, 0)
+        farms.take(other, 0)
 
 
 # -- what is left behind --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("how", ["end", "close", "collect", "reset", "model error", "never reset"])
-def test_no_thread_is_left_after_any_end(how, older_threads):
-    decide = decision()
-    fail = (lambda: 1 / 0) if how == "model error" else decide
-    env = single_env(calling(decide, fail), decide, driver="thread")
-    assert len(simulation_threads()) == len(older_threads) + 1  # in which the simulation was made
-    if how != "never reset":
-        env.reset()
-        with pytest.raises(ZeroDivisionError) if how == "model error" else nullcontext():
-            env.step(1)
-        if how == "end":
-            env.step(1)
-        for _ in range(5 if how == "reset" else 0):
-            env.reset()
-    assert len(simulation_threads()) == len(older_threads) + 1  # the one in which the next episode is going to run
-    if how in ("collect", "never reset"):
-        del env
-    else:
-        env.close()
-    assert simulation_threads() == older_threads
 
 
 def test_too_many_threads_are_an_error(monkeypatch, older_threads):
@@ -204,36 +147,12 @@ def interrupt():
 
 
 @needs_signals
-def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_next_decision():
-    log, interrupted = [], threading.Event()
-
-    def main(simulation):
-        try:
-            log.append(decide())
-            if simulation.episodes == 1:
-                interrupt()
-                assert interrupted.wait(10)
-            log.append(decide())
-        finally:
-            log.append("unwound")
-
-    decide = decision()
-    env = single_env(script(main), decide, driver="thread")
-    env.reset()
-    env.simulation.stop = lambda: interrupted.set()  # is called as soon as the interruption has surfaced
-    with pytest.raises(KeyboardInterrupt) as caught:
-        env.step(1)
-    assert log == [1, "unwound"]
-    assert "seed" in notes(caught.value)
-    env.reset()
-    env.step(2)
-    assert env.step(3)[2]
-    assert log == [1, "unwound", 2, 3, "unwound"]
-
-
-@needs_signals
-def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkeypatch, older_threads):
-    monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
+@pytest.mark.parametrize("stops", [True, False])
+def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_or_is_given_up(
+    stops, monkeypatch, older_threads
+):
+    if not stops:
+        monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, log, decide = threading.Event(), [], decision()
 
     def main(simulation):
@@ -248,16 +167,21 @@ def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkey
 
     env = single_env(script(main), decide, driver="thread")
     env.reset()
-    (stuck,) = set(simulation_threads()) - set(older_threads)
-    with pytest.raises(KeyboardInterrupt), pytest.warns(ResourceWarning, match=r"Script.*neither decided"):
+    (interrupted,) = set(simulation_threads()) - set(older_threads)
+    if stops:
+        env.simulation.stop = go_on.set  # is called as soon as the interruption has surfaced
+    warned = nullcontext() if stops else pytest.warns(ResourceWarning, match=r"Script.*neither decided")
+    with pytest.raises(KeyboardInterrupt) as caught, warned:
         env.step(1)
+    assert "seed" in notes(caught.value)
     env.reset()
     env.step(2)
-    go_on.set()  # it was given up, but it is not to go on for ever
-    stuck.join(10)
-    assert log == [1, 2, "unwound"]
-    env.step(3)
-    assert log == [1, 2, "unwound", 3, "unwound"]
+    go_on.set()  # what was given up is not to go on for ever
+    if not stops:
+        interrupted.join(10)
+    assert log == ([1, "unwound", 2] if stops else [1, 2, "unwound"])
+    assert env.step(3)[2]
+    assert log[3:] == [3, "unwound"]
 
 
 @pytest.mark.parametrize("how", ["close", "collect"])
@@ -271,17 +195,11 @@ def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(mon
         finally:
             go_on.wait(10)
 
-    env = single_env(script(main), decide, driver="thread")
-    env.reset()
+    held = [single_env(script(main), decide, driver="thread")]
+    held[0].reset()
     (stuck,) = set(simulation_threads()) - set(older_threads)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        if how == "close":
-            env.close()
-        del env
-        gc.collect()
-    assert [warning.category for warning in caught] == [ResourceWarning]
-    assert "Script" in str(caught[0].message)
-    assert "neither decided" in str(caught[0].message)
+    with pytest.warns(ResourceWarning, match=r"Script.*neither decided") as caught:
+        held[0].close() if how == "close" else held.clear()
+    assert len(caught) == 1
     go_on.set()
     stuck.join(10)

@@ -272,7 +272,7 @@ def observe(simulation):
         (ZeroDivisionError, {}, ["seed 13"]),
         (ZeroDivisionError, {"seeds": [20, 17, 50]}, ["seed 50"]),
         (ZeroDivisionError, {"seeds": [20, 13, 99]}, ["seed 13", "seed 99", "not yet"]),
-        *((kind, raising(kind), ["seeds 20, 13, 17", "decide"]) for kind in (ZeroDivisionError, KeyboardInterrupt)),
+        *((kind, raising(kind), ["seeds 20, 13, 17", "decide"]) for kind in (StopIteration, KeyboardInterrupt)),
         (ZeroDivisionError, {"points": delicate(observation_space_mapping=observe)}, ["seed 17"]),
         (InvalidActionError, {"policies": {Delicate.decide: lambda seen: [1, 10, 1]}}, ["seed 13", "going_0"]),
         (ZeroDivisionError, {"seeds": [20, 17, 18], "collect": lambda model: 1 // (model.seed - 17)}, ["seed 17"]),

@@ -320,7 +320,7 @@ def test_stored_runs_of_equal_definitions_cause_no_warning(tmp_path):
         def __call__(self, observation):
             return 1
 
-    first = run(tmp_path, contenders={"a": {"keeper": Policy()}}, driver="thread")
+    first = run(tmp_path, contenders={"a": {"keeper": Policy()}}, driver="thread", workers=2)
     kept = [Policy() for _ in range(3)]
     turned = dict(reversed(POINTS.items()))
     assert run(tmp_path, contenders={"a": {"keeper": kept[-1]}}, points=turned, driver="greenlet").equals(first)

@@ -71,7 +71,7 @@ def collect_episodes(
     plan = learners_plan(simulation, policies, points, options)
     arguments = (simulation, policies, points, options), None if workers else plan, collect, batch_size, concurrency
     with progress_bar(len(episodes), progress) as bar:
-        parts = list(spread(_play, arguments, episodes, workers, batch_size, bar))
+        parts = spread(_play, arguments, episodes, workers, batch_size, bar)
     all_seeds = tuple(seed for _, seed in episodes)
     collected = None if collect is None else tuple(value for _, values in parts for value in values)
     return {

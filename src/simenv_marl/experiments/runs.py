@@ -145,7 +145,7 @@ def run_experiment(
                 firsts.append((unseen, [run for run in own if run[0] == own[0][0]]))
         if firsts:
             with suppress(BrokenExecutor):  # a run that has killed its worker does so again below
-                list(spread(_run_first, work, firsts, workers, 1, NO_BAR))
+                spread(_run_first, work, firsts, workers, 1, NO_BAR)
             storage.read(keys, session)
             missing = [run for run in missing if run not in storage.runs]
             bar.update(len(storage.runs))
@@ -239,7 +239,7 @@ def _run_all(
     _, runner, folder, session, notes = work
     while missing:
         try:
-            list(spread(_run_part, work, missing, workers, least, bar, share=16))  # few parts cost nothing
+            spread(_run_part, work, missing, workers, least, bar, share=16)  # few parts cost nothing
             return
         except BrokenExecutor:  # a worker has died, and joblib has ended all others
             suspects: list[Run] = []
@@ -253,7 +253,7 @@ def _run_all(
                 raise
         for run in suspects:
             try:
-                list(spread(_run_part, work, [run], max(workers, 2), 1, bar))
+                spread(_run_part, work, [run], max(workers, 2), 1, bar)
             except BrokenExecutor:
                 with closing(Writer(folder, session)) as writer:
                     writer.write(run, "WorkerError: the worker died in this run, twice; see retry_errors=", {})

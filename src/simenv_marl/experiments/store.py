@@ -32,8 +32,8 @@ HEADER: Final = "experiment.json"
 MADE_OF: Final = ("make", "simulation", "variant", "parameters", "points", "plugins", "policies", "options")
 """The parts of the provenance that affect the results of a run."""
 
-ADDRESS: Final = re.compile(" at 0x[0-9a-fA-F]+")
-"""Addresses in memory, which differ in the texts of equal objects."""
+VARYING: Final = re.compile(r" at 0x[0-9a-fA-F]+|\w+\.<locals>\.")
+"""What differs in the texts of equal objects: addresses in memory, and functions around classes, which workers lose."""
 
 Run = tuple[str, str, int]
 """The identity of a run: its row as JSON, the contender, the seed."""
@@ -194,7 +194,7 @@ def _parts_of(provenance: Provenance) -> dict[str, str]:
     """Return the parts of a provenance that affect results, as text without addresses in memory."""
     options = {name: value for name, value in (provenance.get("options") or {}).items() if name != "driver"}
     parts = {**provenance, "options": options}
-    return {part: ADDRESS.sub("", json.dumps(parts[part], sort_keys=True)) for part in MADE_OF if part in parts}
+    return {part: VARYING.sub("", json.dumps(parts[part], sort_keys=True)) for part in MADE_OF if part in parts}
 
 
 def _changes(then: Iterable[tuple[str, Any]], now: Mapping[str, Any]) -> str:

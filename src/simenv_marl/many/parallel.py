@@ -12,7 +12,7 @@ import re
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext, suppress
 from importlib import import_module
 from math import ceil
@@ -74,16 +74,15 @@ def spread(
     least: int,
     bar: Any,
     share: int = 4,
-) -> Iterator[Any]:
+) -> list[Any]:
     """Call ``work``, a function of this package, for all items in this process, or for parts of them in workers.
 
-    It gets the arguments, the items, and a progress bar. The results come in the order of the items. With -1 workers
+    It gets the arguments, the items, and a progress bar. The results are in the order of the items. With -1 workers
     there are as many as joblib's backend has. A worker gets about ``share`` parts, none of which is smaller than
     ``least``, unless a worker would get none.
     """
     if not workers or not items:
-        yield work(*arguments, items, bar)
-        return
+        return [work(*arguments, items, bar)]
     joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
     size = max(1, ceil(len(items) / (share * processes)), min(least, ceil(len(items) / processes)))
@@ -95,6 +94,7 @@ def spread(
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
     # Errors are packed in the worker, because each backend would pass them on in its own way.
     outcomes = parallel(joblib.delayed(pack_outcome)(pack, _work, parcel, home, part) for part in parts)
+    results = []
     try:
         for part, outcome in zip(parts, outcomes, strict=True):
             result, error = unpack_outcome(outcome)
@@ -104,12 +104,13 @@ def spread(
             for token, numbers in counts.items():
                 count(token, **numbers)
             bar.update(len(part))
-            yield result
+            results.append(result)
     finally:
-        if hasattr(outcomes, "close"):  # cancels the remaining work when the caller stops reading results
+        if hasattr(outcomes, "close"):  # cancels the remaining work
             with warnings.catch_warnings():  # joblib warns that it cancels
                 warnings.simplefilter("ignore")
                 outcomes.close()
+    return results
 
 
 _IN_SCRIPT: Final = re.compile(rb"__main__\.([A-Za-z_]\w*)")

@@ -31,6 +31,7 @@ from tests.conftest import DRIVERS
 from tests.planning.test_action_values import GRAZING, Herd, begun, greedy, made
 from tests.test_branch import METHODS
 from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
+from tests.worlds.inventory import Shop, best_values, state
 from tests.worlds.models import define, step
 
 
@@ -403,3 +404,33 @@ def test_invalid_options_are_refused(option, values):
             TreeSearchPolicy(**{option: value})
     with pytest.raises(OptionValueError, match="4 candidates once"):
         RolloutPolicy(budget=3).choose(made("single"))
+
+
+VALUES = best_values()
+BEST = VALUES[0, 4, 2].max()
+
+
+def share(policy, seeds):
+    """What a policy is worth, as a share of the optimum.
+
+    What it loses is added up decision by decision: what the best order was worth, and what its own was. That is free of
+    most of the chance that is in profits.
+    """
+    lost = []
+
+    def watched(observation, info, *, _environment):
+        order = policy(_environment)
+        here = VALUES[state(observation)]
+        lost.append(here.max() - here[1 if order is RULE else order])
+        return order
+
+    for seed in seeds:
+        simulate(Shop, {"buyer": watched}, points=Shop.order, seed=seed)
+    return 1 - sum(lost) / len(seeds) / BEST
+
+
+def test_plans_are_better_than_a_poor_rule():
+    """Beside the optimum of a model that can be solved."""
+    planner = RolloutPolicy(futures=16, horizon=3, method="replay")
+    assert share(lambda env: 1, range(40)) < 0.75
+    assert share(lambda env: planner.choose(env).best, [1, 2]) >= 0.95

@@ -68,6 +68,16 @@ def test_items_decide_in_order_and_those_that_are_answered_by_the_rule_get_their
     assert env.simulation.grid.rules == 4
 
 
+def test_infos_have_the_part_of_each_item_in_what_the_rule_decided():
+    env = aec_env(Day, points(rule_action_mapping=int))
+    env.reset(seed=5)
+    seen = []
+    for _ in range(6):
+        seen.append(env.last()[4].get("rule_action"))
+        env.step(RULE)
+    assert seen == [None, None, None, *PLAIN.log[0]]
+
+
 def test_all_views_and_policies_answer_items():
     env = parallel_env(Day, points())
     env.reset(seed=5)

@@ -180,6 +180,8 @@ def test_the_schema_of_numbers_has_their_bounds_and_labels():
     assert found["properties"]["a"] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
     assert found["properties"]["b"]["properties"]["1"] == {"type": "number", "maximum": 1.0}
     assert found["properties"]["c"] == {"type": "integer", "minimum": 1, "maximum": 3}
+    pair = schema(spaces.MultiDiscrete([3, 4]))["properties"]
+    assert pair == {str(at): {"type": "integer", "minimum": 0, "maximum": 2 + at} for at in range(2)}
     assert schema(amount, action_labels=["litres"]) == found["properties"]["a"] | {"description": "litres"}
     assert describe(env_of(filling(amount, action_labels=["litres"]))).endswith("\n- litres: a number from 0 to 2")
     with pytest.raises(ViewError, match="cannot be put into words"):

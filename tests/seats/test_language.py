@@ -148,6 +148,7 @@ def test_a_client_of_the_user_and_own_words_are_taken():
     assert played(policy) == played(lambda observation: 2)
     assert asked[0]["messages"][0]["content"].endswith("Be quick.")
     assert asked[0]["messages"][1]["content"] == "at 5 m"
+    assert {len(request["messages"]) for request in asked} == {2}  # no decisions before
 
 
 def test_the_prompt_of_a_pending_decision_is_shown():

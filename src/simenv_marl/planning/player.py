@@ -268,7 +268,7 @@ class ParallelPlayer(Player):
         others = {name: self._decide_for(name) for name in self.episode.agents if name != self.agent}
         observations, rewards, terminations, truncations, infos = self._step_env(actions | others, self.agent)
         self.seen = {name: (observations[name], infos.get(name, {})) for name in observations}
-        over = terminations.get(self.agent, True) or truncations.get(self.agent, True)
+        over = terminations.get(self.agent, True) or truncations[self.agent]
         self.over = bool(over or self.record.ended)  # pad_agents keeps ended agents
         return float(rewards.get(self.agent, 0.0))
 

@@ -9,8 +9,10 @@ from examples.greenhouse_coop.env import VENTILATION, WATERING, GreenhouseSim
 from examples.market_seats.env import Free, Levied
 from examples.queue_admission.env import QueueSimulation
 from examples.wolf_sheep.env import Meadow, sheep_points
+from gymnasium.utils.env_checker import check_env
 from studies.debt_collection.env import CASES, NAMED_COLLECTOR, CollectionSim
 
+from simenv_marl import joint_env
 from simenv_marl.testing import check_simulation
 
 MANAGER = {point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"}
@@ -32,6 +34,12 @@ EXAMPLES = {
     "sheep": (meadow, sheep_points(1)),
     "sheep that see further": (meadow, sheep_points(2)),
 }
+
+
+@pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # of their energy
+def test_gymnasium_accepts_a_herd_as_one_agent():
+    herd = [f"sheep_{number}" for number in range(1, 21)]
+    check_env(joint_env(meadow, possible_agents=herd, undeclared="rule"), skip_render_check=True)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -7,24 +7,19 @@ from typing import Any
 
 import numpy as np
 
-HELD_OUT = range(10_000, 10_030)
+from simenv_marl import parallel_env
 
 
-def single_return(env: Any, act: Callable[[Any, dict[str, Any]], Any], seeds: Iterable[int] = HELD_OUT) -> float:
-    """The mean return of a Gymnasium environment, over an episode for each seed."""
-    returns = []
-    for seed in seeds:
-        observation, info = env.reset(seed=seed)
-        gained, over = 0.0, False
-        while not over:
-            observation, reward, terminated, truncated, info = env.step(act(observation, info))
-            gained, over = gained + reward, terminated or truncated
-        returns.append(gained)
-    return float(np.mean(returns))
-
-
-def parallel_return(env: Any, act: Callable[[str, Any, dict[str, Any]], Any], seeds: Iterable[int] = HELD_OUT) -> float:
-    """The mean of what all agents of a PettingZoo parallel environment together have gained."""
+def mean_return(
+    simulation: Any,
+    points: Any,
+    act: Callable[[str, Any, dict[str, Any]], Any],
+    *,
+    seeds: Iterable[int] = range(10_000, 10_030),
+    **options: Any,
+) -> float:
+    """The mean of what all agents together gain when ``act`` decides by agent, observation and info."""
+    env = parallel_env(simulation, points, **options)
     returns = []
     for seed in seeds:
         observations, infos = env.reset(seed=seed)
@@ -33,19 +28,5 @@ def parallel_return(env: Any, act: Callable[[str, Any, dict[str, Any]], Any], se
             actions = {agent: act(agent, observations[agent], infos[agent]) for agent in env.agents}
             observations, rewards, _, _, infos = env.step(actions)
             gained += sum(rewards.values())
-        returns.append(gained)
-    return float(np.mean(returns))
-
-
-def aec_return(env: Any, act: Callable[[str, Any, dict[str, Any]], Any], seeds: Iterable[int] = HELD_OUT) -> float:
-    """The same of a PettingZoo AEC environment."""
-    returns = []
-    for seed in seeds:
-        env.reset(seed=seed)
-        gained = 0.0
-        for agent in env.agent_iter():
-            observation, reward, terminated, truncated, info = env.last()
-            gained += reward
-            env.step(None if terminated or truncated else act(agent, observation, info))
         returns.append(gained)
     return float(np.mean(returns))

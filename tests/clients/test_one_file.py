@@ -5,26 +5,24 @@ from importlib import import_module
 import numpy as np
 import torch
 
-from simenv_marl import single_env
 from tests.worlds.undone import models_of_pages_forgotten
 
 from .page import DOCS
-from .returns import single_return
+from .returns import mean_return
 
 
 def test_the_script_of_the_page_learns(monkeypatch):
     monkeypatch.syspath_prepend(DOCS)
     with models_of_pages_forgotten():
         script = import_module("one_file")
-        env = single_env(script.FourWeeks, script.points)
 
-        def act(observation, info):
+        def act(agent, observation, info):
             with torch.no_grad():
                 return script.Categorical(logits=script.actor(script.seen(observation))).sample().item()
 
-        before = single_return(env, act)
+        before = mean_return(script.FourWeeks, script.points, act)
         script.train(21)
-        assert single_return(env, act) > before + 100
+        assert mean_return(script.FourWeeks, script.points, act) > before + 100
         assert len(script.envs.return_queue) == 100
         assert np.mean(script.envs.length_queue) == 28
         script.envs.close()

@@ -2,27 +2,27 @@
 
 import torch
 from examples.greenhouse_coop.env import WATERING, GreenhouseSim
+from hive import BEES, DEFINITION, HiveSim, points
 from skrl.envs.wrappers.torch import wrap_env
 
 from simenv_marl import parallel_env, single_env, vector_env
 from simenv_marl.envs import pad_agents
 
 from . import page
-from .worlds import FORAGERS, HerdSim
 
 
 def test_agents_that_are_born_and_die_are_all_there_all_the_time():
-    options = {"possible_agents": FORAGERS, "state_space": "observations"}
-    env = wrap_env(pad_agents(parallel_env(HerdSim, **options)), wrapper="pettingzoo")
+    options = {"possible_agents": BEES, "state_space": "observations"}
+    env = wrap_env(pad_agents(parallel_env(HiveSim, points(DEFINITION), **options)), wrapper="pettingzoo")
     observations, _ = env.reset()
     days = 0
     while env.agents:
-        assert observations.keys() == set(FORAGERS)
-        assert {state.shape for state in env.state().values()} == {(1, 2 * len(FORAGERS))}
-        observations, rewards, *_ = env.step({agent: torch.tensor([[1]]) for agent in FORAGERS})
-        assert rewards.keys() == set(FORAGERS)
+        assert observations.keys() == set(BEES)
+        assert {state.shape for state in env.state().values()} == {(1, 4 * len(BEES))}
+        observations, rewards, *_ = env.step({agent: torch.tensor([[0]]) for agent in BEES})
+        assert rewards.keys() == set(BEES)
         days += 1
-    assert days >= 8  # each of them lives two days at least
+    assert days >= 8  # the last bee hatches on the sixth day, and lives two days at least
     env.close()
 
 

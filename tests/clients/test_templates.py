@@ -5,14 +5,10 @@ from simenv_marl.testing.templates import write_template
 from .commands import python
 
 
-def test_training_is_worth_something(tmp_path):
+def test_training_is_worth_something_and_can_be_tried_quickly(tmp_path):
     write_template("plain", "tank", tmp_path)
+    assert "trained " in python(tmp_path / "tank.py", "--quick")
     printed = python(tmp_path / "tank.py")
     row = next(line.split() for line in printed.splitlines() if line.startswith("trained "))
     difference, difference_low, difference_high = map(float, row[4:])
     assert 1 < difference_low <= difference <= difference_high
-
-
-def test_templates_train(tmp_path):
-    write_template("plain", "tank", tmp_path)
-    assert "trained " in python(tmp_path / "tank.py", "--quick")

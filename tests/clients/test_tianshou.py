@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 from gymnasium import spaces
+from hive import BEES, DEFINITION, Bee, HiveSim, points
 from tianshou.data import Batch
 from tianshou.env import PettingZooEnv
 
-from simenv_marl import aec_env
+from simenv_marl import aec_env, simulate
 from simenv_marl.envs import pad_agents
 
 from . import page
-from .returns import aec_return
-from .worlds import FORAGERS, HerdSim
+from .returns import mean_return
 
 
 def greedy(algorithm):
@@ -48,30 +48,28 @@ def test_masks_in_observations_reach_the_policy(monkeypatch):
 
 def test_agents_that_are_born_and_die():
     """Without padding an episode ends for it when the first of them dies."""
-    days = {}
-    for padded in (False, True):
-        env = aec_env(HerdSim, possible_agents=FORAGERS)
-        env = PettingZooEnv(pad_agents(env) if padded else env)
-        days[padded] = []
+
+    def days(env):
+        lived = []
         for seed in range(5):
             env.reset(seed=seed)
-            over = False
-            while not over:
-                _, _, terminated, truncated, _ = env.step(1)
-                over = terminated or truncated
-            days[padded].append(env.env.simulation.herd.day)
-        env.close()
-    assert days[True] == [15] * 5
-    assert min(days[False]) < 15
+            while not any(env.step(0)[2:4]):
+                pass
+            lived.append(env.env.unwrapped.simulation.hive.day)
+        return lived
+
+    hive, policies = points(DEFINITION), {Bee.choose_meadow: lambda seen: 0}
+    plain = [simulate(HiveSim, policies, points=hive, seed=seed).hive.day for seed in range(5)]
+    env = aec_env(HiveSim, hive, possible_agents=BEES)
+    assert sum(days(PettingZooEnv(env))) < sum(plain)
+    assert days(PettingZooEnv(pad_agents(env))) == plain
 
 
 def test_the_code_of_the_page_runs(monkeypatch):
     np.random.seed(0)
     steps = page.steps("Tianshou", monkeypatch)
     names = next(steps)
-    env = aec_env(names["FourWeeks"], names["points"])
-    before = aec_return(env, greedy(names["algorithm"]))
+    before = mean_return(names["FourWeeks"], names["points"], greedy(names["algorithm"]))
     names = next(steps)
-    after = aec_return(env, greedy(names["algorithm"]))
-    assert after > before + 3
+    assert mean_return(names["FourWeeks"], names["points"], greedy(names["algorithm"])) > before + 3
     assert names["baker"](Batch(obs=np.array([[0, 0.5]]), info=Batch())).act[0] in spaces.Discrete(5)

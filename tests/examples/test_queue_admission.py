@@ -1,16 +1,13 @@
-"""Admission to a queue: the model, its exact values, and the environment; its training is in ``tests/clients``."""
+"""Admission to a queue: its exact values, and those of the model; its training is in ``tests/clients``."""
 
 import math
 
 import numpy as np
-import pytest
-from examples.queue_admission.env import AGENT, QueueSimulation, env, observation
+from examples.queue_admission.env import AGENT, QueueSimulation, observation
 from examples.queue_admission.exact import ADMIT_ALL, DECISIONS, EMPTY, best_table, values, worth
-from examples.queue_admission.model import INTEREST, Queue
+from examples.queue_admission.model import INTEREST
 
 from simenv_marl import simulate_many
-from simenv_marl.testing import check_simulation
-from tests.worlds.models import follow_the_rule
 
 SEEN = {observation(decision).tobytes(): decision for decision in DECISIONS}
 
@@ -41,29 +38,3 @@ def test_a_table_is_worth_what_it_earns_in_the_model():
     expected = values(best)[EMPTY] - values(ADMIT_ALL)[EMPTY]
     assert abs(gains.mean() - expected) < 2.5 * gains.std() / math.sqrt(len(seeds))
     assert gains.mean() > 5 * gains.std() / math.sqrt(len(seeds))
-
-
-def test_discounted_rewards_add_up_to_the_present_value():
-    world = env()
-    for seed in range(3):
-        seen, info = world.reset(seed=seed)
-        total, weight, over = 0.0, math.exp(-INTEREST * info["time"]), False
-        while not over:
-            assert seen.tobytes() in SEEN  # a full queue asks nobody
-            seen, reward, terminated, truncated, info = world.step(world.action_space.sample())
-            total, weight, over = total + weight * reward, weight * info["discount"], truncated
-            assert not terminated
-        assert total == pytest.approx(world.unwrapped.simulation.model.present_value(), rel=1e-9)
-
-
-def test_left_to_the_rule_it_is_the_plain_model():
-    def picture(model):
-        states = [generator.bit_generator.state for generator in model.generators]
-        return model.clock.now, model.present_value(), model.serving(), model.waiting(0), model.waiting(1), states
-
-    for seed in range(3):
-        plain = Queue(seed)
-        plain.clock.run(until=150)
-        assert picture(follow_the_rule(env(), seed=seed).model) == picture(plain)
-    report = check_simulation(QueueSimulation, episodes=3)
-    assert report.findings == (), str(report)

@@ -1,5 +1,9 @@
 """Each study runs from its command line to its figures, in a small way; those of learners are in ``tests/clients``."""
 
+import json
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from examples.greenhouse_coop import plan, train
@@ -8,6 +12,7 @@ from examples.queue_admission.env import HORIZON
 from examples.queue_admission.model import Queue
 from studies.debt_collection import model as agency
 from studies.debt_collection import study as debts
+from studies.debt_collection.env import CollectionSim
 from studies.demo import picture
 from studies.event_planning import measure as events
 from studies.event_planning import model as event_models
@@ -34,9 +39,14 @@ def short(kind):
     return Short
 
 
-def test_demo_draws_what_was_trained_and_what_was_planned(tmp_path, monkeypatch):
-    monkeypatch.setattr(plan, "GreenhouseSim", short(GreenhouseSim))
+def test_greenhouse_trains_plans_and_draws(tmp_path, capsys, monkeypatch):
     train.main(["--budget", "1", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)])
+    named = re.findall(r"^  (\S+/\S+)", capsys.readouterr().out.partition("What to do next:")[2], re.MULTILINE)
+    assert len(named) == 4
+    assert all((Path(__file__).parents[2] / path).is_file() for path in named)
+    found = json.loads((tmp_path / "greenhouse.json").read_text())
+    assert [len(values) for values in found["returns"].values()] == [2] * 6
+    monkeypatch.setattr(plan, "GreenhouseSim", short(GreenhouseSim))
     plan.main(["--seeds", "1", "--futures", "1", "--out", str(tmp_path)])
     for name in picture.TITLES:
         picture.main([str(tmp_path / f"{name}.json")])
@@ -111,6 +121,10 @@ def test_debt_collection_learns_and_compares(capsys):
     shown = capsys.readouterr().out
     assert "Thresholds(" in shown
     assert all(name in shown for name in ("learned", "rule", *debts.CONSTANTS))
+    third = CollectionSim(parameters=agency.Parameters(arrivals=0.3, stock=20, calls=1))  # of what it has learned from
+    unseen = range(debts.HELD_OUT, debts.HELD_OUT + 32)
+    result = debts.compare({"learned": debts.LEARNED}, unseen, third).summary().loc["learned"]
+    assert result["difference"] > result["difference_low"] > 0
 
 
 def test_pages_state_the_figures_of_the_finals():

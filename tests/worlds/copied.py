@@ -23,10 +23,6 @@ def to_step(action: int) -> int:
     return action - 1
 
 
-def learned(decision: int) -> int:
-    return decision + 1
-
-
 def define(**changes: Any) -> Definition:
     given: dict[str, Any] = {
         "observation_space": spaces.Box(-100, 100, (1,), np.float32),

@@ -105,11 +105,11 @@ class DialEnv(gymnasium.Env[Any, Any]):
         return self.dial.picture()
 
 
-def points(seen: str, agent: Any = "hand_0") -> dict[Any, Any]:
+def points(seen: str) -> dict[Any, Any]:
     """The decision point of dials of which that is seen."""
     space, look = SEEN[seen]
     definition = define(
-        agent=agent,
+        agent="hand_0",
         observation_space=space,
         observation_space_mapping=look,
         action_space=ACTIONS,

@@ -1,15 +1,16 @@
 """Random simulations, and what must come of them, computed without the library.
 
 A world has a level, which every decision changes, and a program: the calls of its decision points in their
-order. ``Reference`` goes through the same program by itself, and tells who decides when, what it observes, what
-it is paid and what the model comes to. It knows of no environment, stack or greenlet.
+order. ``Reference`` is a world that goes through its program by itself, and tells who decides when, what it observes,
+what it is paid and what the model comes to. It knows of no environment, stack or greenlet.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 from gymnasium import spaces
@@ -218,8 +219,7 @@ class _PendingError(Exception):
     pass
 
 
-@dataclass
-class Reference:
+class Reference(World):
     """What must come of a design, a seed and the answers that were given so far.
 
     Attributes:
@@ -229,29 +229,18 @@ class Reference:
         trace: What the model has noted.
     """
 
-    design: Design
-    seed: int
-    answers: list[Any]
-    turns: list[Told] = field(default_factory=list)
-    ends: dict[str, Told] | None = None
-    truncated: bool = False
-
-    def __post_init__(self) -> None:
-        self.random = random.Random(self.seed)
-        self.level, self.calls, self.trace = self.random.randrange(50), 0, list[Any]()
+    def __init__(self, design: Design, seed: int, answers: list[Any]) -> None:
+        super().__init__(design, [])
+        self.turns: list[Told] = []
+        self.ends: dict[str, Told] | None = None
+        self.truncated = False
         self._decided: dict[str, int] = {}
         self._remembered: dict[str, int] = {}
-        self._given = iter(self.answers)
-        self._steps = 0
-        try:
-            for point, entity in self.design.program:
-                value = self._decide(point, entity)
-                self.calls += 1
-                self.level = (self.level * 3 + value + self.random.randrange(4)) % 101
-                self.trace.append((point, value, self.level))
-            self._end(truncated=self.design.truncates)
-        except _PendingError:
-            pass
+        self._given, self._steps = iter(answers), 0
+        self.reset(seed)
+        with suppress(_PendingError):
+            self._end(truncated=self.run() is TRUNCATED)
+        self.trace = [what for what in self.trace if what != "over"]
 
     def _end(self, *, truncated: bool) -> None:
         self.truncated = truncated
@@ -266,11 +255,12 @@ class Reference:
         before, self._remembered[agent] = self._remembered.get(agent, self.level), self.level
         return (self.level - before) / 4
 
-    def _decide(self, point: int, entity: int) -> int:
+    def call(self, point: int, entity: int) -> int:
+        """Who decides is told so, and does what was answered."""
         kind = self.design.kinds[point]
         agent = agent_of(kind, point, entity)
         if agent is None or point in self.design.rules:
-            return self._rule(point)
+            return self.rule(point)
         if point in self.design.policies:
             return self._value(kind, self.level)
         if self._steps == self.design.max_steps:
@@ -285,9 +275,7 @@ class Reference:
         if answer is None:
             raise _PendingError
         self._steps += 1
-        if answer is RULE:
-            return self._rule(point)
-        return self._value(kind, answer)
+        return self.rule(point) if answer is RULE else self._value(kind, answer)
 
     def _value(self, kind: str, answer: int) -> int:
         if kind == "choices":
@@ -295,9 +283,3 @@ class Reference:
             return choices[answer % len(choices)]
         action = answer % 10
         return action + self.random.randrange(3) if kind == "apply" else action
-
-    def _rule(self, point: int) -> int:
-        value = self.random.randrange(7)
-        if self.design.kinds[point] == "nested" and point > 0:
-            value += self._decide(point - 1, value % 3)
-        return value

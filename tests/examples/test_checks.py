@@ -1,0 +1,49 @@
+"""The library's check, which runs those of PettingZoo and Gymnasium, on the environments of all examples."""
+
+from functools import partial
+
+import pytest
+from examples.fin_base.env import PREMIUMS, TEAM, FundSim
+from examples.fin_base.pension import Parameters
+from examples.greenhouse_coop.env import VENTILATION, WATERING, GreenhouseSim
+from examples.market_seats.env import Free, Levied
+from examples.queue_admission.env import QueueSimulation
+from examples.wolf_sheep.env import Meadow, sheep_points
+from gymnasium.utils.env_checker import check_env
+from studies.debt_collection.env import CASES, NAMED_COLLECTOR, CollectionSim
+
+from simenv_marl import joint_env
+from simenv_marl.testing import check_simulation
+
+MANAGER = {point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"}
+fund = partial(FundSim, 3, Parameters(clients=60, coverage=1.0))  # poor enough for plans, cuts and demands
+meadow = partial(Meadow, 25, width=8, height=8, initial_sheep=20, initial_wolves=5)
+
+EXAMPLES = {
+    "greenhouse": (GreenhouseSim, None),
+    "watering": (GreenhouseSim, WATERING),
+    "ventilation": (GreenhouseSim, VENTILATION),
+    "team of the fund": (fund, TEAM),
+    "manager of the fund": (fund, MANAGER),
+    "clients of the fund": (fund, PREMIUMS),
+    "debtors": (partial(CollectionSim, 30), CASES),
+    "collector, named actions": (partial(CollectionSim, 30), NAMED_COLLECTOR),
+    "market": (Free, None),
+    "market with a levy": (Levied, None),
+    "queue": (QueueSimulation, None),
+    "sheep": (meadow, sheep_points(1)),
+    "sheep that see further": (meadow, sheep_points(2)),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # of their energy
+def test_gymnasium_accepts_a_herd_as_one_agent():
+    herd = [f"sheep_{number}" for number in range(1, 21)]
+    check_env(joint_env(meadow, possible_agents=herd, undeclared="rule"), skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_check_of_the_library_finds_nothing_in_an_example(name):
+    simulation, points = EXAMPLES[name]
+    report = check_simulation(simulation, points, episodes=2)
+    assert not [finding for finding in report.findings if finding.severity != "note"], report

@@ -88,7 +88,7 @@ def leaves(value):
         (duplicate, {"a": np.arange(3.0), "b": ({"c": np.arange(2)}, 3)}),
         (duplicate, {"a": [np.arange(2), 3]}),
     ],
-    ids=str,
+    ids=["box", "integers", "tuple", "dict", "list"],
 )
 def test_casts_and_duplicates_share_nothing(made_of, value):
     kept = copy.deepcopy(value)

@@ -1,5 +1,6 @@
 """The library's check, which runs those of PettingZoo and Gymnasium, on the environments of all examples."""
 
+import pickle
 from functools import partial
 
 import pytest
@@ -12,7 +13,7 @@ from examples.wolf_sheep.env import Meadow, sheep_points
 from gymnasium.utils.env_checker import check_env
 from studies.debt_collection.env import CASES, NAMED_COLLECTOR, CollectionSim
 
-from simenv_marl import joint_env
+from simenv_marl import aec_env, joint_env
 from simenv_marl.testing import check_simulation
 
 MANAGER = {point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"}
@@ -43,7 +44,10 @@ def test_gymnasium_accepts_a_herd_as_one_agent():
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_check_of_the_library_finds_nothing_in_an_example(name):
+def test_the_check_of_the_library_finds_nothing_in_an_example_whose_environments_pickle(name):
     simulation, points = EXAMPLES[name]
+    copied = pickle.loads(pickle.dumps(aec_env(simulation, points)))
+    copied.reset(seed=1)
+    assert copied.agents
     report = check_simulation(simulation, points, episodes=2)
     assert not [finding for finding in report.findings if finding.severity != "note"], report

@@ -37,7 +37,7 @@ test-all: test test-studies test-wheel test-oldest test-templates test-pythons t
 # The quickest of them, for each commit: about a minute on two cores, once the environment is there.
 CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
 	$(addprefix tests/contract/test_,$(addsuffix .py,conformance environments episodes errors identity joint many_agents \
-	messages one_agent rounds simulate)) \
+	one_agent rounds simulate)) \
 	tests/core/test_spaces.py tests/envs/test_vector.py tests/hooks/test_points.py
 check: lint
 	$(BIN)/python -m pytest --quiet -n 2 $(CHECK_TESTS)

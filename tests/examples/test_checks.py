@@ -11,7 +11,6 @@ from examples.market_seats.env import Free, Levied
 from examples.queue_admission.env import QueueSimulation
 from examples.wolf_sheep.env import Meadow, sheep_points
 from gymnasium.utils.env_checker import check_env
-from studies.debt_collection.env import CASES, NAMED_COLLECTOR, CollectionSim
 
 from simenv_marl import aec_env, joint_env
 from simenv_marl.testing import check_simulation
@@ -27,8 +26,6 @@ EXAMPLES = {
     "team of the fund": (fund, TEAM),
     "manager of the fund": (fund, MANAGER),
     "clients of the fund": (fund, PREMIUMS),
-    "debtors": (partial(CollectionSim, 30), CASES),
-    "collector, named actions": (partial(CollectionSim, 30), NAMED_COLLECTOR),
     "market": (Free, None),
     "market with a levy": (Levied, None),
     "queue": (QueueSimulation, None),

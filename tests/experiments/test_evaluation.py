@@ -377,5 +377,5 @@ def test_returns_are_not_counted_where_two_points_have_the_same_agent_which_is_t
         order, sell = map(NEAR[Shop.order], (Shop.order, Shop.sell))
 
     with pytest.warns(UserWarning, match="not counted, .* have the same agent"):
-        found = evaluate(Doubled, {"rule": {}}, seeds=[1])
+        found = evaluate(Doubled, {"rule": {}}, seeds=[1], points=[Doubled.order, Doubled.sell])
     assert found.frame["length"].tolist() == [0]

@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from examples.queue_admission.env import HORIZON
 from examples.queue_admission.model import Queue
 from studies.debt_collection import model as agency
 from studies.debt_collection import study as debts
-from studies.debt_collection.env import CollectionSim
+from studies.debt_collection.env import CASES, NAMED_COLLECTOR, CollectionSim
 from studies.demo import picture
 from studies.event_planning import measure as events
 from studies.event_planning import model as event_models
@@ -22,6 +23,7 @@ from studies.pension import study as pension
 from studies.queue_network import study as network
 
 from simenv_marl import simulate
+from simenv_marl.testing import check_simulation
 
 
 def big(path):
@@ -112,6 +114,12 @@ def test_pension_shows_what_it_has_found(tmp_path, capsys):
     for name in ("compared", "worlds", "moved"):
         assert (tmp_path / f"pension-{name}.md").read_text() in shown
     assert all(big(tmp_path / f"pension-{name}.png") for name in ("worlds", "learned", "years"))
+
+
+@pytest.mark.parametrize("points", [CASES, NAMED_COLLECTOR])
+def test_the_check_of_the_library_finds_nothing_in_debt_collection(points):
+    report = check_simulation(partial(CollectionSim, 30), points, episodes=2)
+    assert not [finding for finding in report.findings if finding.severity != "note"], report
 
 
 def test_debt_collection_learns_and_compares(capsys):

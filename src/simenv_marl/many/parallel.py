@@ -100,11 +100,10 @@ def spread(
             result, error = unpack_outcome(outcome)
             if error is not None:
                 raise error
-            result, counts = result
-            for token, numbers in counts.items():
+            results.append(result[0])
+            for token, numbers in result[1].items():  # what policies have counted there
                 count(token, **numbers)
             bar.update(len(part))
-            results.append(result)
     finally:
         if hasattr(outcomes, "close"):  # cancels the remaining work
             with warnings.catch_warnings():  # joblib warns that it cancels

@@ -134,6 +134,7 @@ def test_an_environment_that_is_dropped_unwinds_at_once_and_takes_everything_alo
             decide(witness)
         finally:
             log.append("unwound")
+        return witness
 
     before, log = stacks(), []
     decide = decision(lambda witness: 0, agent="a_0")

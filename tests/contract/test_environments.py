@@ -88,7 +88,9 @@ def test_environments_have_metadata_and_a_generator(make):
     assert env.unwrapped is env
     assert isinstance(env.simulation, Rendering)
     assert isinstance(env.metadata["name"], str)
-    assert (env.metadata["render_fps"], env.metadata["render_modes"]) == (0.5, ["ansi", "rgb_array"])
+    made = generate_env(Rendering, PUMP)  # which Gymnasium asks as a class
+    for metadata in (env.metadata, made.metadata):
+        assert (metadata["render_fps"], metadata["render_modes"]) == (0.5, ["ansi", "rgb_array"])
     assert env.metadata.get("is_parallelizable") == {aec_env: False, parallel_env: True}.get(make)
     env.reset(seed=3)
     assert env.unwrapped.np_random_seed == 3

@@ -49,6 +49,20 @@ def test_spaces_are_dicts_keyed_by_agent():
     assert env.simulation.log == [1, 7, 2]
 
 
+def test_an_action_that_is_illegal_by_its_turn_counts_as_missing_and_infos_have_the_masks_of_all():
+    mask = np.array([1] * 3 + [0] * 7, np.int8)
+    ant, cat = decision(agent="ant_0", action_mask_mapping=lambda: mask), decision(agent="cat_0")
+    bee = decision(agent="bee_0", choices=lambda: ["x", "y"], action_space=spaces.Discrete(3))
+    env = joint_env(calling(ant, bee, cat, ant, bee), [ant, bee, cat])
+    env.reset()
+    env.step({"ant_0": 2, "bee_0": 1, "cat_0": 0})
+    *_, info = env.step({"ant_0": 2, "bee_0": 2, "cat_0": 0})
+    assert env.simulation.log == [2, "y", 0, 2]
+    assert (info["deciding"], info["acted"]) == ("bee_0", {"ant_0": True, "bee_0": False, "cat_0": False})
+    masks = {name: given.tolist() for name, given in info["action_mask"].items()}
+    assert masks == {"ant_0": mask.tolist(), "bee_0": [1, 1, 0]}
+
+
 @pytest.mark.parametrize("max_steps", [None, 2])
 def test_a_step_is_a_round(max_steps):
     ant, bee = points(reward_mapping=lambda: 1.5)

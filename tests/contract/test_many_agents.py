@@ -511,6 +511,11 @@ def test_an_agent_that_is_ended_is_rewarded_and_observed_for_the_last_time_and_l
     turns = play(aec_env(ending(program), BY_NAME), 1)
     assert story(turns) == "0 1 2 1+ 0 2 0+ 2+"
     assert (turns[3].observation.tolist(), turns[3].reward) == ([1, 2], 2.0)
+    env = parallel_env(ending("0 acts, 1 acts, 1 health 3, 1 ends, 0 acts"), BY_NAME, possible_agents=NAMES[:2])
+    env.reset()
+    _, rewards, terminations, *_ = env.step({"being_0": 1, "being_1": 1})
+    assert (rewards["being_1"], terminations) == (3.0, {"being_0": False, "being_1": True})
+    assert env.agents == ["being_0"]
 
 
 def test_outside_an_environment_end_agent_does_nothing():

@@ -113,6 +113,7 @@ def test_same_compares_number_for_number():
 
 def test_blanks_are_zero_clipped_into_their_space():
     assert_alike(blank(spaces.Discrete(9, start=-4)), np.int64(0))
+    assert_alike(blank(spaces.Box(-3, -2, (1,), np.float64)), np.array([-2.0]))
     assert_alike(blank(spaces.MultiDiscrete([2, 2], start=[-5, -1])), np.array([-4, 0]))
     assert_alike(blank(TREE), {"box": np.float32([0, 0]), "pair": (np.int64(5), {"bits": np.int8([0, 0, 0])})})
 
@@ -159,6 +160,7 @@ def test_each_element_of_a_box_counts_and_bounds_are_legal_in_every_precision(nu
     check = action_check(spaces.Box(-high, high, dtype=dtype))
     for legal in (high, -high, high.astype(np.float64), high.tolist(), np.zeros(number, np.float32)):
         assert_alike(check(legal), np.asarray(legal, dtype))
+        assert check(legal) is not legal
     for at in (0, -1):
         for wrong in (0.2, -0.2, np.nan, np.inf):
             action = np.zeros(number)
@@ -208,6 +210,8 @@ def test_other_spaces_are_asked_themselves_and_actions_are_copied():
     assert found is not given
     assert_alike(action_check(BYTES)([10, 0]), np.uint8([10, 0]))
     assert [action_check(spaces.Discrete(2))(truth) for truth in (True, np.bool_(0))] == [1, 0]
+    for number in (0.1, 1, np.float32(0.25), np.array(0.5)):  # for a box of one element
+        assert action_check(spaces.Box(0, 1, (1,), np.float32))(number) is number
 
 
 # -- masks ----------------------------------------------------------------------------------------

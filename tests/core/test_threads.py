@@ -83,6 +83,13 @@ def test_an_environment_may_be_used_from_a_new_thread_each_time(view, older_thre
     assert simulation_threads() == older_threads
     env.reset()
     assert env.simulation.episodes == 4
+    env.close()
+    failing = view(calling(decide, lambda: 1 / 0), decide, driver="thread")
+    for _ in range(3):
+        failing.reset()
+        with pytest.raises(ZeroDivisionError):
+            step(failing, 1, "a_0")
+    assert len(simulation_threads()) == len(older_threads) + 1
 
 
 @VIEWS

@@ -325,6 +325,7 @@ def two(a, b):
             ((wrong, two, "before"), HandlerError)
             for wrong in (None, lambda: 0, lambda a, *, b: 0, lambda a, b, _result: 0, lambda **kwargs: 0)
         ),
+        ((lambda a, b, _result: 0, two, "instead"), HandlerError),
         ((lambda good, *, discount=0: None, f"{MARKET}.price", "before"), HandlerError),
         ((lambda self, good: None, BID, "before"), HandlerError),
         ((print, BID), HandlerError),
@@ -340,7 +341,13 @@ def test_handlers_that_cannot_work_are_refused_when_they_are_attached(entry, err
         generate_env(House, House.water, plugins=[good, entry])
 
 
-@pytest.mark.parametrize(("thing", "why"), [(Trader, "expose one of its"), (3, "neither")])
+async def items_of_a_stream():
+    yield 1
+
+
+@pytest.mark.parametrize(
+    ("thing", "why"), [(Trader, "expose one of its"), (3, "neither"), (items_of_a_stream, "async generator")]
+)
 def test_exposing_anything_but_functions_and_iterables_is_refused(thing, why):
     with pytest.raises(PatchError, match=why):
         expose_to_plugins(thing)
@@ -396,6 +403,14 @@ def test_a_handlers_error_is_its_own_says_where_it_was_attached_and_closes_its_g
     assert said == f"simenv_marl: in the handler failing, attached {position} {target}"
     assert rest == [] or with_handlers is of_an_environment
     assert with_handlers(call, (nothing, target, "before")) == expected
+
+
+@EVERYWHERE
+def test_an_error_of_the_function_is_its_own_and_no_handler_runs_after_it(with_handlers):
+    function, log = local(), []
+    with pytest.raises(TypeError) as caught:
+        with_handlers(lambda: function("text", 1), *telling(log, function))
+    assert (log, "handler" in notes(caught.value)) == (["before"], False)
 
 
 # -- generator and coroutine functions ------------------------------------------------------------
@@ -516,14 +531,17 @@ def test_calls_are_traced_in_the_order_in_which_they_begin():
     function = local()
     with (
         handlers((lambda value, more=0: market.price("tea", rebate=value) and None, function, "before")),
-        trace(function, f"{MARKET}.price", counting) as calls,
+        trace(function, f"{MARKET}.price", counting, Trader.wire) as calls,
     ):
         function(3, more=4)
         list(counting(2))
+        asyncio.run(Trader().wire(8))
         with pytest.raises(TypeError):
             function([])
     *shown, failed, price = [(call.target.rpartition(".")[2], call.arguments, call.result) for call in calls]
-    assert shown == [("function", "3, more=4", "7"), ("price", "'tea', rebate=3", "7"), ("counting", "2", "0")]
+    assert shown[:2] == [("function", "3, more=4", "7"), ("price", "'tea', rebate=3", "7")]
+    assert shown[2] == ("counting", "2", "0")
+    assert shown[3][::2] == ("wire", "8")
     assert (failed[:2], price[:2]) == (("function", "[]"), ("price", "'tea', rebate=[]"))
     assert failed[2].startswith("raised TypeError")
     with handlers((nothing, BID, "before")), trace() as everything:  # which is what is exposed, or has handlers
@@ -531,7 +549,7 @@ def test_calls_are_traced_in_the_order_in_which_they_begin():
         Trader().bid("tea")
         Trader.rounded(2.5)
     assert [call.target for call in everything] == [f"{HERE}.local.<locals>.function", BID]
-    assert len(calls) == 5
+    assert len(calls) == 6
 
 
 # -- one environment alone ------------------------------------------------------------------------

@@ -68,6 +68,18 @@ def test_clones_and_branches_do_what_the_environment_does_and_none_sees_another(
         assert (future(deeper), type(deeper), type(deeper.unwrapped)) == (found, type(env), type(env.unwrapped))
 
 
+@pytest.mark.filterwarnings("ignore:.* draws from the global generator")
+def test_a_replayed_clone_leaves_the_generators_of_its_user_alone():
+    class Drawing(Trip):
+        def reset(self, seed=None):
+            random.random()
+            super().reset(seed)
+
+    env, before = trip(simulation=Drawing), world()
+    clone(env, method="replay")
+    assert world() == before
+
+
 @METHODS
 def test_a_checkpoint_rewinds_when_what_it_was_cloned_from_is_gone(method):
     env = trip("single, limited", taken=2)

@@ -68,7 +68,7 @@ def test_a_simulation_with_an_error_ends_the_command_with_status_1(capsys):
     assert told["findings"][0]["severity"] == "error"
 
 
-def test_inspections_as_text_and_json(capsys):
+def test_an_inspection_is_printed_as_text_or_as_json(capsys):
     assert main(["inspect", "walking:Walk", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["calls"] == "choose{10}"
     assert main(["inspect", "walking:Walk"]) == 0

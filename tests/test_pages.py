@@ -68,7 +68,7 @@ def linked(page, text):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_code_of_a_page_fits_on_it_and_needs_what_can_be_installed_or_saved_or_what_it_says_how_to_get(page):
+def test_the_code_of_a_page_fits_on_it_and_the_page_says_what_it_needs(page):
     text, code = code_of(page)
     saved = {path.stem for path in linked(page, text)}
     assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {"examples", "studies"}

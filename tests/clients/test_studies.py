@@ -11,7 +11,8 @@ pytestmark = pytest.mark.filterwarnings("default")  # learners warn of much that
 
 
 def test_the_study_of_imitation_runs(capsys):
-    pytest.importorskip("minari"), pytest.importorskip("torchrl")
+    pytest.importorskip("minari")
+    pytest.importorskip("torchrl")
     from studies.imitation import rule
 
     results = rule.main(["--episodes", "10", "--steps", "1000", "--seeds", "4"])
@@ -22,7 +23,8 @@ def test_the_study_of_imitation_runs(capsys):
 
 @pytest.mark.parametrize("plainly", [[], ["--plainly"]])
 def test_the_study_of_planned_imitation_runs(plainly):
-    pytest.importorskip("minari"), pytest.importorskip("torchrl")
+    pytest.importorskip("minari")
+    pytest.importorskip("torchrl")
     options = "--budget", 2800, "--learners", 1, "--steps", 5, "--seeds", 1, "--workers", 2
     assert "learner 1: " in commands.python("-m", "studies.imitation.plans", *options, *plainly)
 
@@ -49,7 +51,8 @@ def test_learner_sweep_has_the_table_of_its_page(tmp_path, monkeypatch):
 
 
 def test_wolf_sheep_from_training_to_the_pictures(tmp_path):
-    pytest.importorskip("torchrl"), pytest.importorskip("mesa")
+    pytest.importorskip("torchrl")
+    pytest.importorskip("mesa")
     from studies.wolf_sheep import picture
 
     curves, path = tmp_path / "shared-policy-training.csv", tmp_path / "shared-policy.json"

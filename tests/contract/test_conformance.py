@@ -11,7 +11,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec, turn_based_aec_to_parallel
 
-from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, parallel_env
+from simenv_marl import RULE, TRUNCATED, aec_env, clone, generate_env, parallel_env, single_env
 from simenv_marl.envs import pad_agents
 from tests.worlds.many_worlds import HERE, ROSTER, Announcing, Design, colony_points
 from tests.worlds.models import define, play
@@ -106,6 +106,14 @@ def test_pettingzoos_tests_pass(shape):
 def test_pettingzoos_conversions_pass_its_tests():
     api_test(parallel_to_aec(made(SHAPES["twice in a row"], "parallel")), num_cycles=20)
     parallel_api_test(turn_based_aec_to_parallel(aec_env(walk("ant", "bee"), [ANT, BEE])), num_cycles=20)
+
+
+def test_clones_pass_pettingzoos_and_gymnasiums_tests():
+    kits = {"aec": api_test, "parallel": parallel_api_test, "single": partial(check_env, skip_render_check=True)}
+    for view, kit in kits.items():
+        env = made(SHAPES["twice in a row"], view) if view != "single" else single_env(walk("ant"), ANT)
+        env.reset(seed=1)
+        kit(clone(env))
 
 
 # PettingZoo keeps a list of its own environments whose observations may be dicts.

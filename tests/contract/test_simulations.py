@@ -167,7 +167,7 @@ def seeds_of(env):
     return env.unwrapped.simulation.got
 
 
-def test_seeds_are_integers_drawn_until_one_is_given_and_following_from_the_last_in_every_view():
+def test_every_view_draws_seeds_until_one_is_given_and_derives_the_later_ones():
     one, two, three = (make(recording(reset_seed), Model.decide) for make in (aec_env, single_env, aec_env))
     for env in (one, two):
         env.reset()

@@ -161,7 +161,7 @@ def deciding(driver, interrupted=False):
 
 
 @DRIVERS
-def test_an_interrupt_between_steps_is_the_users_with_a_handler_of_their_own_too(driver):
+def test_an_interrupt_between_steps_reaches_the_users_handler(driver):
     caught = []
 
     def handler(number, frame):

@@ -73,7 +73,7 @@ def plain(seed):
 @pytest.mark.usefixtures("_states")
 @DRIVERS
 @pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
-def test_environments_draw_as_the_plain_runs_with_their_seeds_and_untouched_by_each_other_and_their_user(make, driver):
+def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
     logs = {seed: plain(seed) for seed in (7, 8)}
     envs = {seed: make(Casino, {BET: define(agent="player_0")}, global_rng=True, driver=driver) for seed in logs}
 
@@ -81,7 +81,8 @@ def test_environments_draw_as_the_plain_runs_with_their_seeds_and_untouched_by_e
         before = world()
         move(*args, **kwargs)
         assert world() == before
-        random.gauss(0, 1), np.random.random()
+        random.gauss(0, 1)
+        np.random.random()
 
     for _ in range(2):
         for seed, env in envs.items():

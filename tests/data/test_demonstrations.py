@@ -100,7 +100,7 @@ def test_invalid_mixtures_are_refused(parts):
         Mixture(parts)
 
 
-def test_each_policy_needs_a_data_set_of_its_own_and_without_minari_the_extra_is_named(monkeypatch):
+def test_data_sets_need_minari_and_one_name_for_each_policy(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari.dataset.minari_dataset", None)
     monkeypatch.setitem(sys.modules, "minari", None)
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")

@@ -244,7 +244,7 @@ def test_episodes_are_counted_from_either_end_also_those_without_decisions():
 
 
 @pytest.mark.parametrize("draw", [plot_timeline, plot_returns])
-def test_other_things_cannot_be_drawn_and_nothing_without_matplotlib_whose_extra_is_named(draw, monkeypatch):
+def test_arguments_that_cannot_be_drawn_and_a_missing_matplotlib_are_errors(draw, monkeypatch):
     for wrong in (None, {}, {"ant": 1}):
         with pytest.raises(OptionValueError, match="draw"):
             draw(wrong)

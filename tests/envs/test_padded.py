@@ -199,7 +199,7 @@ def test_padding_needs_a_view_of_many_agents_and_a_roster():
 
 
 @pytest.mark.parametrize(("view", "action"), VIEWS)
-def test_the_state_of_observations_has_blanks_for_the_removed_and_a_copy_needs_a_reset(view, action):
+def test_a_padded_state_has_blanks_for_removed_agents_and_a_padded_copy_needs_a_reset(view, action):
     env = pad_agents(view(GENERATIONS, beings(), possible_agents=NAMES, state_space="observations"))
     env.reset(seed=0)
     assert env.state()[:2].tolist() == [1, 0]

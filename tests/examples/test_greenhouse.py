@@ -6,8 +6,9 @@ import gymnasium
 import numpy as np
 import pytest
 from examples.greenhouse_coop import model, train
-from examples.greenhouse_coop.env import DAYS, raw_env
+from examples.greenhouse_coop.env import DAYS, env, parallel_env, raw_env
 from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import api_test, parallel_api_test
 
 from tests.worlds.models import play
 
@@ -22,6 +23,19 @@ def test_the_model_prints_its_days_as_in_the_paper(capsys):
     assert alive[:2] == [200, 200]
     assert alive == sorted(alive, reverse=True)
     assert alive[-1] == 0  # the rule means too well
+
+
+def test_a_day_has_the_numbers_of_the_paper():
+    house = model.Greenhouse(5)
+    house.update_temperature = lambda: None  # 20 degrees
+    house.update_day()
+    assert house.humidity == pytest.approx(0.8 * (0.6 + 32 / 480) + 0.2 * 0.6)
+    assert (house.water_use, house.day) == (200, 1)
+
+
+def test_pettingzoo_accepts_the_greenhouse():
+    api_test(env(), num_cycles=100)
+    parallel_api_test(parallel_env(), num_cycles=100)
 
 
 def test_an_episode_terminates_when_all_plants_are_dead_and_is_truncated_after_a_hundred_days():

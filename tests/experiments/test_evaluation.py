@@ -116,6 +116,10 @@ def test_mixtures_decide_as_policies_of_many(workers, capsys):
     assert values["much"].equals(alone["much"])
     assert (values["mixed"] <= values["much"]).all()
     assert values["mixed"].mean() < values["much"].mean() - 2
+    sizes = []
+    many = {"keeper": lambda seen: sizes.append(len(seen)) or much_of_many(seen)}
+    evaluate(Shop, {"a": many}, seeds=SEEDS, points=POINTS, batched=True)
+    assert max(sizes) == len(SEEDS)
 
 
 @pytest.mark.parametrize("confidence", [0.8, 0.95])
@@ -337,7 +341,7 @@ def test_an_agent_must_not_be_called_team():
         evaluate(Shop, {"rule": {}}, seeds=[1], points=points)
 
 
-def test_metrics_are_numbers_strings_or_none_and_those_that_are_no_numbers_have_no_mean():
+def test_metrics_are_numbers_strings_or_none():
     metrics = {
         "float": lambda shop: np.float32(0.5),
         "array": lambda shop: np.array(3),

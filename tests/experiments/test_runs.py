@@ -259,7 +259,7 @@ def test_a_store_of_another_experiment_is_refused(tmp_path):
             run(tmp_path, **arguments)
     other = tmp_path / "other"
     other.mkdir()
-    for name in (".hidden", "thesis.tex"):
+    for name in (".hidden", "experiment.json.0123", "thesis.tex"):
         (other / name).write_text("")
     with pytest.raises(OptionValueError, match="not the store of an experiment"):
         run(other)
@@ -500,8 +500,9 @@ SCRIPT = """
 
     store, workers, most = sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
     if __name__ == "__main__":
-        undecided = run_experiment(Own, {"days": [1]}, seeds=[1], store=f"{store}.undecided", workers=workers)
-        assert undecided[["agent", "length"]].values.tolist() == [["team", 0]]
+        undecided = run_experiment(Own, {"days": [1]}, seeds=[1], store=f"{store}.undecided", workers=workers,
+                                   metric=lambda shop: shop.days)
+        assert undecided[["agent", "return", "length", "metric"]].values.tolist() == [["team", 0.0, 0, 1]]
         order, sell = POINTS.values()
         design = pd.DataFrame({"days": range(1, 7), "price": 0.5, "kind": ["plain"] * 5 + ["faulty"]})
         frame = run_experiment(Own, design, contenders={"some": {"__main__.Own.order": some}}, seeds=range(4),
@@ -509,7 +510,6 @@ SCRIPT = """
                                workers=workers)
         frame.to_pickle(f"{store}.table")
 """
-"""Workers find what a script defines, and a model need not decide."""
 """Workers find what a script defines, and a model need not decide."""
 
 

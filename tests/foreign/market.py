@@ -1,7 +1,6 @@
 """A market whose traders decide by functions of every kind."""
 
 from collections.abc import Generator
-from functools import lru_cache
 from typing import Any
 
 OPEN = True
@@ -10,11 +9,6 @@ OPEN = True
 def price(good: str, *, rebate: int = 0) -> int:
     """The price of a good."""
     return 10 - rebate
-
-
-@lru_cache
-def cached_price(good: str) -> int:
-    return 30
 
 
 class Trader:

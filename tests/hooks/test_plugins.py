@@ -212,7 +212,7 @@ def test_a_call_runs_the_handlers_that_were_attached_when_it_began():
 # -- what is exposed ------------------------------------------------------------------------------
 
 
-def test_methods_may_be_exposed_in_either_order_again_and_for_one_class_alone():
+def test_a_method_is_exposed_for_one_class_and_may_be_exposed_again():
     held, log = vars(Trader), []
 
     class Model(Trader):
@@ -237,7 +237,7 @@ def test_methods_may_be_exposed_in_either_order_again_and_for_one_class_alone():
     assert isinstance(expose_to_plugins(expose_to_plugins(Trader.opening)), classmethod)
 
 
-def test_what_has_no_dotted_name_can_be_exposed_and_all_that_is_exposed_or_has_handlers_is_listed():
+def test_functions_without_dotted_names_can_be_exposed_and_are_listed():
     gc.collect()  # other tests have exposed functions, too
     first, function, length, items = local(), local(), expose_to_plugins(len), expose_to_plugins({1})
     name = f"{HERE}.local.<locals>.function"
@@ -388,9 +388,7 @@ def test_blocks_and_removals_take_away_nothing_but_their_own():
 @pytest.mark.parametrize(
     ("position", "target"), [("before", BID), ("after", BID), ("instead", BID), ("after_next", f"{HERE}.counting")]
 )
-def test_a_handlers_error_is_its_own_says_where_it_was_attached_and_closes_its_generator(
-    position, target, with_handlers
-):
+def test_an_error_of_a_handler_says_where_it_was_attached_and_closes_the_generator(position, target, with_handlers):
     def call():
         return next(counting(3)) if position == "after_next" else Trader().bid("tea")
 
@@ -450,7 +448,8 @@ def test_sent_values_and_thrown_errors_reach_the_generator(position, with_handle
         assert stop.value.value == 8
         closed.clear()
         given_up, failed = counting(5), counting(6)
-        next(given_up), next(failed)
+        next(given_up)
+        next(failed)
         given_up.close()
         with pytest.raises(ZeroDivisionError):
             failed.throw(ZeroDivisionError())

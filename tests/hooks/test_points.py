@@ -298,18 +298,24 @@ def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_
             meet.wait()
             crowd.Plain().choose_0()
             meet.wait()
+        meet.wait()
+        for _ in range(5):
+            env = aec_env(calling(lambda: crowd.Plain().choose_1()), {names[1]: define()})
+            logs.append(log_of(env))
+            env.close()
         return registered, points
 
     crowd, names = types.ModuleType("crowd"), [f"crowd.Plain.choose_{number}" for number in range(20)]
     crowd.Plain = type("Plain", (), {name.rpartition(".")[2]: lambda self: 0 for name in names})
     monkeypatch.setitem(sys.modules, "crowd", crowd)
-    make, called, meet = PlacedHook.__init__, [], threading.Barrier(8, timeout=30)
+    make, called, logs, meet = PlacedHook.__init__, [], [], threading.Barrier(8, timeout=30)
     monkeypatch.setattr(PlacedHook, "__init__", dawdle)
     with left_as_they_were(crowd.Plain), ThreadPoolExecutor(8) as threads:
         found = list(threads.map(work, range(8)))
     assert all(points == found[0][1] for _, points in found)
     assert {hook_of(choose) for registered, _ in found for choose in registered} <= set(hooks())
     assert len(called) == 8 * 8
+    assert logs == [[9]] * 40
 
 
 # -- in other processes ---------------------------------------------------------------------------

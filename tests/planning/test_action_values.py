@@ -16,7 +16,7 @@ from pettingzoo.utils.wrappers import (
     TerminateIllegalWrapper,
 )
 
-from simenv_marl import RULE, aec_env, difference, joint_env, parallel_env, single_env
+from simenv_marl import RULE, TRUNCATED, aec_env, difference, joint_env, parallel_env, single_env, vector_env
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
@@ -24,6 +24,7 @@ from simenv_marl.errors import (
     InvalidActionError,
     OptionValueError,
     UnknownAgentError,
+    ViewError,
 )
 from simenv_marl.planning import RolloutPolicy, action_values
 from simenv_marl.planning.rollouts import Rollouts
@@ -67,14 +68,22 @@ def down(observation):
 BASES = {"left": greedy, "right": down}
 
 
+class Limited(Duel):
+    """One that ends truncated."""
+
+    def run(self):
+        super().run()
+        return TRUNCATED
+
+
 @METHODS
 @pytest.mark.parametrize("driver", DRIVERS)
 @pytest.mark.parametrize("view", VIEWS)
 def test_values_are_the_same_in_every_view_and_driver(view, driver, method):
     if driver == "thread" and method == "fork":
         method = None  # which is then a replay
-    env = made(view, driver=driver)
-    told = action_values(env, futures=3, method=method)
+    env = made(view, Limited, driver=driver)
+    told = action_values(env, futures=3, method=method, terminal_value=lambda env: 1e6)
     table = expected(env, "left")
     assert told.actions == (0, 1, 2)
     assert told.returns == pytest.approx(table)
@@ -358,6 +367,12 @@ def test_an_agent_that_has_ended_must_step_before_another_one_plans():
         action_values(env)
     env.step(None)
     assert action_values(env, futures=2).best == 2
+
+
+def test_only_environments_of_one_simulation_can_be_planned_in():
+    for other in (vector_env(Duel, {LEFT: points()[LEFT]}, num_envs=2), Duel()):
+        with pytest.raises(ViewError, match="one simulation"):
+            action_values(other)
 
 
 def test_candidates_must_be_listed_unless_they_are_discrete():

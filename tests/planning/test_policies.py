@@ -31,7 +31,6 @@ from tests.conftest import DRIVERS
 from tests.planning.test_action_values import GRAZING, Herd, begun, greedy, made
 from tests.test_branch import METHODS
 from tests.worlds.duels import LEFT, Duel, Unseeded, points, worth
-from tests.worlds.inventory import Shop, best_values, state
 from tests.worlds.models import define, step
 
 
@@ -174,7 +173,7 @@ def test_planners_decide_in_vector_environments():
     envs.close()
 
 
-def test_max_steps_do_not_end_the_branch_of_an_agent_beside_whom_others_take_steps():
+def test_max_steps_end_the_branch_of_an_agent_only_if_no_other_takes_steps():
     def to_the_end(twin, number):
         taken = 1
         while not any(over := twin.step(1)[2:4]):
@@ -188,6 +187,9 @@ def test_max_steps_do_not_end_the_branch_of_an_agent_beside_whom_others_take_ste
     seen = []
     evaluate(Duel, {"planner": {"left": left}}, points=points(), seeds=[5], max_steps=4)
     assert seen == [(6, (True, False)), (5, (True, False))]
+    seen.clear()
+    evaluate(Duel, {"planner": {"left": left}}, points={LEFT: points()[LEFT]}, seeds=[5], max_steps=4)
+    assert seen == [(taken, (False, True)) for taken in (4, 3, 2, 1)]
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -216,6 +218,9 @@ def test_a_policy_gets_the_environment_with_its_decision_pending(many):
                 copied(_environment)
         for method in ("fork", "replay"):
             seen.append(branch(_environment, tried, 3, method=method))
+            twin = clone(_environment, method=method)
+            assert repr(twin.step(1)[:4]) == repr(seen[-1][1][0])
+            twin.close()
         return 1
 
     if many:
@@ -404,33 +409,3 @@ def test_invalid_options_are_refused(option, values):
             TreeSearchPolicy(**{option: value})
     with pytest.raises(OptionValueError, match="4 candidates once"):
         RolloutPolicy(budget=3).choose(made("single"))
-
-
-VALUES = best_values()
-BEST = VALUES[0, 4, 2].max()
-
-
-def share(policy, seeds):
-    """What a policy is worth, as a share of the optimum.
-
-    What it loses is added up decision by decision: what the best order was worth, and what its own was. That is free of
-    most of the chance that is in profits.
-    """
-    lost = []
-
-    def watched(observation, info, *, _environment):
-        order = policy(_environment)
-        here = VALUES[state(observation)]
-        lost.append(here.max() - here[1 if order is RULE else order])
-        return order
-
-    for seed in seeds:
-        simulate(Shop, {"buyer": watched}, points=Shop.order, seed=seed)
-    return 1 - sum(lost) / len(seeds) / BEST
-
-
-def test_plans_are_better_than_a_poor_rule():
-    """Beside the optimum of a model that can be solved."""
-    planner = RolloutPolicy(futures=16, horizon=3, method="replay")
-    assert share(lambda env: 1, range(40)) < 0.75
-    assert share(lambda env: planner.choose(env).best, [1, 2]) >= 0.95

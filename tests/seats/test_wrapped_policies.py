@@ -3,6 +3,7 @@
 import asyncio
 import copy
 import json
+import os
 import pickle
 import time
 
@@ -157,7 +158,7 @@ def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
     assert guarded.counts == counted(asked=60, failed=6, fallbacks=6)
 
 
-def test_contenders_with_many_fallbacks_are_marked_and_tables_without_one_have_no_column_for_it():
+def test_contenders_with_many_fallbacks_are_marked():
     contenders = {"bad": {"filler": FallbackPolicy(raises)}, "good": {"filler": FallbackPolicy(one)}}
     found = evaluate(Tank, contenders, seeds=range(3), points={Tank.fill: FILL})
     summary = found.summary()
@@ -184,6 +185,7 @@ def then_the_rule(observation, *, _decision):
     ("policy", "plain"),
     [
         (two_outside_clones, then_the_rule),
+        (RecordedPolicy(two, os.devnull), then_the_rule),
         (FallbackPolicy(illegal, two), two),
         (FallbackPolicy(illegal_later, two), two),
     ],
@@ -247,7 +249,7 @@ def test_the_same_seeds_run_again_without_one_call(kind, tmp_path):
     assert second.times == 5  # those of the new seed
 
 
-def test_what_a_crash_has_left_of_a_recording_and_answers_to_other_observations(tmp_path):
+def test_a_recording_is_used_after_a_crash_but_not_for_other_observations(tmp_path):
     path = tmp_path / "answers.jsonl"
 
     def asked_again():

@@ -209,6 +209,7 @@ REWARD = "reward_mapping"
 OBSERVED = "differently when it is observed"
 of_mapping("error", OBSERVED, "aec view, driver greenlet, seed 0", "simulation.place is first",
            "must not change it or draw random numbers", mapping=moving)  # fmt: skip
+of_mapping("error", OBSERVED, "state of the generator", like=REWARD, mapping=lambda walk: walk.random.random())
 of_mapping("error", "a mapping draws from", "should only read the model", mapping=lambda walk: [np.random.rand(), 0.0])
 of_mapping("error", "outside their space", "walker_0 has observed", "Box(-1.0, 1.0, (2,), float32)",
            mapping=Walk.observe, observation_space=spaces.Box(-1, 1, (2,), np.float32))  # fmt: skip
@@ -397,7 +398,7 @@ def test_errors_are_raised_as_assertions():
     assert "NOTE" not in str(caught.value)
 
 
-def test_checks_print_and_warn_of_nothing_and_leave_generators_and_functions_as_they_were(capsys):
+def test_a_check_prints_nothing_and_restores_generators_and_functions(capsys):
     class Loud(Walk):
         def run(self):
             print("hello")

@@ -240,7 +240,6 @@ class Reference(World):
         self.reset(seed)
         with suppress(_PendingError):
             self._end(truncated=self.run() is TRUNCATED)
-        self.trace = [what for what in self.trace if what != "over"]
 
     def _end(self, *, truncated: bool) -> None:
         self.truncated = truncated

@@ -229,6 +229,8 @@ def measure(cache: Path) -> Measured:
 
 def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
     """Read the measurements of the tests of a copy, and of the processes that they have started."""
+    from coverage.exceptions import CoverageException
+
     outcomes: dict[str, tuple[str, float]] = {}
     for name, outcome, seconds in read(notes):
         if outcomes.get(name, ("passed",))[0] == "passed":
@@ -243,10 +245,11 @@ def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
         if "" in contexts:
             at_import.add((module, line))
     for part in folder.glob("processes.*"):
-        for module, line, contexts in covered(part, folder):
-            if (module, line) not in at_import:
-                tests = {context.rpartition(" (")[0] for context in contexts} & seconds_of.keys()
-                lines.setdefault(module, {}).setdefault(line, set()).update(tests)
+        with suppress(CoverageException):  # its process was killed while it wrote
+            for module, line, contexts in covered(part, folder):
+                if (module, line) not in at_import:
+                    tests = {context.rpartition(" (")[0] for context in contexts} & seconds_of.keys()
+                    lines.setdefault(module, {}).setdefault(line, set()).update(tests)
     both = {
         module: {line: sorted(tests | set(map(twin, tests))) for line, tests in of_module.items() if tests}
         for module, of_module in lines.items()

@@ -172,7 +172,7 @@ class Evaluation:
         """Return the share of decisions that a fallback answered, by contender; empty if they are not counted."""
         if FALLBACKS not in self.frame:
             return {}
-        team = self.frame[self.frame["agent"] == TEAM].groupby("contender", sort=False)[[FALLBACKS, "length"]].sum()
+        team = self.frame[self.frame["agent"] == TEAM].groupby("contender")[[FALLBACKS, "length"]].sum()
         return {str(name): number / max(1, length) for name, number, length in team.itertuples()}
 
     def _differences(self, metric: str) -> dict[str, NDArray[np.float64]]:

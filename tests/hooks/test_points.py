@@ -10,7 +10,7 @@ from time import sleep
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, aec_env, generate_env, single_env
+from simenv_marl import RULE, aec_env, generate_env, simulate, single_env
 from simenv_marl.core import packing
 from simenv_marl.core.packing import pack, pack_plainly, unpack
 from simenv_marl.core.points import find_point, portable
@@ -115,6 +115,7 @@ def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch
         aec_env(home())
     registered += [f"{HOME}.cool", f"{HOME}.heat"]
     assert aec_env(home()).possible_agents == ["cool_0", "heat_0"]
+    assert simulate(home(), {"heat_0": lambda seen: 7}).log == [7, "cool", "air", "light"]
     registered.append("other.third")
     with pytest.raises(UnknownPointError, match="other, tests"):
         aec_env(home())

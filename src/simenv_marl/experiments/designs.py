@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
 from itertools import product
-from math import ceil, floor, prod
+from math import ceil, prod
 from string import ascii_lowercase
 from sys import float_info
 from typing import TYPE_CHECKING, Any, Final
@@ -48,10 +48,7 @@ class Factor:
         if self.levels is None and not self.is_whole:
             return self.scale(unit)
         number = self.high - self.low + 1 if self.levels is None else len(self.levels)
-        if number < EXACT:
-            places = [min(floor(u * number), number - 1) for u in unit.tolist()]
-        else:
-            places = [int(u * EXACT) * number // EXACT for u in unit.tolist()]
+        places = [int(u * EXACT) * number // EXACT for u in unit.tolist()]
         return [self.low + place if self.levels is None else self.levels[place] for place in places]
 
     def scale(self, unit: NDArray[np.float64]) -> list[Any]:

@@ -313,7 +313,8 @@ def test_wrappers_of_single_views_take_part():
 class Doubled(BaseParallelWrapper):
     def step(self, actions):
         observations, rewards, *rest = self.env.step(dict(actions))
-        return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
+        doubled = ({agent: 2 * told for agent, told in all_told.items()} for all_told in (observations, rewards))
+        return *doubled, *rest
 
 
 @METHODS
@@ -324,6 +325,8 @@ def test_wrappers_of_pettingzoo_take_part_and_see_legal_actions(method):
     env = begun(Doubled(made("parallel")))
     told = action_values(env, [RULE, 2], futures=3, method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
+    told = action_values(env, [2], futures=3, base=lambda seen: greedy(seen / 2), method=method)
+    assert told.returns == pytest.approx(2 * expected(env, "left", (2,), bases={"left": greedy}))
     masked = {"action_space": spaces.Discrete(6), "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0]}
     given = {name: replace(point, **masked) for name, point in points().items()}
     env, wrapped = aec_env(Duel, given), TerminateIllegalWrapper(aec_env(Duel, given), -1)

@@ -18,7 +18,8 @@ MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")
 @contextmanager
 def registries_put_back() -> Iterator[None]:
     """Put back what Gymnasium's and PettingZoo's registries held."""
-    registries = (gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry)
+    names = ("aec_registry", "parallel_registry")  # older releases have none
+    registries = (gymnasium.registry, *(getattr(pettingzoo, name) for name in names if hasattr(pettingzoo, name)))
     before = [dict(registry) for registry in registries]
     try:
         yield

@@ -191,7 +191,7 @@ def _versions_in(provenance: Provenance) -> dict[str, Any]:
 
 
 def _parts_of(provenance: Provenance) -> dict[str, str]:
-    """Return the parts of a provenance that affect results, as text without addresses in memory."""
+    """Return the parts of a provenance that affect results, as text without what varies."""
     options = {name: value for name, value in (provenance.get("options") or {}).items() if name != "driver"}
     parts = {**provenance, "options": options}
     return {part: VARYING.sub("", json.dumps(parts[part], sort_keys=True)) for part in MADE_OF if part in parts}

@@ -77,9 +77,8 @@ def spread(
 ) -> list[Any]:
     """Call ``work``, a function of this package, for all items in this process, or for parts of them in workers.
 
-    It gets the arguments, the items, and a progress bar. The results are in the order of the items. With -1 workers
-    there are as many as joblib's backend has. A worker gets about ``share`` parts, none of which is smaller than
-    ``least``, unless a worker would get none.
+    It gets the arguments, the items, and a progress bar. Results have the order of the items. -1 workers are as many as
+    joblib's backend has. A worker gets about ``share`` parts of at least ``least`` items, unless one would get none.
     """
     if not workers or not items:
         return [work(*arguments, items, bar)]
@@ -100,8 +99,9 @@ def spread(
             result, error = unpack_outcome(outcome)
             if error is not None:
                 raise error
-            results.append(result[0])
-            for token, numbers in result[1].items():  # what policies have counted there
+            found, counts = result
+            results.append(found)
+            for token, numbers in counts.items():
                 count(token, **numbers)
             bar.update(len(part))
     finally:

@@ -373,7 +373,8 @@ def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
     env = make(Clock((0, ant), (1, bee), (2, ant), (3, ant), (4, bee), end=5), [ant, bee, elk])
     always = {"time", "elapsed"} | ({"deciding", "acted"} if make is parallel_env else set())
     expected = {"ant_0": always | {"action_mask"}, "bee_0": always | {"action_mask"}, "elk_0": always}
-    _, infos = env.reset() or (None, env.infos)
+    told = env.reset()
+    infos = env.infos if told is None else told[1]
     assert infos.keys() == expected.keys()
     while env.agents:
         assert all(info.keys() == expected[agent] for agent, info in infos.items())
@@ -407,8 +408,8 @@ def test_a_mask_in_an_observation_without_a_decision_is_open(make):
     given = {"observation_space": seen, "observation_space_mapping": lambda: {"observations": [1.0]}}
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **MASKED, **given)
     env = make(calling(ant, bee), [ant, bee])
-    observations, _ = env.reset() or ({"bee_0": env.observe("bee_0")}, None)
-    observation = observations["bee_0"]
+    told = env.reset()
+    observation = env.observe("bee_0") if told is None else told[0]["bee_0"]
     assert observation["action_mask"].tolist() == [1] * 10
     assert observation["observations"].tolist() == [0.0]
     assert observation in (env.observation_space["bee_0"] if make is joint_env else env.observation_space("bee_0"))

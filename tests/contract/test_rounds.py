@@ -1,7 +1,6 @@
 """The parallel view: what becomes of the actions of a round."""
 
 from collections import Counter
-from functools import cache
 
 import numpy as np
 import pytest
@@ -286,12 +285,6 @@ class Rounds:
         return used, paid
 
 
-@cache
-def world_env(max_steps):
-    """An environment of a world, whose program may be changed."""
-    return parallel_env(World, World.decide, possible_agents=AGENTS, max_steps=max_steps)
-
-
 @given(
     program=st.lists(st.integers(0, 3), min_size=1, max_size=20),
     seed=st.integers(0, 16),
@@ -301,7 +294,7 @@ def world_env(max_steps):
 @settings(max_examples=250)
 @pytest.mark.filterwarnings("ignore:.*agents that did not appear")
 def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
-    env = world_env(max_steps)
+    env = parallel_env(World, World.decide, possible_agents=AGENTS, max_steps=max_steps)
     env.simulation.program = program
     reference = Rounds(program, seed, max_steps)
     _, infos = env.reset(seed=seed)

@@ -98,7 +98,8 @@ def test_rounds_have_everybody_and_are_those_of_the_living(world):
                 assert is_blank(env, agent, observations[agent])
                 assert not infos[agent]["deciding"]
         actions = {agent: chance.choice([0, 1, 2, 3, 4, 99 if agent not in present else RULE]) for agent in everybody}
-        told = observations, rewards, terminations, truncations, infos = env.step(actions)
+        told = env.step(actions)
+        observations, rewards, terminations, truncations, infos = told
         expected, paid, *_ = bare.step({agent: actions[agent] for agent in present})
         assert all(set(book) == set(everybody) for book in told)
         assert {agent: value for agent, value in rewards.items() if value} == {a: v for a, v in paid.items() if v}

@@ -58,7 +58,9 @@ class Failing(Counter):
             self.call("unwinding")
 
     def call(self, when: str) -> None:
-        (self.options or {}).get(when, {}).get(self.seed, int)()
+        happens = (self.options or {}).get(when, {})
+        if self.seed in happens:
+            happens[self.seed]()
 
 
 ONES = np.ones(4, np.int64)

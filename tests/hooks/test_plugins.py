@@ -396,7 +396,7 @@ def test_an_error_of_a_handler_says_where_it_was_attached_and_closes_the_generat
     closed.clear()
     with pytest.raises(ZeroDivisionError, match="of the handler") as caught:
         with_handlers(call, (failing, target, position))
-    assert closed == [3] * (position == "after_next")
+    assert closed == ([3] if position == "after_next" else [])
     said, *rest = notes(caught.value).splitlines()
     assert said == f"simenv_marl: in the handler failing, attached {position} {target}"
     assert rest == [] or with_handlers is of_an_environment

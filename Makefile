@@ -2,6 +2,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# Tests start hundreds of processes, each of which would compile the library anew where this is set.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo plan matrix pension check test test-studies test-all test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-browser test-oldest test-clusters test-outside release coverage mutants soak lint docs benchmark clean
 

@@ -20,8 +20,11 @@ def alone(function: Callable[..., None], *arguments: Any) -> None:
     Environments have the driver of the test that calls. The arguments are strings and numbers.
     """
     code = f"""
+import gc
 from simenv_marl.core.options import Options
 from {function.__module__} import {function.__name__}
+gc.collect()
+gc.freeze()  # so that the function's own collections look at what it makes
 Options.__init__.__kwdefaults__["driver"] = {(Options.__init__.__kwdefaults__ or {})["driver"]!r}
 {function.__name__}(*{arguments!r})
 """

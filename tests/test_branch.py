@@ -385,19 +385,22 @@ def test_selectors_of_branches_take_no_events_from_the_environment():
 
 
 @pytest.mark.parametrize("flush", [False, True])
-def test_output_of_a_branch_is_printed_once(flush):
+def test_output_of_branches_and_clones_is_printed_once_and_in_order(flush):
     code = f"""if True:
-        from simenv_marl import branch
+        from simenv_marl import branch, clone
         from tests.worlds.trips import trip
 
         env = trip()
         print("before", flush={flush})
         branch(env, lambda env, number: print("in", number, flush={flush}), method="fork")
-        print("after", flush={flush})
+        twin = clone(env, method="fork")
+        twin.unwrapped.call(lambda env: print("in a clone", flush={flush}))
+        print("after", flush=True)
     """
     command = [sys.executable, "-W", "error", "-c", code]
-    ran = subprocess.run(command, cwd=ROOT, check=True, timeout=60, capture_output=True, text=True)
-    assert ran.stdout.splitlines() == ["before", "in 0", "after"]
+    buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
+    ran = subprocess.run(command, cwd=ROOT, env=buffered, check=True, timeout=60, capture_output=True, text=True)
+    assert ran.stdout.splitlines() == ["before", "in 0", "in a clone", "after"]
     assert ran.stderr == ""
 
 

@@ -246,7 +246,7 @@ def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
     signal.setitimer(signal.ITIMER_REAL, 0.1)
     try:
         with pytest.raises(KeyboardInterrupt):
-            Fork.begin(lambda connection: None, lambda: time.sleep(60), wait=True)
+            Fork.begin(lambda connection: None, lambda: time.sleep(600), wait=True)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, handler)

@@ -49,7 +49,11 @@ def test_a_written_template_passes_its_own_tests(kind, tmp_path):
         assert "WaterTankSimulation" in text
     tested = run(tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error")
     assert tested.returncode == 0, tested.stdout
-    checked = run(tmp_path / "water_tank", "-m", "simenv_marl", "check", "water_tank:WaterTankSimulation")
+
+
+def test_the_command_check_finds_a_written_template(tmp_path):
+    assert main(["new", "plain", "water_tank", "--folder", str(tmp_path)]) == 0
+    checked = run(tmp_path, "-m", "simenv_marl", "check", "water_tank:WaterTankSimulation")
     assert checked.returncode == 0, checked.stdout + checked.stderr
     assert "nothing to complain of" in checked.stdout
 

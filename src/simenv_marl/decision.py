@@ -247,7 +247,7 @@ def fit_labels(space: Any, labels: Any) -> bool:
         parts = range(int(space.start), int(space.start + space.n))
     elif isinstance(space, spaces.Dict):
         parts = space.spaces
-    elif space is not None and space.shape is not None and len(space.shape) == 1:
+    elif len(getattr(space, "shape", None) or ()) == 1:
         parts = range(space.shape[0])
     texts = labels.values() if isinstance(labels, Mapping) else labels
     if (

@@ -1,4 +1,4 @@
-"""What is outside Python is tested with every driver. Programs in C++ are compiled for that."""
+"""Processes are tested with every driver, and what goes on in them with one. Programs in C++ are compiled for that."""
 
 import os
 import shutil

@@ -20,10 +20,12 @@ from simenv_marl.errors import (
     WrongThreadError,
 )
 from simenv_marl.remote import ProcessSimulation, guardian
-from simenv_marl.remote.child import GRACE, STDERR_TAIL, Child
+from simenv_marl.remote.child import DESCRIPTORS, GRACE, STDERR_TAIL, Child
 from tests.outside.reservoirs import BOTH, PRICE, broken, by_its_rule, child, plays_by_its_rule, reservoirs
 from tests.processes import alone, descriptors, gone, runs
 from tests.worlds.models import play
+
+pytestmark = pytest.mark.greenlet("errors of any kind are tested with every driver in the contract")
 
 IN_MID_EPISODE = {
     "garbage": (WireError, "not JSON"),
@@ -129,6 +131,24 @@ def test_long_lines_cross_in_both_directions(make_env):
     with pytest.raises(ProcessDiedError) as caught:
         env.reset()
     assert len(str(caught.value)) < 2 * STDERR_TAIL
+
+
+TALKS = f"""
+import os, time
+reading, writing = map(int, os.environ["{DESCRIPTORS}"].split(","))
+os.write(writing, b'{{"hello": 1, "points": ["a"]}}\\nno frame\\n')
+os.read(reading, 1)
+os.write(2, b"broken")
+time.sleep(600)
+"""
+
+
+def test_an_error_has_what_was_said_after_the_last_frame():
+    process = Child([sys.executable, "-c", TALKS], 60.0)
+    process.send(b"\n")
+    assert select.select([process._stderr], [], [], 60.0)[0]
+    with pytest.raises(WireError, match=r"no frame(?s:.*)broken"):
+        process.receive()
 
 
 def test_words_without_end_do_not_put_off_the_limit(monkeypatch):

@@ -65,7 +65,10 @@ def needs(name: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(bool(missing), reason=missing)
 
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # what PettingZoo says where no roster is declared
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::UserWarning"),  # what PettingZoo says where no roster is declared
+    pytest.mark.greenlet("the other process is the same with every driver: test_process.py"),
+]
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=needs(name)) for name in MODELS])
@@ -115,7 +118,6 @@ def environment(command: list[str]) -> dict[str, Any]:
     return names
 
 
-@pytest.mark.greenlet("the page takes the driver as it is")
 @needs("town")
 def test_the_code_of_the_page_on_java(here, capsys):
     (here / "Ferries.java").write_text(shown("java")[0])
@@ -130,7 +132,6 @@ def test_the_code_of_the_page_on_java(here, capsys):
     assert check_wire(command).ok
 
 
-@pytest.mark.greenlet("the page takes the driver as it is")
 @needs("town")
 def test_the_code_of_the_page_on_the_town(capsys):
     names = {"__name__": "__main__"}
@@ -142,7 +143,6 @@ def test_the_code_of_the_page_on_the_town(capsys):
     assert "by the granary" in capsys.readouterr().out
 
 
-@pytest.mark.greenlet("the page takes the driver as it is")
 def test_the_code_of_the_page_on_python(here, capsys):
     (here / "ferries.py").write_text(shown("python")[0], encoding="utf-8")
     shutil.copy(DOCS.parent / "clients" / "python" / "simenv_marl_client.py", here)

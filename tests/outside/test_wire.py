@@ -192,6 +192,16 @@ STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "oth
             VALUE + "reservoir.inflow",
             "the decisions '[abc]', '[abc]' lead to the same episode",
         ),
+        (
+            "sys.argv.append('tells')\n" + RECEIVES.format("assert 'value' not in answer"),
+            VALUE + "broker.price",
+            "AssertionError",
+        ),
+        (
+            RECEIVES.format("if 'value' in answer: self.send({'hello': {}})"),
+            VALUE + "broker.price",
+            "has sent .*'hello'",
+        ),
         (SEEDS.format("seed % 2**16"), SEED, "1 to 4 lead to the same episodes as .*: keep all 31 bits"),
         (SEEDS.format("seed & ~127 if seed > 2**24 else seed"), SEED, "1073741825 to .* lead to the same episode:"),
         (SEEDS.format("7"), SEED, 'though "reseed" changes it: seed the generators with the seed of "start"'),
@@ -209,7 +219,7 @@ STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "oth
         (SENDS.format({"hello": {"name": "dam"}}), HELLO, "the key 'name' of .* does not exist"),
         (SENDS.format({"hello": {"can": ["reseeds"]}}), HELLO, "'reseeds', which does not exist; did you mean reseed"),
     ],
-    ids=range(18),
+    ids=range(20),
 )
 def test_wire_check_says_what_is_wrong_and_what_to_do(tmp_path, change, tried, text):
     report = check_wire(changed(tmp_path, change), timeout=10.0)

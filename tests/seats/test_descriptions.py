@@ -208,6 +208,7 @@ def test_timelines_name_actions_by_their_labels():
     *[{"action_labels": labels} for labels in (["a", "b"], {0: "a", 1: "b"}, "abc", ["a", "b", 3])],
     *[{"observation_labels": labels} for labels in (["a", "b"], {"level": "a"})],
     {"observation_labels": ["a", "a"], "observation_space": spaces.Box(0, 1, (2,))},
+    {"observation_labels": ["a", "b"], "observation_space": spaces.Box(0, 1, (2, 2))},
 ])  # fmt: skip
 def test_labels_that_do_not_fit_their_space_are_refused(labels):
     with pytest.raises(SimEnvError, match=f"{next(iter(labels))} must be texts for the parts"):

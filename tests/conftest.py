@@ -42,8 +42,8 @@ def pytest_report_header(config) -> str | None:
 def pytest_collection_modifyitems(config, items) -> None:
     if config.option.order:
         random.Random(config.option.order).shuffle(items)
-        files = list(dict.fromkeys(item.path for item in items))
-        items.sort(key=lambda item: files.index(item.path))
+        places = {path: place for place, path in enumerate(dict.fromkeys(item.path for item in items))}
+        items.sort(key=lambda item: places[item.path])
 
 
 @pytest.fixture(autouse=True)

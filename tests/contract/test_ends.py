@@ -116,7 +116,7 @@ def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
     driver = Options.__init__.__kwdefaults__["driver"]
     soak.play(driver, 200, draw)
     before = soak.figures()
-    soak.play(driver, 1500, draw)
+    soak.play(driver, 1000, draw)
     after = soak.figures()
     for name in ("threads", "greenlets", "descriptors", "objects"):
         assert after[name] <= before[name] + soak.GROWTH.get(name, 0), name

@@ -87,9 +87,8 @@ def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
     fresh = run(farm_env(view, place)[0])
     env, farm = farm_env(view, place)
     kinds = list(ERRORS.items())
-    some = kinds[:6]
-    later = [] if place in farms.ONCE else some
-    for time, (kind, make) in [*product([1], kinds if view is aec_env else some), *product([3], later)]:
+    later = [] if place in farms.ONCE else kinds[:6]
+    for time, (kind, make) in [*product([1], kinds[: None if view is aec_env else 6]), *product([3], later)]:
         error = make()
         cause = error.__cause__
         farm.let(partial(throw, error), place, time)

@@ -135,7 +135,7 @@ uses = st.lists(
 
 
 @given(designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses)
-@settings(max_examples=200)
+@settings(max_examples=120)
 def test_whatever_is_done_with_some_environments_each_is_as_if_it_were_alone(design, kinds, sequence):
     players = [Player(view, design, options) for view, options in kinds]
     for which, what, number in sequence:

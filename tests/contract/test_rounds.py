@@ -291,7 +291,7 @@ class Rounds:
     max_steps=st.none() | st.integers(1, 6),
     data=st.data(),
 )
-@settings(max_examples=250)
+@settings(max_examples=150)
 @pytest.mark.filterwarnings("ignore:.*agents that did not appear")
 def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
     env = parallel_env(World, World.decide, possible_agents=AGENTS, max_steps=max_steps)

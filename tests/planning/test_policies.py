@@ -313,10 +313,10 @@ def choice(planner, model=Lock, given=None):
 @pytest.mark.filterwarnings("ignore:all futures of Lock are the same")
 def test_two_decisions_that_are_worth_something_together(method):
     tree = TreeSearchPolicy(futures=10, exploration=1.4, method=method)
-    rollouts = RolloutPolicy(futures=10, method=method)
+    rollouts = RolloutPolicy(futures=2, method=method)
     told = choice(tree)
     assert (told.best, told.counts.sum()) == (2, 50)
-    assert choice(rollouts).best is choice(TreeSearchPolicy(futures=10, depth=1, method=method)).best is RULE
+    assert choice(rollouts).best is choice(TreeSearchPolicy(futures=2, depth=1, method=method)).best is RULE
     assert simulate(Lock, {"thief": tree}, points=locked(), seed=1).tried[:2] == [2, 3]
     assert not simulate(Lock, {"thief": rollouts}, points=locked(), seed=1).open
 

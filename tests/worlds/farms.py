@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from typing import Any
 
@@ -209,15 +211,18 @@ def take(env: Any, action: Any) -> Any:
     return env.step(dict.fromkeys(env.action_space, action) if isinstance(env.action_space, spaces.Dict) else action)
 
 
+dumps = partial(json.dumps, default=lambda told: getattr(told, "tolist", told.__repr__)())
+
+
 def run(env: Any, seed: int = 11) -> str:
     """Play an episode in any view, every third decision by its rule; return what it was like."""
     answers = (RULE if number % 3 == 0 else 0 for number in count())
     if isinstance(env, AECEnv):
-        return str([turn[:6] for turn in play(env, lambda agent, env: next(answers), seed=seed)])
+        return dumps([turn[:6] for turn in play(env, lambda agent, env: next(answers), seed=seed)])
     told = [env.reset(seed=seed)]
     while env.agents if isinstance(env, ParallelEnv) else not np.any(told[-1][2:4]):
         told.append(take(env, next(answers)))
-    return str(told)
+    return dumps(told)
 
 
 def cut_short(env: Any) -> None:

@@ -22,6 +22,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from datetime import date, datetime
 from itertools import islice
+from pickle import dumps
 from textwrap import shorten
 from typing import Any, Final
 
@@ -194,7 +195,7 @@ class Subject:
         except (Exception, SystemExit, LimitReached) as error:
             run.error = None if run.cut else error
             run.stuck = time.monotonic() - run.latest > self.seconds / 2
-        run.drawn = {name for name, state in global_generators().items() if repr(state) != repr(states[name])}
+        run.drawn = {name for name, state in global_generators().items() if dumps(state) != dumps(states[name])}
         return run
 
     def run_plainly(self, seed: int, *, shared_seed: int | None = None) -> Run:

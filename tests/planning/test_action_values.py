@@ -120,7 +120,7 @@ def test_horizons_and_discounts_count_the_agents_decisions_or_time(view, given, 
     env, joint = made(view), view == "joint"
     actions = [{"left": action, "right": 1} for action in range(3)] if joint else None
     value = {"terminal_value": lambda env: np.array([10 + env.unwrapped.simulation.value])}
-    found = action_values(env, actions, futures=3, **given, **value)
+    found = action_values(env, actions, futures=3, **{"method": "replay"} | given, **value)
     reference = {name: given[name] for name in ("horizon", "discount") if name in given} | told
     terminal = None if given.get("discount") == 0 else lambda value: 10 + value
     table = expected(env, "left", both=joint, terminal=terminal, **reference)

@@ -85,7 +85,7 @@ def wide():
 
 
 def test_the_budget_is_divided_among_rounds(wide):
-    told = RolloutPolicy([*range(8), RULE], budget=96).choose(wide)
+    told = RolloutPolicy([*range(8), RULE], budget=96, method="replay").choose(wide)
     assert told.actions == RolloutPolicy(budget=96).choose(wide).actions == (*range(8), RULE)
     assert sorted(told.counts.tolist()) == [2, 2, 2, 2, 7, 7, 15, 29, 29]
     assert told.best == 7
@@ -100,13 +100,13 @@ def test_the_budget_is_divided_among_rounds(wide):
     [*[({"budget": budget}, budget) for budget in (9, 10, 17, 50)], ({"actions": [1, 4, 2], "futures": 6}, 24)],
 )
 def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
-    counts = RolloutPolicy(**given).choose(wide).counts
+    counts = RolloutPolicy(method="replay", **given).choose(wide).counts
     assert budget - 1 <= counts.sum() <= budget
     assert counts.min() >= 1
 
 
 def test_candidates_of_a_round_meet_the_same_futures(wide):
-    told = RolloutPolicy([2, 2, 2, RULE], budget=32).choose(wide)
+    told = RolloutPolicy([2, 2, 2, RULE], budget=32, method="replay").choose(wide)
     assert told.counts.tolist() == [12, 12, 4, 4]
     assert told.returns[0].tolist() == told.returns[1].tolist()
     assert told.returns[2, :4].tolist() == told.returns[0, :4].tolist()
@@ -240,7 +240,7 @@ def test_a_policy_gets_the_environment_with_its_decision_pending(many):
 
 def test_entities_plan_each_for_itself():
     point = f"{Herd.__module__}.Herd.graze"
-    told = simulate(Herd, {point: RolloutPolicy(futures=1)}, points=GRAZING, seed=1)
+    told = simulate(Herd, {point: RolloutPolicy(futures=1, method="replay")}, points=GRAZING, seed=1)
     assert told.sum == 6 * 9
 
 

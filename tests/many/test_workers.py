@@ -171,30 +171,35 @@ def test_an_interrupt_cancels_the_remaining_work(monkeypatch):
 
 
 SCRIPT = """
-    import sys, time
+    import gc, sys, time
     from simenv_marl import simulate_many
     from tests.worlds.models import define
 
-    class Model:
-        @define(observation_space_mapping=lambda model: [model.level, 0])
-        def decide(self):
-            return 0
+    def define_model():
+        global Model
 
-        def reset(self, seed):
-            self.level = seed
+        class Model:
+            @define(observation_space_mapping=lambda model: [model.level, 0])
+            def decide(self):
+                return 0
 
-        def run(self):
-            for _ in range(3):
-                self.level += self.decide()
-                if len(sys.argv) > 1:
-                    open(sys.argv[1], "w").close()
-                    time.sleep(60)
+            def reset(self, seed):
+                gc.disable()  # what a worker has got stays there
+                self.level = seed
+
+            def run(self):
+                for _ in range(3):
+                    self.level += self.decide()
+                    if len(sys.argv) > 1:
+                        open(sys.argv[1], "w").close()
+                        time.sleep(60)
 
     if __name__ == "__main__":
-        policies = {Model.decide: lambda seen: seen[:, 0].astype(int) % 5}
-        given = {"seeds": range(3), "collect": lambda model: model.level}
+        given = {"seeds": range(3), "batch_size": 1, "collect": lambda model: model.level}
         try:
-            for workers in (2, 0):
+            for workers in (2, 2, 0):
+                define_model()  # as one does again and again in a notebook
+                policies = {"__main__.Model.decide": lambda seen: seen[:, 0].astype(int) % 5}
                 print(simulate_many(Model, policies, workers=workers, **given))
         except KeyboardInterrupt:
             print("interrupted")
@@ -207,7 +212,7 @@ def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path, mo
     path, begun = tmp_path / "script.py", tmp_path / "begun"
     path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
     done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=120, check=False)
-    assert done.stdout.splitlines() == ["[0, 8, 11]"] * 2, done.stderr
+    assert done.stdout.splitlines() == ["[0, 8, 11]"] * 3, done.stderr
     command = [sys.executable, path, begun]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True) as process:
         for _ in range(600):

@@ -21,7 +21,6 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import cloudpickle
 
-from ..decision import Definition
 from ..errors import WorkerError, describe_error, error_notes
 from ..hooks.hook import Hook, hook_of, made_with, unwrap
 
@@ -71,6 +70,9 @@ class Pickler(cloudpickle.Pickler):
             reduced = _reduce_function(obj)
         elif isinstance(obj, BaseException):
             reduced = _reduce_error(obj)
+        elif isinstance(obj, Hook):
+            make, args, state = obj.__reduce__()
+            return _make, (_token_of(obj), make, args), state
         if reduced is not None:
             return reduced
         reduced = super().reducer_override(obj)
@@ -168,7 +170,7 @@ def _restore_class(made: type, sent: tuple[Any, Any, Any]) -> None:
 
 _tokens: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
-"""Functions that were sent or received, by token. A function that comes back is identical to the one that was sent."""
+"""Functions and hooks that were sent or received, by token. What comes back is identical to what was sent."""
 
 
 def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
@@ -180,9 +182,7 @@ def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
     hook = hook_of(function)
     if hook is None:
         return None
-    token = _tokens.setdefault(function, uuid4().hex)
-    _known[token] = function
-    return _make_wrapper, (token, hook, made_with(function))
+    return _make, (_token_of(function), hook.make_wrapper, (made_with(function),))
 
 
 _WAYS: Final = {
@@ -203,9 +203,15 @@ def _find(module: str | None, path: str, way: str) -> Any:
         return None
 
 
-def _make_wrapper(token: str, hook: Hook, definition: Definition | None) -> Any:
-    """Make the decision function that has a token, unless this process has it."""
+def _token_of(thing: Any) -> str:
+    token = _tokens.setdefault(thing, uuid4().hex)
+    _known[token] = thing
+    return token
+
+
+def _make(token: str, make: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    """Make the function or hook that has a token, unless this process has it."""
     if token not in _known:
-        made = _known[token] = hook.make_wrapper(definition)
+        made = _known[token] = make(*args)
         _tokens[made] = token
     return _known[token]

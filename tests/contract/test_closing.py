@@ -59,9 +59,7 @@ def _log():
 
 BOOKS = {
     BOOK: define(
-        observation_space_mapping=lambda shop: [shop.sold(), 0],
-        reward_mapping=lambda shop: shop.sold(),
-        agent="clerk",
+        observation_space_mapping=lambda shop: [shop.sold(), 0], reward_mapping=lambda shop: shop.sold(), agent="clerk"
     )
 }
 

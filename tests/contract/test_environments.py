@@ -208,12 +208,7 @@ def first_legal(observation, info=None):
 
 @pytest.mark.parametrize(
     ("policy", "answer"),
-    [
-        (first_legal, 3),
-        (lambda observation, scale=2: scale, 2),
-        (lambda *arguments: len(arguments[0]), 2),
-        (len, 2),
-    ],
+    [(first_legal, 3), (lambda observation, scale=2: scale, 2), (lambda *arguments: len(arguments[0]), 2), (len, 2)],
 )
 def test_policies_are_callables_of_the_observation_or_of_observation_and_info(policy, answer):
     masks = {"action_mask_mapping": lambda: [0] * 3 + [1] * 7} if answer == 3 else {}

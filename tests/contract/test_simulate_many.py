@@ -14,11 +14,7 @@ from hypothesis import strategies as st
 
 from simenv_marl import RULE, evaluate, simulate, simulate_many
 from simenv_marl.data import collect_episodes
-from simenv_marl.errors import (
-    InvalidActionError,
-    MissingExtraError,
-    OptionValueError,
-)
+from simenv_marl.errors import InvalidActionError, MissingExtraError, OptionValueError
 from simenv_marl.experiments import run_experiment
 from tests.worlds import worlds
 from tests.worlds.counters import same
@@ -213,9 +209,7 @@ def test_actions_come_as_anything_that_has_rows(space, answer, expected):
 
 
 @pytest.mark.parametrize(
-    "answer",
-    [[1], [1, 1, 1], [], np.int64(1), 1, None, "ab", {}, {"a": [1], "b": [1, 2]}, np.ones((3, 2))],
-    ids=repr,
+    "answer", [[1], [1, 1, 1], [], np.int64(1), 1, None, "ab", {}, {"a": [1], "b": [1, 2]}, np.ones((3, 2))], ids=repr
 )
 def test_a_wrong_number_of_actions_is_refused(answer):
     ant = decision(agent="ant_0")

@@ -138,11 +138,11 @@ def test_an_environment_says_what_it_is_made_of():
 
 
 def test_versions_are_those_of_the_packages_that_the_model_comes_from():
-    said = provenance(
-        Farm, {"mesa.examples.advanced.wolf_sheep.agents.Wolf.move": define(agent=lambda wolf: str(wolf))}
-    )
-    assert said["packages"] == {"mesa": version("mesa"), "tests": None}
-    assert said["points"] == {"mesa.examples.advanced.wolf_sheep.agents.Wolf.move": None}
+    move, untold = "mesa.examples.advanced.wolf_sheep.agents.Wolf.move", "typing_extensions.reveal_type"
+    said = provenance(Farm, {move: define(agent=str), untold: define(agent="one")})
+    versions = {package: version(package) for package in ("mesa", "typing_extensions")}
+    assert said["packages"] == versions | {"tests": None}
+    assert said["points"] == {move: None, untold: "one"}
     assert said["variant"] is None
 
 

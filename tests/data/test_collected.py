@@ -202,8 +202,7 @@ def test_policies_can_tell_decisions_apart_and_their_extras_stand_row_by_row():
 
 
 @pytest.mark.parametrize(
-    ("second", "match"),
-    [({"values": [1.0]}, "2 decisions"), ({"values": 1.0}, "2 decisions"), (None, "values")],
+    ("second", "match"), [({"values": [1.0]}, "2 decisions"), ({"values": 1.0}, "2 decisions"), (None, "values")]
 )
 def test_extras_that_do_not_fit_are_refused(second, match):
     ant = decision(agent="ant_0")

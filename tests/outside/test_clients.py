@@ -125,7 +125,7 @@ ARGUMENTS = {
             "value": [[1, 2], [0.5, {"float": "nan"}], [], "GLAD", "c", 1.5, 3, [{"1": "one"}], 7, 0.5, BIG, None],
             "full": True,
             "mark": "m",
-        },
+        }
     ],
 }
 

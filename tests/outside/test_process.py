@@ -39,16 +39,7 @@ from simenv_marl.errors import (
 from simenv_marl.experiments import design, run_experiment
 from simenv_marl.plugins import handlers
 from simenv_marl.remote import ProcessSimulation
-from tests.outside.reservoirs import (
-    BOTH,
-    INFLOW,
-    PRICE,
-    by_its_rule,
-    child,
-    command,
-    plays_by_its_rule,
-    reservoirs,
-)
+from tests.outside.reservoirs import BOTH, INFLOW, PRICE, by_its_rule, child, command, plays_by_its_rule, reservoirs
 from tests.processes import runs
 from tests.worlds import bare
 from tests.worlds.models import play

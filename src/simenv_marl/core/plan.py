@@ -125,8 +125,7 @@ class Plan:
             raise UnknownOptionError("agent is an option of single views only, as single_env makes them")
         inspected: Any = source
         self._prototypes: list[Prototype] = []
-        is_factory = not isinstance(source, type) and not hasattr(source, "run")
-        if is_factory or (points is None and getattr(source, "points", None) is None):
+        if not isinstance(source, type) or (points is None and getattr(source, "points", None) is None):
             self._prototypes.append(Prototype(source, self.options.driver))
             inspected = self._prototypes[0].simulation
         kind = inspected if isinstance(inspected, type) else type(inspected)

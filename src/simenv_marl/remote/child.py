@@ -85,8 +85,6 @@ class Child:
         self._rest = b""  # received bytes of the next lines
         self._tail = bytearray()  # the last part of its standard error
         self._owner, self._closed = os.getpid(), False
-        self._frames = self._bytes = 0  # since the latest call
-        self._since = 0.0  # when the first of these frames came
         try:
             self._start(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
@@ -194,7 +192,7 @@ class Child:
 
     def _check_flood(self) -> None:
         """Count a frame that is neither a call nor an end, so that such frames end some time."""
-        if not self._frames:
+        if not self._frames:  # the first one since the latest call
             self._bytes, self._since = 0, monotonic()
         self._frames, self._bytes = self._frames + 1, self._bytes + self._length
         if self._frames > MOST_FRAMES or self._bytes > MOST_BYTES:

@@ -6,13 +6,14 @@ import zlib
 from base64 import b64decode
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, simulate
 from simenv_marl.errors import InvalidActionError, OptionValueError, StoreError
 from simenv_marl.seats.play import replay
-from simenv_marl.seats.play.forms import action_of
+from simenv_marl.seats.play.forms import action_of, jsonable
 from simenv_marl.seats.play.game import Game
 from tests.seats.play.worlds import ORDER, BreakingShop, FixedShop, Shop
 from tests.worlds import models
@@ -199,7 +200,8 @@ def test_without_reseed_there_is_one_future_and_a_note(make_game):
     assert game.returns()["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
 
 
-def test_actions_of_all_spaces_have_a_form_in_json():
+def test_observations_and_actions_have_a_form_in_json():
+    assert jsonable({1: np.array([np.inf, 1.5]), "time": -np.inf}) == {"1": ["inf", 1.5], "time": "-inf"}
     pair = spaces.Tuple([spaces.Discrete(3), spaces.MultiDiscrete([2, 2])])
     space = spaces.Dict({"amount": spaces.Discrete(4), "pair": pair})
     action = action_of(space, {"amount": 2, "pair": [1, [0, 1]]})
@@ -324,6 +326,21 @@ def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_ga
     path.write_text("{")
     with pytest.raises(StoreError, match="cannot be read"):
         replay(path, Shop)
+
+
+def test_a_recording_has_agents_that_end_before_others(make_game, tmp_path):
+    class Closing(Shop):
+        days = 2
+
+        def run(self):
+            super().run()
+            self.end_agent("seller")
+            self.order()
+
+    game = make_game(Closing, record=tmp_path / "game.jsonl")
+    assert play(game, [1, 1, 1])["over"] == "terminated"
+    found = replay(tmp_path / "game.jsonl", Closing)
+    assert {agent: len(trajectories) for agent, trajectories in found.items()} == {"buyer": 3, "seller": 2}
 
 
 def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_game, tmp_path):

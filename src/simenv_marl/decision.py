@@ -249,17 +249,15 @@ def fit_labels(space: Any, labels: Any) -> bool:
         parts = space.spaces
     elif len(getattr(space, "shape", None) or ()) == 1:
         parts = range(space.shape[0])
-    texts = labels.values() if isinstance(labels, Mapping) else labels
-    if (
-        not isinstance(space, spaces.Discrete)
-        and isinstance(texts, Iterable)
-        and len(set(map(str, texts))) < len(parts)
-    ):
-        return False  # the parts of arrays and dicts are told apart by their labels
-    if isinstance(labels, Mapping):
-        return set(labels) == set(parts) and all(isinstance(text, str) for text in labels.values())
-    listed = isinstance(labels, Sequence) and not isinstance(labels, str) and not isinstance(space, spaces.Dict)
-    return listed and len(labels) == len(parts) and all(isinstance(text, str) for text in labels)
+    texts: list[Any] = []
+    if isinstance(labels, Mapping) and set(labels) == set(parts):
+        texts = list(labels.values())
+    elif isinstance(labels, Sequence) and not isinstance(labels, str) and not isinstance(space, spaces.Dict):
+        texts = list(labels)
+    if not len(texts) == len(parts) > 0 or not all(isinstance(text, str) for text in texts):
+        return False
+    # The parts of arrays and dicts are told apart by their labels.
+    return isinstance(space, spaces.Discrete) or len(set(texts)) == len(texts)
 
 
 def _answers(mapping: Any) -> Mapping[Any, Any] | None:

@@ -322,12 +322,14 @@ def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_
 # -- in other processes ---------------------------------------------------------------------------
 
 
-def test_a_point_is_itself_again_where_it_is_and_comes_along_with_its_hook():
+def test_a_point_is_itself_again_where_it_is_and_comes_along_with_one_hook(monkeypatch):
     local = decision(agent="local_0")
     point, _ = point_of(Home.heat)
     assert unpack(pack(point)) is point
-    hook = unpack(pack(hook_of(local)))
-    assert hook is not hook_of(local)
+    parcel = pack(hook_of(local))
+    monkeypatch.setattr(packing, "_known", {})  # as in another process
+    hook = unpack(parcel)
+    assert unpack(parcel) is hook is not hook_of(local)
     assert hook.definition.agent == "local_0"
 
 

@@ -64,7 +64,7 @@ class Pickler(cloudpickle.Pickler):
     """A pickler for objects that the default pickling would change: errors, and functions that a patch has wrapped."""
 
     def reducer_override(self, obj: Any) -> Any:
-        """How to pickle a function, an error or a class."""
+        """How to pickle a function, a hook, an error or a class."""
         reduced = None
         if isinstance(obj, FunctionType):
             reduced = _reduce_function(obj)
@@ -72,7 +72,7 @@ class Pickler(cloudpickle.Pickler):
             reduced = _reduce_error(obj)
         elif isinstance(obj, Hook):
             make, args, state = obj.__reduce__()
-            return _make, (_token_of(obj), make, args), state
+            return *_by_token(obj, make, *args), state
         if reduced is not None:
             return reduced
         reduced = super().reducer_override(obj)
@@ -180,9 +180,7 @@ def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
         if _find(*place, way) is function:
             return None if way == "itself" else (_find, (*place, way))
     hook = hook_of(function)
-    if hook is None:
-        return None
-    return _make, (_token_of(function), hook.make_wrapper, (made_with(function),))
+    return None if hook is None else _by_token(function, hook.make_wrapper, made_with(function))
 
 
 _WAYS: Final = {
@@ -203,10 +201,10 @@ def _find(module: str | None, path: str, way: str) -> Any:
         return None
 
 
-def _token_of(thing: Any) -> str:
+def _by_token(thing: Any, make: Callable[..., Any], *args: Any) -> tuple[Any, ...]:
     token = _tokens.setdefault(thing, uuid4().hex)
     _known[token] = thing
-    return token
+    return _make, (token, make, args)
 
 
 def _make(token: str, make: Callable[..., Any], args: tuple[Any, ...]) -> Any:

@@ -177,7 +177,6 @@ SCRIPT = """
 
     def define_model():
         global Model
-
         class Model:
             @define(observation_space_mapping=lambda model: [model.level, 0])
             def decide(self):

@@ -330,9 +330,8 @@ def test_a_recording_has_all_episodes_and_an_unfinished_one_is_truncated(make_ga
 
 def test_a_recording_has_agents_that_end_before_others(make_game, tmp_path):
     class Closing(Shop):
-        days = 2
-
         def run(self):
+            self.days = 2
             super().run()
             self.end_agent("seller")
             self.order()

@@ -106,17 +106,6 @@ def test_clones_have_many_generations_and_end_when_they_are_collected():
     assert gone(number)
 
 
-def test_a_clones_process_has_no_descriptors_that_it_does_not_need():
-    gc.collect()  # so that none that another test has left is closed only here
-    with open(__file__, encoding="utf-8"):  # each has its own opening
-        env = trip()
-        other, number = clone(env, method="fork"), len(descriptors())
-        twin = clone(env, method="fork")
-        twin.call(lambda env: setattr(sys, "unraisablehook", lambda unclosed: os._exit(1)))
-        for each in (twin, clone(twin, method="fork"), other):
-            assert each.call(lambda env: len(descriptors())) == number - (each is other)
-
-
 @METHODS
 def test_wrappers_keep_count(method):
     env = trip("single, limited", Free)
@@ -439,6 +428,17 @@ def starve():
         assert (children(), source.call(lambda env: children())) == (before, before if source is env else set())
 
 
-@pytest.mark.parametrize("function", [crowd, starve])
+def spare():
+    """A clone's process has no descriptors that it does not need."""
+    with open(__file__, encoding="utf-8"):  # each has its own opening
+        env = trip()
+        other, number = clone(env, method="fork"), len(descriptors())
+        twin = clone(env, method="fork")
+        twin.call(lambda env: setattr(sys, "unraisablehook", lambda unclosed: os._exit(1)))
+        for each in (twin, clone(twin, method="fork"), other):
+            assert each.call(lambda env: len(descriptors())) == number - (each is other)
+
+
+@pytest.mark.parametrize("function", [crowd, starve, spare])
 def test_clones_take_one_descriptor_each_and_leave_none(function):
     alone(function)

@@ -428,7 +428,7 @@ def starve():
         assert (children(), source.call(lambda env: children())) == (before, before if source is env else set())
 
 
-def spare():
+def lean():
     """A clone's process has no descriptors that it does not need."""
     with open(__file__, encoding="utf-8"):  # each has its own opening
         env = trip()
@@ -439,6 +439,6 @@ def spare():
             assert each.call(lambda env: len(descriptors())) == number - (each is other)
 
 
-@pytest.mark.parametrize("function", [crowd, starve, spare])
+@pytest.mark.parametrize("function", [crowd, starve, lean])
 def test_clones_take_one_descriptor_each_and_leave_none(function):
     alone(function)

@@ -249,12 +249,12 @@ def fit_labels(space: Any, labels: Any) -> bool:
         parts = space.spaces
     elif len(getattr(space, "shape", None) or ()) == 1:
         parts = range(space.shape[0])
-    texts: list[Any] = []
+    texts: list[Any] | None = None
     if isinstance(labels, Mapping) and set(labels) == set(parts):
         texts = list(labels.values())
     elif isinstance(labels, Sequence) and not isinstance(labels, str) and not isinstance(space, spaces.Dict):
         texts = list(labels)
-    if not len(texts) == len(parts) > 0 or not all(isinstance(text, str) for text in texts):
+    if texts is None or len(texts) != len(parts) or not all(isinstance(text, str) for text in texts):
         return False
     # The parts of arrays and dicts are told apart by their labels.
     return isinstance(space, spaces.Discrete) or len(set(texts)) == len(texts)

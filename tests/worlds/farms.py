@@ -211,7 +211,7 @@ def take(env: Any, action: Any) -> Any:
     return env.step(dict.fromkeys(env.action_space, action) if isinstance(env.action_space, spaces.Dict) else action)
 
 
-dumps = partial(json.dumps, default=lambda told: getattr(told, "tolist", told.__repr__)())
+dumps = partial(json.dumps, default=lambda told: [told.dtype.name, told.tolist()])
 
 
 def run(env: Any, seed: int = 11) -> str:

@@ -61,7 +61,7 @@ def unpack_outcome(parcel: bytes) -> tuple[Any, BaseException | None]:
 
 
 class Pickler(cloudpickle.Pickler):
-    """A pickler for objects that the default pickling would change: errors, and functions that a patch has wrapped."""
+    """A pickler for what the default pickling would change: errors, hooks, and functions that a patch has wrapped."""
 
     def reducer_override(self, obj: Any) -> Any:
         """How to pickle a function, a hook, an error or a class."""
@@ -72,7 +72,7 @@ class Pickler(cloudpickle.Pickler):
             reduced = _reduce_error(obj)
         elif isinstance(obj, Hook):
             make, args, state = obj.__reduce__()
-            return *_by_token(obj, make, *args), state
+            reduced = *_by_token(obj, make, *args), state
         if reduced is not None:
             return reduced
         reduced = super().reducer_override(obj)

@@ -95,11 +95,12 @@ class ProcessSimulation(SimulationInterface):
 
     def __getstate__(self) -> dict[str, Any]:
         points = {getattr(function, BY_NAME): definition for function, definition in self.points.items()}
-        of_this_process = dict.fromkeys(("_child", "_finalizer", "_frame", "_time", "_seed"))
-        return {**vars(self), "points": points, **of_this_process, "_calls": {}, "_expected": {}}
+        of_this_process = dict.fromkeys(("_child", "_finalizer", "_frame", "_calls", "_expected"))
+        return {**vars(self), "points": points, **of_this_process}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, points=_by_function(state["points"]))
+        self._clear()
 
     # -- episodes ---------------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, branch, clone, single_env
-from simenv_marl.core import run
+from simenv_marl.core import episode as run
 from simenv_marl.core.separation import loops_on
 from simenv_marl.errors import (
     BranchError,

@@ -7,7 +7,7 @@ Each module imports only from those below it::
     provenance                  the record of what an environment was made of
     session                     the simulation of one environment, over all its episodes
     episode, plan               one episode, and the life cycle of a decision; the checked description of an environment
-    run                         the state of an episode, its errors, and how it is unwound
+    rounds                      the rounds of parallel and joint views
     agent                       one agent of an episode
     split                       calls that hold many decisions
     point                       decision points and other events

@@ -104,9 +104,8 @@ class Agent:
                 point.warn_of_several(self.name)
             self.rest, self.kwargs = args, kwargs  # a strong reference: the first argument is no entity of the model
         episode.latest = self
-        decide = episode.decide
-        if decide is not None:  # in a round, after the last step, or where forced moves are skipped
-            return decide(self, episode, args, kwargs)
+        if not episode.plain:  # in a round, after the last step, or where forced moves are skipped
+            return episode.decide(self, args, kwargs)
         update = self.update  # a local variable: calling the attribute directly is slower
         update(self, args, kwargs)
         episode.pending = self
@@ -158,26 +157,10 @@ class Agent:
         legal = action if action is RULE else self.point.checked(action, self.name, self.mask)
         return episode.answer(self, legal, False)
 
-    def decide_unless_forced(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Update the agent. Its rewards add up until it has more than one legal action."""
-        self.update(self, args, kwargs)
-        forced = self.only_action()
-        self.add_carried_reward(carry_on=forced is not None or not self.asked)
-        if forced is not None:
-            return self.answer_forced(episode, forced)
-        self.asked = True
-        episode.pending = self
-        return WAIT
-
     def add_carried_reward(self, *, carry_on: bool) -> None:
         """Add the rewards of forced moves. Carry the sum on where no reward is returned, as at a reset."""
         reward = self.reward + self.carried
         self.reward, self.carried = (0.0, reward) if carry_on else (reward, 0.0)
-
-    def decide_too_late(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Truncate the episode in place of a decision, because the user has taken the last step."""
-        episode.finish(truncated=True)
-        return WAIT
 
     def answer_forced(self, episode: Episode, action: Any) -> Any:
         """Answer with the only legal action. The elapsed time adds up until the agent is asked, as rewards do."""

@@ -22,13 +22,14 @@ A decision::
       ended              ------>   ``finish``: last reward and last observation of each agent; OVER
 
 In AEC and single views an episode is played in turns: each agent is updated when its decision arises. In parallel and
-joint views it is played in rounds: all live agents are updated when a step returns (``Rounds``). Where policies answer
+joint views it is played in rounds: all live agents are updated when a step returns (``Round``). Where policies answer
 all agents (``simulate``, ``simulate_many``), agents are observed when a policy is asked, and not rewarded. While an
 episode is RESETTING or MOVING on the user's side, decision functions run their rule.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from math import inf
 from threading import current_thread
@@ -36,29 +37,160 @@ from typing import TYPE_CHECKING, Any, Final
 
 from greenlet import getcurrent
 
-from ..errors import AgentError, InvalidActionError, NoDecisionError, UnknownAgentError, listed, short_repr, warn_user
+from ..errors import (
+    AgentError,
+    ClosedError,
+    EpisodeOverError,
+    NoDecisionError,
+    NotResetError,
+    OptionValueError,
+    ReentrancyError,
+    annotate,
+    clear_frames,
+    listed,
+    short_repr,
+    warn_user,
+)
 from ..hooks.hook import Hook
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
-from .driver import WAIT
+from .context import GlobalRandom, environment_context
+from .driver import WAIT, Driver
 from .points import declared_agents, overrides
 from .policies import policy_in_branch
-from .run import Run
+from .rounds import Round
 from .spaces import duplicate
 
 if TYPE_CHECKING:
+    from .plan import Plan
     from .point import Point
 
-MANY_ROUNDS: Final = 100
-"""The number of rounds in a row without an action for the pending agent after which the user is warned."""
+LONGEST_TAPE: Final = 200_000
+"""How many answers are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""
 
 
-class Episode(Run):
-    """One run of a simulation, from its reset to its end. It has no reference to the environment."""
+class EpisodeState:
+    """What views read of an episode. A clone has no more of it than this: the rest is in its process.
 
-    __slots__ = ()
+    Attributes:
+        agents: The live agents of the environment, by name, in the order in which they joined.
+        others: The agents for which policies answer, by name.
+        ended: The agents of the environment whose episodes ended before the simulation's, by name.
+        just_ended: The ended agents whose end no view has reported yet.
+        pending: The agent whose decision waits for an answer. None while the episode moves, and when it is over.
+        consulted: The agent whose policy is being asked. In a replay, the one at whose decision the replay ends.
+        over: Whether the episode is over, and nothing moves any more.
+        terminated, truncated: How the episode ended. Both are False before its end, and if an error ended it.
+        unreported_end: Whether there were ends during the reset, which the first step reports.
+        turns: How many actions the environment's user has given.
+        round: The round that is played; None if the episode is played in turns.
+        skips: Whether a decision with one legal action is answered with it.
+        clock: Returns the simulation's time. None if the simulation has no time.
+        last_time: The time at the latest step of a joint view.
+    """
+
+    __slots__ = (
+        "agents", "clock", "consulted", "ended", "just_ended", "last_time", "others", "over", "pending", "plan",
+        "round", "seed", "skips", "terminated", "truncated", "turns", "unreported_end",
+    )  # fmt: skip
+
+    def __init__(self, plan: Plan, seed: int, clock: Callable[[], float] | None, *, in_rounds: bool) -> None:
+        self.plan, self.seed, self.clock = plan, seed, clock
+        self.round = Round() if in_rounds else None
+        self.skips = plan.options.skip_forced
+        self.agents: dict[str, Agent] = {}
+        self.others: dict[str, Agent] = {}
+        self.ended: dict[str, Agent] = {}
+        self.just_ended: list[Agent] = []
+        self.pending: Agent | None = None
+        self.consulted: Agent | None = None
+        self.over = self.terminated = self.truncated = self.unreported_end = False
+        self.turns = 0
+        self.last_time: float | None = None
+
+    @property
+    def in_rounds(self) -> bool:
+        """Whether all agents are updated when a step returns."""
+        return self.round is not None
+
+    @property
+    def deciding(self) -> Agent | None:
+        """The agent whose decision waits for the user, or for its policy."""
+        return self.pending or self.consulted
+
+    def agent(self, name: str) -> Agent | None:
+        """An agent of the environment, live or ended; None if there is no such agent."""
+        return self.agents.get(name) or self.ended.get(name)
+
+    def may_have(self, name: Any) -> bool:
+        """Whether there is an agent with that name, or could be one later."""
+        declared = self.plan.options.possible_agents
+        open_to_all = declared is None and any(point.agent is None for point in self.plan.points)
+        known = (self.agents, self.others, self.plan.roster, self.plan.policies, declared_agents(declared))
+        return any(name in names for names in known) or (open_to_all and isinstance(name, str))
+
+    def refusal(self) -> Exception:
+        """Make the error that says why no action can be taken now."""
+        return refusal("over" if self.over else "moving")
+
+    def report_end(self) -> None:
+        """Handle a step without a pending decision: report an end during the reset, or refuse."""
+        if not (self.over and self.unreported_end):
+            raise self.refusal()
+        self.unreported_end = False
+
+
+class Episode(EpisodeState):
+    """One run of a simulation, from its reset to its end. It has no reference to the environment.
+
+    Attributes:
+        entities: The agent as which an entity last decided, by its point and its id.
+        latest: The agent that decided last, for the notes of errors.
+        running: Whether the simulation's ``run`` has not ended yet.
+        failed_in_model: Whether the error that ended the episode came from the simulation.
+        most_steps: The number of turns after which the episode is truncated; infinity without ``max_steps``.
+        plain: Whether a decision of the user's agents is just updated, and waits. If not, see ``decide``.
+        tape: The answers of the user and of policies, in order. If it is full, later ones are not kept.
+        script: During a replay, the answers on the other episode's tape that are still to be given. Else None.
+        items: The items of a call that was split, until the rule has decided or another call is split.
+    """
+
+    __slots__ = (
+        "_lock", "_rng", "driver", "entities", "failed_in_model", "items", "latest", "most_steps", "plain", "running",
+        "script", "simulation", "tape", "tape_size",
+    )  # fmt: skip
+
+    def __init__(
+        self, plan: Plan, simulation: Any, driver: Driver, seed: int, rng: GlobalRandom | None, lock: Any,
+        *, in_rounds: bool = False,
+    ) -> None:  # fmt: skip
+        """Prepare the run of a simulation that has been reset. The driver's next ``resume`` begins it."""
+        clock = getattr(simulation, "time", None)
+        if clock is None and plan.options.discount_rate is not None:
+            raise OptionValueError(
+                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no method time(); add"
+                " one that returns its clock, or leave out discount_rate"
+            )
+        if clock is not None and (plan.plugins is not None or rng is not None):
+            clock = _in_context(plan.plugins, rng, clock)  # views call it, too, outside of the context
+        super().__init__(plan, seed, clock, in_rounds=in_rounds)
+        self.simulation, self.driver, self._rng, self._lock = simulation, driver, rng, lock
+        self.agents = {name: Agent(name, point, plan, clock) for name, point in plan.roster.items()}
+        self.entities: dict[tuple[Point, int], Agent] = {}
+        self.latest: Agent | None = None
+        self.running, self.failed_in_model = True, False
+        self.most_steps = plan.options.max_steps or inf
+        self.plain = not (in_rounds or self.skips)
+        self.tape: list[Any] = []  # not a deque, which takes 600 bytes
+        self.tape_size = LONGEST_TAPE + 1 if plan.has_planner or not plan.unattended else 0
+        self.script: deque[Any] | None = None
+        self.items: list[Any] | None = None
+
+    def context(self) -> environment_context:
+        """The context in which the environment's code must run."""
+        return environment_context(self.plan.plugins, self._rng, self._lock, self.driver)
 
     def events_by_hook(self) -> dict[Hook, Any]:
         """The events that the simulation sends: an agent where it is the only one of a point, else the plan's event."""
@@ -87,7 +219,7 @@ class Episode(Run):
             except BaseException as error:
                 self.fail(error)
                 raise
-        self.unreported_end = self.over
+        self.unreported_end = self.over or (self.in_rounds and bool(self.just_ended))
         if self.pending is None and not self.plan.unattended:
             forced = self.skips and any(agent.decided for agent in (*self.agents.values(), *self.just_ended))
             if not forced:
@@ -96,7 +228,8 @@ class Episode(Run):
     def step(self, action: Any, entered: bool = False) -> None:
         """Answer the pending decision by an action or ``RULE``, and run to the user's next decision, or to the end.
 
-        ``entered``: The environment's context is already entered.
+        In rounds, the action is a dict of actions by agent: see ``Round.play``. ``entered``: The environment's context
+        is already entered.
 
         Raises:
             InvalidActionError: The action is not legal. Nothing has moved.
@@ -109,6 +242,9 @@ class Episode(Run):
         if not entered and (getcurrent() is not self.driver.caller or EVALUATING):
             with self.context():
                 self.step(action, True)
+            return
+        if self.round is not None:
+            self.round.play(self, action)
             return
         try:
             if action is not RULE:
@@ -124,12 +260,6 @@ class Episode(Run):
             else:
                 self.annotate(error)
             raise
-
-    def report_end(self) -> None:
-        """Handle a step without a pending decision: report an end during the reset, or refuse."""
-        if not (self.over and self.unreported_end):
-            raise self.refusal()
-        self.unreported_end = False
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
         """Turn the checked action of an agent, or ``RULE``, into the reply for the driver's ``resume``.
@@ -165,8 +295,25 @@ class Episode(Run):
             if len(self.tape) < self.tape_size:
                 self.tape.append(recorded)
             if turns == self.most_steps:
-                self.decide = Agent.decide_too_late
+                self.plain = False
         return reply
+
+    def decide(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Handle a decision of a user's agent where more than an update is due; return ``WAIT`` or the reply."""
+        if self.round is not None:
+            return self.round.decide(self, agent, args, kwargs)
+        if self.turns >= self.most_steps:  # the user has taken the last step
+            self.finish(truncated=True)
+            return WAIT
+        agent.update(agent, args, kwargs)
+        if self.skips:
+            forced = agent.only_action()
+            agent.add_carried_reward(carry_on=forced is not None or not agent.asked)
+            if forced is not None:
+                return agent.answer_forced(self, forced)
+            agent.asked = True
+        self.pending = agent
+        return WAIT
 
     def advance(self, reply: Any) -> None:
         """Resume the simulation with a reply, and run to the user's next decision, or to the end.
@@ -230,10 +377,6 @@ class Episode(Run):
             )
         return agent
 
-    def agent(self, name: str) -> Agent | None:
-        """An agent of the environment, live or ended; None if there is no such agent."""
-        return self.agents.get(name) or self.ended.get(name)
-
     def named_before(self, point: Point, entity: Any) -> str | None:
         """The name of the agent as which an entity last decided at a point; None if it was no agent."""
         agent = self.entities.get((point, id(entity)))
@@ -274,8 +417,7 @@ class Episode(Run):
         self.others |= others
         self.agents, self.just_ended = {agent.name: agent}, []
         agent.policy, agent.delegated, agent.asked = None, False, True
-        self.__class__ = Episode  # it is played in turns from now on
-        self.decide = Agent.decide_unless_forced if self.skips else None
+        self.round, self.plain = None, not self.skips  # it is played in turns from now on
         if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
             with self.context():
                 agent.update(agent, agent.arguments(), agent.kwargs, observe=False)
@@ -290,13 +432,6 @@ class Episode(Run):
         for name, agent in self.others.items():
             if name in given and agent.policy is RULE:
                 agent.policy = self.plan.policies[name]
-
-    def may_have(self, name: Any) -> bool:
-        """Whether there is an agent with that name, or could be one later."""
-        declared = self.plan.options.possible_agents
-        open_to_all = declared is None and any(point.agent is None for point in self.plan.points)
-        known = (self.agents, self.others, self.plan.roster, self.plan.policies, declared_agents(declared))
-        return any(name in names for names in known) or (open_to_all and isinstance(name, str))
 
     # -- ends -------------------------------------------------------------------------------------
 
@@ -338,113 +473,91 @@ class Episode(Run):
         hint = "; ".join(hints) or "does the simulation call its decision functions as attributes of class or module?"
         return NoDecisionError(f"{type(self.simulation).__name__}.run() ended without a decision of {expected}; {hint}")
 
+    # -- errors, and the end by a close -------------------------------------------------------------
 
-class Rounds(Episode):
-    """An episode that is played in rounds.
+    def annotate(self, error: BaseException) -> None:
+        """Add a note to an error: at which decision of which agent it arose."""
+        agent, where = self.latest, "before the first decision"
+        if agent is not None:
+            number, when = self.turns + 1, "at"
+            if self.failed_in_model:
+                number, when = self.turns, "in the model, after"
+            where = f"{when} decision {number}, of {agent.name!r} at {agent.point.point.name}"
+        annotate(error, f"simenv_marl: {where}; seed {self.seed}")
 
-    A round uses each action once, up to the first decision without one. Then all live agents are updated.
-    """
+    def fail(self, error: BaseException) -> None:
+        """End the episode because of an error, and add a note to the error that says where it arose."""
+        self.pending, self.over = None, True  # first, because the next call may come to the end of the stack
+        self.annotate(error)
+        try:
+            problems = self._unwind()
+        except Warning as warning:  # warnings may be errors; this one must not replace the original error
+            problems = [warning]
+        for problem in problems:
+            annotate(error, f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well")
+        clear_frames(error)
 
-    __slots__ = ()
-    in_rounds = True
-
-    def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
-        """Run the simulation to its first decision: see ``Episode``. The first round reports the ends until then."""
-        self.decide, self.actions, self.stalled, self.given, self.unused = decide, {}, 0, 0, 0
-        super().begin(at_first_event)
-        self.unreported_end = self.over or bool(self.just_ended)
-
-    def step(self, action: Mapping[str, Any], entered: bool = False) -> None:
-        """Play a round with an action, or ``RULE``, for each agent's name: see ``Episode``.
-
-        An action that is legal now and illegal at its turn counts as missing.
+    def close(self) -> None:
+        """Unwind the simulation if it is suspended, without answering its decisions.
 
         Raises:
-            UnknownAgentError: An action is for an agent that is not live. Nothing has moved.
+            ReentrancyError, WrongThreadError: The simulation is moving, or suspended in another thread.
         """
-        pending = self.pending
-        if pending is None:
-            self.report_end()
-            return
-        if not entered and (getcurrent() is not self.driver.caller or EVALUATING):
+        if self.running and (self.driver.lost or self.driver.given_up is not None):
+            self.running, self.over = False, True
+        if self.pending is None and not self.over:
+            raise self.refusal()
+        if self.running:
             with self.context():
-                self.step(action, True)
-            return
-        self.actions = actions = self.check(action)
-        self.pending = None
+                for problem in self._unwind():
+                    self.annotate(problem)
+                    raise problem
+        self.pending, self.over = None, True
+
+    def _unwind(self) -> list[BaseException]:
+        """Unwind the simulation if it is suspended; then the episode is over. Return the errors that it raised."""
+        problems: list[BaseException] = []
+        if self.driver.given_up is not None:  # it was inherited by a fork
+            self.running = False
+        self.pending, self.over = None, not self.running  # until then it moves
+        if self.over:
+            return problems
         try:
-            if len(self.tape) < self.tape_size:
-                answers = {name: part if type(part) is int else duplicate(part) for name, part in actions.items()}
-                self.tape.append(answers)
-            self.turns += bool(action)
-            for agent in (*self.agents.values(), *self.just_ended):
-                agent.acted = False
-            if self.unreported_end:
-                self.unreported_end = False
-            else:
-                self.just_ended = []
-            reply = self.use_action(pending)
-            self.stalled = self.stalled + 1 if reply is WAIT else 0
-            if reply is not WAIT:
-                self.advance(reply)
-            if not self.skips:  # else forced moves are not asked for
-                self.unused += sum(part is not RULE for part in actions.values())
-            if not self.over and self.consulted is None:  # it is set where a replay ends
-                self.update_all(truncated=bool(action) and self.turns == self.most_steps)
-        except BaseException as error:
-            self.fail(error)
-            raise
-        if self.stalled == MANY_ROUNDS:
-            warn_user(
-                f"the simulation stands still: {short_repr(pending.name)} must decide, but {MANY_ROUNDS} rounds in a"
-                ' row had no action for it; the info of the agent that must decide has "deciding": True'
-            )
-
-    def check(self, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Check the actions of a round before the simulation moves; return them in the form that mappings take."""
-        pending, agents, checked = self.pending, self.agents, {}
-        if type(actions) is not dict and not isinstance(actions, Mapping):
-            raise InvalidActionError(f"a round takes a dict of actions by agent, not {short_repr(actions)}")
-        for name, action in actions.items():
-            agent = agents.get(name)
-            if agent is None:
-                if self.unreported_end and name in self.ended:
-                    continue
-                raise UnknownAgentError(
-                    f"there is an action for {short_repr(name)}, which is not a live agent; live agents:"
-                    f" {listed(agents)}"
-                )
-            if action is not RULE:
-                check = agent.point.check
-                legal = check(action)
-                mask = agent.mask if agent is pending else None
-                if legal is ILLEGAL or mask is not None:
-                    legal = agent.point.checked(action, name, mask)
-                action = legal
-                self.given += 1
-            checked[name] = action
-        return checked
-
-    def use_action(self, agent: Agent) -> Any:
-        """Answer a decision with the agent's action of this round, or wait for the next round."""
-        action = agent.only_action() if self.skips else None
-        if action is None:
-            action = self.actions.pop(agent.name, WAIT)
-            mask = agent.mask
-            if action is WAIT or (mask is not None and action is not RULE and not agent.point.allows(mask, action)):
-                self.pending = agent
-                return WAIT
-            agent.acted = True
-        self.latest = agent
-        if not agent.decided:  # it acts before it was ever updated
-            agent.update(agent, agent.arguments(), agent.kwargs, observe=False)
-        return self.answer(agent, action, False)
+            try:
+                stop = getattr(self.simulation, "stop", None)
+                if stop is not None:
+                    stop()
+            except BaseException as error:
+                problems.append(error)
+            problems += self.driver.unwind()
+            self.running = False
+        finally:
+            self.over = True
+        if self.driver.given_up is not None:
+            warn_user(f"{type(self.simulation).__name__} {self.driver.given_up}.", ResourceWarning)
+        return problems
 
 
-def decide(agent: Agent, episode: Rounds, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Handle a decision in a round: the agent was observed when the latest step returned."""
-    if agent.point.legal is not None:
-        agent.mask, agent.choices = agent.point.legal(args, kwargs)
-    if agent.clock is not None:
-        agent.read_clock(agent)
-    return episode.use_action(agent)
+def refusal(state: str) -> Exception:
+    """Make the error that says why no action can be taken in a state of an environment."""
+    return {
+        "new": NotResetError("there is no episode yet; call reset() first"),
+        "copied": NotResetError(
+            "this is a copy of an environment, and has no episode yet; call reset() first, or use clone() to go on from"
+            " where the original stands"
+        ),
+        "moving": ReentrancyError(
+            "the environment was used from inside its own reset, simulation or mappings, or while another thread was"
+            " using it"
+        ),
+        "over": EpisodeOverError("the episode is over; call reset() to begin the next one"),
+        "closed": ClosedError("the environment is closed; call reset() to use it again"),
+    }[state]
+
+
+def _in_context(plugins: Any, rng: GlobalRandom | None, function: Callable[[], Any]) -> Callable[[], Any]:
+    def call() -> Any:
+        with environment_context(plugins, rng):
+            return function()
+
+    return call

@@ -15,26 +15,23 @@ from typing import Any
 from ..errors import BranchError, ClosedError, annotate, describe_error, short_repr, warn_user
 from .agent import Agent
 from .context import ExclusiveLock
-from .episode import Episode, Rounds
+from .episode import EpisodeState
 from .forks import Fork, exhausted, send
 from .host import FIELDS, MOVES, State, layers_of, pack_env, pack_reply, state_of, unpack_env
 from .packing import pack, pack_plainly, unpack, unpack_error
 from .session import Session
 
 
-class Mirror(Episode):
+class Mirror(EpisodeState):
     """The episode of a clone, as its view sees it: the agents, and what is pending, as of the latest reply."""
 
     __slots__ = ("remote",)
 
     def __init__(self, remote: ForkedSession, state: State) -> None:
         """Mirror a state that lists all agents."""
-        nothing: Any = None
-        self.remote, self.plan, self.seed = remote, remote.plan, remote.seed or 0
-        self.simulation = self.driver = self.latest = self.consulted = self.script = nothing
-        self.clock = None if state.time is None else partial(getattr, remote, "time")
-        self.agents, self.others, self.ended, self.entities = {}, {}, {}, {}
-        self.running, self.skips, self.given, self.unused = True, False, 0, 0
+        self.remote = remote
+        clock = None if state.time is None else partial(getattr, remote, "time")
+        super().__init__(remote.plan, remote.seed or 0, clock, in_rounds=state.in_rounds)
         self.unreported_end, self.last_time = state.unreported_end, state.last_time
         self.load(state)
 
@@ -68,12 +65,6 @@ class Mirror(Episode):
         self.remote.request("step", action)
 
 
-class MirrorOfRounds(Mirror, Rounds):
-    """The same for an episode that is played in rounds."""
-
-    __slots__ = ()
-
-
 class ForkedSession(Session):
     """The session of a clone in a forked process.
 
@@ -95,7 +86,7 @@ class ForkedSession(Session):
         self._gone: str | None = None  # why the process is gone
         self._renewed = self._warned = False
         self._stepped: bool = self._made_from is not None and self._made_from._stepped
-        self.episode = None
+        self.episode: Any = None
         self.time: float | None = None
         fork.limit(time_limit)
 
@@ -180,7 +171,7 @@ class ForkedSession(Session):
             if isinstance(self.episode, Mirror) and not whole:
                 self.episode.load(state)
             else:
-                self.episode = (MirrorOfRounds if state.in_rounds else Mirror)(self, state)
+                self.episode = Mirror(self, state)
         elif whole is not None:
             self.episode = None
         if error is None:
@@ -235,14 +226,13 @@ class ForkedSession(Session):
 
     def start(
         self, seed: int | None, options: dict[str, Any] | None, *, in_rounds: bool = False, script: Any = None
-    ) -> Episode:
+    ) -> Any:
         """Reset the simulation in the clone's process."""
         self.options, self.seed = options, self.seed_for(seed)
         self.episode, self.state = None, "over"
         self._renewed = True
         self.request("start", self.seed, options, in_rounds)
-        episode: Any = self.episode
-        return episode  # type: ignore[no-any-return]
+        return self.episode
 
     def end(self) -> None:
         """Forget the episode. It ends when another begins, or with the process."""

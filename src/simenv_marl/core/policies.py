@@ -109,9 +109,7 @@ def policy_in_branch(policy: Any, agent: str, episode: Any) -> Callable[[Any, An
     asked = two_arguments(base)
     if not isinstance(asked, AskingPolicy):
         return asked
-    return lambda observation, info: asked.ask(
-        observation, info, episode, episode.consulted or episode.pending, None, in_clone=True
-    )
+    return lambda observation, info: asked.ask(observation, info, episode, episode.deciding, None, in_clone=True)
 
 
 class Caller:
@@ -207,7 +205,7 @@ class AskingPolicy:
                 " there is no environment; pass the policy in policies="
             )
         episode = session.episode
-        agent = episode.consulted or episode.pending
+        agent = episode.deciding
         in_branch = episode.plan.solo or PLANNING.get()
         policy: Any = self.policy
         if self.plans and in_branch:

@@ -22,10 +22,9 @@ from ..hooks.handlers import Installation
 from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, GlobalRandom, environment_context, reuse_resources
 from .driver import Driver
-from .episode import Episode, Rounds
+from .episode import LONGEST_TAPE, Episode, refusal
 from .plan import DRIVERS, Plan
 from .rng import ENVIRONMENT, draws_check, is_seed, seed_globals
-from .run import LONGEST_TAPE, refusal
 from .spaces import same
 
 
@@ -167,8 +166,8 @@ class Session:
         self._close = closer(self.simulation)
         if self.bound_plan is None and self.plan.is_bound_to_simulation:
             self.bound_plan = self.plan.with_simulation(self.simulation, self)
-        kind = Rounds if in_rounds else Episode
-        episode = kind(self.bound_plan or self.plan, self.simulation, self._driver, seed, self._rng, self.lock)
+        plan = self.bound_plan or self.plan
+        episode = Episode(plan, self.simulation, self._driver, seed, self._rng, self.lock, in_rounds=in_rounds)
         episode.script = None if script is None else deque(script)
         self._driver.begin(self.simulation.run, episode.events_by_hook(), context)
         try:
@@ -329,7 +328,7 @@ class _Reseeded:
 
 def _decision(episode: Episode) -> Any:
     """What the pending decision of an episode looks like; None if there is none."""
-    agent = episode.pending or episode.consulted
+    agent = episode.deciding
     return agent and (agent.name, list(episode.agents), agent.observation, agent.mask)
 
 

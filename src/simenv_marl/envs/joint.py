@@ -62,7 +62,7 @@ class Joint:
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
             raise InvalidActionError("RULE is not an action in vector environments; use joint_env, or policies=")
-        episode.check(actions)  # type: ignore[attr-defined]
+        episode.round.check(episode, actions)  # type: ignore[union-attr]
 
     def observe(self, episode: Episode) -> Any:
         """Return the observations of all agents; an agent that has ended keeps its last observation."""

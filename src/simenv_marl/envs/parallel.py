@@ -76,10 +76,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 self.agents = []
             raise
         self.agents = [] if episode.over else list(episode.agents)
-        if episode.over and not self._warned and 10 * episode.unused > episode.given:
+        played: Any = episode.round
+        if episode.over and not self._warned and 10 * played.unused > played.given:
             self._warned = True
             warn_user(
-                f"of {episode.given} actions in this episode, {episode.given - episode.unused} were used: the agents do"
+                f"of {played.given} actions in this episode, {played.given - played.unused} were used: the agents do"
                 " not decide in each round, and the other actions are lost. aec_env loses none; joint_env gives one"
                 ' controller all of them; infos[agent]["acted"] tells which were used'
             )

@@ -124,7 +124,7 @@ class PlannerEnv(SimulationEnv):
     def _set_up(self) -> None:
         episode: Any = self._session.episode
         if episode is not None:  # otherwise the session is going to replay one
-            self._own = episode.consulted or episode.pending
+            self._own = episode.deciding
             self._agent, self._definition = self._own.name, self._own.point.definition
             self._roster = {self._agent: self._own.point}
         self._shows = False
@@ -144,7 +144,7 @@ class PlannerEnv(SimulationEnv):
     def _check_pending(self) -> None:
         """Refuse a branch after the planner has returned its action."""
         episode = self.episode
-        if (episode.pending or episode.consulted) is not self._own:
+        if episode.deciding is not self._own:
             raise episode.refusal()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

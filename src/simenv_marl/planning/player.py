@@ -51,7 +51,7 @@ class Player:
     def __init__(self, env: Any, base: Any) -> None:
         self.env, self.view, self.base = env, env.unwrapped, base
         self.episode = self.view.episode
-        self.record: Agent = self.episode.pending or self.episode.consulted
+        self.record: Agent = self.episode.deciding
         self.agent = self.record.name
         self.may_be: Callable[[Any], bool] = self.episode.may_have
         self.over = False
@@ -203,7 +203,7 @@ class JointPlayer(Player):
 
     def _check(self, action: Any, mask: Any) -> None:
         if self._space_of(self.agent) == self.view.action_space:
-            self.episode.check(self.view.joint.actions(self.episode, action))
+            self.episode.round.check(self.episode, self.view.joint.actions(self.episode, action))
         elif isinstance(action, Mapping):
             super()._check({name: self._sample(name) if part is RULE else part for name, part in action.items()}, mask)
         else:

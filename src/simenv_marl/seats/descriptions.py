@@ -130,7 +130,7 @@ def _normal(text: str) -> str | float:
 def pending(env: Any) -> Decision:
     """Return the pending decision of an environment of this process."""
     episode = env.unwrapped.episode
-    return decision_of(episode, episode.pending or episode.consulted)
+    return decision_of(episode, episode.deciding)
 
 
 def _describe_pending(env: Any, as_json: bool) -> Any:

@@ -18,7 +18,7 @@ from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
 from .actions import MASK, only_choice
 from .driver import WAIT
-from .policies import AskingPolicy, DeferredPolicy
+from .policies import AskingPolicy, DeferredPolicy, Where
 from .spaces import duplicate
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class Agent:
         if alone:
             self.keep(episode, args, kwargs)
         deferred = isinstance(policy, DeferredPolicy)
-        if deferred and not episode.plan.solo:
+        if deferred and episode.where < Where.BRANCH:
             episode.pending = self
             return WAIT
         if episode.script:
@@ -149,7 +149,8 @@ class Agent:
                 episode.pending = self
                 return WAIT
             try:
-                action = policy.alone(episode, self) if deferred else policy(self.observation, self.info)
+                seen = self.observation, self.info
+                action = policy.answer(episode, self, *seen) if alone or deferred else policy(*seen)
             finally:
                 episode.consulted = None
         if len(episode.tape) < episode.tape_size:

@@ -39,6 +39,7 @@ from .forks import CAN_FORK, Fork, flush, send
 from .host import DEEPEST, DEPTH, Host, separator_of
 from .mirror import ForkedSession
 from .packing import pack_outcome, pack_plainly, unpack_outcome
+from .policies import Where
 from .rng import PROCESS, is_seed, seed_globals
 from .session import Session
 
@@ -172,7 +173,7 @@ def branch(
         try:
             twin = getattr(continuation, "unwrapped", continuation)
             twin._begin_branch()
-            twin._session.is_copy = True
+            twin._session.move_to(Where.CLONE)
             if seeds is not None:
                 seed_globals(int(seeds[number]), PROCESS)
                 twin._session.reseed(int(seeds[number]))

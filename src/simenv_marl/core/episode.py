@@ -59,7 +59,7 @@ from .agent import Agent
 from .context import GlobalRandom, environment_context
 from .driver import WAIT, Driver
 from .points import declared_agents, overrides
-from .policies import policy_in_branch
+from .policies import Where, policy_for, two_arguments
 from .rounds import Round
 from .spaces import duplicate
 
@@ -87,19 +87,20 @@ class EpisodeState:
         turns: How many actions the environment's user has given.
         round: The round that is played; None if the episode is played in turns.
         skips: Whether a decision with one legal action is answered with it.
+        where: Where it is played, from which follows which policies are asked themselves.
         clock: Returns the simulation's time. None if the simulation has no time.
         last_time: The time at the latest step of a joint view.
     """
 
     __slots__ = (
         "agents", "clock", "consulted", "ended", "just_ended", "last_time", "others", "over", "pending", "plan",
-        "round", "seed", "skips", "terminated", "truncated", "turns", "unreported_end",
+        "round", "seed", "skips", "terminated", "truncated", "turns", "unreported_end", "where",
     )  # fmt: skip
 
     def __init__(self, plan: Plan, seed: int, clock: Callable[[], float] | None, *, in_rounds: bool) -> None:
         self.plan, self.seed, self.clock = plan, seed, clock
         self.round = Round() if in_rounds else None
-        self.skips = plan.options.skip_forced
+        self.skips, self.where = plan.options.skip_forced, Where.USER
         self.agents: dict[str, Agent] = {}
         self.others: dict[str, Agent] = {}
         self.ended: dict[str, Agent] = {}
@@ -153,13 +154,14 @@ class Episode(EpisodeState):
         most_steps: The number of turns after which the episode is truncated; infinity without ``max_steps``.
         plain: Whether a decision of the user's agents is just updated, and waits. If not, see ``decide``.
         tape: The answers of the user and of policies, in order. If it is full, later ones are not kept.
+        session: Returns its session, for the environment that planners get.
         script: During a replay, the answers on the other episode's tape that are still to be given. Else None.
         items: The items of a call that was split, until the rule has decided or another call is split.
     """
 
     __slots__ = (
         "_lock", "_rng", "driver", "entities", "failed_in_model", "items", "latest", "most_steps", "plain", "running",
-        "script", "simulation", "tape", "tape_size",
+        "script", "session", "simulation", "tape", "tape_size",
     )  # fmt: skip
 
     def __init__(
@@ -186,6 +188,7 @@ class Episode(EpisodeState):
         self.tape: list[Any] = []  # not a deque, which takes 600 bytes
         self.tape_size = LONGEST_TAPE + 1 if plan.has_planner or not plan.unattended else 0
         self.script: deque[Any] | None = None
+        self.session: Callable[[], Any] = lambda: None
         self.items: list[Any] | None = None
 
     def context(self) -> environment_context:
@@ -411,7 +414,8 @@ class Episode(EpisodeState):
         others = {name: other for name, other in self.agents.items() if other is not agent}
         if others:
             self.most_steps = inf  # ``max_steps`` counts the steps of other agents
-        self.plan = self.plan.for_one(agent.name)
+        self.plan, self.where = self.plan.for_one(agent.name), max(self.where, Where.BRANCH)
+        self.tape, self.tape_size = [], 0  # it cannot be replayed, because this is not on the tape
         for name, other in others.items():
             other.policy, other.delegated = self.plan.policy_of(name, other.point), True
         self.others |= others
@@ -425,13 +429,15 @@ class Episode(EpisodeState):
 
     def delegate(self, policies: Mapping[str, Any]) -> None:
         """In a branch, let policies, given by agent, answer for agents that neither the user nor a policy answers."""
-        given = {name: policy for name, policy in policies.items() if policy is not RULE and name not in self.agents}
-        self.plan = self.plan.with_policies(
-            {name: policy_in_branch(policy, name, self) for name, policy in given.items()}
-        )
+        given: dict[str, Any] = {}
+        for name in policies.keys() - self.agents.keys():
+            policy = policy_for(policies, name, self.where)
+            if policy is not RULE:
+                given[name] = two_arguments(policy)
+        self.plan = self.plan.with_policies(given)
         for name, agent in self.others.items():
             if name in given and agent.policy is RULE:
-                agent.policy = self.plan.policies[name]
+                agent.policy = given[name]
 
     # -- ends -------------------------------------------------------------------------------------
 

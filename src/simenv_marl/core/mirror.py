@@ -19,6 +19,7 @@ from .episode import EpisodeState
 from .forks import Fork, exhausted, send
 from .host import FIELDS, MOVES, State, layers_of, pack_env, pack_reply, state_of, unpack_env
 from .packing import pack, pack_plainly, unpack, unpack_error
+from .policies import Where
 from .session import Session
 
 
@@ -32,6 +33,7 @@ class Mirror(EpisodeState):
         self.remote = remote
         clock = None if state.time is None else partial(getattr, remote, "time")
         super().__init__(remote.plan, remote.seed or 0, clock, in_rounds=state.in_rounds)
+        self.where = remote.where
         self.unreported_end, self.last_time = state.unreported_end, state.last_time
         self.load(state)
 
@@ -77,7 +79,7 @@ class ForkedSession(Session):
     def __init__(self, original: Session, fork: Fork, time_limit: float) -> None:
         """Take over a process in which the episode of a session goes on."""
         self.plan, self.bound_plan = original.plan, None
-        self.is_copy = True
+        self.where = Where.CLONE
         self.state, self.options, self.seed = "over", original.options, original.seed
         self.np_random_seed, self._np_random = original.np_random_seed, copy.deepcopy(original._np_random)
         self.exclusive = self.lock = ExclusiveLock()

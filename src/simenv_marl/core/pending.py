@@ -67,7 +67,7 @@ class Decision:
         self._agent.fallbacks += 1
 
 
-def decision_of(episode: Episode, agent: Agent, *, in_clone: bool = False) -> Decision:
+def decision_of(episode: Episode, agent: Agent) -> Decision:
     """Describe the decision of an agent that is pending, or is put to a policy."""
     point, choices = agent.point, agent.choices
     call = agent.arguments() or (), agent.kwargs
@@ -85,7 +85,7 @@ def decision_of(episode: Episode, agent: Agent, *, in_clone: bool = False) -> De
         observation_labels=point.observation_labels(*call),
         reward=agent.reward,
         doc=point.point.function.__doc__,
-        in_clone=in_clone or episode.plan.solo,
+        in_clone=episode.where > 0,
         memory=agent.memory,
         _agent=agent,
     )

@@ -45,7 +45,7 @@ from .points import (
     resolve_policies,
     resolve_roster,
 )
-from .policies import AskingPolicy, DeferredPolicy, bind_session
+from .policies import AskingPolicy, DeferredPolicy
 from .split import Split
 from .threads import ThreadDriver
 
@@ -85,9 +85,8 @@ class Plan:
         active: The decision points that the environment's user answers.
         events: For each hook, the event that the simulation sends when its function is called.
         policies: By agent name, the policies of agents that are not agents of the environment.
-        is_bound_to_simulation: Whether a mapping asks for the simulation, or a policy is asked alone.
+        is_bound_to_simulation: Whether a mapping asks for the simulation.
         has_planner: Whether a policy asks for the environment, and so may branch it.
-        solo: Whether this is the plan of a branch that waits for one agent only.
         unmatched_names: The agents that ``policies`` and ``possible_agents`` name. Agents that do not appear in an
             episode are removed from this set, with one warning.
         one_agent: The name of the only agent that the environment's user answers for. None if there may be several.
@@ -120,7 +119,7 @@ class Plan:
         if self.variant is not None:
             source, points, options = self.variant.environment_arguments(points, options)
         self.source, self.options = source, Options().amended(options)
-        self.unattended, self.rewarded, self._others, self.solo = unattended, rewarded, others, False
+        self.unattended, self.rewarded, self._others = unattended, rewarded, others
         if unattended and self.options.agent is not None:
             raise UnknownOptionError("agent is an option of single views only, as single_env makes them")
         inspected: Any = source
@@ -159,9 +158,8 @@ class Plan:
         self.plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
         self.unmatched_names = {*self.policies, *declared_agents(options.possible_agents)}
         policies = (*self._by_point.values(), *self.policies.values())
-        alone = [policy for policy in policies if isinstance(policy, AskingPolicy)]
-        self.has_planner = any(policy.plans for policy in alone)
-        self.is_bound_to_simulation = bool(alone) or any(
+        self.has_planner = any(isinstance(policy, AskingPolicy) and policy.plans for policy in policies)
+        self.is_bound_to_simulation = any(
             given_simulation(definition, None) is not definition for definition in self._definitions.values()
         )
         self._prepare_points()
@@ -294,17 +292,14 @@ class Plan:
         vars(made).update(vars(self), **changes)
         return made
 
-    def with_simulation(self, simulation: Any, session: Any) -> Plan:
-        """The same plan, in which mappings and policies get the simulation or the session that they ask for."""
-        return self._changed(
-            _definitions={key: given_simulation(value, simulation) for key, value in self._definitions.items()},
-            _by_point={key: bind_session(policy, session) for key, policy in self._by_point.items()},
-            policies={key: bind_session(policy, session) for key, policy in self.policies.items()},
-        )._prepare_points()
+    def with_simulation(self, simulation: Any) -> Plan:
+        """The same plan, in which mappings get the simulation that they ask for."""
+        definitions = {key: given_simulation(value, simulation) for key, value in self._definitions.items()}
+        return self._changed(_definitions=definitions)._prepare_points()
 
     def for_one(self, agent: str) -> Plan:
         """The plan of a branch that waits for one agent only. The rule decides for agents without a policy."""
-        return self._changed(unattended=True, rewarded=False, solo=True, one_agent=agent, unmatched_names=set())
+        return self._changed(unattended=True, rewarded=False, one_agent=agent, unmatched_names=set())
 
     def with_policies(self, policies: Mapping[str, Any]) -> Plan:
         """The plan of a branch in which policies, given by agent, answer for agents that have none."""

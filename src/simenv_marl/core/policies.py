@@ -3,29 +3,40 @@
 A *planner* has a keyword-only parameter ``_environment``, and gets the environment in which it decides. A policy with
 ``_decision`` gets the pending ``Decision``. A policy that is a coroutine function is awaited.
 
-In branches of an environment, and where a planner tries a candidate, no policy gets an environment, because two
-planners would ask each other without end. There the planner's attribute ``base`` answers, or the rule if it has none.
-In clones, no policy that waits or records is asked: its attribute ``fallback`` answers, or the rule.
+In copies of an environment, some policies are not asked themselves: see ``Where`` and ``policy_for``.
 """
 
 from __future__ import annotations
 
-import copy
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from contextvars import ContextVar
+from enum import IntEnum
 from functools import partial
 from importlib import import_module
 from typing import Any, Final
-from weakref import ref
 
 from ..errors import OptionValueError, short_repr
 from ..simulation import RULE, asks_for, positional
 from .awaiting import wait_for
 from .pending import decision_of
 
-PLANNING: Final[ContextVar[bool]] = ContextVar("simenv_marl.planning", default=False)
-"""Whether this code runs in a branch in which a planner tries a candidate action."""
+
+class Where(IntEnum):
+    """Where an episode is played. Each place asks fewer policies themselves than those before it."""
+
+    USER = 0
+    """In the user's environment: all policies."""
+
+    CLONE = 1
+    """In a clone or a branch: none that waits or records."""
+
+    BRANCH = 2
+    """In a branch that a policy has made of the environment that it gets: nor any that gets an environment, because two
+    planners would ask each other without end."""
+
+    PLAN = 3
+    """In a branch in which a planner tries a candidate: as before, and planners answer by their base."""
+
 
 ASKED: Final = ("_environment", "_decision")
 """The keyword-only parameters by which policies ask for more."""
@@ -65,22 +76,18 @@ def two_arguments(policy: Callable[..., Any]) -> Callable[[Any, Any], Any]:
     return policy if takes_info(policy) else lambda observation, info: policy(observation)
 
 
-def base_of(base: Any, agent: str) -> Any:
-    """Find the base of an agent, which is ``RULE`` or a policy, in a base, a dict of these by agent, or a planner."""
-    while True:
-        if isinstance(base, Mapping):
-            base = base.get(agent, RULE)
-        elif hasattr(base, "base") and is_planner(base):
-            base = base.base
+def policy_for(policy: Any, agent: str, where: Where) -> Any:
+    """Return what answers for a policy (or policies by agent): itself, the one that stands for it, or ``RULE``."""
+    while policy is not RULE:
+        if isinstance(policy, Mapping):
+            policy = policy.get(agent, RULE)
+        elif where >= Where.BRANCH and is_planner(policy):
+            policy = getattr(policy, "base", RULE)
+        elif where >= Where.CLONE and (waits(policy) or getattr(policy, "records", False) is True):
+            policy = getattr(policy, "fallback", RULE)
         else:
-            return base
-
-
-def stand_in(policy: Any) -> Any:
-    """Return what answers for a policy in clones: ``RULE`` or another policy for those that wait or record."""
-    while waits(policy) or getattr(policy, "records", False) is True:
-        policy = getattr(policy, "fallback", RULE)
-    return policy
+            return policy
+    return RULE
 
 
 COUNTS: Final[dict[str, dict[str, float]]] = {}
@@ -99,17 +106,6 @@ def has_fallback(policy: Any) -> bool:
     while isinstance(policy, PolicyWrapper) and not policy.counts_fallbacks:
         policy = policy.policy
     return isinstance(policy, PolicyWrapper)
-
-
-def policy_in_branch(policy: Any, agent: str, episode: Any) -> Callable[[Any, Any], Any]:
-    """Return what answers for a policy in the episode of a branch, as a callable of observation and info."""
-    base = stand_in(base_of(policy, agent))
-    if is_planner(base) or not callable(base):
-        return lambda observation, info: RULE
-    asked = two_arguments(base)
-    if not isinstance(asked, AskingPolicy):
-        return asked
-    return lambda observation, info: asked.ask(observation, info, episode, episode.deciding, None, in_clone=True)
 
 
 class Caller:
@@ -166,16 +162,32 @@ class PolicyWrapper:
         self.__signature__ = inspect.Signature(seen + asked)
 
 
-class DeferredPolicy:
-    """A policy that answers many decisions in one call. An episode waits for it as it waits for the user."""
+class EpisodePolicy:
+    """The wrapper, in a plan, of a policy that is not just called with an observation and an info.
 
-    waits = False  # whether it has to be awaited
+    Attributes:
+        policy: The user's policy.
+        waits: Whether it has to be awaited.
+    """
 
-    alone: Any  # a method of episode and agent: answers at once, in a branch that waits for one agent only
+    policy: Any
+    waits = False
+    answer: Any  # takes the episode, the agent, the observation and the info
+
+    def __call__(self, observation: Any, info: Any) -> Any:
+        """Refuse a call without an episode."""
+        raise OptionValueError(
+            f"the policy {short_repr(self.policy)} is asked for one decision of an environment at a time, and here"
+            " there is no environment; pass the policy in policies="
+        )
 
 
-class AskingPolicy:
-    """The wrapper, in a plan, of a policy that is asked alone. Other policies have none, and so cost nothing extra.
+class DeferredPolicy(EpisodePolicy):
+    """One that answers many decisions in one call. An episode waits for it as it waits for the user."""
+
+
+class AskingPolicy(EpisodePolicy):
+    """One that is asked alone.
 
     Attributes:
         plans, asks, waits: Whether it gets the environment, gets the decision, and has to be awaited.
@@ -185,66 +197,33 @@ class AskingPolicy:
         self.policy, self._call = policy, Caller(policy)
         self.plans, self.asks = (name in self._call.names for name in ASKED)
         self.waits = waits(policy)
-        self._session: ref[Any] | None = None
         if self.plans and self.waits:
             raise OptionValueError(
                 f"the policy {short_repr(policy)} waits, and asks for _environment, which only the simulation's own"
                 " thread can use; let it ask for _decision, or let it answer at once"
             )
 
-    def __call__(self, observation: Any, info: Any) -> Any:
-        """Ask the policy, and wait for its answer."""
-        return wait_for(self.begin(observation, info))
+    def answer(self, episode: Any, agent: Any, observation: Any, info: Any) -> Any:
+        """Ask about the decision of an agent, and wait for the answer."""
+        return wait_for(self.begin(episode, agent, observation, info))
 
-    def begin(self, observation: Any, info: Any) -> Any:
-        """Ask the policy; in a branch or a clone, what stands for it there. Return its answer, or an awaitable."""
-        session = None if self._session is None else self._session()
-        if session is None:
-            raise OptionValueError(
-                f"the policy {short_repr(self.policy)} is asked for one decision of an environment at a time, and here"
-                " there is no environment; pass the policy in policies="
-            )
-        episode = session.episode
-        agent = episode.deciding
-        in_branch = episode.plan.solo or PLANNING.get()
-        policy: Any = self.policy
-        if self.plans and in_branch:
-            policy = base_of(getattr(policy, "base", RULE), agent.name)
-            policy = RULE if is_planner(policy) else policy
-        if in_branch or session.is_copy:
-            policy = stand_in(policy)
-        if policy is not self.policy:
-            return self._by(policy, observation, info)
-        environment = None
-        if self.plans:
-            views = import_module("..envs.single", __package__)  # by name, because views import the core
-            environment = views.PlannerEnv(session.plan, session)
-        return self.ask(observation, info, episode, agent, environment, in_clone=session.is_copy)
-
-    def _by(self, policy: Any, observation: Any, info: Any) -> Any:
-        """Return the answer of the policy that stands for this one."""
-        if not callable(policy) or policy is RULE:
+    def begin(self, episode: Any, agent: Any, observation: Any, info: Any) -> Any:
+        """Ask the policy, or what answers for it where the episode is played. Return the answer, or an awaitable."""
+        policy = policy_for(self.policy, agent.name, episode.where)
+        if policy is RULE:
             return RULE
-        asked = two_arguments(policy)
-        if isinstance(asked, AskingPolicy):
-            asked._session = self._session
-            return asked.begin(observation, info)
-        return asked(observation, info)
+        asked = self if policy is self.policy else two_arguments(policy)
+        if not isinstance(asked, AskingPolicy):
+            return asked(observation, info)
+        return asked.ask(episode, agent, observation, info)
 
-    def ask(
-        self, observation: Any, info: Any, episode: Any, agent: Any, environment: Any, *, in_clone: bool = False
-    ) -> Any:
-        """Ask the policy itself about the pending decision of an agent. Return its answer, or an awaitable."""
-        asked: dict[str, Any] = {"_environment": environment}
+    def ask(self, episode: Any, agent: Any, observation: Any, info: Any) -> Any:
+        """Ask the policy itself. Return its answer, or an awaitable."""
+        asked: dict[str, Any] = {}
+        if self.plans:
+            session = episode.session()
+            views = import_module("..envs.single", __package__)  # by name, because views import the core
+            asked["_environment"] = views.PlannerEnv(session.plan, session)
         if self.asks:
-            asked["_decision"] = decision_of(episode, agent, in_clone=in_clone)
+            asked["_decision"] = decision_of(episode, agent)
         return self._call(observation, info, asked)
-
-
-def bind_session(policy: Any, session: Any) -> Any:
-    """Copy a wrapped policy for the episodes of a session, held weakly; return any other policy unchanged."""
-    if not isinstance(policy, AskingPolicy):
-        return policy
-    bound = copy.copy(policy)
-    bound._session = ref(session)
-    return bound

@@ -13,6 +13,7 @@ from contextvars import Context, copy_context
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
+from weakref import ref
 
 import numpy as np
 from gymnasium.utils import seeding
@@ -24,6 +25,7 @@ from .context import ExclusiveLock, GlobalRandom, environment_context, reuse_res
 from .driver import Driver
 from .episode import LONGEST_TAPE, Episode, refusal
 from .plan import DRIVERS, Plan
+from .policies import Where
 from .rng import ENVIRONMENT, draws_check, is_seed, seed_globals
 from .spaces import same
 
@@ -32,24 +34,24 @@ class Session:
     """The simulation of one environment, and its episodes.
 
     Attributes:
-        bound_plan: The plan in which mappings and policies have what they ask for: the simulation, or the environment.
+        bound_plan: The plan in which mappings have the simulation that they ask for.
         state: The reason why there is no episode, as ``refusal`` takes it; "moving" in a reset and a close.
         seed, options: The seed of the latest episode, and the options that the latest ``reset`` got.
         episode: The current or latest episode. None before the first one, and after it was closed.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
-        is_copy: Whether it belongs to a clone or a branch.
+        where: Whether it belongs to the user, a clone or a branch.
         exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
         lock: The same lock, if steps need it, too. None if only the thread that began an episode can step it.
     """
 
     __slots__ = (
         "__weakref__", "_close", "_driver", "_installed", "_np_random", "_reset", "_rng", "bound_plan", "episode",
-        "exclusive", "is_copy", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state",
+        "exclusive", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state", "where",
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:
         """Make the simulation, and set the plan's decision functions in the model."""
-        self.plan, self.state, self.is_copy = plan, "new", False
+        self.plan, self.state, self.where = plan, "new", Where.USER
         self.bound_plan: Plan | None = None
         self.seed: int | None = None
         self.options: dict[str, Any] | None = None
@@ -165,9 +167,10 @@ class Session:
             raise
         self._close = closer(self.simulation)
         if self.bound_plan is None and self.plan.is_bound_to_simulation:
-            self.bound_plan = self.plan.with_simulation(self.simulation, self)
+            self.bound_plan = self.plan.with_simulation(self.simulation)
         plan = self.bound_plan or self.plan
         episode = Episode(plan, self.simulation, self._driver, seed, self._rng, self.lock, in_rounds=in_rounds)
+        episode.session, episode.where = ref(self), self.where
         episode.script = None if script is None else deque(script)
         self._driver.begin(self.simulation.run, episode.events_by_hook(), context)
         try:
@@ -184,7 +187,7 @@ class Session:
         """Return what a replay of the episode needs: seed, options, kind, answers, decision, and last time."""
         episode = self.episode
         assert episode is not None
-        if len(episode.tape) == episode.tape_size or episode.plan.solo:
+        if len(episode.tape) == episode.tape_size:
             raise BranchError(
                 f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of the environment that"
                 ' a policy is given, so its actions were not kept; use method="fork"'
@@ -193,7 +196,7 @@ class Session:
 
     def replay(self, other: Session) -> None:
         """Bring the simulation to the current decision of another session with the same plan, or raise an error."""
-        self.is_copy = True
+        self.move_to(max(other.where, Where.CLONE))
         seed, options, in_rounds, tape, decision, last_time = other.recording()
         again = self.start(seed, options, in_rounds=in_rounds, script=tape)
         while again.script:
@@ -219,8 +222,14 @@ class Session:
 
     def inherit(self) -> None:
         """In a forked process: leave the episode's stack and simulation as they are when it ends, not unwound."""
-        self.is_copy = True
+        self.move_to(Where.CLONE)
         self._driver.given_up, self._close = "belongs to the environment that was cloned", None
+
+    def move_to(self, where: Where) -> None:
+        """Note that from now on its episodes are played in a clone, or in a branch."""
+        self.where = max(self.where, where)
+        if self.episode is not None:
+            self.episode.where = max(self.episode.where, where)
 
     def ask(self, name: str, *args: Any) -> Any:
         """Call a method of the simulation on the user's side; raise ``NotImplementedError`` if it has none."""

@@ -92,16 +92,12 @@ class PolicyKey(DeferredPolicy):
         self.place = place
         self.asked = asked
 
-    def __call__(self, observation: Any, info: Any) -> Any:
-        """Answer one decision, if the policy answers one decision at a time."""
-        return self.asked.policy(observation, info)
-
-    def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
+    def answer(self, episode: Any, agent: Any, observation: Any, info: Any) -> Any:
+        """Answer one decision at once."""
         if self.asked.alone:
-            return self(agent.observation, agent.info)
+            return self.asked.policy(observation, info)
         group = self.asked.group(agent.point)
-        actions, _ = group.ask(group.stack([agent.observation]), [episode], [agent])
+        actions, _ = group.ask(group.stack([observation]), [episode], [agent])
         return actions[0]
 
 
@@ -262,7 +258,8 @@ class _Simulations:
         while self.backlog and len(self.awaited) < self.concurrency:
             place, episode = self.backlog.popleft()
             try:
-                self.awaited.add((place, episode), _ask_alone(episode, AskingPolicy.begin))
+                agent: Any = episode.pending
+                self.awaited.add((place, episode), agent.policy.begin(*_seen(episode)))
             except BaseException as error:
                 episode.annotate(error)
                 raise
@@ -377,17 +374,18 @@ def _checked(episode: Episode, action: Any) -> Any:
         raise
 
 
-def _ask_alone(episode: Episode, ask: Callable[[Any, Any, Any], Any]) -> Any:
-    """Ask the policy of the agent whose decision is pending."""
+def _seen(episode: Episode) -> tuple[Any, ...]:
+    """Return what a policy of one decision is asked with: the episode, the agent, its observation and its info."""
     agent: Any = episode.pending
     info, agent.info = agent.info, {}  # a policy may change its info; the next decision gets a new one
-    return ask(agent.policy, duplicate(agent.observation), info)
+    return episode, agent, duplicate(agent.observation), info
 
 
 def _ask_now(episode: Episode) -> Any:
     """Ask this policy, and wait for its answer."""
+    agent: Any = episode.pending
     with episode.context() if episode.plan.options.global_rng else nullcontext():
-        return _ask_alone(episode, lambda policy, observation, info: policy(observation, info))
+        return agent.policy.answer(*_seen(episode))
 
 
 # -- many episodes and sessions -------------------------------------------------------------------

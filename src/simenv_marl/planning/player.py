@@ -23,7 +23,7 @@ from gymnasium import spaces
 from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
 from ..core.clone import pending_view
-from ..core.policies import PLANNING, AskingPolicy, base_of, stand_in, two_arguments
+from ..core.policies import AskingPolicy, Where, policy_for, two_arguments
 from ..core.rng import is_seed
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
 from ..errors import (
@@ -138,12 +138,12 @@ class Player:
         """Return an agent's action by its base."""
         policy: Any = self._policies.get(name)
         if policy is None:
-            base: Any = base_of(self.base, name) if name == self.agent or isinstance(self.base, Mapping) else RULE
-            base = stand_in(base)
-            policy = base if base is RULE else two_arguments(base)
+            base = self.base if name == self.agent or isinstance(self.base, Mapping) else RULE
+            policy = policy_for(base, name, Where.PLAN)
+            policy = policy if policy is RULE else two_arguments(policy)
             if isinstance(policy, AskingPolicy):
                 record = self.record if name == self.agent else self.episode.agents[name]
-                policy = partial(policy.ask, episode=self.episode, agent=record, environment=self.env, in_clone=True)
+                policy = partial(policy.ask, self.episode, record)
             self._policies[name] = policy
         return RULE if policy is RULE else policy(*self._observe(name))
 
@@ -331,7 +331,8 @@ def rollout_from(
     Take actions, one after the other, and continue with the base. If an action is illegal when its decision arises, the
     base decides. The terminal value is added to the last reward. ``policy`` is a ``RolloutPolicy``.
     """
-    planning, began = PLANNING.set(True), perf_counter()
+    began = perf_counter()
+    env.unwrapped._session.move_to(Where.PLAN)
     try:
         player = player_of(env, policy.base)
         player.start(progress.seen)
@@ -345,8 +346,6 @@ def rollout_from(
         tried = ", ".join(map(short_repr, actions))
         annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
         raise
-    finally:
-        PLANNING.reset(planning)
 
 
 def _digest(seen: Any) -> int:

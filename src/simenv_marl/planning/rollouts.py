@@ -11,8 +11,8 @@ from zlib import crc32
 
 import numpy as np
 
-from ..core.clone import branch
-from ..core.policies import PLANNING, AskingPolicy
+from ..core.clone import branch, pending_view
+from ..core.policies import AskingPolicy, Where
 from ..core.session import checked_seed
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
@@ -91,7 +91,7 @@ def action_values(
         actions, base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
         discount=discount, discount_by=discount_by, seed=seed, method=method, time_limit=time_limit,
     )  # fmt: skip
-    if PLANNING.get():
+    if _is_planned(env):
         return base_value(env, base)
     rollouts = Rollouts(env, policy)
     candidates = range(len(rollouts.actions))
@@ -100,6 +100,11 @@ def action_values(
             rollouts.add(candidates, number)
             bar.update(number * len(candidates))
     return rollouts.values(candidates)
+
+
+def _is_planned(env: Any) -> bool:
+    """Return whether a planner already tries a candidate in this environment."""
+    return pending_view(env, "planning").episode.where is Where.PLAN
 
 
 def base_value(env: Any, base: Any) -> ActionValues:
@@ -302,7 +307,7 @@ class RolloutPolicy:
             OptionValueError: The budget is too small to try each candidate.
             BaseException: As ``action_values``.
         """
-        if PLANNING.get():
+        if _is_planned(env):
             return base_value(env, self.base)
         rollouts = Rollouts(env, self, planner=True)
         number = len(rollouts.actions)

@@ -1,8 +1,8 @@
 """A sweep of Mesa's wealth model, with Mesa's ``batch_run`` and with ``run_experiment``: lines of code, and seconds.
 
-The sweep measures the final inequality, depending on the number of people and on the space: a mean with its interval
-for each combination. The same seeds give the same numbers. A user would write the functions ``by_...``, whose lines are
-counted.
+The sweep measures the final inequality, depending on the number of people and on the space: a mean
+with its interval for each combination. The same seeds give the same numbers. A user would write the
+functions ``by_...``, whose lines are counted.
 """
 
 from __future__ import annotations
@@ -45,14 +45,21 @@ def interval(values: Any) -> Any:
 
 def by_batch_run(processes: int = 1) -> Any:
     parameters = {**FACTORS, "seed": SEEDS}
-    runs = batch_run(BoltzmannWealth, parameters, processes, max_steps=STEPS, display_progress=False)
+    runs = batch_run(
+        BoltzmannWealth, parameters, processes, max_steps=STEPS, display_progress=False
+    )
     table = DataFrame(runs).drop_duplicates("RunId")  # there is a row for each agent
     return table.groupby(["n", "width"])["Gini"].agg(["mean", interval])
 
 
 def by_run_experiment(store: Path, workers: int = 0) -> Any:
-    make, gini = partial(SteppedSimulation, BoltzmannWealth, STEPS), lambda wealth: wealth.model.compute_gini()
-    table = run_experiment(make, design(FACTORS), seeds=SEEDS, metric={"Gini": gini}, store=store, workers=workers)
+    make, gini = (
+        partial(SteppedSimulation, BoltzmannWealth, STEPS),
+        lambda wealth: wealth.model.compute_gini(),
+    )
+    table = run_experiment(
+        make, design(FACTORS), seeds=SEEDS, metric={"Gini": gini}, store=store, workers=workers
+    )
     return table.groupby(["n", "width"])["Gini"].agg(["mean", interval])
 
 
@@ -64,7 +71,11 @@ def by_batch_run_resumed(store: Path) -> Any:
         for n, width, seed in product(*FACTORS.values(), SEEDS):
             if (n, width, seed) not in known:
                 parameters = {"n": n, "width": width, "seed": seed}
-                runs.append(batch_run(BoltzmannWealth, parameters, max_steps=STEPS, display_progress=False)[0])
+                runs.append(
+                    batch_run(BoltzmannWealth, parameters, max_steps=STEPS, display_progress=False)[
+                        0
+                    ]
+                )
                 print(json.dumps(runs[-1]), file=file, flush=True)
     return DataFrame(runs).groupby(["n", "width"])["Gini"].agg(["mean", interval])
 
@@ -74,13 +85,18 @@ def by_batch_run_resumed(store: Path) -> Any:
 
 def lines(*functions: Any) -> int:
     """Count the lines of functions, without empty ones."""
-    return sum(bool(line.strip()) for function in functions for line in inspect.getsource(function).splitlines())
+    return sum(
+        bool(line.strip())
+        for function in functions
+        for line in inspect.getsource(function).splitlines()
+    )
 
 
 def sweep(name: str, processes: int, *, start: bool = False) -> Contender:
     """Make a contender: the seconds of a sweep, of the processor for one process, else of the wall clock.
 
-    With ``start``, joblib's workers of earlier sweeps are ended before, so that new ones have to start.
+    With ``start``, joblib's workers of earlier sweeps are ended before, so that new ones have to
+    start.
     """
     clock = now if processes == 1 else time.perf_counter
 
@@ -107,7 +123,13 @@ def groups(number: int) -> Iterator[Group]:
     yield Group(
         [
             Row(f"{what}, lines", lambda: ours, lambda: theirs, 1.0, unit="lines"),
-            Row(f"{what}, lines, where a kill loses one run", lambda: ours, lambda: resumable, 1.0, unit="lines"),
+            Row(
+                f"{what}, lines, where a kill loses one run",
+                lambda: ours,
+                lambda: resumable,
+                1.0,
+                unit="lines",
+            ),
         ],
         most=1,
     )
@@ -115,7 +137,9 @@ def groups(number: int) -> Iterator[Group]:
         raise MissingError("a version of Mesa whose batch_run can run its model of wealth")
 
     def seconds(title: str, processes: int, *, start: bool = False) -> Group:
-        ours, theirs = (sweep(name, processes, start=start) for name in ("run_experiment", "batch_run"))
+        ours, theirs = (
+            sweep(name, processes, start=start) for name in ("run_experiment", "batch_run")
+        )
         return Group([Row(f"{what}, {title}", ours, theirs, 1.0, unit="s")], most=11)
 
     with patch.object(sys.modules[__name__], "SEEDS", SEEDS[: number // 200]):

@@ -47,13 +47,18 @@ class Slow(Busy):
 
 
 def groups(number: int) -> Iterator[Group]:
-    """Yield the rows; the number of decisions does not matter, but a smoke test has few branches."""
+    """Yield the rows.
+
+    The number of decisions does not matter, but a smoke test has few branches.
+    """
     count, many = min(BRANCHES, number // 40), min(MANY, number // 40)
     env = single_env(Chancy, Model.left)
     env.reset(seed=0)
     least = milliseconds(lambda: [by_hand(env, number) for number in range(count)], count)
     ours = milliseconds(lambda: branch(env, some_steps, count, method="fork"), count)
-    with_seeds = milliseconds(lambda: branch(env, some_steps, count, method="fork", seeds=range(count)), count)
+    with_seeds = milliseconds(
+        lambda: branch(env, some_steps, count, method="fork", seeds=range(count)), count
+    )
     replay = milliseconds(lambda: branch(env, some_steps, count, method="replay"), count)
     what, hand = "a branch of ten steps", "os.fork and a pipe by hand"
     yield Group(
@@ -65,18 +70,31 @@ def groups(number: int) -> Iterator[Group]:
     )
     ours = milliseconds(lambda: [clone(env, method="fork").close() for _ in range(count)], count)
     least = milliseconds(lambda: [os.waitpid(child(int), 0) for _ in range(count)], count)
-    yield Group([Row("a clone, made and closed / os.fork by hand", ours, least, 2.0, 1.5, unit="ms")])
+    yield Group(
+        [Row("a clone, made and closed / os.fork by hand", ours, least, 2.0, 1.5, unit="ms")]
+    )
     number, clock = min(number, 1_000), time.perf_counter
     through, direct = (steps(each, 0, number, clock) for each in (clone(env, method="fork"), env))
-    row = Row("a step of a clone / a round trip to a process by hand", through, timer(echo(), number, clock))
-    yield Group([row, Row("a step of a clone, less a step", lambda: through() - direct(), None, 110, 80)])
+    row = Row(
+        "a step of a clone / a round trip to a process by hand",
+        through,
+        timer(echo(), number, clock),
+    )
+    yield Group(
+        [row, Row("a step of a clone, less a step", lambda: through() - direct(), None, 110, 80)]
+    )
     memory = partial(memory_of_clones, min(300, number // 2))
-    yield Group([Row("memory of each of 300 clones of the greenhouse", memory, None, 3, 2, unit="MiB")], most=1)
+    yield Group(
+        [Row("memory of each of 300 clones of the greenhouse", memory, None, 3, 2, unit="MiB")],
+        most=1,
+    )
     env.close()
     env = single_env(Slow, Model.left)
     env.reset(seed=0)
     with two_cores():
-        two = milliseconds(lambda: branch(env, lambda env, _: env.step(0)[1], many, method="fork"), many)
+        two = milliseconds(
+            lambda: branch(env, lambda env, _: env.step(0)[1], many, method="fork"), many
+        )
 
         def one() -> float:
             both = os.sched_getaffinity(0)
@@ -86,7 +104,9 @@ def groups(number: int) -> Iterator[Group]:
             finally:
                 os.sched_setaffinity(0, both)
 
-        row = Row("branches of 10 ms: two cores beside one", two, one, 1.7, 1.9, faster=True, unit="ms")
+        row = Row(
+            "branches of 10 ms: two cores beside one", two, one, 1.7, 1.9, faster=True, unit="ms"
+        )
         yield Group([row], most=9)
     env.close()
     kept, replayed = (search(8 if number < 400 else 64, keeps=keeps) for keeps in (True, False))
@@ -142,7 +162,10 @@ def child(main: Callable[[], Any]) -> int:
 
 
 def echo() -> Callable[[int], None]:
-    """Fork a process that sends back what it receives; return a function that sends it a number of messages."""
+    """Fork a process that sends back what it receives.
+
+    Return a function that sends it a number of messages.
+    """
     here, there = socket.socketpair()
 
     def answer() -> None:
@@ -171,7 +194,9 @@ def memory_of_clones(number: int = 300) -> float:
         for path in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):  # it has just ended
                 if own in (path.name, (path / "stat").read_text().rpartition(")")[2].split()[1]):
-                    kib += int((path / "smaps_rollup").read_text().partition("\nPss:")[2].split()[0])
+                    kib += int(
+                        (path / "smaps_rollup").read_text().partition("\nPss:")[2].split()[0]
+                    )
         return kib
 
     before, clones = memory(), [clone(env, method="fork") for _ in range(number)]

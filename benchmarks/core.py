@@ -1,8 +1,8 @@
 """The cost of a simulation that keeps its own loop: this library's views beside their alternatives, in one run.
 
-Run it with ``make benchmark``. It keeps itself on one core, except for rows that need two. A section is a module whose
-function ``groups`` takes a number of decisions and yields its rows; ``--only`` selects sections. ``PYTHONPATH``
-determines which source is measured.
+Run it with ``make benchmark``. It keeps itself on one core, except for rows that need two. A
+section is a module whose function ``groups`` takes a number of decisions and yields its rows;
+``--only`` selects sections. ``PYTHONPATH`` determines which source is measured.
 """
 
 from __future__ import annotations
@@ -24,11 +24,19 @@ SECTIONS = (
 def main() -> None:
     """Run the benchmarks from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="sections to run (all)")
+    parser.add_argument(
+        "--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="sections to run (all)"
+    )
     parser.add_argument("--rounds", type=int, default=31, help="the most rounds (%(default)s)")
-    parser.add_argument("--number", type=int, default=20_000, help="decisions per round (%(default)s)")
-    parser.add_argument("--quick", action="store_true", help="a smoke test on one core; its figures mean nothing")
-    parser.add_argument("--write", type=Path, help="a Markdown file for the table; a figure is written beside it")
+    parser.add_argument(
+        "--number", type=int, default=20_000, help="decisions per round (%(default)s)"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="a smoke test on one core; its figures mean nothing"
+    )
+    parser.add_argument(
+        "--write", type=Path, help="a Markdown file for the table; a figure is written beside it"
+    )
     parser.add_argument("--json", type=Path, help="a file for the figures")
     arguments = parser.parse_args()
     rounds, number = (1, 200) if arguments.quick else (arguments.rounds, arguments.number)

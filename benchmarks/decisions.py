@@ -10,7 +10,19 @@ from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, OrderEnforcingWr
 
 from benchmarks.hand_written import TemplateAECEnv, TemplateEnv, ThreadEnv
 from benchmarks.measure import Contender, Group, Row, both, calls, timer
-from benchmarks.noop import Alone, AloneBy, Crowd, CrowdBy, Dispatched, Entity, Model, Turns, TurnsBy, aec, single
+from benchmarks.noop import (
+    Alone,
+    AloneBy,
+    Crowd,
+    CrowdBy,
+    Dispatched,
+    Entity,
+    Model,
+    Turns,
+    TurnsBy,
+    aec,
+    single,
+)
 from simenv_marl import aec_env, single_env
 
 MANY = 10_000
@@ -21,11 +33,29 @@ def groups(number: int) -> Iterator[Group]:
     model = Model()
     plain = calls_alone(Model.left.__wrapped__, model, number)
     decision = calls_alone(Model.left, model, number)
-    yield Group([Row("a decision function outside any environment / the plain function", decision, plain, 2.5, 2.1)])
+    yield Group(
+        [
+            Row(
+                "a decision function outside any environment / the plain function",
+                decision,
+                plain,
+                2.5,
+                2.1,
+            )
+        ]
+    )
 
     env: Any = single_env(Alone, Model.left)
     env.reset(seed=0)
-    yield Group([Row("the same on its caller's stack, while an environment is in an episode", decision, plain)])
+    yield Group(
+        [
+            Row(
+                "the same on its caller's stack, while an environment is in an episode",
+                decision,
+                plain,
+            )
+        ]
+    )
     env.close()
 
     greenlets = calls(echo().switch, number, 1)
@@ -55,7 +85,12 @@ def groups(number: int) -> Iterator[Group]:
             Row("AEC / template", turns, template_aec),
             Row("AEC / template in two wrappers", turns, wrapped),
             Row("AEC / one greenlet round trip", turns, greenlets),
-            Row("AEC, an item of a call for 100 / a decision with a call of its own", items, hundred, 1.0),
+            Row(
+                "AEC, an item of a call for 100 / a decision with a call of its own",
+                items,
+                hundred,
+                1.0,
+            ),
             Row(f"AEC, entities: {MANY:,} / 2", of_many, entities, 1.2, 1.1),
             Row(f"single / {crossing}", alone, least, 2.6, 2.3),
             Row(f"single, another argument / {crossing}", alone_by, least, 2.7, 2.3),
@@ -68,7 +103,10 @@ def groups(number: int) -> Iterator[Group]:
     few = min(100, many // 2)
     dead_many = dead_steps(aec_env(Crowd(many, rounds=1), Entity.decide), many)
     dead_few = dead_steps(aec_env(Crowd(few, rounds=1), Entity.decide), few)
-    yield Group([Row(f"AEC, a dead agent's step, entities: {MANY:,} / 100", dead_many, dead_few, 1.2, 1.1)], most=6)
+    yield Group(
+        [Row(f"AEC, a dead agent's step, entities: {MANY:,} / 100", dead_many, dead_few, 1.2, 1.1)],
+        most=6,
+    )
 
 
 def calls_alone(function: Any, argument: Any, number: int) -> Contender:

@@ -1,7 +1,7 @@
 """The speed of EnergyPlus when its thermostats are agents, relative to the plain run, with the extra ``energyplus``.
 
-All actions are ``RULE``, so every run writes the same results, digit by digit. The time is that of the whole run:
-set-up, EnergyPlus's warm-up days, the days of the run, and its end.
+All actions are ``RULE``, so every run writes the same results, digit by digit. The time is that of
+the whole run: set-up, EnergyPlus's warm-up days, the days of the run, and its end.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ def groups(number: int) -> Iterator[Group]:
             Row("AEC beside the plain run", turns, model, 0.95, 1.0, faster=True),
             Row("parallel beside the plain run", rounds, model, faster=True),
             Row('AEC, driver="thread" beside the plain run', threads, model, faster=True),
-            Row("a thread and two queues by hand beside the plain run", by_hand, model, faster=True),
+            Row(
+                "a thread and two queues by hand beside the plain run", by_hand, model, faster=True
+            ),
         ],
         most=20,
     )

@@ -38,12 +38,23 @@ class SlowTurn(Turn):
 
 def groups(number: int) -> Iterator[Group]:
     """Yield the rows, with at most as many runs as there are decisions in a round."""
-    one_turn, name = experiment(Turn, min(ROWS, number), now), f"a run beside its model, of {ROWS:,}"
+    one_turn, name = (
+        experiment(Turn, min(ROWS, number), now),
+        f"a run beside its model, of {ROWS:,}",
+    )
     yield Group([Row(name, one_turn, None, 1.0, 0.3, unit="ms")], most=1)
     with two_cores():
         few = min(FEW, number // 10)
         two, one = (experiment(SlowTurn, few, time.perf_counter, workers) for workers in (2, 0))
-        row = Row("runs of 10 ms: two workers beside one process", two, one, 1.8, 1.95, faster=True, unit="ms")
+        row = Row(
+            "runs of 10 ms: two workers beside one process",
+            two,
+            one,
+            1.8,
+            1.95,
+            faster=True,
+            unit="ms",
+        )
         yield Group([row], most=1)
 
 
@@ -54,7 +65,9 @@ def experiment(make: type, rows: int, clock: Callable[[], float], workers: int =
     def run() -> float:
         with TemporaryDirectory() as folder:
             start = clock()
-            run_experiment(make, table, seeds=[0], store=folder, metric=lambda turn: turn.x, workers=workers)
+            run_experiment(
+                make, table, seeds=[0], store=folder, metric=lambda turn: turn.x, workers=workers
+            )
             return (clock() - start) / rows * 1e3
 
     return run

@@ -1,7 +1,7 @@
 """The cost of a decision with a clock, with a plugin that is not called, and beside other objects in the process.
 
-Each figure comes from a process of its own: a ``difference`` stays once it is made, and the features of one environment
-may slow down its neighbours. The processes take turns.
+Each figure comes from a process of its own: a ``difference`` stays once it is made, and the
+features of one environment may slow down its neighbours. The processes take turns.
 """
 
 from __future__ import annotations
@@ -58,14 +58,30 @@ EXTRAS: dict[str, Callable[[], tuple[Any, Any]]] = {
     "an idle plugin": lambda: (OURS(plugins=[(nothing, f"{__name__}.idle", "before")]), None),
     "a difference elsewhere": lambda: (
         OURS(),
-        other_environment({Model.left: make_step(**DEFINITION | {"reward_mapping": difference(lambda model: 1.0)})}),
+        other_environment(
+            {
+                Model.left: make_step(
+                    **DEFINITION | {"reward_mapping": difference(lambda model: 1.0)}
+                )
+            }
+        ),
     ),
-    f"{NEIGHBOURS:,} other environments": lambda: (OURS(), [other_environment() for _ in range(NEIGHBOURS)]),
-    f"{NEIGHBOURS:,} other decision points": lambda: (OURS(), [other_point(number) for number in range(NEIGHBOURS)]),
+    f"{NEIGHBOURS:,} other environments": lambda: (
+        OURS(),
+        [other_environment() for _ in range(NEIGHBOURS)],
+    ),
+    f"{NEIGHBOURS:,} other decision points": lambda: (
+        OURS(),
+        [other_point(number) for number in range(NEIGHBOURS)],
+    ),
 }
 """Functions that make the environment to measure, and what stands beside it."""
 
-LIMITS = {"a clock": (1.08, 1.04), "an idle plugin": (1.08, 1.04), "a difference elsewhere": (1.08, 1.04)}
+LIMITS = {
+    "a clock": (1.08, 1.04),
+    "an idle plugin": (1.08, 1.04),
+    "a difference elsewhere": (1.08, 1.04),
+}
 
 
 def idle(model: Model) -> None:
@@ -75,13 +91,23 @@ def idle(model: Model) -> None:
 def groups(number: int) -> Iterator[Group]:
     """Yield the rows, with a number of decisions of each contender."""
     without, *others = ((extra, apart(extra, number)) for extra in EXTRAS)
-    rows = [Row(f"AEC, {extra} / without", run, without[1], *LIMITS.get(extra, ())) for extra, run in others]
+    rows = [
+        Row(f"AEC, {extra} / without", run, without[1], *LIMITS.get(extra, ()))
+        for extra, run in others
+    ]
     yield Group(rows, most=9)
 
 
 def apart(extra: str, number: int) -> Contender:
-    """Make a contender that measures an extra in a new process; for a smoke test, this one will do."""
-    return partial(measure, extra, number) if number < 1_000 else partial(alone, "extras", extra, str(number))
+    """Make a contender that measures an extra in a new process.
+
+    For a smoke test, this one will do.
+    """
+    return (
+        partial(measure, extra, number)
+        if number < 1_000
+        else partial(alone, "extras", extra, str(number))
+    )
 
 
 def measure(extra: str, number: int) -> float:

@@ -1,7 +1,7 @@
 """Environments written by hand, with which the benchmarks compare the environments of this library.
 
-The AEC environment has the bookkeeping of PettingZoo's documented template, the single one the parts of
-Gymnasium's (``_get_obs``, ``_get_info``). All of them are no-op simulations without an
+The AEC environment has the bookkeeping of PettingZoo's documented template, the single one the
+parts of Gymnasium's (``_get_obs``, ``_get_info``). All of them are no-op simulations without an
 end, with an observation of four float32 and a reward of 1.0.
 """
 
@@ -109,7 +109,9 @@ class TemplateEnv(gym.Env[Any, Any]):
     def _get_info(self) -> dict[str, Any]:
         return {}
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         return self._get_obs(), self._get_info()
 
@@ -134,7 +136,9 @@ class ThreadEnv(TemplateEnv):
         self.action_arrives.acquire()
         self.observation_arrives.acquire()
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         self.over = False
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()

@@ -47,16 +47,28 @@ def groups(number: int) -> Iterator[Group]:
     """Yield the rows: as many simulations as there are decisions in a round, divided by 20, and at most a thousand."""
     number = min(SIMULATIONS, number // 20)
     network = {Model.left: network_policy()}
-    waiting = at_once(Slow, {Model.left: wait}, min(200, number), DECISIONS // 10, time.perf_counter, concurrency=50)
+    waiting = at_once(
+        Slow,
+        {Model.left: wait},
+        min(200, number),
+        DECISIONS // 10,
+        time.perf_counter,
+        concurrency=50,
+    )
     least = 50e3 / 50  # microseconds for each decision
-    yield Group([Row("coroutines of 50 ms, 50 at once / their time", waiting, lambda: least, 1.3, 1.2)], most=1)
+    yield Group(
+        [Row("coroutines of 50 ms, 50 at once / their time", waiting, lambda: least, 1.3, 1.2)],
+        most=1,
+    )
 
     def simulate_each(number: int) -> None:
         for seed in range(number):
             simulate(Asking, network, seed=seed)
 
     one_by_one = per_decision(simulate_each, max(number // 10, 1), DECISIONS)
-    all_at_once, few_at_once = (at_once(Asking, network, number, batch_size=size) for size in (SIMULATIONS, FEW))
+    all_at_once, few_at_once = (
+        at_once(Asking, network, number, batch_size=size) for size in (SIMULATIONS, FEW)
+    )
     beside = "at once beside one by one, MLP 64x64 in NumPy"
     yield Group(
         [
@@ -73,7 +85,9 @@ def groups(number: int) -> Iterator[Group]:
         zeros = {Model.left: lambda observations: np.zeros(len(observations), np.int64)}
         few, clock = DECISIONS // 10, time.perf_counter
         two, one = (at_once(Slow, zeros, number, few, clock, workers=workers) for workers in (2, 0))
-        row = Row("100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True)
+        row = Row(
+            "100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True
+        )
         yield Group([row], most=7)
 
 

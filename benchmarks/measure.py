@@ -1,7 +1,8 @@
 """Measuring side by side: all contenders of a group in turn, many rounds, medians of the ratios within a round.
 
-A machine that is slow for a while is slow for all contenders of a round, so ratios are reliable where times are not.
-Times are processor times of all threads of this process, or wall-clock times where processes share the work.
+A machine that is slow for a while is slow for all contenders of a round, so ratios are reliable
+where times are not. Times are processor times of all threads of this process, or wall-clock times
+where processes share the work.
 """
 
 from __future__ import annotations
@@ -27,11 +28,23 @@ Contender = Callable[[], float]
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("greenlet", "gymnasium", "pettingzoo", "mesa", "numpy")
 
-COLUMNS = {"section": 10, "row": 70, "unit": 5, "candidate": 9, "baseline": 9, "ratio": 20, "bar": 6, "aim": 6}
+COLUMNS = {
+    "section": 10,
+    "row": 70,
+    "unit": 5,
+    "candidate": 9,
+    "baseline": 9,
+    "ratio": 20,
+    "bar": 6,
+    "aim": 6,
+}
 """The columns of the table but the last, and their widths on a terminal."""
 
 now = time.process_time
-"""The clock of all contenders except those of several processes; it does not count other programs on the machine."""
+"""The clock of all contenders except those of several processes.
+
+It does not count other programs on the machine.
+"""
 
 
 @dataclass(frozen=True)
@@ -42,7 +55,8 @@ class Row:
         name: What is compared with what.
         candidate, baseline: The contenders. Without a baseline, the figure is the candidate's own.
         bar, aim: The project's limit for the ratio, and its better target; None for neither.
-        faster: Whether the ratio is that of the speeds, where more is better; else it is that of the times.
+        faster: Whether the ratio is that of the speeds, where more is better; else it is that of
+            the times.
         unit: The unit of what the contenders return.
     """
 
@@ -93,16 +107,28 @@ class Figure:
     def cells(self) -> list[str]:
         """Return the cells of the table's line."""
         sign = "≥" if self.row.faster else "≤"
-        limits = ["" if limit is None else f"{sign} {limit:g}" for limit in (self.row.bar, self.row.aim)]
+        limits = [
+            "" if limit is None else f"{sign} {limit:g}" for limit in (self.row.bar, self.row.aim)
+        ]
         baseline = "" if self.baseline is None else _number(self.baseline)
         ratio = f"{_number(self.ratio)} times as fast" if self.row.faster else _number(self.ratio)
-        return [self.row.name, self.row.unit, _number(self.candidate), baseline, ratio, *limits, self.verdict]
+        return [
+            self.row.name,
+            self.row.unit,
+            _number(self.candidate),
+            baseline,
+            ratio,
+            *limits,
+            self.verdict,
+        ]
 
 
 def measure(group: Group, rounds: int, *, warm_up: bool = True) -> list[Figure]:
     """Run all contenders of a group in turn for a number of rounds, after one that does not count."""
     pairs = [contender for row in group.rows for contender in (row.baseline, row.candidate)]
-    values: dict[Contender, list[float]] = {contender: [] for contender in pairs if contender is not None}
+    values: dict[Contender, list[float]] = {
+        contender: [] for contender in pairs if contender is not None
+    }
     with _without_collections():
         for number in range(-warm_up, min(rounds, group.most)):
             for contender, found in values.items():
@@ -115,7 +141,9 @@ def measure(group: Group, rounds: int, *, warm_up: bool = True) -> list[Figure]:
 def _figure(row: Row, values: Mapping[Contender, list[float]]) -> Figure:
     ours = values[row.candidate]
     theirs = [1.0] * len(ours) if row.baseline is None else values[row.baseline]
-    ratios = [base / own if row.faster else own / base for own, base in zip(ours, theirs, strict=True)]
+    ratios = [
+        base / own if row.faster else own / base for own, base in zip(ours, theirs, strict=True)
+    ]
     ratio = statistics.median(ratios)
     return Figure(
         row,
@@ -181,7 +209,9 @@ def calls(function: Callable[..., Any], number: int, *args: Any) -> Contender:
 def alone(section: str, *arguments: str) -> Any:
     """Measure something in a new process, which runs a section's module and prints JSON."""
     command = [sys.executable, "-m", f"benchmarks.{section}", *arguments]
-    return json.loads(subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout)
+    return json.loads(
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
+    )
 
 
 # -- cores ----------------------------------------------------------------------------------------
@@ -230,8 +260,8 @@ class Table:
         self.remarks: list[str] = []
         packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
         self._heading = (
-            f"Measured with CPython {platform.python_version()} on {platform.machine()} ({_processor()}), {packages};"
-            f" rounds: {rounds} at most."
+            f"Measured with CPython {platform.python_version()} on {platform.machine()}"
+            f" ({_processor()}), {packages}; rounds: {rounds} at most."
         )
         print(self._heading, *_lines([], list(COLUMNS.values())), sep="\n", flush=True)
 
@@ -250,7 +280,10 @@ class Table:
         """Write the table in Markdown."""
         lines = [self._heading, "", *_lines(list(self.figures.items()), [0] * len(COLUMNS))]
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("\n".join([*lines, *(f"\n{remark}" for remark in self.remarks)]) + "\n", encoding="utf-8")
+        path.write_text(
+            "\n".join([*lines, *(f"\n{remark}" for remark in self.remarks)]) + "\n",
+            encoding="utf-8",
+        )
 
     def dump(self, path: Path) -> None:
         """Write all figures as JSON, by section and row."""
@@ -259,7 +292,10 @@ class Table:
             measured = {name: getattr(figure, name) for name in ("ratio", "candidate", "baseline")}
             return measured | {"unit": figure.row.unit}
 
-        figures = {name: {figure.row.name: entry(figure) for figure in found} for name, found in self.figures.items()}
+        figures = {
+            name: {figure.row.name: entry(figure) for figure in found}
+            for name, found in self.figures.items()
+        }
         path.write_text(json.dumps(figures, indent=1), encoding="utf-8")
 
 
@@ -275,4 +311,7 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
+        "unknown",
+    )

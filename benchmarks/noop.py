@@ -227,7 +227,9 @@ def steps(env: Any, action: Any, number: int, clock: Callable[[], float] = now) 
 # -- contenders: whole runs of models, which the rule decides -------------------------------------
 
 
-def whole(prepare: Callable[[], tuple[Callable[[], Any], Callable[[], Any]]], number: int, outcome: Any) -> Contender:
+def whole(
+    prepare: Callable[[], tuple[Callable[[], Any], Callable[[], Any]]], number: int, outcome: Any
+) -> Contender:
     """Make a contender of whole runs: the time of each of a number of decisions.
 
     Args:

@@ -1,6 +1,7 @@
 """The cost of a decision for a simulator in another process, beside the minimum for a pipe and JSON.
 
-Times are processor times of both processes, which alternate on one core; on two cores, they are wall-clock times.
+Times are processor times of both processes, which alternate on one core; on two cores, they are
+wall-clock times.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ class PingPong:
         theirs_in, self._out = os.pipe()
         self._in, theirs_out = os.pipe()
         descriptors = (theirs_in, theirs_out)
-        self._process = subprocess.Popen([str(program), *map(str, descriptors)], pass_fds=descriptors)
+        self._process = subprocess.Popen(
+            [str(program), *map(str, descriptors)], pass_fds=descriptors
+        )
         for descriptor in descriptors:
             os.close(descriptor)
 
@@ -70,7 +73,9 @@ def groups(number: int) -> Iterator[Group]:
             yield from compare(noop, echo, number, ", on two cores", time.perf_counter)
 
 
-def compare(noop: Path, echo: Path, number: int, where: str, *clock: Callable[[], float]) -> Iterator[Group]:
+def compare(
+    noop: Path, echo: Path, number: int, where: str, *clock: Callable[[], float]
+) -> Iterator[Group]:
     """Yield the row of the AEC view beside the bare process."""
     with ExitStack() as stack:
         env = stack.enter_context(closing(aec_env(ProcessSimulation([noop], {"noop.turn": TURN}))))
@@ -80,7 +85,9 @@ def compare(noop: Path, echo: Path, number: int, where: str, *clock: Callable[[]
         answering = child(echo)
         ours = aec(env, number, *(clock or [processors(asking)]))
         least = timer(bare.play, number, *(clock or [processors(answering)]))
-        row = Row(f"AEC, C++ / a JSON round trip{where}", ours, least, *(() if clock else (1.6, 1.3)))
+        row = Row(
+            f"AEC, C++ / a JSON round trip{where}", ours, least, *(() if clock else (1.6, 1.3))
+        )
         yield Group([row], most=9 if clock else 1_000)
 
 
@@ -88,14 +95,20 @@ def compiler(folder: str, name: str) -> Path:
     """Compile a program."""
     program = Path(folder) / name
     sources = [f"-I{ROOT / 'clients' / 'cpp'}", str(ROOT / "benchmarks" / "cpp" / f"{name}.cpp")]
-    subprocess.run([str(COMPILER), "-std=c++17", "-O2", *sources, "-o", str(program)], check=True, timeout=300)
+    subprocess.run(
+        [str(COMPILER), "-std=c++17", "-O2", *sources, "-o", str(program)], check=True, timeout=300
+    )
     return program
 
 
 def child(program: Path) -> int:
     """Return the child process of this process that runs a program."""
     children = Path(f"/proc/self/task/{os.getpid()}/children").read_text("ascii").split()
-    return next(int(process) for process in children if Path(f"/proc/{process}/exe").resolve() == program.resolve())
+    return next(
+        int(process)
+        for process in children
+        if Path(f"/proc/{process}/exe").resolve() == program.resolve()
+    )
 
 
 def processors(process: int) -> Callable[[], float]:

@@ -15,14 +15,28 @@ def draw(figures: Mapping[str, list[Figure]], path: Path) -> None:
     """Draw the figures of the sections ``vector`` and ``suspended`` in a file."""
     by_name = {figure.row.name: figure for figure in figures["vector"]}
     template, view = (
-        [(int(name.split()[0].replace(",", "")), figure) for name, figure in by_name.items() if name.endswith(end)]
+        [
+            (int(name.split()[0].replace(",", "")), figure)
+            for name, figure in by_name.items()
+            if name.endswith(end)
+        ]
         for end in ("simulations / SyncVectorEnv of template", "of single_env")
     )
-    threads = [(64, figure) for figure in figures["suspended"] if figure.row.name.endswith("beside a thread for each")]
+    threads = [
+        (64, figure)
+        for figure in figures["suspended"]
+        if figure.row.name.endswith("beside a thread for each")
+    ]
     lines = {
         "vector_env": ("#1b6f5f", [(size, figure.candidate) for size, figure in template]),
-        "SyncVectorEnv of template": ("#8c8c8c", [(size, figure.baseline) for size, figure in template]),
-        "SyncVectorEnv of single_env": ("#d1812c", [(size, figure.baseline) for size, figure in view]),
+        "SyncVectorEnv of template": (
+            "#8c8c8c",
+            [(size, figure.baseline) for size, figure in template],
+        ),
+        "SyncVectorEnv of single_env": (
+            "#d1812c",
+            [(size, figure.baseline) for size, figure in view],
+        ),
         "a thread for each": ("#b3402e", [(size, figure.baseline) for size, figure in threads]),
     }
     canvas = Canvas(figsize=(7.2, 4.2), layout="constrained")

@@ -67,7 +67,15 @@ def groups(number: int) -> Iterator[Group]:
         for name, (function, *limits) in functions.items()
     ]
     none_of = calls(model.none_of, number, 1.0)
-    rows.append(Row("exposed, no handlers, an argument / a plain call, an argument", none_of, plain_of, 3.0, 2.0))
+    rows.append(
+        Row(
+            "exposed, no handlers, an argument / a plain call, an argument",
+            none_of,
+            plain_of,
+            3.0,
+            2.0,
+        )
+    )
     with handlers(
         (nothing, Model.one_before, "before"),
         (lambda model, _result: ChangedResult(None), Model.one_after, "after"),
@@ -81,8 +89,14 @@ def groups(number: int) -> Iterator[Group]:
     env = single_env(Model, Model.decide)
     without = single(env, number)
     envs = {
-        name: single_env(Model, Model.decide, plugins=[(nothing, target, "before")]) for name, target in plugins.items()
+        name: single_env(Model, Model.decide, plugins=[(nothing, target, "before")])
+        for name, target in plugins.items()
     }
-    yield Group([Row(f"a step, a plugin {name} / a step", single(env, number), without) for name, env in envs.items()])
+    yield Group(
+        [
+            Row(f"a step, a plugin {name} / a step", single(env, number), without)
+            for name, env in envs.items()
+        ]
+    )
     for each in (env, *envs.values()):
         each.close()

@@ -32,13 +32,20 @@ def groups(number: int) -> Iterator[Group]:
     views: dict[str, Any] = {
         "single": (single_env(Short, Model.left), TemplateEnv(), partial(play, 1)),
         "AEC": (aec_env(Short, Model.left), template, play_aec),
-        "parallel": (parallel_env(Short, Model.left), aec_to_parallel(template), partial(play, {"agent_0": 1})),
+        "parallel": (
+            parallel_env(Short, Model.left),
+            aec_to_parallel(template),
+            partial(play, {"agent_0": 1}),
+        ),
     }
     start, whole = (calls(play_greenlet, number, decisions) for decisions in (0, DECISIONS))
     rows = []
     for view, (env, hand, plays) in views.items():
         reset, reset_by_hand = calls(env.reset, number), both(calls(hand.reset, number), start)
-        episode, episode_by_hand = calls(plays, number, env), both(calls(plays, number, hand), whole)
+        episode, episode_by_hand = (
+            calls(plays, number, env),
+            both(calls(plays, number, hand), whole),
+        )
         rows += [
             Row(f"{view}: a reset / template + a greenlet", reset, reset_by_hand),
             Row(f"{view}: three decisions / template + a greenlet", episode, episode_by_hand),

@@ -17,7 +17,10 @@ CONVERTIBLE = (2, 100, 1_000)
 """The numbers of agents for ``aec_to_parallel``: its step is quadratic, and takes tens of seconds at 10,000."""
 
 TURNS = 50
-"""The number of steps of the turn-based converter; each is one decision, and is linear in the number of agents."""
+"""The number of steps of the turn-based converter.
+
+Each is one decision, and is linear in the number of agents.
+"""
 
 
 def groups(number: int) -> Iterator[Group]:
@@ -25,22 +28,40 @@ def groups(number: int) -> Iterator[Group]:
     sizes = [size for size in SIZES if size <= number]
     turns = {size: aec(aec_env(Crowd(size), Entity.decide), number) for size in sizes}
     ours = {
-        size: parallel(parallel_env(Crowd(size), Entity.decide, possible_agents=Crowd(size).names()), size, number)
+        size: parallel(
+            parallel_env(Crowd(size), Entity.decide, possible_agents=Crowd(size).names()),
+            size,
+            number,
+        )
         for size in sizes
     }
-    foretold = {size: parallel(parallel_env(ForetoldCrowd(size), Entity.decide), size, number) for size in sizes}
+    foretold = {
+        size: parallel(parallel_env(ForetoldCrowd(size), Entity.decide), size, number)
+        for size in sizes
+    }
     rows = []
     for size in sizes:
         limits = (0.95, 0.85) if size == 2 else (0.75, 0.65)
         rows += [
-            Row(f"{size:,} agents: a parallel step, for each / an AEC decision", ours[size], turns[size], *limits),
+            Row(
+                f"{size:,} agents: a parallel step, for each / an AEC decision",
+                ours[size],
+                turns[size],
+                *limits,
+            ),
             Row(f"{size:,} agents: with expected_calls / without", foretold[size], ours[size]),
         ]
     most = sizes[-1]
     if most > 100:
         rows += [
-            Row(f"a parallel step, for each: {most:,} agents / 100", ours[most], ours[100], 1.5, 1.1),
-            Row(f"the same with expected_calls: {most:,} agents / 100", foretold[most], foretold[100]),
+            Row(
+                f"a parallel step, for each: {most:,} agents / 100", ours[most], ours[100], 1.5, 1.1
+            ),
+            Row(
+                f"the same with expected_calls: {most:,} agents / 100",
+                foretold[most],
+                foretold[100],
+            ),
         ]
     yield Group(rows)
 
@@ -48,7 +69,14 @@ def groups(number: int) -> Iterator[Group]:
     for size in sizes:
         if size in CONVERTIBLE:
             converter = parallel(aec_to_parallel(TemplateAECEnv(size)), size, few)
-            rows.append(Row(f"{size:,} agents: ours beside aec_to_parallel", ours[size], converter, faster=True))
+            rows.append(
+                Row(
+                    f"{size:,} agents: ours beside aec_to_parallel",
+                    ours[size],
+                    converter,
+                    faster=True,
+                )
+            )
         env = turn_based_aec_to_parallel(TemplateAECEnv(size))
         env.reset(seed=0)
         one_decision = steps(env, dict.fromkeys(env.agents, 1), few if size == 2 else TURNS)

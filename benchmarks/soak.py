@@ -1,7 +1,7 @@
 """A soak test: very many episodes that are cut short at random must not leak resources.
 
-Run it with ``python -m benchmarks.soak``; ``make soak`` does so with both drivers. It fails if threads, greenlets, file
-descriptors, objects or memory leak.
+Run it with ``python -m benchmarks.soak``; ``make soak`` does so with both drivers. It fails if
+threads, greenlets, file descriptors, objects or memory leak.
 """
 
 from __future__ import annotations
@@ -125,7 +125,9 @@ def episode(env: Any, draw: random.Random) -> None:
         if hasattr(env, "agent_selection"):
             env.step(None if env.terminations[env.agent_selection] else draw.choice([0, 1, RULE]))
         elif hasattr(env, "agents"):
-            env.step({agent: draw.choice([0, 1, RULE]) for agent in env.agents if draw.random() < 0.9})
+            env.step(
+                {agent: draw.choice([0, 1, RULE]) for agent in env.agents if draw.random() < 0.9}
+            )
         else:
             env.step(RULE if hasattr(env.action_space, "spaces") else draw.choice([0, 1, RULE]))
 
@@ -158,7 +160,9 @@ def figures() -> dict[str, int]:
     return {
         "threads": threading.active_count(),
         # a thread's own greenlet, which has no parent, is freed a moment after the thread has ended
-        "greenlets": sum(isinstance(thing, greenlet) and thing.parent is not None for thing in things),
+        "greenlets": sum(
+            isinstance(thing, greenlet) and thing.parent is not None for thing in things
+        ),
         "descriptors": len(os.listdir("/proc/self/fd")),
         "objects": len(things),
         "KiB": resident // 1024,

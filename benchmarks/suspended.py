@@ -1,4 +1,6 @@
-"""Simulations suspended side by side, beside one thread or process for each; their memory; the speed-up by workers.
+"""Simulations suspended side by side, beside one thread or process for each.
+
+Their memory; the speed-up by workers.
 
 ``python -m benchmarks.suspended memory`` prints the KiB of each of 10,000 suspended simulations.
 """
@@ -38,23 +40,36 @@ def groups(number: int) -> Iterator[Group]:
     """Yield the rows, with a number of decisions of each contender."""
     threads, here = Threads(SIZE), vector_env(Alone, Model.left, num_envs=SIZE)
     ours, theirs = vector(here, SIZE, number), vector(threads, SIZE, number // 10)
-    yield Group([Row(f"{SIZE} simulations beside a thread for each", ours, theirs, 11, 20, faster=True)], most=10)
+    yield Group(
+        [Row(f"{SIZE} simulations beside a thread for each", ours, theirs, 11, 20, faster=True)],
+        most=10,
+    )
     threads.close()
     here.close()
 
     clock = time.perf_counter
-    processes, workers = AsyncVectorEnv([TemplateEnv] * FEW), vector_env(Alone, Model.left, num_envs=FEW, workers=2)
+    processes, workers = (
+        AsyncVectorEnv([TemplateEnv] * FEW),
+        vector_env(Alone, Model.left, num_envs=FEW, workers=2),
+    )
     ours, theirs = (vector(env, FEW, number // 20, clock) for env in (workers, processes))
-    yield Group([Row(f"{FEW} simulations in two workers / AsyncVectorEnv of template", ours, theirs)], most=10)
+    yield Group(
+        [Row(f"{FEW} simulations in two workers / AsyncVectorEnv of template", ours, theirs)],
+        most=10,
+    )
     processes.close()
     workers.close()
 
     memory = partial(alone, "suspended", "memory", str(min(10_000, number)))
-    yield Group([Row("memory of each of 10,000 simulations", memory, None, 10, 9, unit="KiB")], most=1)
+    yield Group(
+        [Row("memory of each of 10,000 simulations", memory, None, 10, 9, unit="KiB")], most=1
+    )
     with two_cores():
         envs = [vector_env(Slow, Model.left, num_envs=SIZE, workers=workers) for workers in (0, 2)]
         one, two = (vector(env, SIZE, min(SIZE * 20, number), clock) for env in envs)
-        row = Row("100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True)
+        row = Row(
+            "100 µs per decision: two workers beside one process", two, one, 1.7, 1.9, faster=True
+        )
         yield Group([row], most=9)
         for env in envs:
             env.close()
@@ -63,14 +78,16 @@ def groups(number: int) -> Iterator[Group]:
 class Threads:
     """One thread per simulation, which alternates with its user as in RLlib's ExternalEnv.
 
-    Each thread has a queue for observations and one for actions. All threads share a condition, which they notify after
-    each observation.
+    Each thread has a queue for observations and one for actions. All threads share a condition,
+    which they notify after each observation.
     """
 
     def __init__(self, number: int) -> None:
         self.arrival = threading.Condition()
         self.queues: list[Any] = [(queue.Queue(), queue.Queue()) for _ in range(number)]
-        self.threads = [threading.Thread(target=self._run, args=pair, daemon=True) for pair in self.queues]
+        self.threads = [
+            threading.Thread(target=self._run, args=pair, daemon=True) for pair in self.queues
+        ]
 
     def _run(self, observations: queue.Queue[Any], actions: queue.Queue[Any]) -> None:
         model, reward = Model(), 0.0
@@ -91,7 +108,13 @@ class Threads:
         rows: dict[int, Any] = {}
         while len(rows) < len(self.queues):
             with self.arrival:
-                while not (ready := [n for n, (observations, _) in enumerate(self.queues) if not observations.empty()]):
+                while not (
+                    ready := [
+                        n
+                        for n, (observations, _) in enumerate(self.queues)
+                        if not observations.empty()
+                    ]
+                ):
                     self.arrival.wait()
                 for number in ready:
                     rows[number] = self.queues[number][0].get_nowait()

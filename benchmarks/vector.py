@@ -36,7 +36,12 @@ def beside_gymnasium(size: int, number: int) -> Iterator[Group]:
     yield Group(
         [
             Row(f"{what} {beside} template", ours, hand, *((1.3, 1.15) if held else ())),
-            Row(f"{what}, another argument {beside} template", ours_by, hand, *((1.4, 1.25) if held else ())),
+            Row(
+                f"{what}, another argument {beside} template",
+                ours_by,
+                hand,
+                *((1.4, 1.25) if held else ()),
+            ),
             Row(f"{what} {beside} single_env", ours, views),
         ],
         most=1_000 if held else 10,

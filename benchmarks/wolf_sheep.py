@@ -1,7 +1,7 @@
 """The speed of a third-party model in environments, relative to the plain run: Mesa's unmodified wolf-sheep model.
 
-All actions are ``RULE``, so every run ends with the same animals in the same places and the same state of the
-generator.
+All actions are ``RULE``, so every run ends with the same animals in the same places and the same
+state of the generator.
 """
 
 from __future__ import annotations
@@ -41,7 +41,12 @@ class Meadow(SimulationInterface):
         return TRUNCATED
 
     def expected_calls(self, point: str) -> list[tuple[Any]]:
-        return [(animal,) for kind in KINDS.values() if point == name_of(kind) for animal in self.animals(kind)]
+        return [
+            (animal,)
+            for kind in KINDS.values()
+            if point == name_of(kind)
+            for animal in self.animals(kind)
+        ]
 
     def animals(self, kind: type) -> Any:
         """Return all animals of a kind that are alive."""
@@ -106,11 +111,20 @@ def groups(number: int) -> Iterator[Group]:
     env: Any = aec_env(Meadow, POINTS)
     env.reset(seed=SEED)
     decisions = aec_by_rule(env)
-    model, least, turns, rounds = (whole(run, decisions, expected) for run in (plain, crossing, aec, parallel))
+    model, least, turns, rounds = (
+        whole(run, decisions, expected) for run in (plain, crossing, aec, parallel)
+    )
     yield Group(
         [
             Row("AEC beside the plain model", turns, model, 0.68, 0.8, faster=True),
-            Row("parallel with expected_calls beside the plain model", rounds, model, 0.65, 0.75, faster=True),
+            Row(
+                "parallel with expected_calls beside the plain model",
+                rounds,
+                model,
+                0.65,
+                0.75,
+                faster=True,
+            ),
             Row("bare crossing beside the plain model", least, model, faster=True),
             Row("AEC beside bare crossing", turns, least, faster=True),
             Row("parallel beside bare crossing", rounds, least, faster=True),

@@ -54,7 +54,8 @@ def _trim(app, doctree):
 def _label(app, doctree):
     """Tell tables of words from tables of numbers, and label the cells of words.
 
-    A narrow screen shows each row of a table of words as a list, without the head. It scrolls a table of numbers.
+    A narrow screen shows each row of a table of words as a list, without the head. It scrolls a
+    table of numbers.
     """
     for table in doctree.findall(nodes.table):
         head = table.next_node(nodes.thead)
@@ -63,10 +64,14 @@ def _label(app, doctree):
         titles = [title.astext() for title in head[0]]
         rows = [row[1:] for row in table.next_node(nodes.tbody)]
         cells = [text for row in rows for cell in row if (text := cell.astext())]
-        if 2 * sum(bool(re.match(r"[-+\N{MINUS SIGN}≤≥ ]*\d", text)) for text in cells) >= len(cells):
+        if 2 * sum(bool(re.match(r"[-+\N{MINUS SIGN}≤≥ ]*\d", text)) for text in cells) >= len(
+            cells
+        ):
             table["classes"].append("numbers")
             for text in list(table.findall(nodes.Text)):
-                text.parent.replace(text, nodes.Text(re.sub("([≤≥]) ", "\\1\N{NO-BREAK SPACE}", text)))
+                text.parent.replace(
+                    text, nodes.Text(re.sub("([≤≥]) ", "\\1\N{NO-BREAK SPACE}", text))
+                )
             continue
         table["classes"].append("words")
         for row in rows if len(titles) > 2 else ():
@@ -76,7 +81,10 @@ def _label(app, doctree):
 
 
 def _enlarge(app, doctree):
-    """Load figures when they come into view. A click shows one in its own size; the pictures of cards link to pages."""
+    """Load figures when they come into view.
+
+    A click shows one in its own size; the pictures of cards link to pages.
+    """
     for image in doctree.findall(nodes.image):
         image["loading"] = "lazy"
         if "sd-card-img-top" not in image["classes"]:
@@ -85,7 +93,11 @@ def _enlarge(app, doctree):
 
 def _shorten(app, what, name, obj, options, lines):
     """Link the page on options, where docstrings for editors list all of them."""
-    text = re.sub(r"(\*\*options: )Any of these:\n\n(?: {8}.*\n)+", r"\1See :doc:`/options`.\n", "\n".join(lines))
+    text = re.sub(
+        r"(\*\*options: )Any of these:\n\n(?: {8}.*\n)+",
+        r"\1See :doc:`/options`.\n",
+        "\n".join(lines),
+    )
     lines[:] = text.split("\n")
 
 

@@ -1,6 +1,7 @@
 """A hive whose bees are born and die, and its environments: learners with fixed rosters find such agents hardest.
 
-The model has a loop, a clock and rules of its own. Some meadows have no nectar; action masks exclude these.
+The model has a loop, a clock and rules of its own. Some meadows have no nectar; action masks
+exclude these.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class Bee:
 
     def choose_meadow(self) -> int:
         """Decide where to fly."""
-        return next(number for number in range(MEADOWS) if self.hive.nectar[number])  # the nearest with nectar
+        # the nearest with nectar
+        return next(number for number in range(MEADOWS) if self.hive.nectar[number])
 
     def fly(self) -> None:
         """Fly to a meadow; become stronger or weaker, according to its nectar."""
@@ -54,7 +56,9 @@ class Hive:
 
     def dawn(self) -> None:
         """Draw the nectar of the meadows; on every other day, a bee hatches."""
-        self.nectar = [self.random.random() if self.random.random() < 0.8 else 0.0 for _ in range(MEADOWS)]
+        self.nectar = [
+            self.random.random() if self.random.random() < 0.8 else 0.0 for _ in range(MEADOWS)
+        ]
         self.nectar[self.random.randrange(MEADOWS)] = self.random.uniform(0.2, 1.0)
         if self.day % 2 == 0 and self.hatched < len(BEES):
             self.bees.append(Bee(self, self.hatched))
@@ -110,7 +114,9 @@ DEFINITION: dict[str, Any] = {
     "agent": lambda bee: bee.name,
     "removed_by": {"hive.Hive.lose": lambda hive, bee: bee.name},
 }
-MASKED = DEFINITION | {"action_mask_mapping": lambda bee: [nectar > 0 for nectar in bee.hive.nectar]}
+MASKED = DEFINITION | {
+    "action_mask_mapping": lambda bee: [nectar > 0 for nectar in bee.hive.nectar]
+}
 MASK_OBSERVED = MASKED | {  # RLlib needs these keys
     "observation_space": spaces.Dict(
         {

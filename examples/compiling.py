@@ -9,15 +9,20 @@ from pathlib import Path
 
 
 def compiled(
-    target: Path, sources: Sequence[Path], missing: Callable[[], str], command: Callable[[], Sequence[str]]
+    target: Path,
+    sources: Sequence[Path],
+    missing: Callable[[], str],
+    command: Callable[[], Sequence[str]],
 ) -> Path:
     """Compile a program, unless it is up to date.
 
     Args:
         target: The path of the program.
         sources: The files that it is made of.
-        missing: A function that names what is missing for compiling it; its result is empty if nothing is missing.
-        command: A function that returns the command of the compiler, to which ``-o`` and a path are added.
+        missing: A function that names what is missing for compiling it; its result is empty if
+            nothing is missing.
+        command: A function that returns the command of the compiler, to which ``-o`` and a path are
+            added.
 
     Returns:
         The path of the program.
@@ -25,13 +30,19 @@ def compiled(
     Raises:
         RuntimeError: A tool or library is missing, or the program does not compile.
     """
-    if target.exists() and all(source.stat().st_mtime < target.stat().st_mtime for source in sources):
+    if target.exists() and all(
+        source.stat().st_mtime < target.stat().st_mtime for source in sources
+    ):
         return target
     if lacking := missing():
         raise RuntimeError(f"the model of the {target.name} cannot be compiled without {lacking}")
     target.parent.mkdir(parents=True, exist_ok=True)
     made = target.with_name(f"{target.name}.{os.getpid()}")  # takes its place once it is complete
-    done = subprocess.run([*command(), "-o", str(made)], check=False, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        [*command(), "-o", str(made)], check=False, capture_output=True, text=True, timeout=600
+    )
     if done.returncode:
-        raise RuntimeError(f"the model of the {target.name} does not compile:\n{done.stderr[:4000]}")
+        raise RuntimeError(
+            f"the model of the {target.name} does not compile:\n{done.stderr[:4000]}"
+        )
     return made.replace(target)

@@ -23,8 +23,8 @@ def evolve(
     """Find weights with high returns.
 
     Args:
-        rate: Returns the mean return of each candidate of a generation. It should play the same seeds for all of them,
-            so that no candidate is chosen for its luck.
+        rate: Returns the mean return of each candidate of a generation. It should play the same
+            seeds for all of them, so that no candidate is chosen for its luck.
         first: ``(weights,)``: the initial weights.
         generations: The number of generations.
         rng: The source of all random numbers; ``rate`` may draw its seeds from it.
@@ -32,8 +32,9 @@ def evolve(
         spread: The standard deviation of the weights of the first generation.
 
     Returns:
-        ``(weights,)``: the mean of the best weights found so far, over the last quarter of the generations. The best of
-        a single generation varies with the seeds of that generation; this mean hardly does.
+        ``(weights,)``: the mean of the best weights found so far, over the last quarter of the
+        generations. The best of a single generation varies with the seeds of that generation; this
+        mean hardly does.
     """
     import cma  # imported here, because a process with many imports forks slowly
 

@@ -1,11 +1,11 @@
 """Mesa's own example models as environments: the models are unchanged, and each function below is all that one needs.
 
-``python -m examples.mesa_models`` runs each model without an environment and as an AEC environment with ``RULE`` as
-every action, and compares the final states of the two models. It then plays random actions, and prints a table in
-Markdown. It needs Mesa 3.3 or newer, with its extra ``network``.
+``python -m examples.mesa_models`` runs each model without an environment and as an AEC environment
+with ``RULE`` as every action, and compares the final states of the two models. It then plays random
+actions, and prints a table in Markdown. It needs Mesa 3.3 or newer, with its extra ``network``.
 
-From Mesa 3.5 on, some of these models take a scenario. ``stepped`` handles both kinds; a model of your own needs only
-``SteppedSimulation``.
+From Mesa 3.5 on, some of these models take a scenario. ``stepped`` handles both kinds; a model of
+your own needs only ``SteppedSimulation``.
 """
 
 from __future__ import annotations
@@ -58,7 +58,11 @@ def boltzmann_wealth() -> Example:
         reward_mapping=difference(lambda person: person.wealth),
         agent=lambda person: f"person_{person.unique_id}",
     )
-    return BoltzmannWealth, {"mesa.examples.basic.boltzmann_wealth_model.agents.MoneyAgent.move": move}, {}
+    return (
+        BoltzmannWealth,
+        {"mesa.examples.basic.boltzmann_wealth_model.agents.MoneyAgent.move": move},
+        {},
+    )
 
 
 def schelling() -> Example:
@@ -106,22 +110,34 @@ def conways_game_of_life() -> Example:
     """A cell decides whether it lives on."""
     state = make_step(
         observation_space=Box(0, 8, (2,), np.float32),
-        observation_space_mapping=lambda cell: [cell.state, sum(other.is_alive for other in cell.neighbors)],
+        observation_space_mapping=lambda cell: [
+            cell.state,
+            sum(other.is_alive for other in cell.neighbors),
+        ],
         action_space=Discrete(2),
         apply=lambda action, cell: setattr(cell, "_next_state", int(action)),
         reward_mapping=lambda cell: cell.state,
         agent=lambda cell: f"cell_{cell.unique_id}",
     )
-    return ConwaysGameOfLife, {"mesa.examples.basic.conways_game_of_life.agents.Cell.determine_state": state}, {}
+    return (
+        ConwaysGameOfLife,
+        {"mesa.examples.basic.conways_game_of_life.agents.Cell.determine_state": state},
+        {},
+    )
 
 
 def virus_on_network() -> Example:
-    """A computer decides on its treatment. The network uses Python's global generator, hence ``global_rng``."""
+    """A computer decides on its treatment.
+
+    The network uses Python's global generator, hence ``global_rng``.
+    """
     check = make_step(
         observation_space=Discrete(3),
         observation_space_mapping=lambda node: node.state.value,
         action_space=Discrete(2),
-        apply=lambda action, node: node.try_remove_infection() if action and node.state.value == 1 else None,
+        apply=lambda action, node: (
+            node.try_remove_infection() if action and node.state.value == 1 else None
+        ),
         reward_mapping=lambda node: -float(node.state.value == 1),
         agent=lambda node: f"node_{node.unique_id}",
     )
@@ -130,17 +146,27 @@ def virus_on_network() -> Example:
 
 
 def epstein_civil_violence() -> Example:
-    """A cop decides where to go. The inherited ``Cop.move``, named like this, leaves the citizens' move unchanged."""
+    """A cop decides where to go.
+
+    The inherited ``Cop.move``, named like this, leaves the citizens' move unchanged.
+    """
     patrol = make_step(
         observation_space=Box(0, np.inf, (2,), np.float32),
-        observation_space_mapping=lambda cop: [sum(1 for _ in cop.neighbors), len(cop.empty_neighbors)],
+        observation_space_mapping=lambda cop: [
+            sum(1 for _ in cop.neighbors),
+            len(cop.empty_neighbors),
+        ],
         action_space=Discrete(250),
         choices=lambda cop: [cop.cell, *cop.empty_neighbors],
         apply=lambda cell, cop: None if cell is cop.cell else cop.move_to(cell),
         reward_mapping=lambda cop: -float(cop.model.ACTIVE),
         agent=lambda cop: f"cop_{cop.unique_id}",
     )
-    return EpsteinCivilViolence, {"mesa.examples.advanced.epstein_civil_violence.agents.Cop.move": patrol}, {}
+    return (
+        EpsteinCivilViolence,
+        {"mesa.examples.advanced.epstein_civil_violence.agents.Cop.move": patrol},
+        {},
+    )
 
 
 def pd_grid() -> Example:
@@ -164,7 +190,12 @@ def sugarscape() -> Example:
     """A trader decides where to go, until it starves."""
     move = make_step(
         observation_space=Box(-np.inf, np.inf, (4,), np.float32),
-        observation_space_mapping=lambda trader: [trader.sugar, trader.spice, trader.cell.sugar, trader.cell.spice],
+        observation_space_mapping=lambda trader: [
+            trader.sugar,
+            trader.spice,
+            trader.cell.sugar,
+            trader.cell.spice,
+        ],
         action_space=Discrete(62),
         choices=lambda trader: [
             trader.cell,
@@ -186,13 +217,18 @@ def wolf_sheep() -> Example:
             observation_space=Box(-1, np.inf, (2,), np.float32),
             observation_space_mapping=lambda animal: [animal.energy, len(animal.cell.agents)],
             action_space=Discrete(4),
-            apply=lambda action, animal: setattr(animal, "cell", list(animal.cell.neighborhood)[action]),
+            apply=lambda action, animal: setattr(
+                animal, "cell", list(animal.cell.neighborhood)[action]
+            ),
             reward_mapping=lambda animal: 1.0,
             agent=lambda animal: f"{kind}_{animal.unique_id}",
             removed_by="mesa.agent.Agent.remove",
         )
 
-    points = {f"mesa.examples.advanced.wolf_sheep.agents.{kind}.move": moves(kind) for kind in ("Wolf", "Sheep")}
+    points = {
+        f"mesa.examples.advanced.wolf_sheep.agents.{kind}.move": moves(kind)
+        for kind in ("Wolf", "Sheep")
+    }
     return WolfSheep, points, {}
 
 
@@ -201,7 +237,9 @@ def alliance_formation() -> Example:
     worth = MultiLevelAllianceModel.calculate_shapley_value  # the rule
     join = make_step(
         observation_space=Box(0, np.inf, (4,), np.float32),
-        observation_space_mapping=lambda model, pair: [number for one in pair for number in (one.power, one.position)],
+        observation_space_mapping=lambda model, pair: [
+            number for one in pair for number in (one.power, one.position)
+        ],
         action_space=Discrete(2),
         apply=lambda action, model, pair: worth(model, pair) if action else None,
         reward_mapping=difference(lambda model, pair: max(agent.power for agent in model.agents)),
@@ -212,7 +250,10 @@ def alliance_formation() -> Example:
 
 
 NEEDS_SIMULATOR: Final = "simulator" in inspect.signature(WolfSheep).parameters
-"""Whether a simulator runs ``WolfSheep``, as before Mesa 3.5. Then only ``examples.wolf_sheep`` runs it."""
+"""Whether a simulator runs ``WolfSheep``, as before Mesa 3.5.
+
+Then only ``examples.wolf_sheep`` runs it.
+"""
 
 EXAMPLES: Final = (
     boltzmann_wealth, schelling, boid_flockers, conways_game_of_life, virus_on_network, epstein_civil_violence, pd_grid,
@@ -226,7 +267,9 @@ EXAMPLES: Final = (
 def stepped(model: Callable[..., Any], steps: int = STEPS) -> SteppedSimulation:
     """Make a simulation of one of these models, which takes a seed, or a scenario with the seed."""
     known = vars(sys.modules[model.__module__])
-    scenario = next((known[name] for name in known if name.endswith("Scenario") and name != "Scenario"), None)
+    scenario = next(
+        (known[name] for name in known if name.endswith("Scenario") and name != "Scenario"), None
+    )
     if scenario is None:
         return SteppedSimulation(model, steps)
     return SteppedSimulation(lambda seed: model(scenario=scenario(rng=seed)), steps)
@@ -236,13 +279,23 @@ def fingerprint(simulation: SteppedSimulation) -> str:
     """Write the state of a model as text: agents, landscape, generators, collected data."""
     model = simulation.model
     agents = [
-        (type(agent).__name__, {name: plain(value) for name, value in vars(agent).items()}, positions(agent))
+        (
+            type(agent).__name__,
+            {name: plain(value) for name, value in vars(agent).items()},
+            positions(agent),
+        )
         for agent in model.agents
     ]
     layers = getattr(getattr(model, "grid", None), "_mesa_property_layers", {})
     landscape = {name: plain(layer.data) for name, layer in layers.items()}
-    collected = plain(list(model.datacollector.model_vars.values())) if hasattr(model, "datacollector") else None
-    return repr([agents, landscape, model.random.getstate(), model.rng.bit_generator.state, collected])
+    collected = (
+        plain(list(model.datacollector.model_vars.values()))
+        if hasattr(model, "datacollector")
+        else None
+    )
+    return repr(
+        [agents, landscape, model.random.getstate(), model.rng.bit_generator.state, collected]
+    )
 
 
 def positions(agent: Any) -> Any:
@@ -329,8 +382,11 @@ def outcome(function: Callable[[], Example], seed: int = 5) -> Outcome:
     agents, asked, by_rules = play(function(), seed, by_rule)
     return Outcome(
         model=model.__name__,
-        decisions=", ".join(".".join(name.split(".")[-2:]).removeprefix(f"{model.__name__}.") for name in points),
-        lines=sum(bool(line.strip()) for line in inspect.getsource(function).splitlines()) - 1,  # its docstring
+        decisions=", ".join(
+            ".".join(name.split(".")[-2:]).removeprefix(f"{model.__name__}.") for name in points
+        ),
+        # its docstring
+        lines=sum(bool(line.strip()) for line in inspect.getsource(function).splitlines()) - 1,
         agents=agents,
         asked=asked,
         same=by_rules == run_plainly(function(), seed),
@@ -354,9 +410,17 @@ def table(outcomes: Iterable[Outcome]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the examples, and print the table."""
-    parser = argparse.ArgumentParser(description="Run Mesa's example models as environments, and by themselves.")
-    names = [function.__name__ for function in EXAMPLES if function is not wolf_sheep or not NEEDS_SIMULATOR]
-    parser.add_argument("names", nargs="*", default=names, help="which examples to run (default: all)")
+    parser = argparse.ArgumentParser(
+        description="Run Mesa's example models as environments, and by themselves."
+    )
+    names = [
+        function.__name__
+        for function in EXAMPLES
+        if function is not wolf_sheep or not NEEDS_SIMULATOR
+    ]
+    parser.add_argument(
+        "names", nargs="*", default=names, help="which examples to run (default: all)"
+    )
     outcomes = [outcome(globals()[name]) for name in parser.parse_args(arguments).names]
     print(f"Mesa {mesa.__version__}, Python {platform.python_version()}, {STEPS} steps")
     print(table(outcomes))

@@ -12,7 +12,11 @@ from simenv_marl.core.options import Options
 
 # Hypothesis draws the same examples at every run, keeps no files, and does not look at the clock.
 settings.register_profile(
-    "tests", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+    "tests",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("tests")
 
@@ -24,32 +28,53 @@ DRIVERS = ("greenlet", "thread")
 
 
 def pytest_addoption(parser) -> None:
-    parser.addoption("--driver", choices=(*DRIVERS, "both"), default="both", help="drivers to test the contract with")
-    parser.addoption("--order", metavar="SEED", help="shuffle files and tests by this seed, or by a new one: random")
+    parser.addoption(
+        "--driver",
+        choices=(*DRIVERS, "both"),
+        default="both",
+        help="drivers to test the contract with",
+    )
+    parser.addoption(
+        "--order",
+        metavar="SEED",
+        help="shuffle files and tests by this seed, or by a new one: random",
+    )
 
 
 def pytest_configure(config) -> None:
-    config.addinivalue_line("markers", "greenlet(reason): what is tested is different with other drivers")
+    config.addinivalue_line(
+        "markers", "greenlet(reason): what is tested is different with other drivers"
+    )
     if config.option.order == "random":
         # The processes of pytest-xdist are to have the same one.
-        config.option.order = os.environ.setdefault("TEST_ORDER", str(random.SystemRandom().randrange(10**6)))
+        config.option.order = os.environ.setdefault(
+            "TEST_ORDER", str(random.SystemRandom().randrange(10**6))
+        )
 
 
 def pytest_report_header(config) -> str | None:
-    return f"files and tests in the order of --order {config.option.order}" if config.option.order else None
+    return (
+        f"files and tests in the order of --order {config.option.order}"
+        if config.option.order
+        else None
+    )
 
 
 def pytest_collection_modifyitems(config, items) -> None:
     if config.option.order:
         random.Random(config.option.order).shuffle(items)
-        places = {path: place for place, path in enumerate(dict.fromkeys(item.path for item in items))}
+        places = {
+            path: place for place, path in enumerate(dict.fromkeys(item.path for item in items))
+        }
         items.sort(key=lambda item: places[item.path])
 
 
 @pytest.fixture(autouse=True)
 def _driver(request, monkeypatch):
     """Makes environments with that driver, unless they are told otherwise."""
-    monkeypatch.setitem(Options.__init__.__kwdefaults__, "driver", getattr(request, "param", "greenlet"))
+    monkeypatch.setitem(
+        Options.__init__.__kwdefaults__, "driver", getattr(request, "param", "greenlet")
+    )
 
 
 def pytest_collection_finish() -> None:
@@ -62,7 +87,8 @@ def pytest_collection_finish() -> None:
 def pytest_runtest_protocol(item, nextitem):
     """Spare the collector's calls what the files before have left: it is the same from now on.
 
-    Not in a fixture: until this hook returns, the test holds its fixtures, and what is frozen is never collected.
+    Not in a fixture: until this hook returns, the test holds its fixtures, and what is frozen is
+    never collected.
     """
     result = yield
     if nextitem is None or nextitem.path != item.path:
@@ -73,7 +99,9 @@ def pytest_runtest_protocol(item, nextitem):
 
 @pytest.fixture
 def _collected():
-    """For tests in whose midst no finalizer may run, as at the end of the stack: it would swallow an error."""
+    """For tests in whose midst no finalizer may run, as at the end of the stack: it would swallow
+    an error.
+    """
     gc.collect()
     gc.disable()
     yield

@@ -15,7 +15,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def alone(function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function of a test file in a process of its own, where no other test has left anything open.
+    """Call a function of a test file in a process of its own, where no other test has left
+    anything open.
 
     Environments have the driver of the test that calls. The arguments are strings and numbers.
     """
@@ -28,9 +29,14 @@ gc.freeze()  # so that the function's own collections look at what it makes
 Options.__init__.__kwdefaults__["driver"] = {(Options.__init__.__kwdefaults__ or {})["driver"]!r}
 {function.__name__}(*{arguments!r})
 """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(ROOT)])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(ROOT)]),
+    }
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -40,8 +46,12 @@ def run_code(*parts: str, status: int = 0, options: Iterable[str] = ()) -> str:
     One that ends well prints no errors; one that hangs is ended.
     """
     command = [sys.executable, *options, "-c", "\n".join(map(dedent, parts))]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr if status == 0 else "") == (status, ""), done.stdout + done.stderr
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr if status == 0 else "") == (status, ""), (
+        done.stdout + done.stderr
+    )
     return done.stdout
 
 
@@ -62,13 +72,18 @@ def runs(number: int) -> bool:
         os.kill(number, 0)
         if not Path("/proc/self").exists():
             return True
-        return Path(f"/proc/{number}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+        return (
+            Path(f"/proc/{number}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+            != "Z"
+        )
     except (ProcessLookupError, FileNotFoundError):
         return False
 
 
 def gone(number: int) -> bool:
-    """Whether a process ends, within a time that is long enough on a machine that is busy with other things."""
+    """Whether a process ends, within a time that is long enough on a machine that is busy with
+    other things.
+    """
     until = time.monotonic() + 60
     while runs(number) and time.monotonic() < until:
         time.sleep(0.01)

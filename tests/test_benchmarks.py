@@ -1,4 +1,6 @@
-"""The benchmark: its sections run, its page explains its rows, and its two sweeps of Mesa's model find the same."""
+"""The benchmark: its sections run, its page explains its rows, and its two sweeps of Mesa's model
+find the same.
+"""
 
 import json
 import multiprocessing
@@ -14,15 +16,35 @@ ROOT = Path(__file__).parents[1]
 
 def names(page, column):
     """The names of rows in a column of a page's tables, without their numbers."""
-    lines = [line.split(" | ") for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
-    return {re.sub(r"\d[\d,]*", "n", line[column].strip("| ")) for line in lines if len(line) > column}
+    lines = [
+        line.split(" | ")
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if line.startswith("| ")
+    ]
+    return {
+        re.sub(r"\d[\d,]*", "n", line[column].strip("| ")) for line in lines if len(line) > column
+    }
 
 
 def test_a_quick_run_measures_rows_that_the_page_explains(tmp_path):
     options = f"--quick --json {tmp_path / 'json'} --write {tmp_path / 'table'}".split()
-    subprocess.run([sys.executable, "-m", "benchmarks.core", *options], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "benchmarks.core", *options],
+        cwd=ROOT,
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     figures = json.loads((tmp_path / "json").read_text())
-    assert {"decisions", "resets", "rounds", "vector", "suspended", "many", "branches", "plugins"} <= figures.keys()
+    assert {
+        "decisions",
+        "resets",
+        "rounds",
+        "vector",
+        "suspended",
+        "many",
+        "branches",
+        "plugins",
+    } <= figures.keys()
     assert all(figure["candidate"] > 0 for rows in figures.values() for figure in rows.values())
     explained = names(ROOT / "docs/speed.md", 0) | {"row", "---"}
     assert names(tmp_path / "table", 1) | names(ROOT / "docs/figures/core.md", 1) <= explained
@@ -30,7 +52,10 @@ def test_a_quick_run_measures_rows_that_the_page_explains(tmp_path):
 
 @pytest.fixture
 def sweeps(monkeypatch):
-    """The benchmark's sweeps, small ones. Mesa's batch_run says how all processes are to be started."""
+    """The benchmark's sweeps, small ones.
+
+    Mesa's batch_run says how all processes are to be started.
+    """
     before = multiprocessing.get_start_method(allow_none=True)
     from benchmarks import batch_run
 

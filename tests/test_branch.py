@@ -1,6 +1,8 @@
-"""Branches: what functions return from them, what forks share, and the chance ahead that ``seeds=`` draws anew.
+"""Branches: what functions return from them, what forks share, and the chance ahead that
+``seeds=`` draws anew.
 
-That branches do what the environment would have done is asserted beside the same of clones, in ``test_clone.py``.
+That branches do what the environment would have done is asserted beside the same of clones, in
+``test_clone.py``.
 """
 
 import asyncio
@@ -52,14 +54,23 @@ def never(twin, number):
 
 
 def children():
-    return {line for path in Path("/proc/self/task").glob("*/children") for line in path.read_text().split()}
+    return {
+        line
+        for path in Path("/proc/self/task").glob("*/children")
+        for line in path.read_text().split()
+    }
 
 
 @METHODS
 def test_branches_can_be_branched_a_few_times(method):
     def plan(twin, number):
         twin.step(number)
-        return branch(twin, lambda deeper, second: (repr(deeper.step(second)), number, second), 2, method=method)
+        return branch(
+            twin,
+            lambda deeper, second: (repr(deeper.step(second)), number, second),
+            2,
+            method=method,
+        )
 
     def deeper(twin, number):
         return branch(twin, deeper, 1, method=method)
@@ -104,9 +115,17 @@ class Unpicklable(Exception):
 @pytest.mark.parametrize(
     ("function", "limit", "message"),
     [
-        (lambda twin, number: os.kill(os.getpid(), signal.SIGKILL), 60, r"branch [01] has died.*signal 9"),
+        (
+            lambda twin, number: os.kill(os.getpid(), signal.SIGKILL),
+            60,
+            r"branch [01] has died.*signal 9",
+        ),
         (lambda twin, number: os._exit(3), 60, r"branch [01] has died.*exit code 3"),
-        (lambda twin, number: sys.exit(4), float("inf"), r"branch [01] has raised[\s\S]*SystemExit: 4"),
+        (
+            lambda twin, number: sys.exit(4),
+            float("inf"),
+            r"branch [01] has raised[\s\S]*SystemExit: 4",
+        ),
         (lambda twin, number: (yield), 60, "cannot be pickled"),
         (lambda twin, number: Unpicklable(1, 2), 60, "cannot be pickled"),
         (lambda twin, number: time.sleep(600), 0.3, "longer than"),
@@ -131,7 +150,9 @@ def test_an_error_that_cannot_be_pickled_is_named():
     assert "in fail" in str(caught.value.__cause__)
 
 
-@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say")
+@pytest.mark.skipif(
+    not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say"
+)
 def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
     def slow(twin, number):
         (tmp_path / str(os.getpid())).touch()
@@ -139,7 +160,13 @@ def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
 
     for limit in (0.5, 2.0, 8.0, 32.0):  # until the branch in the branch begins within it
         with pytest.raises(BranchError, match="longer than"):
-            branch(trip(), lambda twin, _: branch(twin, slow, 1, method="fork"), 1, method="fork", time_limit=limit)
+            branch(
+                trip(),
+                lambda twin, _: branch(twin, slow, 1, method="fork"),
+                1,
+                method="fork",
+                time_limit=limit,
+            )
         if inner := [int(path.name) for path in tmp_path.iterdir()]:
             break
     assert inner
@@ -184,7 +211,9 @@ def test_environments_without_a_pending_decision_cannot_be_branched(method):
     with pytest.raises(NotResetError, match="no episode yet"):
         branch(env, never, method=method)
     env.reset()
-    assert branch(env, never, 0, method=method) == branch(env, never, 0, method=method, seeds=[]) == []
+    assert (
+        branch(env, never, 0, method=method) == branch(env, never, 0, method=method, seeds=[]) == []
+    )
     env.step(1)
     with pytest.raises(EpisodeOverError, match="begin the next one"):
         branch(env, never, method=method, seeds=[1])
@@ -192,7 +221,20 @@ def test_environments_without_a_pending_decision_cannot_be_branched(method):
         branch("env", never, method=method)
 
 
-WRONG_SEEDS = [[], [1], [1, 2, 3], [1, True], [1, -1], [1, 2.0], [1, None], [1, "2"], "12", 1, {1, 2}, iter([1, 2])]
+WRONG_SEEDS = [
+    [],
+    [1],
+    [1, 2, 3],
+    [1, True],
+    [1, -1],
+    [1, 2.0],
+    [1, None],
+    [1, "2"],
+    "12",
+    1,
+    {1, 2},
+    iter([1, 2]),
+]
 
 
 @pytest.mark.parametrize(
@@ -200,7 +242,10 @@ WRONG_SEEDS = [[], [1], [1, 2, 3], [1, True], [1, -1], [1, 2.0], [1, None], [1, 
     [
         *[({"n": n}, "n must be a non-negative integer") for n in (-1, 2.0, True, None)],
         *[({"time_limit": limit}, "time_limit") for limit in (0, float("nan"), "1")],
-        *[({"n": 2, "seeds": seeds}, "seeds must be n = 2 non-negative integers") for seeds in WRONG_SEEDS],
+        *[
+            ({"n": 2, "seeds": seeds}, "seeds must be n = 2 non-negative integers")
+            for seeds in WRONG_SEEDS
+        ],
         ({"method": "clone"}, "method must be"),
     ],
 )
@@ -220,7 +265,9 @@ def test_not_from_inside_its_own_policies():
         env.step(1)
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the number of cores cannot be set")
+@pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="the number of cores cannot be set"
+)
 def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
     env = trip()
 
@@ -240,7 +287,9 @@ def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
 
 
 def test_actions_are_replayed_as_they_were_given():
-    """Also if the user, a policy or the mapping changes them later; and nobody is asked again for what he has said."""
+    """Also if the user, a policy or the mapping changes them later; and nobody is asked again for
+    what he has said.
+    """
     walk, buffer, asked = next(iter(POINTS)), np.zeros(1, np.float32), []
     amount = define(
         agent="walker_0",
@@ -266,7 +315,10 @@ def test_actions_are_replayed_as_they_were_given():
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 def test_branches_and_clones_of_random_worlds_are_exact():
-    """Also of files and of global generators. For a larger number: ``python -m tests.worlds.exactness 10000``."""
+    """Also of files and of global generators.
+
+    For a larger number: ``python -m tests.worlds.exactness 10000``.
+    """
     differ, number = exactness.differing(300)
     assert (differ, number >= 300) == (0, True)
 
@@ -345,7 +397,9 @@ class Listening(Holding):
         loop, (reading, writing) = asyncio.get_running_loop(), os.pipe()
         for number in range(3):
             heard = loop.create_future()
-            loop.add_reader(reading, lambda heard=heard: heard.done() or heard.set_result(os.read(reading, 1)))
+            loop.add_reader(
+                reading, lambda heard=heard: heard.done() or heard.set_result(os.read(reading, 1))
+            )
             filing.choose()
             os.write(writing, bytes([number]))
             self.log.append(await asyncio.wait_for(heard, 10))
@@ -357,7 +411,9 @@ class Listening(Holding):
 def test_event_loops_of_asyncio_go_on_in_a_fork(monkeypatch):
     env = held_by(Listening)
     env.step(1)
-    assert branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
+    assert (
+        branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
+    )
     monkeypatch.delitem(sys.modules, "asyncio.selector_events")  # as where asyncio is not imported
     assert loops_on({0}) == []
 
@@ -399,7 +455,9 @@ def test_output_of_branches_and_clones_is_printed_once_and_in_order(flush):
     """
     command = [sys.executable, "-W", "error", "-c", code]
     buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
-    ran = subprocess.run(command, cwd=ROOT, env=buffered, check=True, timeout=60, capture_output=True, text=True)
+    ran = subprocess.run(
+        command, cwd=ROOT, env=buffered, check=True, timeout=60, capture_output=True, text=True
+    )
     assert ran.stdout.splitlines() == ["before", "in 0", "in a clone", "after"]
     assert ran.stderr == ""
 
@@ -444,7 +502,11 @@ def test_the_generators_of_the_process_are_seeded_for_each_future(method):
     assert found[0][2] != found[1][2]  # the simulation is reseeded, too
     assert found == branch(env, base, 3, seeds=[7, 8, 7])
     assert len({value for each in found[:2] for part in each[:2] for value in part}) == 16
-    plain = [random.Random(7).random(), np.random.RandomState(7).random(), np.random.default_rng(7).random()]
+    plain = [
+        random.Random(7).random(),
+        np.random.RandomState(7).random(),
+        np.random.default_rng(7).random(),
+    ]
     for child in np.random.SeedSequence(7).spawn(3):
         plain += [np.random.default_rng(part).random() for part in (child, *child.spawn(3))]
     assert not {*plain} & {value for part in found[0][:2] for value in part}

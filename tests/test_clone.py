@@ -1,4 +1,6 @@
-"""Clones: what they do, what they leave alone, and how they end; and that branches do what clones do."""
+"""Clones: what they do, what they leave alone, and how they end; and that branches do what clones
+do.
+"""
 
 import errno
 import gc
@@ -53,7 +55,9 @@ def number_of(twin):
 @METHODS
 @pytest.mark.parametrize("options", OPTIONS)
 @pytest.mark.parametrize("view", VIEWS)
-def test_clones_and_branches_do_what_the_environment_does_and_none_sees_another(view, options, method):
+def test_clones_and_branches_do_what_the_environment_does_and_none_sees_another(
+    view, options, method
+):
     given = dict(OPTIONS[options])
     if (options, method) == ("short", "replay"):  # threads cannot be forked
         given["driver"] = "thread"
@@ -68,7 +72,11 @@ def test_clones_and_branches_do_what_the_environment_does_and_none_sees_another(
         found = future(twin)
         assert another == future(other) != found == future(env)
         assert branched == [(found, type(env))] * 2
-        assert (future(deeper), type(deeper), type(deeper.unwrapped)) == (found, type(env), type(env.unwrapped))
+        assert (future(deeper), type(deeper), type(deeper.unwrapped)) == (
+            found,
+            type(env),
+            type(env.unwrapped),
+        )
 
 
 @pytest.mark.filterwarnings("ignore:.* draws from the global generator")
@@ -174,7 +182,9 @@ def test_infos_lose_what_cannot_be_pickled():
 @METHODS
 @pytest.mark.parametrize("view", ["aec, padded", "parallel", "single, limited", "joint"])
 @pytest.mark.parametrize("options", [{}, LUCKY])
-def test_the_same_seed_is_the_same_future_of_clones_and_branches_and_nothing_else_moves(view, options, method):
+def test_the_same_seed_is_the_same_future_of_clones_and_branches_and_nothing_else_moves(
+    view, options, method
+):
     env, threaded = trip(view, **options), trip(view, driver="thread", **options)
     random.gauss(0, 1)  # the generators keep a second number
     np.random.standard_normal()
@@ -199,7 +209,9 @@ def fail(*_):
 
 @METHODS
 def test_a_clone_that_cannot_be_made_leaves_nothing(method, monkeypatch):
-    faulty, fixed = (trip(simulation=type("Model", (Trip,), {"reseed": reseed})) for reseed in (fail, None))
+    faulty, fixed = (
+        trip(simulation=type("Model", (Trip,), {"reseed": reseed})) for reseed in (fail, None)
+    )
     twin = clone(fixed, method="fork")
     gc.collect()
     before = children(), descriptors().keys()
@@ -207,9 +219,16 @@ def test_a_clone_that_cannot_be_made_leaves_nothing(method, monkeypatch):
     if method == "fork":
         twin.call(lambda env: setattr(os, "fork", fail))
     refused = [(faulty, seed, OptionValueError, "seed must") for seed in (-1, True, 2.0, "3")]
-    refused += [(fixed, 1, BranchError, "reseed"), (twin, 1, BranchError, "reseed"), (faulty, 1, OSError, "no more")]
+    refused += [
+        (fixed, 1, BranchError, "reseed"),
+        (twin, 1, BranchError, "reseed"),
+        (faulty, 1, OSError, "no more"),
+    ]
     if method == "fork":
-        refused += [(each, None, BranchError, "no process .* no more; close some clones") for each in (fixed, twin)]
+        refused += [
+            (each, None, BranchError, "no process .* no more; close some clones")
+            for each in (fixed, twin)
+        ]
     for source, seed, error, message in refused:
         with pytest.raises((error, BranchError), match=message):
             clone(source, seed=seed, method=method)
@@ -298,7 +317,12 @@ try: twins[0].call(lambda env: print("ready", flush=True) or time.sleep(600))
 except KeyboardInterrupt: print(twins[1].call(lambda env: "well"))
 twins[0].step(1)
 """
-ENDS = [("os.kill(os.getpid(), 9)", ""), ("1 / 0", "ZeroDivisionError"), ("os._exit(0)", ""), ("", "")]
+ENDS = [
+    ("os.kill(os.getpid(), 9)", ""),
+    ("1 / 0", "ZeroDivisionError"),
+    ("os._exit(0)", ""),
+    ("", ""),
+]
 ENDS += [(INTERRUPTED, "BranchError: the clone is gone: it was ended by an interrupt")]
 
 
@@ -323,7 +347,9 @@ def test_no_clone_outlives_its_users_process_and_interrupts_reach_that_alone(end
 
 def test_a_clone_that_dies_says_so_and_others_go_on():
     env = trip()
-    killed, exits, late, other = (clone(env, method="fork", time_limit=limit) for limit in (60, 60, 0.3, float("inf")))
+    killed, exits, late, other = (
+        clone(env, method="fork", time_limit=limit) for limit in (60, 60, 0.3, float("inf"))
+    )
     os.kill(number_of(killed), signal.SIGKILL)
     for use in (number_of, lambda twin: twin.step(1), clone, lambda twin: twin.reset(), number_of):
         with pytest.raises(BranchError, match="has died, killed by signal 9"):
@@ -382,7 +408,11 @@ def test_a_default_timeout_of_sockets_is_none_of_clones():
         deeper = clone(twin, method="fork")
     finally:
         socket.setdefaulttimeout(None)
-    assert deeper.call(lambda env: time.sleep(0.3) or 5) == twin.call(lambda env: time.sleep(0.3) or 5) == 5
+    assert (
+        deeper.call(lambda env: time.sleep(0.3) or 5)
+        == twin.call(lambda env: time.sleep(0.3) or 5)
+        == 5
+    )
 
 
 @FORKS
@@ -403,7 +433,9 @@ def test_a_clone_is_refused_in_a_fork_of_its_users_process_and_unharmed():
 def crowd():
     env, before = trip(), descriptors()
     twins = [clone(env, method="fork") for _ in range(100)]
-    assert sum(each.startswith("socket") for each in descriptors().values()) == len(children()) == 100
+    assert (
+        sum(each.startswith("socket") for each in descriptors().values()) == len(children()) == 100
+    )
     while twins:
         twins.pop().close()
     assert (children(), descriptors()) == (set(), before)
@@ -425,7 +457,10 @@ def starve():
             os.close(taken.pop())
         assert number not in map(number_of, twins)
         twins.clear()
-        assert (children(), source.call(lambda env: children())) == (before, before if source is env else set())
+        assert (children(), source.call(lambda env: children())) == (
+            before,
+            before if source is env else set(),
+        )
 
 
 def lean():

@@ -52,7 +52,9 @@ def test_a_sound_simulation_of_the_current_directory():
     root = Path(__file__).parent.parent
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root / "src"), str(root)])}
     command = [sys.executable, "-m", "simenv_marl", "check", "walking:Walk", "--episodes", "2"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=300)
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env=environment, timeout=300
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Walk: nothing to complain of")
 
@@ -61,7 +63,10 @@ def test_a_simulation_with_an_error_ends_the_command_with_status_1(capsys):
     limits = ["--episodes", "2", "--seed", "4", "--max-steps", "5", "--time-limit", "59.5"]
     assert main(["check", "walking:Limping", *limits]) == 1
     text = capsys.readouterr().out
-    assert all(part in text for part in ("behaves differently when it is observed", "seed 4", "5 decisions"))
+    assert all(
+        part in text
+        for part in ("behaves differently when it is observed", "seed 4", "5 decisions")
+    )
     assert main(["check", "walking:Limping", *limits, "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
     assert told["ok"] is False
@@ -113,7 +118,13 @@ def test_objects_that_are_no_simulation_are_refused(command, target, told, capsy
 @pytest.mark.parametrize(
     "arguments",
     [
-        *("", "chek walking:Walk", "check", "check walking:Walk --time-limit never", "wire-check --options [1] s"),
+        *(
+            "",
+            "chek walking:Walk",
+            "check",
+            "check walking:Walk --time-limit never",
+            "wire-check --options [1] s",
+        ),
         *("new", "new plain", "new netlogo tank"),
     ],
 )
@@ -127,9 +138,15 @@ def test_wrong_arguments_end_the_command_with_status_2(arguments, capsys):
 @pytest.mark.parametrize(
     ("command", "options"),
     [
-        ("check walking:Walk", ["seed -1", "episodes 0", "max-steps 0", "time-limit 0", "time-limit inf"]),
+        (
+            "check walking:Walk",
+            ["seed -1", "episodes 0", "max-steps 0", "time-limit 0", "time-limit inf"],
+        ),
         ("inspect walking:Walk", ["seed -1"]),
-        ("wire-check true", ["seed -1", f"seed {2**31}", "decisions 0", "timeout nan", "timeout inf"]),
+        (
+            "wire-check true",
+            ["seed -1", f"seed {2**31}", "decisions 0", "timeout nan", "timeout inf"],
+        ),
     ],
 )
 def test_numbers_that_cannot_be_used(command, options, capsys):

@@ -54,9 +54,17 @@ class BigPump(Pump):
 
 def test_outside_any_environment_a_decision_function_is_the_rule_and_keeps_its_binding():
     pump = Pump()
-    assert pump.flow(1.5, unit="m", fast=True) == Pump.flow(pump, 1.5, "m", fast=True) == (1.5, "m", True)
+    assert (
+        pump.flow(1.5, unit="m", fast=True)
+        == Pump.flow(pump, 1.5, "m", fast=True)
+        == (1.5, "m", True)
+    )
     assert Pump.flow.__wrapped__(pump, 4) == (4, "l", False)
-    for held, kind in (("rounded", staticmethod), ("halved", staticmethod), ("strongest", classmethod)):
+    for held, kind in (
+        ("rounded", staticmethod),
+        ("halved", staticmethod),
+        ("strongest", classmethod),
+    ):
         assert type(vars(Pump)[held]) is kind
     assert Pump.rounded(2.5) == Pump().rounded(2.5) == 2
     assert Pump.halved(3) == BigPump().halved(3) == 1.5
@@ -65,9 +73,15 @@ def test_outside_any_environment_a_decision_function_is_the_rule_and_keeps_its_b
 
 
 def test_a_decision_function_keeps_its_looks_and_is_pickled_by_name():
-    assert (Pump.flow.__name__, Pump.flow.__qualname__, Pump.flow.__module__) == ("flow", "Pump.flow", __name__)
+    assert (Pump.flow.__name__, Pump.flow.__qualname__, Pump.flow.__module__) == (
+        "flow",
+        "Pump.flow",
+        __name__,
+    )
     assert (Pump.flow.__doc__, Pump.strongest.__doc__) == ("How much flows.", "The power.")
-    signature = "amount: float, /, unit: str = 'l', *, fast: bool = False) -> tuple[typing.Any, ...]"
+    signature = (
+        "amount: float, /, unit: str = 'l', *, fast: bool = False) -> tuple[typing.Any, ...]"
+    )
     assert str(inspect.signature(Pump.flow)) == f"(self, {signature}"
     assert str(inspect.signature(Pump().flow)) == f"({signature}"
     assert inspect.isfunction(Pump.flow)
@@ -93,19 +107,31 @@ GOAL = {"achieved_goal_mapping": list, "desired_goal_mapping": list, "compute_re
         ({"reward_mapping": None}, "reward_mapping must be callable"),
         ({"action_space_mapping": None}, "give one of action_space_mapping, apply and choices"),
         ({"action_space_mapping": [1, 2]}, "action_space_mapping must be a callable or a dict"),
-        ({"action_space": spaces.Discrete(3), "action_space_mapping": {0: 1, 1: 2}}, "must have just the actions"),
-        ({"action_space": spaces.Discrete(2), "action_space_mapping": {0: 1, 1: 2, 2: 3}}, "just the actions"),
+        (
+            {"action_space": spaces.Discrete(3), "action_space_mapping": {0: 1, 1: 2}},
+            "must have just the actions",
+        ),
+        (
+            {"action_space": spaces.Discrete(2), "action_space_mapping": {0: 1, 1: 2, 2: 3}},
+            "just the actions",
+        ),
         ({"action_space": spaces.Box(0, 1), "action_space_mapping": {0: 1}}, "needs a Discrete"),
         ({"apply": print, "action_space_mapping": print}, "give one of"),
         ({"choices": list, "action_space_mapping": print}, "give one of"),
         ({"choices": list, "action_space": spaces.Box(0, 1)}, "choices needs a Discrete"),
         ({"choices": list, "action_space": spaces.Discrete(3, start=1)}, "starts at 0"),
         ({"choices": list, "action_mask_mapping": list}, "leave action_mask_mapping out"),
-        ({"action_mask_mapping": list, "action_space": spaces.Box(0, 1)}, "needs a Discrete or MultiDiscrete"),
+        (
+            {"action_mask_mapping": list, "action_space": spaces.Box(0, 1)},
+            "needs a Discrete or MultiDiscrete",
+        ),
         ({"rule_action_mapping": 3}, "rule_action_mapping must be a callable or a dict"),
         ({"agent": ""}, "agent must be a name"),
         ({"removed_by": {3: None}}, "removed_by must be a dict from dotted names"),
-        ({"removed_by": {"package.function": "ant_0"}}, "removed_by must be a dict from dotted names"),
+        (
+            {"removed_by": {"package.function": "ant_0"}},
+            "removed_by must be a dict from dotted names",
+        ),
         ({"goal_space": spaces.Discrete(3)}, "a goal needs all of its parts"),
         (GOAL, "missing: goal_space"),
     ],
@@ -123,13 +149,19 @@ def test_definitions_that_cannot_work_are_refused(changes, match):
 
 def test_a_definition_that_is_replaced_in_part_is_made_ready_as_a_whole():
     definition = define(
-        action_space=spaces.Discrete(2), action_space_mapping={0: "no", 1: "yes"}, removed_by="package.module.function"
+        action_space=spaces.Discrete(2),
+        action_space_mapping={0: "no", 1: "yes"},
+        removed_by="package.module.function",
     )
     same = dataclasses.replace(definition, agent="ant_0")
     assert same.action_space_mapping(1) == "yes"
     assert same.removed_by == {"package.module.function": None}
     answers, removed_by = {0: "no", 1: "yes", 2: "maybe"}, {"package.module.other": None}
-    more = {"action_space": spaces.Discrete(3), "action_space_mapping": answers, "removed_by": removed_by}
+    more = {
+        "action_space": spaces.Discrete(3),
+        "action_space_mapping": answers,
+        "removed_by": removed_by,
+    }
     other = dataclasses.replace(definition, **more)
     answers.clear()
     removed_by.clear()
@@ -144,10 +176,14 @@ async def flow():
 
 
 @pytest.mark.parametrize(
-    "function", [len, property(lambda self: 1), functools.partial(int), int, None, Pump().flow, flow], ids=plainly
+    "function",
+    [len, property(lambda self: 1), functools.partial(int), int, None, Pump().flow, flow],
+    ids=plainly,
 )
 def test_only_functions_can_be_decided(function):
-    with pytest.raises(PatchError, match="is an async generator function" if function is flow else None):
+    with pytest.raises(
+        PatchError, match="is an async generator function" if function is flow else None
+    ):
         define()(function)
 
 
@@ -160,7 +196,9 @@ def test_only_functions_can_be_decided(function):
         ("weakest", lambda pump: pump.weakest(), ("class",), {}),
     ],
 )
-def test_mappings_of_static_and_class_methods_receive_the_arguments_bound_to_the_signature(name, call, args, kwargs):
+def test_mappings_of_static_and_class_methods_receive_the_arguments_bound_to_the_signature(
+    name, call, args, kwargs
+):
     seen = []
 
     def observe(*args, **kwargs):
@@ -238,7 +276,9 @@ async def apply_later(action, good):
 
 
 def finished(made):
-    """What a generator or coroutine yields, where each yield is answered by 100, and what it returns."""
+    """What a generator or coroutine yields, where each yield is answered by 100, and what it
+    returns.
+    """
     yields = []
     try:
         yields.append(made.send(None))
@@ -258,7 +298,9 @@ def finished(made):
         (order, apply_later, ([], (5, "tea")), ([], ("rule", "tea"))),
     ],
 )
-def test_what_a_generator_or_coroutine_returns_is_decided_when_it_starts(function, apply, told, rule):
+def test_what_a_generator_or_coroutine_returns_is_decided_when_it_starts(
+    function, apply, told, rule
+):
     changes = {"apply": apply} if apply else {}
     decide = define(observation_space_mapping=lambda good: [len(started), 0], **changes)(function)
     started = []
@@ -323,7 +365,12 @@ def named(name, **changes):
     return decision(rule, **changes)
 
 
-WATER, GO, ALSO_GO, GIVEN = named("Choose_water_2"), named("go"), named("go"), named("going", agent="go_0")
+WATER, GO, ALSO_GO, GIVEN = (
+    named("Choose_water_2"),
+    named("go"),
+    named("go"),
+    named("going", agent="go_0"),
+)
 
 
 @pytest.mark.parametrize(
@@ -334,7 +381,9 @@ WATER, GO, ALSO_GO, GIVEN = named("Choose_water_2"), named("go"), named("go"), n
         ([GO, GIVEN], ["go_1", "go_0"]),
     ],
 )
-def test_default_names_are_the_functions_letters_in_the_order_of_points_and_collide_with_none(points, names):
+def test_default_names_are_the_functions_letters_in_the_order_of_points_and_collide_with_none(
+    points, names
+):
     env = aec_env(calling(GO), points)
     assert env.possible_agents == names
     env.reset()

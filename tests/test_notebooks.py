@@ -1,4 +1,7 @@
-"""The notebooks of pages show what the pages show. Those of the documentation are executed whenever it is built."""
+"""The notebooks of pages show what the pages show.
+
+Those of the documentation are executed whenever it is built.
+"""
 
 from pathlib import Path
 
@@ -38,23 +41,39 @@ def test_the_text_of_a_notebook_has_nothing_that_only_pages_know(page):
 
 @pytest.fixture
 def page(tmp_path):
-    for name, text in {"page.md": PAGE, "concepts.md": "# Concepts\n", "model.py": "VALUE = 1\n"}.items():
+    for name, text in {
+        "page.md": PAGE,
+        "concepts.md": "# Concepts\n",
+        "model.py": "VALUE = 1\n",
+    }.items():
         (tmp_path / name).write_text(text)
     return tmp_path / "page.md"
 
 
 def test_an_executed_notebook_is_written_beside_its_page(page):
     notebooks.write_notebooks(page.parent, ("page",))
-    text, model, *cells = nbformat.read(page.parent / "_notebooks" / "page.ipynb", as_version=4).cells
+    text, model, *cells = nbformat.read(
+        page.parent / "_notebooks" / "page.ipynb", as_version=4
+    ).cells
     assert text.source == "# A page\n\nSee *Concepts*, and `model.py`."
     assert model.source == "%%writefile model.py\nVALUE = 1"
-    assert [cell.source for cell in cells] == ["from model import VALUE\nVALUE + 1", 'print("a line")', "1 / 0"]
+    assert [cell.source for cell in cells] == [
+        "from model import VALUE\nVALUE + 1",
+        'print("a line")',
+        "1 / 0",
+    ]
     value, printed, error = (cell.outputs[0] for cell in cells)
-    assert (value.data["text/plain"], printed.text, error.ename) == ("2", "a line\n", "ZeroDivisionError")
+    assert (value.data["text/plain"], printed.text, error.ename) == (
+        "2",
+        "a line\n",
+        "ZeroDivisionError",
+    )
     assert [cell.execution_count for cell in cells] == [2, 3, 4]
 
 
-@pytest.mark.parametrize(("shown", "wrong"), [("\n2\n", "\n3\n"), ("\na line", "\nno line"), ("ZeroDiv", "Zero")])
+@pytest.mark.parametrize(
+    ("shown", "wrong"), [("\n2\n", "\n3\n"), ("\na line", "\nno line"), ("ZeroDiv", "Zero")]
+)
 def test_a_page_that_shows_something_else_is_refused(page, shown, wrong):
     page.write_text(PAGE.replace(shown, wrong))
     with pytest.raises(ValueError, match="and its page has"):

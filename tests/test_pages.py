@@ -1,4 +1,6 @@
-"""Pages: their code runs and needs only what can be got as they say, and what they quote is what the library says."""
+"""Pages: their code runs and needs only what can be got as they say, and what they quote is what
+the library says.
+"""
 
 import builtins
 import random
@@ -25,7 +27,9 @@ CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 BUDGETS = CONFIG["tool"]["simenv_marl"]["budgets"]
 EXTRAS = set(CONFIG["project"]["optional-dependencies"])
 ROOMS = {page.stem: page for page in (DOCS / "reference").glob("*.md")}
-PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md")) + sorted(f"reference/{room}" for room in ROOMS)
+PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md")) + sorted(
+    f"reference/{room}" for room in ROOMS
+)
 FRONT = [
     *("README.md", "CONTRIBUTING.md", "SECURITY.md", ".github/PULL_REQUEST_TEMPLATE.md"),
     *(f"docs/{page}.md" for page in PAGES),
@@ -50,14 +54,18 @@ def can_be_installed():
     """The packages that the project requires, with any of its extras."""
     project = CONFIG["project"]
     required = chain(project["dependencies"], *project["optional-dependencies"].values())
-    return {re.match(r"[\w-]+", requirement)[0].lower().replace("-", "_") for requirement in required}
+    return {
+        re.match(r"[\w-]+", requirement)[0].lower().replace("-", "_") for requirement in required
+    }
 
 
 def sources(text):
     """The files of the examples and studies whose modules a page imports, runs or names."""
     for name in re.findall(r"(?<![\w.])(?:examples|studies)(?:\.\w+)+", text):
         parts = name.split(".")
-        paths = (ROOT.joinpath(*parts[:length]).with_suffix(".py") for length in range(len(parts), 1, -1))
+        paths = (
+            ROOT.joinpath(*parts[:length]).with_suffix(".py") for length in range(len(parts), 1, -1)
+        )
         yield from [path for path in paths if path.exists()][:1]
 
 
@@ -71,9 +79,14 @@ def linked(page, text):
 def test_the_code_of_a_page_fits_on_it_and_the_page_says_what_it_needs(page):
     text, code = code_of(page)
     saved = {path.stem for path in linked(page, text)}
-    assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {"examples", "studies"}
+    assert imported(code) - sys.stdlib_module_names - can_be_installed() - BESIDE - saved <= {
+        "examples",
+        "studies",
+    }
     assert set(sources(text)) <= linked(page, text)  # each example that it imports or runs
-    first = re.search(r"(?<![\w./])(?:benchmarks|examples|studies)[./]\w|^make \w|`make \w", text, re.MULTILINE)
+    first = re.search(
+        r"(?<![\w./])(?:benchmarks|examples|studies)[./]\w|^make \w|`make \w", text, re.MULTILINE
+    )
     if first:  # only the repository has it
         up_to_there = " ".join(text[: text.find("\n\n", first.end())].split())
         assert re.search(r"[Cc]lone the repository\b.* from its root\b", up_to_there)
@@ -86,22 +99,33 @@ def words_of(page):
 
 
 def test_the_map_has_few_pages_and_each_is_short():
-    captions = re.findall(r":caption: (.+)\n\n((?:[\w-]+\n)+)", (DOCS / "index.md").read_text(encoding="utf-8"))
+    captions = re.findall(
+        r":caption: (.+)\n\n((?:[\w-]+\n)+)", (DOCS / "index.md").read_text(encoding="utf-8")
+    )
     pages = {caption: names.split() for caption, names in captions}
     studies = {page: words_of(page) for page in pages.pop("Studies")}
-    others = {page: words_of(page) for page in {"index", *chain(*pages.values())} - {"changelog", "reference"}}
+    others = {
+        page: words_of(page)
+        for page in {"index", *chain(*pages.values())} - {"changelog", "reference"}
+    }
     assert len(pages) <= 7
     assert len(others) <= BUDGETS["pages"]
     assert sum(others.values()) <= BUDGETS["words_of_pages"], others
-    assert {page: words for page, words in others.items() if words > BUDGETS["words_of_a_page"]} == {}
-    assert {page: words for page, words in studies.items() if words > BUDGETS["words_of_a_study"]} == {}
+    assert {
+        page: words for page, words in others.items() if words > BUDGETS["words_of_a_page"]
+    } == {}
+    assert {
+        page: words for page, words in studies.items() if words > BUDGETS["words_of_a_study"]
+    } == {}
 
 
 @pytest.mark.parametrize("room", ["simenv_marl", *simenv_marl.ROOMS])
 def test_the_page_of_a_room_lists_the_names_that_it_has(room):
     text = ROOMS[room].read_text(encoding="utf-8")
     names = set(getattr(simenv_marl, room, simenv_marl).__all__)
-    described = re.findall(r"^\.\. (auto\w+|data):: (\w+)$|^\.\. \w+:: (\w+)\(\)$", text, re.MULTILINE)
+    described = re.findall(
+        r"^\.\. (auto\w+|data):: (\w+)$|^\.\. \w+:: (\w+)\(\)$", text, re.MULTILINE
+    )
     constants = {name for kind, name, _ in described if kind == "data"}
     table = re.search(r"autosummary::\n   :nosignatures:\n\n((?:   \S+\n)+)", text)[1].split()
     assert {name for name in table if "." not in name} | constants == names
@@ -119,43 +143,72 @@ def texts():
 
 @cache
 def programs_of_tests():
-    """The modules that tests run as programs, and our commands; a star stands for what a test fills in."""
+    """The modules that tests run as programs, and our commands; a star stands for what a test
+    fills in.
+    """
     found = set()
     for path in ROOT.glob("tests/**/*.py"):
         text = re.sub(r"\{.+?\}", "*", texts()[path])
         found.update(re.findall(r'"-m", f?"([^"]+)"', text))
-        found.update(f"simenv_marl {name}" for name in re.findall(r'(?:main\(\[|"simenv_marl", )"([\w-]+)"', text))
-        for package, names in re.findall(r"^ *from ((?:examples|studies)\S*) import (.+)$", text, re.MULTILINE):
+        found.update(
+            f"simenv_marl {name}"
+            for name in re.findall(r'(?:main\(\[|"simenv_marl", )"([\w-]+)"', text)
+        )
+        for package, names in re.findall(
+            r"^ *from ((?:examples|studies)\S*) import (.+)$", text, re.MULTILINE
+        ):
             aliases = (name.partition(" as ") for name in names.split(", "))
-            found.update(f"{package}.{name}" for name, _, alias in aliases if f" {alias or name}.main(" in text)
+            found.update(
+                f"{package}.{name}"
+                for name, _, alias in aliases
+                if f" {alias or name}.main(" in text
+            )
     return found
 
 
 def commands_of(text):
-    """The commands of a page, in its blocks and lines, without the blocks that it marks as not run."""
+    """The commands of a page, in its blocks and lines, without the blocks that it marks as not
+    run.
+    """
     yield from re.findall(r"`((?:make|python -m) [^`<]+)`", text)
     blocks = re.findall(
-        r"^(<!-- not run: .+ -->\n\n?)?( *)```(sh|console)\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE
+        r"^(<!-- not run: .+ -->\n\n?)?( *)```(sh|console)\n(.*?)^ *```$",
+        text,
+        re.DOTALL | re.MULTILINE,
     )
     for mark, _, language, block in blocks:
         lines = [line.partition(" #")[0].strip() for line in block.replace("\\\n", "").splitlines()]
         if not mark:
-            yield from (line.removeprefix("$ ") for line in lines if language == "sh" or line.startswith("$ "))
+            yield from (
+                line.removeprefix("$ ")
+                for line in lines
+                if language == "sh" or line.startswith("$ ")
+            )
 
 
 def untested(command, written):
-    """What a command runs or installs, and no test; ``written`` are the modules that a command before it writes."""
+    """What a command runs or installs, and no test; ``written`` are the modules that a command
+    before it writes.
+    """
     if command.startswith("make "):
         dry_run = [*shlex.split(command), "--dry-run"]
-        recipe = subprocess.run(dry_run, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        recipe = subprocess.run(
+            dry_run, cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
         command = "; ".join(re.findall(r"-m (?:examples|studies)\S+", recipe)) or "-m pytest"
     extras = re.findall(r"pip install .*\[(.+)\]", command)
-    programs = [name.replace("$script", "*") for name in re.findall(r"-m (simenv_marl \S+|[\w.$]+)", command)]
+    programs = [
+        name.replace("$script", "*")
+        for name in re.findall(r"-m (simenv_marl \S+|[\w.$]+)", command)
+    ]
     if programs or "pip install" in command:
         known = {"pytest", "venv", *written, *programs_of_tests()}
-        unknown = {name for name in programs if not any(fnmatch(name, pattern) for pattern in known)}
+        unknown = {
+            name for name in programs if not any(fnmatch(name, pattern) for pattern in known)
+        }
         return unknown | set(chain(*(names.split(",") for names in extras))) - EXTRAS
-    name = [word for word in command.split() if not word.isdigit()][-1].rpartition("/")[2]  # a file, a class, a package
+    # a file, a class, a package
+    name = [word for word in command.split() if not word.isdigit()][-1].rpartition("/")[2]
     named = re.compile(rf'["/ ]{re.escape(name)}\b')
     return set() if name in written or any(map(named.search, texts().values())) else {name}
 
@@ -164,7 +217,9 @@ def untested(command, written):
 def test_a_command_of_a_page_is_run_by_tests_or_marked_as_not_run(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     written = re.findall(r"-m simenv_marl new \w+ (\w+)", text)
-    found = {command: missing for command in commands_of(text) if (missing := untested(command, written))}
+    found = {
+        command: missing for command in commands_of(text) if (missing := untested(command, written))
+    }
     assert found == {}
 
 
@@ -230,13 +285,15 @@ def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are()
         parts = [re.escape(part.strip()) for part in quote.replace("`", "").split("...")]
         assert re.search(".*".join(parts), said), quote
     named = set(re.findall(r"`([A-Z]\w+Error)`", text))
-    assert {name for name in named if not hasattr(builtins, name)} <= set(simenv_marl.errors.__all__)
+    assert {name for name in named if not hasattr(builtins, name)} <= set(
+        simenv_marl.errors.__all__
+    )
 
 
 TERMS = (
-    "parameter sharing", "centralised training", "CTDE", "self-play", "black death", "discrete-event simulation",
-    "agent-based model", "semi-MDP", "callback", "hook", "DAgger", "action mask", "PPO", "wrapper", "seed", "pickle",
-    "AEC", "turn-based", "MARL", "behavior cloning",
+    "parameter sharing", "centralised training", "CTDE", "self-play", "black death",
+    "discrete-event simulation", "agent-based model", "semi-MDP", "callback", "hook",
+    "DAgger", "action mask", "PPO", "wrapper", "seed", "pickle", "AEC", "turn-based", "MARL", "behavior cloning",
 )  # fmt: skip
 
 

@@ -1,4 +1,6 @@
-"""Mistakes of users that are told when the environment is made, or with the remedy; and what ``help`` tells them."""
+"""Mistakes of users that are told when the environment is made, or with the remedy; and what
+``help`` tells them.
+"""
 
 import pydoc
 from dataclasses import fields
@@ -36,18 +38,25 @@ class Derived(Model):
 CHOOSE = f"{__name__}.Model.choose"
 
 
-@pytest.mark.parametrize("part", ["observation_space_mapping", "reward_mapping", "agent", "action_mask_mapping"])
+@pytest.mark.parametrize(
+    "part", ["observation_space_mapping", "reward_mapping", "agent", "action_mask_mapping"]
+)
 def test_a_simulation_parameter_that_is_not_keyword_only_is_refused(part):
     def mapping(model, _simulation=None):
         return 0
 
-    with pytest.raises(DefinitionError, match=r"_simulation of .*mapping.* must be keyword-only: write it behind a \*"):
+    with pytest.raises(
+        DefinitionError,
+        match=r"_simulation of .*mapping.* must be keyword-only: write it behind a \*",
+    ):
         aec_env(Model, {CHOOSE: define(**{part: mapping})})
 
 
 def test_an_episode_without_a_decision_names_the_functions_that_override_the_point():
     env = single_env(Derived, {CHOOSE: define()})
-    with pytest.raises(NoDecisionError, match=rf"{CHOOSE}; .* called instead.*{__name__}\.Derived\.choose"):
+    with pytest.raises(
+        NoDecisionError, match=rf"{CHOOSE}; .* called instead.*{__name__}\.Derived\.choose"
+    ):
         env.reset()
 
 
@@ -63,7 +72,9 @@ def test_possible_agents_without_a_roster_say_how_to_declare_them(make):
 
 def test_an_episode_whose_decisions_fall_in_a_late_thread_names_the_thread_and_the_point():
     calls, answers = SimpleQueue(), SimpleQueue()
-    middleware = Thread(target=lambda: [answers.put(call()) for call in iter(calls.get, None)], name="middleware")
+    middleware = Thread(
+        target=lambda: [answers.put(call()) for call in iter(calls.get, None)], name="middleware"
+    )
 
     class Served(Model):
         def run(self):
@@ -73,7 +84,9 @@ def test_an_episode_whose_decisions_fall_in_a_late_thread_names_the_thread_and_t
     middleware.start()
     env = single_env(Served, {f"{__name__}.Model.choose": define()})
     try:
-        with pytest.raises(NoDecisionError, match=rf"{CHOOSE}; .*threads that are not the simulation's: middleware"):
+        with pytest.raises(
+            NoDecisionError, match=rf"{CHOOSE}; .*threads that are not the simulation's: middleware"
+        ):
             env.reset()
     finally:
         calls.put(None)
@@ -102,7 +115,10 @@ def test_help_explains_every_option(name):
 
 
 def test_hints_name_what_is_close():
-    assert did_you_mean("sheep_1", ["sheep_0", "sheep_2", "wolf_0"]) == "; did you mean sheep_2 or sheep_0?"
+    assert (
+        did_you_mean("sheep_1", ["sheep_0", "sheep_2", "wolf_0"])
+        == "; did you mean sheep_2 or sheep_0?"
+    )
     assert did_you_mean("quite different", ["max_steps"]) == did_you_mean(3, ["3"]) == ""
 
 
@@ -116,7 +132,10 @@ def test_hints_name_what_is_close():
         (lambda env: simenv_marl.generate_env(Walk, Walk.choose, view="paralel"), "parallel"),
         (lambda env: env.observe("walker_1"), "walker_0"),
         (lambda env: simenv_marl.branch(env, 1, method="frok"), "fork"),
-        (lambda env: simenv_marl.experiments.design({"a": [1, 2]}, "full_factorail"), "full_factorial"),
+        (
+            lambda env: simenv_marl.experiments.design({"a": [1, 2]}, "full_factorail"),
+            "full_factorial",
+        ),
     ],
 )
 def test_messages_hint_at_the_name_that_was_meant(wrong, hint):

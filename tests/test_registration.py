@@ -65,7 +65,11 @@ def sailed(env):
 def test_all_other_points_run_their_rule_or_the_policy_that_is_given(register):
     """A policy may be given under any name of the point, and then answers in every view."""
     assert -0.61 < sailed(made(SINGLES[0])) < -0.39
-    assert 0.89 < sailed(made(SINGLES[0], policies={Boat.set_sail: lambda observation: np.float32([1.0])})) < 1.11
+    assert (
+        0.89
+        < sailed(made(SINGLES[0], policies={Boat.set_sail: lambda observation: np.float32([1.0])}))
+        < 1.11
+    )
     for key in (Boat.set_sail, f"{Boat.__module__}.Boat.set_sail", "sail_0"):
         ids = register(Voyage, name="policies", policies={key: lambda observation: 0.25})
         assert ids == ["policies/SteerBoat-v0", "policies/Joint-v0", "policies/coop_v0"]
@@ -98,7 +102,12 @@ def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_ve
     assert length(first) == 3
     assert register(Voyage, name="versions") == first  # as when a notebook's cell runs again
     second = register(Voyage, name="versions", version=3, max_steps=2)
-    assert first == ["versions/SteerBoat-v0", "versions/SetSail-v0", "versions/Joint-v0", "versions/coop_v0"]
+    assert first == [
+        "versions/SteerBoat-v0",
+        "versions/SetSail-v0",
+        "versions/Joint-v0",
+        "versions/coop_v0",
+    ]
     assert second == [identity.replace("v0", "v3") for identity in first]
     assert (length(first), length(second), length(second, max_steps=None)) == (26, 4, 26)
     env = made(second[0])
@@ -107,7 +116,11 @@ def test_options_are_those_of_the_registration_which_may_be_repeated_and_have_ve
 
 
 def test_points_are_those_that_are_named(register):
-    steering = {f"{Boat.__module__}.Boat.steer_boat": define(action_space=spaces.Discrete(2), agent="helm_0")}
+    steering = {
+        f"{Boat.__module__}.Boat.steer_boat": define(
+            action_space=spaces.Discrete(2), agent="helm_0"
+        )
+    }
     ids = register(Voyage, steering, name="named")
     assert ids == ["named/SteerBoat-v0", "named/Joint-v0", "named/coop_v0"]
     assert pettingzoo.make("aec", "named/coop_v0").possible_agents == ["helm_0"]
@@ -119,7 +132,9 @@ def test_entities_have_no_single_view_and_are_in_that_of_another_point(register)
     clerk = decision(agent="clerk_0")
     points = {clerk: define(agent="clerk_0"), **beings()}
     roster = {Being.act: ["being_0"]}  # an option of a point that the single view lacks
-    ids = register(calling(clerk, lambda: Being(0).act()), points, name="mixed", possible_agents=roster)
+    ids = register(
+        calling(clerk, lambda: Being(0).act()), points, name="mixed", possible_agents=roster
+    )
     assert ids == ["mixed/Choose-v0", "mixed/Joint-v0", "mixed/coop_v0"]
     env = made(ids[0])
     env.reset()
@@ -131,7 +146,9 @@ def test_entities_have_no_single_view_and_are_in_that_of_another_point(register)
 
 @pytest.mark.parametrize("flatten", [False, True])
 def test_flatten_is_an_option_of_the_joint_view_alone(register, flatten):
-    """It may be one of the variant, of the registration and of the one who makes it, who comes first."""
+    """It may be one of the variant, of the registration and of the one who makes it, who comes
+    first.
+    """
     ids = register(Variant("flat", Voyage, options={"flatten": True}), flatten=flatten)
     for options, expected in (({}, flatten), ({"flatten": not flatten}, not flatten)):
         env = made("flat/Joint-v0", **options)
@@ -145,9 +162,22 @@ def test_flatten_is_an_option_of_the_joint_view_alone(register, flatten):
 
 
 def test_names_of_points_become_camel_case_and_stay_distinct(register):
-    """The id of the joint view is taken, names may differ in how they are written alone, and classes share names."""
-    named = ["Robot.joint", "Robot.choose_2nd_route", "Robot.open_grip", "Robot.openGrip", "Legs.move", "Arms.move"]
-    inside = [f"{function}.<locals>.{name}" for function in "fg" for name in ("Boat.choose", "choose", "<lambda>")]
+    """The id of the joint view is taken, names may differ in how they are written alone, and
+    classes share names.
+    """
+    named = [
+        "Robot.joint",
+        "Robot.choose_2nd_route",
+        "Robot.open_grip",
+        "Robot.openGrip",
+        "Legs.move",
+        "Arms.move",
+    ]
+    inside = [
+        f"{function}.<locals>.{name}"
+        for function in "fg"
+        for name in ("Boat.choose", "choose", "<lambda>")
+    ]
     points = []
     for number, name in enumerate([*named, *inside]):
 
@@ -155,12 +185,16 @@ def test_names_of_points_become_camel_case_and_stay_distinct(register):
             return 0
 
         rule.__name__, rule.__qualname__, rule.__module__ = name.rpartition(".")[2], name, __name__
-        points.append(define(agent=f"robot_{number}", observation_space_mapping=lambda n=number: [0, n])(rule))
+        points.append(
+            define(agent=f"robot_{number}", observation_space_mapping=lambda n=number: [0, n])(rule)
+        )
     ids = register(calling(*points), points, name="robots")
     assert ids[:2] == ["robots/RobotJoint-v0", "robots/Choose2ndRoute-v0"]
     assert "robots/Joint-v0" in ids
     assert len(set(ids)) == len(ids) == len(points) + 2
-    assert [made(each).reset()[0].tolist() for each in ids[:-2]] == [[0, number] for number in range(len(points))]
+    assert [made(each).reset()[0].tolist() for each in ids[:-2]] == [
+        [0, number] for number in range(len(points))
+    ]
 
 
 @pytest.mark.parametrize(
@@ -170,7 +204,10 @@ def test_names_of_points_become_camel_case_and_stay_distinct(register):
         ({"speed": 3}, UnknownOptionError),
         ({"max_steps": 0}, SimEnvError),
         ({"simulation": 3}, SimEnvError),
-        *(({"name": name}, OptionValueError) for name in ("a:b", "a/b", "", "a\n", 3, "\ud800", None)),
+        *(
+            ({"name": name}, OptionValueError)
+            for name in ("a:b", "a/b", "", "a\n", 3, "\ud800", None)
+        ),
         *(({"version": version}, OptionValueError) for version in (-1, 1.0, True)),
         ({"simulation": Variant("hot summer", Voyage), "name": None}, OptionValueError),
     ],
@@ -184,7 +221,9 @@ def test_a_refused_registration_leaves_the_registries_unchanged(register, change
 
 
 def test_in_another_process_by_module_and_id_or_by_a_spec_that_was_written_down():
-    """And in vectors: where processes are spawned, as on all systems but Linux, they know no more than the spec."""
+    """And in vectors: where processes are spawned, as on all systems but Linux, they know no more
+    than the spec.
+    """
     env = gymnasium.make(f"tests.worlds.many_registered:{SINGLES[0]}", max_steps=2)
     code = f"""
 import gymnasium, pettingzoo
@@ -204,11 +243,23 @@ if __name__ == "__main__":
     path = {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
     command = [sys.executable, "-W", "error", "-c", code]
     done = subprocess.run(
-        command, cwd=ROOT, env=os.environ | path, capture_output=True, text=True, timeout=120, check=False
+        command,
+        cwd=ROOT,
+        env=os.environ | path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     observation, agents = env.reset(seed=5)[0].tolist(), ["helm_0", "sail_0"]
-    assert done.stdout.splitlines() == [str(observation), "[False, True]", JOINT, f"{agents} {agents}", "(2, 2)"]
+    assert done.stdout.splitlines() == [
+        str(observation),
+        "[False, True]",
+        JOINT,
+        f"{agents} {agents}",
+        "(2, 2)",
+    ]
 
 
 def test_pictures_for_people_are_made_of_arrays(register, monkeypatch):
@@ -216,7 +267,9 @@ def test_pictures_for_people_are_made_of_arrays(register, monkeypatch):
         render_modes = ("rgb_array",)
 
     shown = []
-    monkeypatch.setattr(HumanRendering, "_render_frame", lambda env: shown.append(env.env.render().shape))
+    monkeypatch.setattr(
+        HumanRendering, "_render_frame", lambda env: shown.append(env.env.render().shape)
+    )
     ids = register(Pictured, name="pictured")
     env = gymnasium.make(ids[0], render_mode="human")
     assert env.render_mode == "human"

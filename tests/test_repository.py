@@ -26,10 +26,16 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
     citation = loaded("CITATION.cff")
     assert citation["version"] == simenv_marl.__version__
     assert citation["license"] == PROJECT["license"]
-    assert [author["name"] for author in citation["authors"]] == [author["name"] for author in PROJECT["authors"]]
+    assert [author["name"] for author in citation["authors"]] == [
+        author["name"] for author in PROJECT["authors"]
+    ]
     paper = citation["preferred-citation"]
     assert paper["title"] == "Sim-Env: Decoupling OpenAI Gym Environments from Simulation Models"
-    assert [author["family-names"] for author in paper["authors"]] == ["Schuderer", "Bromuri", "Eekelen"]
+    assert [author["family-names"] for author in paper["authors"]] == [
+        "Schuderer",
+        "Bromuri",
+        "Eekelen",
+    ]
     assert paper["identifiers"][0]["value"].removeprefix("arXiv:") in paper["url"]
 
 

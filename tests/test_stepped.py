@@ -65,7 +65,9 @@ def walked(seed, steps, **parameters):
 
 
 def test_with_the_rule_throughout_it_is_the_plain_model():
-    assert simulate(SteppedSimulation(Walk, 20, drift=0.1), seed=3).model.place == walked(3, 20, drift=0.1)
+    assert simulate(SteppedSimulation(Walk, 20, drift=0.1), seed=3).model.place == walked(
+        3, 20, drift=0.1
+    )
     env = single_env(SteppedSimulation(Walk, 20), STRIDE)
     env.reset(seed=3)
     ended = False
@@ -92,17 +94,28 @@ def test_the_model_ends_the_episode_when_it_runs_no_more(steps):
 
 def test_the_seed_goes_where_the_model_takes_it():
     assert simulate(SteppedSimulation(ByRng, 5), seed=2).model.place == walked(2, 5)
-    assert simulate(SteppedSimulation(PassedOn, 5, drift=1.0), seed=2).model.place == walked(2, 5, drift=1.0)
-    assert simulate(SteppedSimulation(partial(PassedOn, 1.0), 5), seed=2).model.place == walked(2, 5, drift=1.0)
-    assert simulate(SteppedSimulation(lambda **given: Walk(**given), 5), seed=2).model.place == walked(2, 5)
+    assert simulate(SteppedSimulation(PassedOn, 5, drift=1.0), seed=2).model.place == walked(
+        2, 5, drift=1.0
+    )
+    assert simulate(SteppedSimulation(partial(PassedOn, 1.0), 5), seed=2).model.place == walked(
+        2, 5, drift=1.0
+    )
+    assert simulate(
+        SteppedSimulation(lambda **given: Walk(**given), 5), seed=2
+    ).model.place == walked(2, 5)
     assert simulate(SteppedSimulation(lambda: Walk(seed=1), 5), seed=2).model.place == walked(1, 5)
-    assert simulate(SteppedSimulation(Walk, 5, seed=9), seed=2).model.place == walked(9, 5)  # by the user's own seed
+    # by the user's own seed
+    assert simulate(SteppedSimulation(Walk, 5, seed=9), seed=2).model.place == walked(9, 5)
 
 
 def test_a_model_whose_scenario_holds_the_seed_is_not_left_unseeded():
-    with pytest.raises(SimulationError, match=r"Planned'> takes a scenario.*lambda seed, \*\*parameters"):
+    with pytest.raises(
+        SimulationError, match=r"Planned'> takes a scenario.*lambda seed, \*\*parameters"
+    ):
         SteppedSimulation(Planned, 5)
-    made = SteppedSimulation(lambda seed, **parameters: Planned({"seed": seed, **parameters}), 5, drift=0.1)
+    made = SteppedSimulation(
+        lambda seed, **parameters: Planned({"seed": seed, **parameters}), 5, drift=0.1
+    )
     assert simulate(made, seed=2).model.place == walked(2, 5, drift=0.1)
     fixed = SteppedSimulation(Planned, 5, scenario={"seed": 4})  # by the user's own scenario
     assert simulate(fixed, seed=2).model.place == walked(4, 5)
@@ -129,6 +142,10 @@ def test_models_steps_and_parameters_that_cannot_be_are_refused():
 def test_points_are_those_that_are_named():
     with pytest.raises(UnknownPointError, match="points is empty"):
         aec_env(SteppedSimulation(Walk, 5))
-    assert evaluate(SteppedSimulation(Walk, 5), {"rule": {}}, seeds=[1]).frame["return"].tolist() == [0.0]
-    played = simulate(SteppedSimulation(Walk, 5), {"stride_0": lambda place: 2}, points=STRIDE, seed=2)
+    assert evaluate(SteppedSimulation(Walk, 5), {"rule": {}}, seeds=[1]).frame[
+        "return"
+    ].tolist() == [0.0]
+    played = simulate(
+        SteppedSimulation(Walk, 5), {"stride_0": lambda place: 2}, points=STRIDE, seed=2
+    )
     assert played.model.place == walked(2, 5, drift=1.0)

@@ -1,4 +1,6 @@
-"""Templates: what the command line writes runs where it stands, and what it cannot write it says."""
+"""Templates: what the command line writes runs where it stands, and what it cannot write it
+says.
+"""
 
 import ast
 import os
@@ -37,7 +39,9 @@ def run(folder, *arguments):
 def test_a_written_template_passes_its_own_tests(kind, tmp_path):
     done = run(tmp_path, "-m", "simenv_marl", "new", kind, "water_tank")
     assert (done.returncode, done.stderr) == (0, "")
-    written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    written = {
+        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
+    }
     assert written == {"water_tank/water_tank.py", "water_tank/test_water_tank.py"}
     assert f"pytest {KINDS[kind]}\n" in done.stdout
     assert kind != "plain" or f"$ python -m simenv_marl new plain water_tank\n{done.stdout}" in PAGE
@@ -47,7 +51,9 @@ def test_a_written_template_passes_its_own_tests(kind, tmp_path):
         assert "MyModel" not in text
         assert "MySimulation" not in text
         assert "WaterTankSimulation" in text
-    tested = run(tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error")
+    tested = run(
+        tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error"
+    )
     assert tested.returncode == 0, tested.stdout
 
 
@@ -58,7 +64,8 @@ def test_the_command_check_finds_a_written_template(tmp_path):
     assert "nothing to complain of" in checked.stdout
 
 
-@pytest.mark.parametrize("kind", ["simpy", "mesa"])  # plain needs Stable-Baselines3: tests/clients/test_templates.py
+# plain needs Stable-Baselines3: tests/clients/test_templates.py
+@pytest.mark.parametrize("kind", ["simpy", "mesa"])
 def test_training_is_worth_something(kind, tmp_path):
     assert run(tmp_path, "-m", "simenv_marl", "new", kind, "tank", "--folder", ".").returncode == 0
     done = run(tmp_path, "-W", "error::DeprecationWarning:tank", "-m", "tank", "--quick")
@@ -75,10 +82,20 @@ def test_training_is_worth_something(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_templates_import_only_packages_that_the_command_names(kind):
-    told = {"simenv_marl", "numpy", "gymnasium", *(package.replace("-", "_") for package in KINDS[kind].split())}
+    told = {
+        "simenv_marl",
+        "numpy",
+        "gymnasium",
+        *(package.replace("-", "_") for package in KINDS[kind].split()),
+    }
     tree = ast.parse((SOURCE / f"simenv_marl/testing/templates/{kind}.py").read_text())
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    imported |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
     packages = {name.partition(".")[0] for name in imported} - set(sys.stdlib_module_names)
     assert packages <= told
     assert packages >= told - {"gymnasium"}
@@ -128,7 +145,10 @@ def test_with_the_rule_throughout_the_environment_is_the_plain_run(kind):
     plain = template.MySimulation()
     plain.reset(seed=7)
     plain.run()
-    for other in (follow_the_rule(template.env(), seed=7), simulate(template.MySimulation, {}, seed=7)):
+    for other in (
+        follow_the_rule(template.env(), seed=7),
+        simulate(template.MySimulation, {}, seed=7),
+    ):
         assert differences(fingerprint("simulation", other), fingerprint("simulation", plain)) == []
 
 
@@ -137,7 +157,11 @@ def test_agents_of_the_mesa_template_are_born_and_die():
     env = import_module("simenv_marl.testing.templates.mesa").env()
     env.reset(seed=7)
     first = set(env.agents)
-    ends = {turn.agent: turn.terminated for turn in play(env, reset=False) if turn.terminated or turn.truncated}
+    ends = {
+        turn.agent: turn.terminated
+        for turn in play(env, reset=False)
+        if turn.terminated or turn.truncated
+    }
     assert set(ends) > first
     assert set(ends.values()) == {True, False}
 

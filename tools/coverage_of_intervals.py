@@ -4,9 +4,10 @@ From the repository's root:
 
     python -m tools.coverage_of_intervals --repetitions 20000
 
-It prints a table of percentages: for each distribution and number of seeds, how often a 95 % interval contains the true
-mean; how often the interval is unknown; how often the paired interval of two equal contenders excludes 0. Repetitions
-whose interval is unknown do not count for the other two.
+It prints a table of percentages: for each distribution and number of seeds, how often a 95 %
+interval contains the true mean; how often the interval is unknown; how often the paired interval of
+two equal contenders excludes 0. Repetitions whose interval is unknown do not count for the other
+two.
 """
 
 import argparse
@@ -56,7 +57,10 @@ def main() -> None:
     for name in DISTRIBUTIONS:
         for number in (5, 8, 16, 32):
             shares = measure(name, number, repetitions)
-            print(f"|{name}, {number}|{'|'.join(f'{100 * share:.1f}' for share in shares)}|", flush=True)
+            print(
+                f"|{name}, {number}|{'|'.join(f'{100 * share:.1f}' for share in shares)}|",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

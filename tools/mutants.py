@@ -1,17 +1,23 @@
-"""Mutation tests of the library: put small mistakes into a copy of it, one at a time; do the tests find them?
+"""Mutation tests of the library: put small mistakes into a copy of it, one at a time.
 
-Run it with ``python -m tools.mutants``, or ``make mutants``. It writes each result to a file at once, one JSON object
-per line. A second call resumes where the first stopped; with ``--again`` it retries the survivors, for example after
-tests were added. It draws mutants from all modules except ``testing`` and those that draw plots.
+Do the tests find them?
 
-Before the first mutant, it runs all tests once and measures their durations, and which tests execute which lines, also
-in processes that they start. Only tests that execute a mutant's module run for it: first those that execute its line,
-then those that execute its function, some quick ones of each file before the others.
+Run it with ``python -m tools.mutants``, or ``make mutants``. It writes each result to a file at
+once, one JSON object per line. A second call resumes where the first stopped; with ``--again`` it
+retries the survivors, for example after tests were added. It draws mutants from all modules except
+``testing`` and those that draw plots.
 
-A mutant that survives can cost half an hour, because nearly all tests execute some functions of the core. ``--most``
-limits the tests for each mutant to the first ones; the report says how many of them ran.
+Before the first mutant, it runs all tests once and measures their durations, and which tests
+execute which lines, also in processes that they start. Only tests that execute a mutant's module
+run for it: first those that execute its line, then those that execute its function, some quick ones
+of each file before the others.
 
-Some changes are no mistakes (equivalent mutants): ``mutants_known.toml`` lists each with the reason.
+A mutant that survives can cost half an hour, because nearly all tests execute some functions of the
+core. ``--most`` limits the tests for each mutant to the first ones; the report says how many of
+them ran.
+
+Some changes are no mistakes (equivalent mutants): ``mutants_known.toml`` lists each with the
+reason.
 """
 
 from __future__ import annotations
@@ -78,9 +84,10 @@ class Measured:
     def tests(self, mutant: Mutant) -> list[str]:
         """List the tests that could find a mutant, in the order in which they should run.
 
-        First those that execute its line; then those that execute any line of its function, because the measurement
-        can miss lines after a switch between stacks; then those that execute any line of its module, because the
-        measurement misses forks. If no test executes the module, as with code that runs at import, all tests.
+        First those that execute its line; then those that execute any line of its function, because
+        the measurement can miss lines after a switch between stacks; then those that execute any
+        line of its module, because the measurement misses forks. If no test executes the module, as
+        with code that runs at import, all tests.
         """
         lines = self.lines.get(mutant.module, {})
         found = [
@@ -97,15 +104,20 @@ class Measured:
         for test in self.seconds:
             if test in found:
                 by_file.setdefault(file_of(test), []).append(test)
-        files = sorted(by_file.values(), key=lambda tests: sum(map(self.seconds.__getitem__, tests)))
+        files = sorted(
+            by_file.values(), key=lambda tests: sum(map(self.seconds.__getitem__, tests))
+        )
         quick = [[test for test in tests if self.seconds[test] < QUICK] for tests in files]
         first_ones = [
             test
             for tests in quick
-            for test in sorted(tests, key=lambda test: ("[thread" in test, self.seconds[test]))[:FIRST]
+            for test in sorted(tests, key=lambda test: ("[thread" in test, self.seconds[test]))[
+                :FIRST
+            ]
         ]
         rest = [test for tests in files for test in tests]
-        rest.sort(key=lambda test: "[thread" in test)  # the second driver rarely finds more than the first
+        # the second driver rarely finds more than the first
+        rest.sort(key=lambda test: "[thread" in test)
         return first_ones + rest
 
 
@@ -116,14 +128,24 @@ def file_of(test: str) -> str:
 
 def main() -> None:
     """Try mutants, and print a report."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--number", type=int, default=200, help="number of mutants (200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the draw (0)")
     parser.add_argument("--jobs", type=int, default=2, help="number of parallel jobs (2)")
-    parser.add_argument("--out", type=Path, default=ROOT / ".mutants", help="folder for the results")
-    parser.add_argument("--only", default="", metavar="PATH", help="only modules whose path begins with PATH")
-    parser.add_argument("--kind", default="", help="only mistakes of this kind, such as copy or clean-up")
-    parser.add_argument("--most", type=float, default=math.inf, help="seconds of tests for each mutant (all tests)")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / ".mutants", help="folder for the results"
+    )
+    parser.add_argument(
+        "--only", default="", metavar="PATH", help="only modules whose path begins with PATH"
+    )
+    parser.add_argument(
+        "--kind", default="", help="only mistakes of this kind, such as copy or clean-up"
+    )
+    parser.add_argument(
+        "--most", type=float, default=math.inf, help="seconds of tests for each mutant (all tests)"
+    )
     parser.add_argument("--again", action="store_true", help="retry the survivors")
     parser.add_argument("--report", action="store_true", help="only show the results so far")
     given = parser.parse_args()
@@ -142,7 +164,10 @@ def main() -> None:
                 file.write(json.dumps(result) + "\n")
                 file.flush()
                 print(
-                    f"{number}/{len(missing)} {result['outcome']:8} {result['seconds']:6.1f} s  {result['mutant']}",
+                    (
+                        f"{number}/{len(missing)} {result['outcome']:8} {result['seconds']:6.1f}"
+                        f" s  {result['mutant']}"
+                    ),
                     flush=True,
                 )
     report([done[mutant.name] for mutant in drawn if mutant.name in done])
@@ -150,14 +175,22 @@ def main() -> None:
 
 def modules() -> list[str]:
     """List the modules from which mutants are drawn."""
-    paths = sorted(path.relative_to(ROOT / PACKAGE).as_posix() for path in (ROOT / PACKAGE).rglob("*.py"))
+    paths = sorted(
+        path.relative_to(ROOT / PACKAGE).as_posix() for path in (ROOT / PACKAGE).rglob("*.py")
+    )
     return [path for path in paths if not path.startswith(LEFT_OUT)]
 
 
 def draw(number: int, seed: int, only: str = "", kind: str = "") -> list[Mutant]:
     """Draw mutants: from each module in proportion to its candidates, at least one, and evenly from all kinds."""
-    found = {path: candidates(path, (ROOT / PACKAGE / path).read_text(encoding="utf-8")) for path in modules()}
-    found = {path: [mutant for mutant in mutants if kind in ("", mutant.kind)] for path, mutants in found.items()}
+    found = {
+        path: candidates(path, (ROOT / PACKAGE / path).read_text(encoding="utf-8"))
+        for path in modules()
+    }
+    found = {
+        path: [mutant for mutant in mutants if kind in ("", mutant.kind)]
+        for path, mutants in found.items()
+    }
     found = {path: mutants for path, mutants in found.items() if mutants and path.startswith(only)}
     total = sum(map(len, found.values()))
     exact = {path: number * len(mutants) / total for path, mutants in found.items()}
@@ -184,7 +217,9 @@ def draw(number: int, seed: int, only: str = "", kind: str = "") -> list[Mutant]
 def copied(folder: Path) -> Path:
     """Copy all files of the repository to a folder, but for those that Git ignores."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    names = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\0")
+    names = subprocess.run(
+        command, cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.split("\0")
     for name in names:
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -195,7 +230,11 @@ def copied(folder: Path) -> Path:
 def environment(folder: Path, **more: Path) -> dict[str, str]:
     """Return the environment variables for the tests of a copy."""
     path = os.pathsep.join([str(folder / "src"), str(folder)])
-    return os.environ | {"PYTHONPATH": path, "MUTANTS_ROOT": str(folder)} | {name: str(at) for name, at in more.items()}
+    return (
+        os.environ
+        | {"PYTHONPATH": path, "MUTANTS_ROOT": str(folder)}
+        | {name: str(at) for name, at in more.items()}
+    )
 
 
 def measure(cache: Path) -> Measured:
@@ -203,24 +242,46 @@ def measure(cache: Path) -> Measured:
     digest = hashlib.sha256()
     for path in sorted([*ROOT.glob("src/**/*.py"), *ROOT.glob("tests/**/*.py")]):
         digest.update(path.read_bytes())
-    if cache.exists() and (known := json.loads(cache.read_text(encoding="utf-8")))["digest"] == digest.hexdigest():
-        lines = {path: {int(at): tests for at, tests in of.items()} for path, of in known["lines"].items()}
+    if (
+        cache.exists()
+        and (known := json.loads(cache.read_text(encoding="utf-8")))["digest"] == digest.hexdigest()
+    ):
+        lines = {
+            path: {int(at): tests for at, tests in of.items()}
+            for path, of in known["lines"].items()
+        }
         names = list(known["seconds"])
-        by_name = {path: {at: [names[n] for n in numbers] for at, numbers in of.items()} for path, of in lines.items()}
+        by_name = {
+            path: {at: [names[n] for n in numbers] for at, numbers in of.items()}
+            for path, of in lines.items()
+        }
         return Measured(known["seconds"], by_name)
     print("measuring which tests execute which lines", flush=True)
     with tempfile.TemporaryDirectory(prefix="mutants-") as temporary:
         folder = copied(Path(temporary).resolve())
         notes, data, settings = folder / "notes.jsonl", folder / "coverage", folder / "settings.ini"
         settings.write_text(PROCESSES.format(folder=folder), encoding="utf-8")
-        options = ["-q", "-n", "2", "--driver", "greenlet", "-p", "tools.mutants_plugin", "--cov", "--cov-context=test"]
+        options = [
+            "-q",
+            "-n",
+            "2",
+            "--driver",
+            "greenlet",
+            "-p",
+            "tools.mutants_plugin",
+            "--cov",
+            "--cov-context=test",
+        ]
         command = [sys.executable, "-m", "pytest", *options, "--cov-report=", "tests"]
-        variables = environment(folder, MUTANTS_NOTE=notes, MUTANTS_COVERAGE=settings, COVERAGE_FILE=data)
+        variables = environment(
+            folder, MUTANTS_NOTE=notes, MUTANTS_COVERAGE=settings, COVERAGE_FILE=data
+        )
         subprocess.run(command, cwd=folder, env=variables, check=False)
         measured = measured_in(folder, notes, data)
     numbers = {name: number for number, name in enumerate(measured.seconds)}
     compact = {
-        path: {at: [numbers[test] for test in tests] for at, tests in of.items()} for path, of in measured.lines.items()
+        path: {at: [numbers[test] for test in tests] for at, tests in of.items()}
+        for path, of in measured.lines.items()
     }
     content = {"digest": digest.hexdigest(), "seconds": measured.seconds, "lines": compact}
     cache.write_text(json.dumps(content), encoding="utf-8")
@@ -237,24 +298,37 @@ def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
             outcomes[name] = outcome, seconds
     for name in (name for name, (outcome, _) in outcomes.items() if outcome != "passed"):
         print(f"left out, because it fails without a mutant: {name}", flush=True)
-    seconds_of = {name: seconds for name, (outcome, seconds) in outcomes.items() if outcome == "passed"}
+    seconds_of = {
+        name: seconds for name, (outcome, seconds) in outcomes.items() if outcome == "passed"
+    }
     lines: dict[str, dict[int, set[str]]] = {}
     at_import = set()
     for module, line, contexts in covered(data, folder):
-        lines.setdefault(module, {})[line] = {context.rpartition("|")[0] for context in contexts} & seconds_of.keys()
+        lines.setdefault(module, {})[line] = {
+            context.rpartition("|")[0] for context in contexts
+        } & seconds_of.keys()
         if "" in contexts:
             at_import.add((module, line))
     for part in folder.glob("processes.*"):
         with suppress(CoverageException):  # its process was killed while it wrote
             for module, line, contexts in covered(part, folder):
                 if (module, line) not in at_import:
-                    tests = {context.rpartition(" (")[0] for context in contexts} & seconds_of.keys()
+                    tests = {
+                        context.rpartition(" (")[0] for context in contexts
+                    } & seconds_of.keys()
                     lines.setdefault(module, {}).setdefault(line, set()).update(tests)
     both = {
-        module: {line: sorted(tests | set(map(twin, tests))) for line, tests in of_module.items() if tests}
+        module: {
+            line: sorted(tests | set(map(twin, tests)))
+            for line, tests in of_module.items()
+            if tests
+        }
         for module, of_module in lines.items()
     }
-    return Measured(seconds_of | {twin(name): 2 * seconds for name, seconds in seconds_of.items()} | seconds_of, both)
+    return Measured(
+        seconds_of | {twin(name): 2 * seconds for name, seconds in seconds_of.items()} | seconds_of,
+        both,
+    )
 
 
 def covered(data: Path, folder: Path) -> Iterator[tuple[str, int, list[str]]]:
@@ -276,15 +350,24 @@ def twin(test: str) -> str:
 
 def read(path: Path) -> list[Any]:
     """Read the objects of a file of JSON lines; none if there is no file."""
-    return list(map(json.loads, path.read_text(encoding="utf-8").splitlines())) if path.exists() else []
+    return (
+        list(map(json.loads, path.read_text(encoding="utf-8").splitlines()))
+        if path.exists()
+        else []
+    )
 
 
 # -- trying mutants -------------------------------------------------------------------------------
 
 
-def tried(mutants: list[Mutant], measured: Measured, jobs: int, most: float) -> Iterator[dict[str, Any]]:
+def tried(
+    mutants: list[Mutant], measured: Measured, jobs: int, most: float
+) -> Iterator[dict[str, Any]]:
     """Run the tests for each mutant, several mutants in parallel, each in its own copy."""
-    with tempfile.TemporaryDirectory(prefix="mutants-") as temporary, ThreadPoolExecutor(jobs) as threads:
+    with (
+        tempfile.TemporaryDirectory(prefix="mutants-") as temporary,
+        ThreadPoolExecutor(jobs) as threads,
+    ):
         free: SimpleQueue[Path] = SimpleQueue()
         for number in range(jobs):
             (Path(temporary).resolve() / str(number)).mkdir()
@@ -308,10 +391,15 @@ def outcome(mutant: Mutant, folder: Path, measured: Measured, most: float) -> di
     changed = mutant.applied(original)
     found_by, notes = measured.tests(mutant), folder / "notes.jsonl"
     spent = accumulate(measured.seconds[test] for test in found_by)
-    tests = [test for test, seconds in zip(found_by, spent, strict=True) if seconds <= most] or found_by[:1]
+    tests = [
+        test for test, seconds in zip(found_by, spent, strict=True) if seconds <= most
+    ] or found_by[:1]
     notes.unlink(missing_ok=True)
     chosen = folder / "chosen.json"
-    chosen.write_text(json.dumps({test: TEST_LIMIT + 10 * measured.seconds[test] for test in tests}), encoding="utf-8")
+    chosen.write_text(
+        json.dumps({test: TEST_LIMIT + 10 * measured.seconds[test] for test in tests}),
+        encoding="utf-8",
+    )
     files = list(dict.fromkeys(map(file_of, tests)))
     options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "tools.mutants_plugin"]
     limit = 120 + 3 * sum(measured.seconds[test] for test in tests)
@@ -339,7 +427,11 @@ def outcome(mutant: Mutant, folder: Path, measured: Measured, most: float) -> di
         "seconds": round(time.monotonic() - begun, 1),
         "diff": "".join(
             difflib.unified_diff(
-                original.splitlines(keepends=True), changed.splitlines(keepends=True), mutant.module, mutant.kind, n=2
+                original.splitlines(keepends=True),
+                changed.splitlines(keepends=True),
+                mutant.module,
+                mutant.kind,
+                n=2,
             )
         ),
     }
@@ -355,7 +447,12 @@ def write(path: Path, text: str) -> None:
 def run(command: list[str], folder: Path, variables: dict[str, str], limit: float) -> int | str:
     """Run a command, end all its processes, and return its exit status or "time limit"."""
     with subprocess.Popen(
-        command, cwd=folder, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        command,
+        cwd=folder,
+        env=variables,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
     ) as process:
         try:
             return process.wait(limit)
@@ -383,17 +480,28 @@ def report(results: list[dict[str, Any]]) -> None:
         print(f"\n{what:32} drawn killed")
         for name in sorted(drawn):
             print(f"{name:32} {drawn[name]:5} {killed[name]:6}")
-    known = {(entry["module"], entry.get("change", "").strip()): entry["why"] for entry in reasons()}
+    known = {
+        (entry["module"], entry.get("change", "").strip()): entry["why"] for entry in reasons()
+    }
     survivors = [result for result in results if result["outcome"] == "survived"]
     told = [
-        (result, known.get((result["module"], change_of(result)), known.get((result["module"], ""))))
+        (
+            result,
+            known.get((result["module"], change_of(result)), known.get((result["module"], ""))),
+        )
         for result in survivors
     ]
     for result, why in sorted(told, key=lambda pair: pair[1] is None):
-        print(f"\nsurvived {result['tests']} of {result['of']} tests: {result['mutant']}\n{why or result['diff']}")
+        print(
+            f"\nsurvived {result['tests']} of {result['of']} tests:"
+            f" {result['mutant']}\n{why or result['diff']}"
+        )
     seconds = sum(result["seconds"] for result in results) / max(1, len(results))
     number, listed = len(results) - len(survivors), sum(why is not None for _, why in told)
-    print(f"\n{len(results)} mutants, {number / max(1, len(results)):.0%} killed, {seconds:.0f} s each")
+    print(
+        f"\n{len(results)} mutants, {number / max(1, len(results)):.0%} killed, {seconds:.0f} s"
+        " each"
+    )
     print(f"{number / max(1, len(results) - listed):.0%} without the {listed} that are no mistakes")
 
 

@@ -1,7 +1,8 @@
 """Find all possible mutants of a module: each is a small mistake of one of a few kinds.
 
-This leaves out changes without an effect on correct programs: in annotations, docstrings, texts of messages, code for
-type checkers, and code that only states what holds anyway (``assert``, ``strict=``, the bodies of abstract methods).
+This leaves out changes without an effect on correct programs: in annotations, docstrings, texts of
+messages, code for type checkers, and code that only states what holds anyway (``assert``,
+``strict=``, the bodies of abstract methods).
 """
 
 from __future__ import annotations
@@ -57,7 +58,10 @@ class Mutant:
     @property
     def name(self) -> str:
         """A name that is unique for this source."""
-        return f"{self.module}:{self.lines[0]} {self.kind} {self.at[0]}-{self.at[1]} {hash_of(self.instead)}"
+        return (
+            f"{self.module}:{self.lines[0]} {self.kind} {self.at[0]}-{self.at[1]}"
+            f" {hash_of(self.instead)}"
+        )
 
     def applied(self, text: str) -> str:
         """Return the text with the mistake."""
@@ -100,7 +104,9 @@ class Drawer:
         """Return the begin and the end of a node, in bytes."""
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
-        return self.starts[node.lineno - 1] + node.col_offset, self.starts[node.end_lineno - 1] + node.end_col_offset
+        return self.starts[node.lineno - 1] + node.col_offset, self.starts[
+            node.end_lineno - 1
+        ] + node.end_col_offset
 
     def source(self, node: ast.expr | ast.stmt) -> str:
         """Return the text of a node."""
@@ -132,19 +138,29 @@ class Drawer:
                 yield Mutant(self.module, "clean-up", at, "pass", final, within)
 
     def of_statement(
-        self, statement: ast.stmt, rest: list[ast.stmt], lines: tuple[int, int], function: tuple[int, int]
+        self,
+        statement: ast.stmt,
+        rest: list[ast.stmt],
+        lines: tuple[int, int],
+        function: tuple[int, int],
     ) -> Iterator[Mutant]:
         """Yield the mutants of a statement as a whole: it is dropped, or swapped with the next one."""
         kind = "clean-up" if puts_away(statement) else "dropped"
         yield Mutant(self.module, kind, self.span(statement), "pass", lines, function)
         if rest and isinstance(rest[0], SIMPLE) and counts(rest[0]) and depend(statement, rest[0]):
             (begin, middle), (after, end) = self.span(statement), self.span(rest[0])
-            swapped = self.source(rest[0]) + self.data[middle:after].decode() + self.source(statement)
-            yield Mutant(self.module, "swapped", (begin, end), swapped, (lines[0], head(rest[0])), function)
+            swapped = (
+                self.source(rest[0]) + self.data[middle:after].decode() + self.source(statement)
+            )
+            yield Mutant(
+                self.module, "swapped", (begin, end), swapped, (lines[0], head(rest[0])), function
+            )
 
     def of_expressions(self, statement: ast.stmt) -> Iterator[tuple[str, tuple[int, int], str]]:
         """Yield the mutants of a statement's own expressions, without those of the statements in it."""
-        if isinstance(statement, ast.If | ast.While) and not isinstance(statement.test, ast.Constant):
+        if isinstance(statement, ast.If | ast.While) and not isinstance(
+            statement.test, ast.Constant
+        ):
             yield "negated", self.span(statement.test), f"not ({self.source(statement.test)})"
         for node in expressions(statement):
             if isinstance(node, ast.IfExp):
@@ -153,13 +169,20 @@ class Drawer:
                 for test in (test for generator in node.generators for test in generator.ifs):
                     yield "negated", self.span(test), f"(not ({self.source(test)}))"
             elif isinstance(node, ast.Call):
-                if isinstance(node.func, ast.Attribute) and node.func.attr == "copy" and not node.args:
+                if (
+                    isinstance(node.func, ast.Attribute)
+                    and node.func.attr == "copy"
+                    and not node.args
+                ):
                     yield "copy", self.span(node), self.source(node.func.value)
                 elif node.args and copies(node.func):
                     yield "copy", self.span(node), f"({self.source(node.args[0])})"
             elif isinstance(node, ast.Compare) and len(node.ops) == 1:
                 between = self.span(node.left)[1], self.span(node.comparators[0])[0]
-                if b"(" not in self.data[slice(*between)] and b")" not in self.data[slice(*between)]:
+                if (
+                    b"(" not in self.data[slice(*between)]
+                    and b")" not in self.data[slice(*between)]
+                ):
                     yield "changed", between, f" {COMPARISONS[type(node.ops[0])]} "
             elif isinstance(node, ast.BoolOp):
                 between = self.span(node.values[0])[1], self.span(node.values[1])[0]
@@ -169,18 +192,26 @@ class Drawer:
                     yield "changed", between, other
             elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int):
                 value = node.value
-                yield "changed", self.span(node), str((not value) if isinstance(value, bool) else value + 1)
+                yield (
+                    "changed",
+                    self.span(node),
+                    str((not value) if isinstance(value, bool) else value + 1),
+                )
 
 
 def head(statement: ast.stmt) -> int:
     """Return the last line of a statement's head, which is the whole statement if it contains no others."""
     inner = [block[0].lineno for block in blocks(statement) if block]
-    return max(statement.lineno, min(inner) - 1) if inner else statement.end_lineno or statement.lineno
+    return (
+        max(statement.lineno, min(inner) - 1) if inner else statement.end_lineno or statement.lineno
+    )
 
 
 def counts(statement: ast.stmt) -> bool:
     """Tell whether a change of a statement can be a mistake, and does not concern names, types or texts alone."""
-    if isinstance(statement, ast.Import | ast.ImportFrom | ast.Global | ast.Nonlocal | ast.Pass | ast.Assert):
+    if isinstance(
+        statement, ast.Import | ast.ImportFrom | ast.Global | ast.Nonlocal | ast.Pass | ast.Assert
+    ):
         return False
     if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
         return False  # a docstring, or an ellipsis
@@ -196,7 +227,9 @@ def counts(statement: ast.stmt) -> bool:
     if isinstance(statement, ast.ClassDef):
         return not any("Protocol" in ast.unparse(base) for base in statement.bases)
     if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef):
-        return not any("overload" in ast.unparse(decorator) for decorator in statement.decorator_list)
+        return not any(
+            "overload" in ast.unparse(decorator) for decorator in statement.decorator_list
+        )
     return True
 
 
@@ -213,16 +246,26 @@ def expressions(statement: ast.stmt) -> Iterator[ast.expr]:
     waiting: list[ast.AST] = []
     for field, value in ast.iter_fields(statement):
         if field not in ("annotation", "returns", "decorator_list", "type_params", "bases"):
-            waiting += [item for item in (value if isinstance(value, list) else [value]) if isinstance(item, ast.AST)]
+            waiting += [
+                item
+                for item in (value if isinstance(value, list) else [value])
+                if isinstance(item, ast.AST)
+            ]
     while waiting:
         node = waiting.pop()
-        if isinstance(node, ast.stmt | ast.JoinedStr | ast.arg | ast.ExceptHandler | ast.match_case):
+        if isinstance(
+            node, ast.stmt | ast.JoinedStr | ast.arg | ast.ExceptHandler | ast.match_case
+        ):
             continue
         if isinstance(node, ast.keyword) and node.arg == "strict":
             continue
         if isinstance(node, ast.expr):
             yield node
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("cast", "TypeVar", "ParamSpec"):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in (
+            "cast",
+            "TypeVar",
+            "ParamSpec",
+        ):
             waiting += node.args[1:]
         else:
             waiting += ast.iter_child_nodes(node)
@@ -244,15 +287,19 @@ def copies(function: ast.expr) -> bool:
 
 def depend(one: ast.stmt, other: ast.stmt) -> bool:
     """Tell whether the order of two statements can matter."""
-    if ast.dump(one) == ast.dump(other) or not isinstance(one, ast.Assign | ast.AugAssign | ast.Expr | ast.Delete):
+    if ast.dump(one) == ast.dump(other) or not isinstance(
+        one, ast.Assign | ast.AugAssign | ast.Expr | ast.Delete
+    ):
         return False  # code after a return is never reached
     lists = [appended_to(one), appended_to(other)]
     if None not in lists and lists[0] != lists[1]:
         return False
     calls = [
-        any(isinstance(node, ast.Call | ast.Yield | ast.Await) for node in ast.walk(part)) for part in (one, other)
+        any(isinstance(node, ast.Call | ast.Yield | ast.Await) for node in ast.walk(part))
+        for part in (one, other)
     ]
-    if all(calls) and (isinstance(one, ast.Expr) or isinstance(other, ast.Expr)):  # a call for its side effects
+    # a call for its side effects
+    if all(calls) and (isinstance(one, ast.Expr) or isinstance(other, ast.Expr)):
         return True
     if isinstance(other, ast.Return | ast.Raise | ast.Continue | ast.Break):
         return True
@@ -262,9 +309,15 @@ def depend(one: ast.stmt, other: ast.stmt) -> bool:
 def appended_to(statement: ast.stmt) -> str | None:
     """Return the list to which a statement appends, if it does nothing else."""
     call = statement.value if isinstance(statement, ast.Expr) else None
-    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute) or call.func.attr != "append":
+    if (
+        not isinstance(call, ast.Call)
+        or not isinstance(call.func, ast.Attribute)
+        or call.func.attr != "append"
+    ):
         return None
-    alone = not any(isinstance(node, ast.Call) for argument in call.args for node in ast.walk(argument))
+    alone = not any(
+        isinstance(node, ast.Call) for argument in call.args for node in ast.walk(argument)
+    )
     return ast.unparse(call.func.value) if alone else None
 
 
@@ -272,10 +325,16 @@ def changed_by(statement: ast.stmt) -> set[str]:
     """Return the targets of a statement's assignments, as source text."""
     inner = [node.target for node in ast.walk(statement) if isinstance(node, ast.comprehension)]
     own = {id(name) for target in inner for name in ast.walk(target)}  # local to the comprehension
-    nodes = (node for node in ast.walk(statement) if isinstance(getattr(node, "ctx", None), ast.Store))
+    nodes = (
+        node for node in ast.walk(statement) if isinstance(getattr(node, "ctx", None), ast.Store)
+    )
     return {ast.unparse(node) for node in nodes if id(node) not in own}
 
 
 def names_in(statement: ast.stmt) -> set[str]:
     """Return the names and attributes in a statement, as source text."""
-    return {ast.unparse(node) for node in ast.walk(statement) if isinstance(node, ast.Name | ast.Attribute)}
+    return {
+        ast.unparse(node)
+        for node in ast.walk(statement)
+        if isinstance(node, ast.Name | ast.Attribute)
+    }

@@ -1,9 +1,10 @@
 """A pytest plugin for ``tools.mutants``: it records the durations of tests, and runs chosen tests in a given order.
 
-Three environment variables with the name of a file each control it. To ``MUTANTS_NOTE`` it writes each test's name,
-outcome and seconds. ``MUTANTS_TESTS`` is a JSON object that maps the names of the tests to run, in their order, to the
-time limit of each in seconds. A test that takes longer ends the whole process. ``MUTANTS_COVERAGE`` has the settings
-with which Coverage.py measures the Python processes that a test starts.
+Three environment variables with the name of a file each control it. To ``MUTANTS_NOTE`` it writes
+each test's name, outcome and seconds. ``MUTANTS_TESTS`` is a JSON object that maps the names of the
+tests to run, in their order, to the time limit of each in seconds. A test that takes longer ends
+the whole process. ``MUTANTS_COVERAGE`` has the settings with which Coverage.py measures the Python
+processes that a test starts.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
     """Keep the chosen tests, in their order."""
     if _TESTS:
         place = {name: number for number, name in enumerate(_limits)}
-        chosen = sorted((item for item in items if item.nodeid in place), key=lambda item: place[item.nodeid])
+        chosen = sorted(
+            (item for item in items if item.nodeid in place), key=lambda item: place[item.nodeid]
+        )
         config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in place])
         items[:] = chosen
 
@@ -62,11 +65,18 @@ def pytest_runtest_logfinish(nodeid: str) -> None:
 
 
 def pytest_runtest_logreport(report: Any) -> None:
-    """Record the outcome of a test. With several processes, the one that collects the reports does it."""
+    """Record the outcome of a test.
+
+    With several processes, the one that collects the reports does it.
+    """
     if _NOTE is None or "PYTEST_XDIST_WORKER" in os.environ:
         return
     _seconds[report.nodeid] = _seconds.get(report.nodeid, 0.0) + report.duration
     if report.failed or report.when == "teardown":
-        note = [report.nodeid, "failed" if report.failed else "passed", round(_seconds[report.nodeid], 4)]
+        note = [
+            report.nodeid,
+            "failed" if report.failed else "passed",
+            round(_seconds[report.nodeid], 4),
+        ]
         with Path(_NOTE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(note) + "\n")

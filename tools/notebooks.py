@@ -1,7 +1,7 @@
 """Make notebooks of pages: the same text and the same code, executed.
 
-``docs/conf.py`` calls ``write_notebooks`` when Sphinx builds the pages. A notebook that shows something else than its
-page ends the build.
+``docs/conf.py`` calls ``write_notebooks`` when Sphinx builds the pages. A notebook that shows
+something else than its page ends the build.
 """
 
 from __future__ import annotations
@@ -105,14 +105,19 @@ def notebook(docs: Path, page: str) -> dict[str, Any]:
         The notebook, in format 4.5, with the outputs that the page shows.
     """
     cells = []
-    for number, cell in enumerate(_cells(docs, NOTEBOOK.sub("\n", (docs / f"{page}.md").read_text(encoding="utf-8")))):
+    for number, cell in enumerate(
+        _cells(docs, NOTEBOOK.sub("\n", (docs / f"{page}.md").read_text(encoding="utf-8")))
+    ):
         cells.append(cell | {"id": f"{page}-{number}", "metadata": cell.get("metadata", {})})
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     return {"cells": cells, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
 
 
 def _cells(docs: Path, text: str) -> Iterator[dict[str, Any]]:
-    """Yield the cells of a page, in order; a cell writes each file that the page needs before its first use."""
+    """Yield the cells of a page, in order.
+
+    A cell writes each file that the page needs before its first use.
+    """
     position, written = 0, set[str]()
     for found in [*FENCE.finditer(text), None]:
         prose = text[position : found.start() if found else None].strip()
@@ -154,11 +159,18 @@ def _examples(session: str) -> Iterator[dict[str, Any]]:
             yield _code("".join(sources), error) | {"metadata": {"tags": ["raises-exception"]}}
             sources = []
         elif example.want:
-            yield _code("".join(sources), {"output_type": "stream", "name": "stdout", "text": example.want})
+            yield _code(
+                "".join(sources), {"output_type": "stream", "name": "stdout", "text": example.want}
+            )
             sources = []
     if sources:
         yield _code("".join(sources))
 
 
 def _code(source: str, *outputs: dict[str, Any]) -> dict[str, Any]:
-    return {"cell_type": "code", "source": source.rstrip("\n"), "outputs": list(outputs), "execution_count": None}
+    return {
+        "cell_type": "code",
+        "source": source.rstrip("\n"),
+        "outputs": list(outputs),
+        "execution_count": None,
+    }

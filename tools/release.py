@@ -19,8 +19,12 @@ def problems() -> list[str]:
     assert found, "src/simenv_marl/__init__.py has no __version__"
     version = found[1]
     wrong = []
-    heading = re.search(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    if heading is None or not re.fullmatch(rf"{re.escape(version)} \(\d{{4}}-\d\d-\d\d\)", heading[1]):
+    heading = re.search(
+        r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    if heading is None or not re.fullmatch(
+        rf"{re.escape(version)} \(\d{{4}}-\d\d-\d\d\)", heading[1]
+    ):
         wrong.append(f"CHANGELOG.md must begin with the heading '## {version} (YYYY-MM-DD)'")
     if f"\nversion: {version}\n" not in (ROOT / "CITATION.cff").read_text(encoding="utf-8"):
         wrong.append(f"CITATION.cff must have the line 'version: {version}'")

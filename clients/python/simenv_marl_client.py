@@ -1,22 +1,22 @@
 """The client of simenv_marl for models in Python that run in a process of their own.
 
-For a model that needs another virtual environment or an older Python than the environment. This file is the whole
-client: Python 3.8 or newer, POSIX, no dependencies. Copy it beside the model::
+For a model that needs another virtual environment or an older Python than the environment. This
+file is the whole client: Python 3.8 or newer, POSIX, no dependencies. Copy it beside the model::
 
     client = Client(["shop.price"])
 
     def live(episode):
         town = Town(episode.seed, **episode.options)
         for day in range(30):
-            town.price = client.decide("shop.price", "a", rule=lambda: 1.2 * town.cost, time=day, stock=town.stock)
-            ...
+            town.price = client.decide("shop.price", "a", rule=lambda: 1.2 * town.cost, time=day,
+            stock=town.stock) ...
         return town.cash
 
     if __name__ == "__main__":
         print(client.run(live, seed=7))
 
-An environment starts the process with the numbers of two descriptors in ``SIMENV_MARL_FDS``. Without that variable, the
-model's rule makes every decision.
+An environment starts the process with the numbers of two descriptors in ``SIMENV_MARL_FDS``.
+Without that variable, the model's rule makes every decision.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
 class Stop(BaseException):
-    """Raised by decisions to unwind an episode that the environment has stopped. Do not catch it; ``finally`` runs."""
+    """Raised by decisions to unwind an episode that the environment has stopped.
+
+    Do not catch it; ``finally`` runs.
+    """
 
 
 class Episode(NamedTuple):
@@ -63,8 +66,8 @@ class Client:
 
         Args:
             points: The names of all decision points of the model.
-            report_rules: Whether the environment is told what the model's rules decide. Rules that ask for other
-                decisions need False.
+            report_rules: Whether the environment is told what the model's rules decide. Rules that
+                ask for other decisions need False.
         """
         self._points = list(points)
         self._reports = report_rules
@@ -73,7 +76,8 @@ class Client:
         self._running = self.stopped = False
         self._gone = self._failed = False  # the environment is gone, or was not understood
         self._number = self._stops = 0
-        self._thread = (0, "")  # the thread that runs the model: its name, and an id that gevent does not replace
+        # the thread that runs the model: its name, and an id that gevent does not replace
+        self._thread = (0, "")
         self._rule_of = ""  # the point whose rule is running, if its decision is to be reported
         self._due = 0  # the number of the call whose rule has not told its decision
         descriptors = os.environ.pop("SIMENV_MARL_FDS", None)  # child processes are not connected
@@ -85,16 +89,23 @@ class Client:
                     os.set_inheritable(descriptor, False)
                 self._reading = os.fdopen(reading, "rb")
             except (OSError, ValueError) as error:
-                raise ValueError(f"SIMENV_MARL_FDS must be two descriptors, R,W, and is {descriptors}") from error
+                raise ValueError(
+                    f"SIMENV_MARL_FDS must be two descriptors, R,W, and is {descriptors}"
+                ) from error
 
     # -- episodes ---------------------------------------------------------------------------------
 
     def on_reseed(self, function: Callable[[int], Any]) -> Callable[[int], Any]:
-        """Set the function that reseeds the model's generators in mid-episode. Call it before ``run``."""
+        """Set the function that reseeds the model's generators in mid-episode.
+
+        Call it before ``run``.
+        """
         self._reseed = function
         return function
 
-    def run(self, model: Callable[[Episode], Any], seed: int = 0, options: dict[str, Any] | None = None) -> Any:
+    def run(
+        self, model: Callable[[Episode], Any], seed: int = 0, options: dict[str, Any] | None = None
+    ) -> Any:
         """Run the model once for each episode that the environment requests, until the environment is gone.
 
         An exception that leaves the model is raised in the environment.
@@ -111,7 +122,9 @@ class Client:
             return model(Episode(seed, options or {}))
         self._thread = threading.get_native_id(), threading.current_thread().name
         able = {"decided": self._reports, "expect": True, "reseed": self._reseed is not None}
-        self._send({"hello": 1, "points": self._points, "can": [name for name in able if able[name]]})
+        self._send(
+            {"hello": 1, "points": self._points, "can": [name for name in able if able[name]]}
+        )
         while not self._gone:
             episode = self._next_episode()
             if episode is not None:
@@ -131,7 +144,10 @@ class Client:
         if seed is None:
             seed = random.SystemRandom().randrange(1 << 31)
         if type(seed) is not int:
-            self._fail(f"the start of an episode with an integer as seed was expected, and this came: {frame}")
+            self._fail(
+                "the start of an episode with an integer as seed was expected, and this came:"
+                f" {frame}"
+            )
             return None
         self._number = self._stops = self._due = 0
         self._running, self.stopped = True, False
@@ -164,8 +180,9 @@ class Client:
     def _refuse_thread(self, about: str) -> NoReturn:
         """Report the use in another thread to the environment, too: libraries often catch errors of callbacks."""
         text = (
-            f"{about} in the thread {threading.current_thread().name!r}, but the model runs in the thread"
-            f" {self._thread[1]!r}; pass what the decision needs to that thread, by a queue.Queue, and decide there"
+            f"{about} in the thread {threading.current_thread().name!r}, but the model runs in the"
+            f" thread {self._thread[1]!r}; pass what the decision needs to that thread, by a"
+            " queue.Queue, and decide there"
         )
         self._error("RuntimeError", text, "".join(traceback.format_stack()))
         self._running = False
@@ -197,8 +214,8 @@ class Client:
         Args:
             point: The name of the decision point.
             entity: The entity that decides; None if there is only one.
-            rule: The model's own rule. It is called if there is no environment, or if the environment leaves the
-                decision to the rule.
+            rule: The model's own rule. It is called if there is no environment, or if the
+                environment leaves the decision to the rule.
             time: The model's time.
             **arguments: The arguments for the environment's mappings: JSON data, or arrays.
 
@@ -208,7 +225,11 @@ class Client:
         return self._decide(point, entity, time, arguments, rule) if self.connected else rule()
 
     def decision(
-        self, point: str, entity: Any = None, time: Any = None, arguments: Callable[..., Any] | None = None
+        self,
+        point: str,
+        entity: Any = None,
+        time: Any = None,
+        arguments: Callable[..., Any] | None = None,
     ) -> Callable[[Any], Any]:
         """Make a function of the model a decision point: a decorator. The function is the rule.
 
@@ -216,7 +237,8 @@ class Client:
             point: The name of the decision point.
             entity: The entity that decides, or a callable that returns it.
             time: The model's time, or a callable that returns it.
-            arguments: A callable that returns a dict of the arguments for the environment's mappings.
+            arguments: A callable that returns a dict of the arguments for the environment's
+                mappings.
 
         All callables get the arguments of the function.
         """
@@ -226,15 +248,25 @@ class Client:
             def decide(*args: Any, **kwargs: Any) -> Any:
                 if not self.connected:
                     return function(*args, **kwargs)
-                parts = [part(*args, **kwargs) if callable(part) else part for part in (entity, time, arguments)]
-                return self._decide(point, parts[0], parts[1], parts[2] or {}, lambda: function(*args, **kwargs))
+                parts = [
+                    part(*args, **kwargs) if callable(part) else part
+                    for part in (entity, time, arguments)
+                ]
+                return self._decide(
+                    point, parts[0], parts[1], parts[2] or {}, lambda: function(*args, **kwargs)
+                )
 
             return decide
 
         return decorate
 
     def update(
-        self, point: str, entity: str | int | None = None, *, time: float | None = None, **arguments: Any
+        self,
+        point: str,
+        entity: str | int | None = None,
+        *,
+        time: float | None = None,
+        **arguments: Any,
     ) -> None:
         """Report the current arguments of an entity, for its last observation and reward.
 
@@ -249,12 +281,17 @@ class Client:
             self._send({"remove": entity, "point": point})
 
     def expect(
-        self, point: str, entity: str | int | None = None, *, time: float | None = None, **arguments: Any
+        self,
+        point: str,
+        entity: str | int | None = None,
+        *,
+        time: float | None = None,
+        **arguments: Any,
     ) -> None:
         """Report that an entity is going to decide, with the arguments that it has now.
 
-        So agents that are born together are observed together, and act in one round of the parallel view. Call it
-        for all of them before the first of them decides.
+        So agents that are born together are observed together, and act in one round of the parallel
+        view. Call it for all of them before the first of them decides.
         """
         if self._reporting():
             self._send({"expect": [{"entity": entity, **_call(point, time, arguments)}]})
@@ -262,7 +299,9 @@ class Client:
     def _reporting(self) -> bool:
         return self.connected and self._running and not self.stopped
 
-    def _decide(self, point: str, entity: Any, time: Any, arguments: dict[str, Any], rule: Callable[[], Any]) -> Any:
+    def _decide(
+        self, point: str, entity: Any, time: Any, arguments: dict[str, Any], rule: Callable[[], Any]
+    ) -> Any:
         if threading.get_native_id() != self._thread[0] and self._running:
             self._refuse_thread(f"a decision at {point}")
         if self.stopped:
@@ -308,7 +347,13 @@ class Client:
         self.stopped = True
         self._stops += 1
         if self._stops > _MOST_STOPS:
-            os.write(2, b"simenv_marl_client: the model catches Stop again and again, and does not unwind\n")
+            os.write(
+                2,
+                (
+                    b"simenv_marl_client: the model catches Stop again and again, and does not"
+                    b" unwind\n"
+                ),
+            )
             os._exit(1)
         raise Stop("the environment has stopped this episode")
 
@@ -318,8 +363,8 @@ class Client:
         """Add a frame to those that are sent before the next wait: the whole frame, or nothing if it has no JSON."""
         if self._rule_of and "error" not in frame:
             raise RuntimeError(
-                f"the rule of {self._rule_of} has asked for a decision, or reported on an entity; it must only decide,"
-                " or make the client by Client(points, report_rules=False)"
+                f"the rule of {self._rule_of} has asked for a decision, or reported on an entity;"
+                " it must only decide, or make the client by Client(points, report_rules=False)"
             )
         line = _line(frame)
         if self._due:  # the rule has raised an exception, which the model has caught
@@ -359,8 +404,14 @@ def _call(point: str, time: float | None, arguments: dict[str, Any]) -> dict[str
     """Return the common part of frames about an entity."""
     for name in ("entity", "point", "time"):
         if name in arguments:
-            raise ValueError(f"{name!r} cannot be the name of an argument at {point}: the call has it besides")
-    return {"point": point, "args": arguments} if time is None else {"point": point, "time": time, "args": arguments}
+            raise ValueError(
+                f"{name!r} cannot be the name of an argument at {point}: the call has it besides"
+            )
+    return (
+        {"point": point, "args": arguments}
+        if time is None
+        else {"point": point, "time": time, "args": arguments}
+    )
 
 
 def _line(frame: dict[str, Any]) -> bytes:

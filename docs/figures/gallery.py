@@ -1,8 +1,8 @@
 """Draw the pictures of the gallery of the front page that no study draws.
 
 Run ``OMP_NUM_THREADS=1 python -m docs.figures.gallery`` from the root of the repository, after
-``pip install ".[clients,fmi]"``. Names of pictures as arguments restrict it to these. The town needs a JDK, the robots
-need Enki, and the follower needs ROS 1.
+``pip install ".[clients,fmi]"``. Names of pictures as arguments restrict it to these. The town
+needs a JDK, the robots need Enki, and the follower needs ROS 1.
 """
 
 import sys
@@ -45,7 +45,9 @@ def observed(env: Any, policy: Any, seed: int) -> np.ndarray:
     return np.array(flat)
 
 
-def over_time(curves: dict[str, np.ndarray], step: float, xlabel: str, ylabel: str, target: float) -> Any:
+def over_time(
+    curves: dict[str, np.ndarray], step: float, xlabel: str, ylabel: str, target: float
+) -> Any:
     """Draw curves over time, and the value that is best."""
     figure, axes = plt.subplots(figsize=(6.4, 4.8))
     for label, values in curves.items():
@@ -64,7 +66,9 @@ def room() -> Any:
     env = single_env(RoomSim)
     column = list(env.observation_space).index("temperature")
     policies = {"thermostat": lambda _: RULE, "trained": learn(25)}
-    temperatures = {label: observed(env, policy, HELD_OUT)[:, column] for label, policy in policies.items()}
+    temperatures = {
+        label: observed(env, policy, HELD_OUT)[:, column] for label, policy in policies.items()
+    }
     return over_time(temperatures, 1 / 4, "hours", "temperature of the room, °C", COMFORT)
 
 
@@ -76,7 +80,9 @@ def follower() -> Any:
         return [min(1.0, max(0.0, 0.5 * observation[0])), float(np.clip(observation[1], -1, 1))]
 
     policies = {"rule": lambda _: RULE, "another policy": slower}
-    distances = {label: np.hypot(*observed(ros.env(), policy, 7).T) for label, policy in policies.items()}
+    distances = {
+        label: np.hypot(*observed(ros.env(), policy, 7).T) for label, policy in policies.items()
+    }
     return over_time(distances, 1 / 10, "seconds", "distance to the leader, m", 1.0)
 
 
@@ -85,14 +91,19 @@ def robots() -> Any:
     from examples.enki_robots.env import robots
 
     straight = {f"robot_{number}": lambda observation: [0.0] for number in range(6)}
-    return evaluate(robots, {"rule": {}, "straight on": straight}, seeds=range(10), baseline="rule").plot()
+    return evaluate(
+        robots, {"rule": {}, "straight on": straight}, seeds=range(10), baseline="rule"
+    ).plot()
 
 
 def market() -> Any:
     """Draw the profits of the traders in both conditions, by the rule and with five crates each."""
     from examples.market_seats.env import AGENTS, Free, Levied
 
-    contenders = {"each for itself (rule)": {}, "five crates each": dict.fromkeys(AGENTS, lambda observation: 5)}
+    contenders = {
+        "each for itself (rule)": {},
+        "five crates each": dict.fromkeys(AGENTS, lambda observation: 5),
+    }
     figure, axes = plt.subplots(figsize=(6.4, 4.8))
     for shift, condition in zip((-0.2, 0.2), (Free, Levied), strict=True):
         means = evaluate(condition, contenders, seeds=range(50)).summary()["mean"] / len(AGENTS)
@@ -113,7 +124,12 @@ def mesa() -> Any:
         model.reset(5)
         model.run()
         agents = list(model.model.agents)
-        places = np.array([agent.position if hasattr(agent, "position") else agent.cell.coordinate for agent in agents])
+        places = np.array(
+            [
+                agent.position if hasattr(agent, "position") else agent.cell.coordinate
+                for agent in agents
+            ]
+        )
         colours = [getattr(agent, "type", 0) if example == "schelling" else 0 for agent in agents]
         axes.scatter(*places.T, c=colours, s=6, cmap="coolwarm")
         axes.set(title=type(model.model).__name__, xticks=[], yticks=[], aspect="equal")
@@ -121,7 +137,10 @@ def mesa() -> Any:
 
 
 PICTURES = {
-    **{f"template-{kind}": lambda kind=kind: of_template(kind).plot() for kind in ("plain", "simpy", "mesa")},
+    **{
+        f"template-{kind}": lambda kind=kind: of_template(kind).plot()
+        for kind in ("plain", "simpy", "mesa")
+    },
     "jvm-market": town,
     "heated-room": room,
     "ros-follower": follower,

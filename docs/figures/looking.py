@@ -58,14 +58,18 @@ def boats() -> Any:
         tried = np.where(fish > 8, generator.choice([0, 0, 1, 3], len(fish)), 0)
         return [RULE if rich else catch for rich, catch in zip(cash > 5, tried, strict=True)]
 
-    return plot_timeline(collect_episodes(Years, dict.fromkeys(POINTS, trying), points=POINTS, seeds=[0]))
+    return plot_timeline(
+        collect_episodes(Years, dict.fromkeys(POINTS, trying), points=POINTS, seeds=[0])
+    )
 
 
 def main() -> None:
     """Run the examples of the page, and save their figures and that of the boats."""
     sys.path.insert(0, str(HERE.parent))  # for the models beside the page
     names: dict[str, Any] = {"__name__": "__main__"}
-    for example in DocTestParser().get_examples((HERE.parent / "experiments.md").read_text(encoding="utf-8")):
+    for example in DocTestParser().get_examples(
+        (HERE.parent / "experiments.md").read_text(encoding="utf-8")
+    ):
         exec(compile(example.source, "experiments.md", "exec"), names)
     names["lake"] = boats()
     for name in ("shop", "lake", "returns"):

@@ -12,7 +12,13 @@ from typing import Any
 
 FOLDER = Path(__file__).parent
 FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-COMMAND = [sys.executable, "-m", "simenv_marl", "play", "examples.greenhouse_coop.env:GreenhouseSim"]
+COMMAND = [
+    sys.executable,
+    "-m",
+    "simenv_marl",
+    "play",
+    "examples.greenhouse_coop.env:GreenhouseSim",
+]
 
 
 def decide(page: Any, value: str) -> None:
@@ -26,14 +32,18 @@ def main() -> None:
     """Play five days, and take a picture of each browser."""
     from playwright.sync_api import sync_playwright
 
-    server = subprocess.Popen([*COMMAND, "--port", "0", "--seed", "3"], stdout=subprocess.PIPE, text=True)
+    server = subprocess.Popen(
+        [*COMMAND, "--port", "0", "--seed", "3"], stdout=subprocess.PIPE, text=True
+    )
     assert server.stdout is not None
     lines = [server.stdout.readline() for _ in range(3)]
     links = [re.search(r"http\S+", line)[0] for line in lines]  # type: ignore[index]
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=FLAGS)
         desktop = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
-        phone = browser.new_context(viewport={"width": 390, "height": 844}, color_scheme="dark").new_page()
+        phone = browser.new_context(
+            viewport={"width": 390, "height": 844}, color_scheme="dark"
+        ).new_page()
         desktop.goto(links[1])
         phone.goto(links[2])
         for day in range(5):

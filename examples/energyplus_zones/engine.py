@@ -1,7 +1,8 @@
 """A run of EnergyPlus, through the part of its C API that this example needs.
 
-EnergyPlus calls callbacks while it runs, through ctypes. An exception in a callback cannot cross its C++ code. So a
-``CallbackGuard`` stops EnergyPlus and raises the exception again in the function that called EnergyPlus.
+EnergyPlus calls callbacks while it runs, through ctypes. An exception in a callback cannot cross
+its C++ code. So a ``CallbackGuard`` stops EnergyPlus and raises the exception again in the function
+that called EnergyPlus.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ class Engine:
         """
         self._library = _library()
         self.folder = Path(mkdtemp(prefix="energyplus-"))
-        self._remove = finalize(self, rmtree, self.folder, True)  # when the process ends, at the latest
+        # when the process ends, at the latest
+        self._remove = finalize(self, rmtree, self.folder, True)
         (self.folder / "in.idf").write_text(building)
         self._state: int | None = self._library.stateNewPython()
         self._guard = CallbackGuard(stop=lambda: self._library.stopSimulation(self._state))
@@ -109,7 +111,10 @@ class Engine:
         self._call_back("callbackBeginTimeStepBeforePredictor", function)
 
     def at_end_of_step(self, function: Callable[[], Any]) -> None:
-        """Register a function that runs after each system time step; a zone time step has one or more of them."""
+        """Register a function that runs after each system time step.
+
+        A zone time step has one or more of them.
+        """
         self._call_back("callbackEndOfSystemTimeStepAfterHVACReporting", function)
 
     def _call_back(self, when: str, function: Callable[[], Any]) -> None:
@@ -122,14 +127,23 @@ class Engine:
         getattr(self._library, when)(self._state, self._callbacks[-1])
 
     def _ready(self) -> bool:
-        """Tell whether the warm-up is over and the days of the run have begun; look up the handles first."""
+        """Tell whether the warm-up is over and the days of the run have begun.
+
+        Look up the handles first.
+        """
         library, state = self._library, self._state
         if not self._handles:
             if not library.apiDataFullyReady(state):
                 return False
-            self._handles = [library.getVariableHandle(state, *variable) for variable in self._variables]
-            self._handles += [library.getActuatorHandle(state, *actuator) for actuator in self._actuators]
-            for handle, words in zip(self._handles, (*self._variables, *self._actuators), strict=True):
+            self._handles = [
+                library.getVariableHandle(state, *variable) for variable in self._variables
+            ]
+            self._handles += [
+                library.getActuatorHandle(state, *actuator) for actuator in self._actuators
+            ]
+            for handle, words in zip(
+                self._handles, (*self._variables, *self._actuators), strict=True
+            ):
                 if handle < 0:
                     raise LookupError(f"EnergyPlus does not have {b', '.join(words).decode()}")
         return not library.warmupFlag(state)
@@ -143,7 +157,14 @@ class Engine:
             RuntimeError: EnergyPlus has failed; the message is its error file.
             BaseException: A callback has raised it.
         """
-        words = ["energyplus", "-w", str(WEATHER), "-d", str(self.folder), str(self.folder / "in.idf")]
+        words = [
+            "energyplus",
+            "-w",
+            str(WEATHER),
+            "-d",
+            str(self.folder),
+            str(self.folder / "in.idf"),
+        ]
         arguments = (_TEXT * len(words))(*map(str.encode, words))
         with self._guard:
             failed = self._library.energyplus(self._state, len(words), arguments)
@@ -157,7 +178,9 @@ class Engine:
 
     def set(self, actuator: int, value: float) -> None:
         """Set an actuator, until the next call."""
-        self._library.setActuatorValue(self._state, self._handles[len(self._variables) + actuator], value)
+        self._library.setActuatorValue(
+            self._state, self._handles[len(self._variables) + actuator], value
+        )
 
     @property
     def weekday(self) -> int:

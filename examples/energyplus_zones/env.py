@@ -1,10 +1,11 @@
 """Environments made from the two rooms: each thermostat is an agent.
 
-- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, without and with PettingZoo's wrappers.
+- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, without and with
+  PettingZoo's wrappers.
 - ``parallel_env``: both agents, with one round every quarter of an hour.
 
-Importing this module registers them as ``energyplus_zones/coop_v0``. An agent's reward is minus the cost of its room
-since its previous decision; the reward of the team is the sum.
+Importing this module registers them as ``energyplus_zones/coop_v0``. An agent's reward is minus the
+cost of its room since its previous decision; the reward of the team is the sum.
 """
 
 from __future__ import annotations
@@ -40,7 +41,14 @@ OBSERVED: Final = (
 def observe(zone: Zone) -> NDArray[np.float32]:
     """Observe a room, as ``OBSERVED`` lists it."""
     building, angle = zone.building, zone.building.hour / 12 * pi
-    values = (sin(angle), cos(angle), building.outside, zone.temperature, zone.other.temperature, zone.people)
+    values = (
+        sin(angle),
+        cos(angle),
+        building.outside,
+        zone.temperature,
+        zone.other.temperature,
+        zone.people,
+    )
     return np.array(values, np.float32)
 
 
@@ -66,7 +74,8 @@ POINT: Final = f"{Zone.__module__}.Zone.choose_setpoint"
 POINTS: Final[dict[Any, Definition]] = {
     POINT: make_step(
         observation_space=Box(
-            np.array([-1, -1, -50, -50, -50, 0], np.float32), np.array([1, 1, 50, 50, 50, 4], np.float32)
+            np.array([-1, -1, -50, -50, -50, 0], np.float32),
+            np.array([1, 1, 50, 50, 50, 4], np.float32),
         ),
         observation_space_mapping=observe,
         action_space=Box(0.0, 1.0, (1,), np.float32),
@@ -147,7 +156,8 @@ def parallel_env(**options: Any) -> SimulationParallelEnv:
 def _register() -> None:
     """Register the environments with PettingZoo, unless they are registered already."""
     for kind, entry_point in (("aec", "env"), ("parallel", "parallel_env")):
-        known = getattr(pettingzoo, f"{kind}_registry", None)  # missing in the oldest supported PettingZoo
+        # missing in the oldest supported PettingZoo
+        known = getattr(pettingzoo, f"{kind}_registry", None)
         if known is not None and "energyplus_zones/coop-v0" not in known:
             pettingzoo.register(kind, "energyplus_zones/coop_v0", f"{__name__}:{entry_point}")
 

@@ -1,6 +1,7 @@
 """A model on top of EnergyPlus: two rooms, the people in them, and the cost of heating and discomfort.
 
-It contains no reinforcement learning: ``python -m examples.energyplus_zones.model`` runs it by its own rule.
+It contains no reinforcement learning: ``python -m examples.energyplus_zones.model`` runs it by its
+own rule.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ class Zone:
         building: The building.
         name: The name of the room.
         other: The adjacent room.
-        begin, end, expected: The hours at which people come and leave on the current day, and their number.
+        begin, end, expected: The hours at which people come and leave on the current day, and their
+            number.
         people: The number of people in the room.
         temperature: The air temperature, in degrees Celsius.
         setpoint: The setpoint of its heater, in degrees Celsius.
@@ -137,7 +139,11 @@ class Building:
     def begin_step(self) -> None:
         """Let people come and go; at every decision step, choose the setpoint of each room."""
         engine, before = self.engine, self.weekday
-        self.hour, self.weekday, self.outside = engine.hour, engine.weekday, engine.read(self._outside)
+        self.hour, self.weekday, self.outside = (
+            engine.hour,
+            engine.weekday,
+            engine.read(self._outside),
+        )
         if self.steps == 0 or self.weekday != before:
             for zone in self.zones:
                 zone.plan_day()
@@ -169,7 +175,10 @@ def main() -> None:
     building = Building(seed=0)
     building.run()
     for zone in building.zones:
-        print(f"{zone.name}: {zone.energy:.1f} kWh, {zone.cost:.2f} in total, {zone.temperature:.1f} °C at the end")
+        print(
+            f"{zone.name}: {zone.energy:.1f} kWh, {zone.cost:.2f} in total, {zone.temperature:.1f}"
+            " °C at the end"
+        )
     building.close()
 
 

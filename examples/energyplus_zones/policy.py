@@ -44,7 +44,9 @@ def compare(seeds: range, workers: int = 0) -> Evaluation:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the comparison."""
     parser = argparse.ArgumentParser(description="Compare two policies for thermostats.")
-    parser.add_argument("--seeds", type=int, default=20, help="number of days (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", type=int, default=20, help="number of days (default: %(default)s)"
+    )
     print(compare(range(parser.parse_args(arguments).seeds)).summary().round(2).to_string())
 
 

@@ -1,16 +1,19 @@
 """Environments made from e-pucks that sweep an arena: each robot is an agent. The simulator is Enki, in C++.
 
-``robots.cpp`` is the model, which runs in a process of its own. Robots come in pairs and leave in mid-episode.
+``robots.cpp`` is the model, which runs in a process of its own. Robots come in pairs and leave in
+mid-episode.
 
 - ``robots``: the simulation.
 - ``raw_env`` and ``parallel_env``: the PettingZoo environments.
 
 **Actions.** A robot chooses how it turns, from 1 (left, on the spot) to -1 (right).
 
-**Observations.** A robot sees four infrared sensors, the distance and the angle of the nearest other robot and of the
-nearest dirty cell that no other robot is nearer to, and the charge of its battery.
+**Observations.** A robot sees four infrared sensors, the distance and the angle of the nearest
+other robot and of the nearest dirty cell that no other robot is nearer to, and the charge of its
+battery.
 
-**Rewards.** Each robot gets the number of cells that all robots have swept since its previous decision.
+**Rewards.** Each robot gets the number of cells that all robots have swept since its previous
+decision.
 """
 
 from __future__ import annotations
@@ -43,20 +46,29 @@ def missing() -> str:
     if shutil.which("g++") is None:
         return "g++ (Debian: apt-get install g++)"
     header = "#include <enki/PhysicalEngine.h>"
-    found = subprocess.run([*COMMAND, "-E", "-"], check=False, input=header, capture_output=True, text=True, timeout=60)
+    found = subprocess.run(
+        [*COMMAND, "-E", "-"], check=False, input=header, capture_output=True, text=True, timeout=60
+    )
     return "" if found.returncode == 0 else "Enki (Debian: apt-get install libenki-dev)"
 
 
 def program(folder: Path = HERE / "out") -> Path:
-    """Compile the model, unless the program is up to date: see ``compiled``. ``folder`` is that of the program."""
-    return compiled(folder / "robots", SOURCES, missing, lambda: [*COMMAND, str(SOURCES[0]), "-lenki"])
+    """Compile the model, unless the program is up to date: see ``compiled``.
+
+    ``folder`` is that of the program.
+    """
+    return compiled(
+        folder / "robots", SOURCES, missing, lambda: [*COMMAND, str(SOURCES[0]), "-lenki"]
+    )
 
 
 def observe(call: Any) -> NDArray[np.float32]:
     """Observe a robot: four sensors in thousands, two distances in metres, two angles in radians, the charge."""
     (other, to_other), (dirt, to_dirt) = call.other, call.dirt
     sensors = np.asarray(call.sensors) / 1000
-    return np.array([*sensors, other / 100, to_other, dirt / 100, to_dirt, call.charge / 120], np.float32)
+    return np.array(
+        [*sensors, other / 100, to_other, dirt / 100, to_dirt, call.charge / 120], np.float32
+    )
 
 
 POINTS: Final[dict[str, Definition]] = {

@@ -1,6 +1,7 @@
 """Building blocks for models of financial entities: entities, money, contracts, requests, a calendar.
 
-Time is an integer number of months, and money an integer number of cents. ``World.advance`` simulates one month.
+Time is an integer number of months, and money an integer number of cents. ``World.advance``
+simulates one month.
 
 >>> world = World(seed=1)
 >>> landlord, tenant = Entity(world), Entity(world)
@@ -83,7 +84,10 @@ class World:
 
 
 class Entity:
-    """An entity, which owns money and can be a party to contracts. Only the ledger changes its cents."""
+    """An entity, which owns money and can be a party to contracts.
+
+    Only the ledger changes its cents.
+    """
 
     __slots__ = ("__weakref__", "cents", "may_owe", "name", "number", "world")
 
@@ -128,7 +132,9 @@ class Ledger:
         if cents < 0:
             raise ValueError(f"an amount cannot be negative: {cents} ({reason})")
         if source.cents < cents and not source.may_owe:
-            raise Shortage(f"{source.name} has {source.cents} cents and cannot pay {cents} ({reason})")
+            raise Shortage(
+                f"{source.name} has {source.cents} cents and cannot pay {cents} ({reason})"
+            )
         source.cents -= cents
         target.cents += cents
         flows = self.flows
@@ -159,13 +165,16 @@ class Contract:
     start: int = -1  # the month of the first payment; by default the current one
     end: int | None = None  # the first month in which it is no longer in force
     every: int = 1  # the months between two payments
-    missed: int = field(default=0, init=False)  # the number of payments for which the debtor did not have the money
+    # the number of payments for which the debtor did not have the money
+    missed: int = field(default=0, init=False)
     number: int = field(init=False)  # its id in the world
 
     def __post_init__(self) -> None:
         world = self.debtor.world
         if self.every < 1 or self.creditor.world is not world:
-            raise ValueError("a contract binds two entities of one world, every month or less often")
+            raise ValueError(
+                "a contract binds two entities of one world, every month or less often"
+            )
         self.start = world.month if self.start < 0 else self.start
         self.number = world.next_id("contract")
         world.contracts[self.number] = self
@@ -198,7 +207,8 @@ class Contract:
 class Request:
     """A request of one entity to another.
 
-    Each kind of request is a subclass: ``objection`` says why the request is denied, ``carry_out`` fulfils it.
+    Each kind of request is a subclass: ``objection`` says why the request is denied, ``carry_out``
+    fulfils it.
     """
 
     applicant: Any
@@ -212,17 +222,25 @@ class Request:
         raise NotImplementedError
 
     def submit(self) -> str | None:
-        """Submit the request: return the reason for its denial, or None once it is carried out. The world counts."""
+        """Submit the request: return the reason for its denial, or None once it is carried out.
+
+        The world counts.
+        """
         reason = self.objection()
         kind = type(self).__name__
-        self.applicant.world.counts[f"{kind} granted" if reason is None else f"{kind} denied: {reason}"] += 1
+        self.applicant.world.counts[
+            f"{kind} granted" if reason is None else f"{kind} denied: {reason}"
+        ] += 1
         if reason is None:
             self.carry_out()
         return reason
 
 
 class Calendar:
-    """The schedule of events by month; events of one month happen in the order in which they were scheduled."""
+    """The schedule of events by month.
+
+    Events of one month happen in the order in which they were scheduled.
+    """
 
     __slots__ = ("_entered", "_events")
 
@@ -243,7 +261,10 @@ class Calendar:
         self.at(start, self._recur, months, action, start)
 
     def _recur(self, months: int, action: Callable[[], object], month: int) -> None:
-        """Run a recurring event, and schedule the next. No closure, so that copies of a world have their own events."""
+        """Run a recurring event, and schedule the next.
+
+        No closure, so that copies of a world have their own events.
+        """
         self.at(month + months, self._recur, months, action, month + months)
         action()
 

@@ -24,7 +24,10 @@ from .people import Client, PensionContract, RecoveryPlan, clients_of
 
 
 class Manager(Entity):
-    """The asset manager of a company, which decides on the share of its assets in equities; the rest is in bonds."""
+    """The asset manager of a company, which decides on the share of its assets in equities.
+
+    The rest is in bonds.
+    """
 
     kind = "manager"
 
@@ -38,7 +41,9 @@ class Manager(Entity):
 
     def choose_mix(self) -> float:
         """Choose the share of equities: 40 %, or 30 % while coverage is below 100 %, within what is lawful."""
-        return min(0.4 if self.company.policy_coverage() >= TRANSFERABLE else 0.3, self.lawful_mix())
+        return min(
+            0.4 if self.company.policy_coverage() >= TRANSFERABLE else 0.3, self.lawful_mix()
+        )
 
     def rebalance(self) -> None:
         """Buy and sell to reach the chosen mix, within what is lawful."""
@@ -61,9 +66,12 @@ class Company(Entity):
 
     Attributes:
         tables: The mortality that it assumes.
-        measured_short: The number of yearly measurements in a row at which its policy coverage was below the minimum.
-        rations: The cents paid by each pension contract in the last month, if the money did not suffice for all.
-        indexed: The current amount of a right that was 1 in the first month, after indexation and cuts.
+        measured_short: The number of yearly measurements in a row at which its policy coverage was
+            below the minimum.
+        rations: The cents paid by each pension contract in the last month, if the money did not
+            suffice for all.
+        indexed: The current amount of a right that was 1 in the first month, after indexation and
+            cuts.
     """
 
     kind = "company"
@@ -76,7 +84,8 @@ class Company(Entity):
         self.measured_short, self.indexed = 0, 1.0
         self.rations: dict[int, int] = {}
         self._rationed = -1
-        self._rights = [0] * OLDEST  # by month of birth; the first is OLDEST - 1 months before month 0
+        # by month of birth; the first is OLDEST - 1 months before month 0
+        self._rights = [0] * OLDEST
         self._history: deque[float] = deque(maxlen=12)
         self._policy_coverage = 1.0
         self._factors = annuity_factors(tables, market.yield_steps, RETIREMENT)
@@ -90,7 +99,9 @@ class Company(Entity):
         """The value of all rights, in cents: a product of sums of rights, by month of birth, and factors."""
         if self._provisions is None:
             youngest = self.world.month
-            self._provisions = sum(map(mul, self._rights[youngest : youngest + OLDEST], self._factors))
+            self._provisions = sum(
+                map(mul, self._rights[youngest : youngest + OLDEST], self._factors)
+            )
         return self._provisions
 
     def coverage(self) -> float:
@@ -113,7 +124,9 @@ class Company(Entity):
     def lawful_premium(self, client: Client) -> tuple[float, float]:
         """The lowest and the highest lawful premium for a client, as shares of the wage."""
         cost = min(self.cost_rate(client) * (1 + client.extra), HIGHEST_PREMIUM)
-        return cost * (0.8 if self.policy_coverage() >= REQUIRED else 1.0), min(1.3 * cost, HIGHEST_PREMIUM)
+        return cost * (0.8 if self.policy_coverage() >= REQUIRED else 1.0), min(
+            1.3 * cost, HIGHEST_PREMIUM
+        )
 
     def repair(self) -> float:
         """The lawful growth of rights in addition to inflation: a fifth of the gap, if coverage is as required."""
@@ -122,7 +135,11 @@ class Company(Entity):
 
     def lawful_indexation(self) -> float:
         """The highest lawful indexation: inflation plus repair, if coverage is high enough."""
-        return max(0.0, self.market.inflation) + self.repair() if self.policy_coverage() >= INDEXING else 0.0
+        return (
+            max(0.0, self.market.inflation) + self.repair()
+            if self.policy_coverage() >= INDEXING
+            else 0.0
+        )
 
     def set_premium(self, client: Client) -> float:
         """Choose a premium, as a share of the wage: the accrual's cost, and 5 % (or 15 or -10 %) of it for solvency."""
@@ -149,7 +166,10 @@ class Company(Entity):
         self._provisions = None
 
     def review(self, client: Client) -> None:
-        """Set premium and accrual for a client's next year; extra contributions end where they are too dear."""
+        """Set premium and accrual for a client's next year.
+
+        Extra contributions end where they are too dear.
+        """
         if self.cost_rate(client) * (1 + client.extra) > HIGHEST_PREMIUM:
             client.extra = 0.0
         lowest, highest = self.lawful_premium(client)
@@ -172,7 +192,9 @@ class Company(Entity):
     def invest(self) -> None:
         """Book a month's gains or losses on the assets, and revalue the rights."""
         share_of_equities, market = self.manager.equities, self.market
-        rate = share_of_equities * market.equity_return + (1 - share_of_equities) * market.bond_return
+        rate = (
+            share_of_equities * market.equity_return + (1 - share_of_equities) * market.bond_return
+        )
         change = round(self.cents * rate)
         outside, ledger = self.world.outside, self.world.ledger
         if change >= 0:
@@ -183,14 +205,23 @@ class Company(Entity):
         self._provisions = None
 
     def ration(self) -> dict[int, int]:
-        """Return the cents of each pension contract if the money does not suffice for all; checked once a month."""
+        """Return the cents of each pension contract if the money does not suffice for all.
+
+        Checked once a month.
+        """
         month, contracts = self.world.month, self.world.contracts.items()
         if self._rationed == month:
             return self.rations
         self._rationed = month
-        due = {number: contract.cents for number, contract in contracts if isinstance(contract, PensionContract)}
+        due = {
+            number: contract.cents
+            for number, contract in contracts
+            if isinstance(contract, PensionContract)
+        }
         short = self.cents < sum(due.values())
-        self.rations = dict(zip(due, share(self.cents, list(due.values())), strict=True)) if short else {}
+        self.rations = (
+            dict(zip(due, share(self.cents, list(due.values())), strict=True)) if short else {}
+        )
         self.world.counts["pensions rationed"] += short
         return self.rations
 
@@ -201,7 +232,10 @@ class Company(Entity):
         self._policy_coverage = sum(history) / len(history)
 
     def conclude_year(self) -> None:
-        """Measure the coverage, then index rights; or cut them, after the regulator has reviewed the recovery plan."""
+        """Measure the coverage, then index rights.
+
+        Or cut them, after the regulator has reviewed the recovery plan.
+        """
         counts = self.world.counts
         if self.policy_coverage() >= MINIMUM:
             self.measured_short = 0

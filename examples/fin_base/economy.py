@@ -1,14 +1,16 @@
 """The economy and the mortality around a pension fund: prices, yields, returns and lifetimes.
 
-**Mortality** has the parameters of the Standard Ultimate Survival Model (Dickson, Hardy and Waters, Actuarial
-Mathematics for Life Contingent Risks; also behind the Life Table of the Society of Actuaries' FAM-L exam).
+**Mortality** has the parameters of the Standard Ultimate Survival Model (Dickson, Hardy and Waters,
+Actuarial Mathematics for Life Contingent Risks; also behind the Life Table of the Society of
+Actuaries' FAM-L exam).
 
-**The market** has three correlated variables in monthly steps. Inflation and the bond yield are first-order
-autoregressive, as inflation is in Wilkie's model (A stochastic investment model for actuarial use, Transactions of the
-Faculty of Actuaries 39, 1986; a yearly coefficient of 0.58, from his revision of 1995) and the interest rate in
-Vasicek's model (An equilibrium characterization of the term structure, Journal of Financial Economics 5, 1977). Equity
-returns are lognormal. The levels are round numbers of our own, in the range of what regulators assume; they are not
-fitted to data: see ``Climate``.
+**The market** has three correlated variables in monthly steps. Inflation and the bond yield are
+first-order autoregressive, as inflation is in Wilkie's model (A stochastic investment model for
+actuarial use, Transactions of the Faculty of Actuaries 39, 1986; a yearly coefficient of 0.58, from
+his revision of 1995) and the interest rate in Vasicek's model (An equilibrium characterization of
+the term structure, Journal of Financial Economics 5, 1977). Equity returns are lognormal. The
+levels are round numbers of our own, in the range of what regulators assume; they are not fitted to
+data: see ``Climate``.
 """
 
 from __future__ import annotations
@@ -38,7 +40,10 @@ class Mortality:
     def monthly(self) -> list[float]:
         """Compute the probability of death within a month, by age in months up to ``OLDEST``."""
         growth = (self.c ** (1 / 12) - 1) / log(self.c)
-        hazards = [self.factor * (self.a / 12 + self.b * self.c ** (age / 12) * growth) for age in range(OLDEST)]
+        hazards = [
+            self.factor * (self.a / 12 + self.b * self.c ** (age / 12) * growth)
+            for age in range(OLDEST)
+        ]
         return [1 - exp(-hazard) for hazard in hazards[:-1]] + [1.0]
 
 
@@ -46,7 +51,8 @@ class Mortality:
 def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[float, ...]:
     """Compute the value of a pension of 1 a year, paid monthly for life from retirement on, at a yield in ``STEP``.
 
-    The values are by age in months, from ``OLDEST - 1`` *down to* 0, that is, in the order of birth.
+    The values are by age in months, from ``OLDEST - 1`` *down to* 0, that is, in the order of
+    birth.
     """
     discount = (1 + STEP * steps) ** (-1 / 12)
     value, values = 0.0, []
@@ -58,17 +64,23 @@ def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[
 
 @dataclass(frozen=True)
 class Climate:
-    """The parameters of the market. Rates are annual, and standard deviations those of the long run."""
+    """The parameters of the market.
+
+    Rates are annual, and standard deviations those of the long run.
+    """
 
     inflation: float = 0.02  # its mean: the European Central Bank's target
     inflation_sd: float = 0.015
-    inflation_memory: float = 0.58  # the share of a deviation from the mean that remains after a year
+    # the share of a deviation from the mean that remains after a year
+    inflation_memory: float = 0.58
     bond_yield: float = 0.025
     yield_sd: float = 0.012
     yield_memory: float = 0.85
-    equity_premium: float = 0.03  # the excess of the mean log return of equities over the mean yield
+    # the excess of the mean log return of equities over the mean yield
+    equity_premium: float = 0.03
     equity_sd: float = 0.18
-    correlations: tuple[float, float, float] = (0.4, -0.1, 0.1)  # inflation and yield, and equities; yield and equities
+    # inflation and yield, and equities; yield and equities
+    correlations: tuple[float, float, float] = (0.4, -0.1, 0.1)
 
 
 class Market:
@@ -79,7 +91,11 @@ class Market:
     def __init__(self, climate: Climate, random: Random) -> None:
         """Create a market, with inflation and yield at their long-run means."""
         self.climate, self.random = climate, random
-        self.inflation, self.bond_yield, self.price_level = climate.inflation, climate.bond_yield, 1.0
+        self.inflation, self.bond_yield, self.price_level = (
+            climate.inflation,
+            climate.bond_yield,
+            1.0,
+        )
         self.equity_return = self.bond_return = 0.0
         self._roots = _cholesky(climate.correlations)
 

@@ -1,20 +1,24 @@
 """Environments made from the pension fund: agents for its decisions, with observations, actions and rewards.
 
-The model itself does not refer to this module: the module names the model's methods as decision points.
+The model itself does not refer to this module: the module names the model's methods as decision
+points.
 
-- ``TEAM``: ``indexer_0`` and ``planner_0`` decide once a year on indexation and cuts, ``manager_0`` each quarter on the
-  asset mix, ``regulator_0`` on what recovery plans must contain. Their common reward is the gain in the members'
-  welfare, as the module ``welfare`` defines it.
-- ``PREMIUMS``: each client is an agent, which decides once a year on its own premium *on behalf of the company*; all
-  these agents can share one policy. The agent ends when the client retires, leaves or dies.
-- ``FundSim``: the simulation: a fund over a number of years. Its time is in years, and so is the time in infos.
+- ``TEAM``: ``indexer_0`` and ``planner_0`` decide once a year on indexation and cuts, ``manager_0``
+  each quarter on the asset mix, ``regulator_0`` on what recovery plans must contain. Their common
+  reward is the gain in the members' welfare, as the module ``welfare`` defines it.
+- ``PREMIUMS``: each client is an agent, which decides once a year on its own premium *on behalf of
+  the company*; all these agents can share one policy. The agent ends when the client retires,
+  leaves or dies.
+- ``FundSim``: the simulation: a fund over a number of years. Its time is in years, and so is the
+  time in infos.
 
-Masks exclude the actions that the law forbids: discounts on premiums without the coverage for them, indexation below
-110 %, more risk in a shortfall. An action that is not masked can still be denied: a recovery plan that cuts less than
-the regulator demands.
+Masks exclude the actions that the law forbids: discounts on premiums without the coverage for them,
+indexation below 110 %, more risk in a shortfall. An action that is not masked can still be denied:
+a recovery plan that cuts less than the regulator demands.
 
-Importing this module registers the team as ``fin_base/coop_v0`` (AEC and parallel) and ``fin_base/Joint-v0``, each of
-its agents alone as ``fin_base/ChooseMix-v0`` and so on, and the clients as ``fin_base/premium_v0``.
+Importing this module registers the team as ``fin_base/coop_v0`` (AEC and parallel) and
+``fin_base/Joint-v0``, each of its agents alone as ``fin_base/ChooseMix-v0`` and so on, and the
+clients as ``fin_base/premium_v0``.
 """
 
 from __future__ import annotations
@@ -28,7 +32,15 @@ import pettingzoo
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from simenv_marl import TRUNCATED, Definition, SimulationInterface, aec_env, difference, make_step, register_simulation
+from simenv_marl import (
+    TRUNCATED,
+    Definition,
+    SimulationInterface,
+    aec_env,
+    difference,
+    make_step,
+    register_simulation,
+)
 from simenv_marl.envs import SimulationAECEnv
 
 from .company import Company, Manager, Regulator
@@ -40,7 +52,8 @@ from .welfare import Account
 YEARS: Final = 40  # after which an episode is truncated
 CLIENTS: Final = 1000  # at the start
 
-SURCHARGES: Final = (0.8, 0.9, 1.0, 1.05, 1.15, 1.3)  # premiums, relative to the cost of the client's accrual
+# premiums, relative to the cost of the client's accrual
+SURCHARGES: Final = (0.8, 0.9, 1.0, 1.05, 1.15, 1.3)
 INDEXATIONS: Final = (0.0, 0.25, 0.5, 0.75, 1.0)  # relative to the highest lawful one
 CUTS: Final = (0.0, 0.5 / SPREAD, 1 / SPREAD, 3 / SPREAD, 1.0)  # relative to the shortfall
 MIXES: Final = (0.0, 0.2, 0.3, 0.4, 0.6, 0.8)  # shares of equities
@@ -213,7 +226,9 @@ PREMIUMS: Final[dict[Any, Definition]] = {
         rule_action_mapping=premium_asked,
         reward_mapping=premium_reward,
         agent=agent_of,
-        removed_by={f"{Client.__module__}.Client.{event}": agent_of for event in ("vanish", "retire")},
+        removed_by={
+            f"{Client.__module__}.Client.{event}": agent_of for event in ("vanish", "retire")
+        },
     )
 }
 """The premiums: one agent per client."""
@@ -233,9 +248,15 @@ def decision(agent: str, levels: Sequence[float], **mappings: Any) -> Definition
 
 TEAM: Final[dict[Any, Definition]] = {
     f"{Company.__module__}.Company.choose_indexation": decision(
-        "indexer_0", INDEXATIONS, apply=index, action_mask_mapping=lawful_indexations, rule_action_mapping=indexed
+        "indexer_0",
+        INDEXATIONS,
+        apply=index,
+        action_mask_mapping=lawful_indexations,
+        rule_action_mapping=indexed,
     ),
-    f"{Company.__module__}.Company.choose_cut": decision("planner_0", CUTS, apply=cut, rule_action_mapping=was_cut),
+    f"{Company.__module__}.Company.choose_cut": decision(
+        "planner_0", CUTS, apply=cut, rule_action_mapping=was_cut
+    ),
     f"{Manager.__module__}.Manager.choose_mix": decision(
         "manager_0",
         MIXES,
@@ -308,7 +329,11 @@ class FundSim(SimulationInterface):
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
         """Return the calls to come at a decision point: those of the company, its manager and its regulator."""
         company = self.fund.company
-        callers = {"Company": (company,), "Manager": (company.manager,), "Regulator": (company.regulator, company)}
+        callers = {
+            "Company": (company,),
+            "Manager": (company.manager,),
+            "Regulator": (company.regulator, company),
+        }
         kind, name = point.split(".")[-2:]
         return [] if name == "set_premium" else [callers[kind]]
 

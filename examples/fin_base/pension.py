@@ -1,12 +1,13 @@
 """A model of a pension company and its clients over decades, in monthly steps. It contains no reinforcement learning.
 
-People join, pay premiums, change jobs, retire, transfer their rights to another fund, and die. A right is an accrued
-yearly pension, paid for life. The *coverage* is the ratio of assets to *provisions*, the value of all rights.
+People join, pay premiums, change jobs, retire, transfer their rights to another fund, and die. A
+right is an accrued yearly pension, paid for life. The *coverage* is the ratio of assets to
+*provisions*, the value of all rights.
 
 **Decisions**, each of them a method with a plausible rule:
 
-========================= ==================== =====================================================================
-``Company.set_premium``    client, yearly       the premium, as a share of a client's wage
+========================= ====================
+===================================================================== ``Company.set_premium``    client, yearly       the premium, as a share of a client's wage
 ``Company.choose_indexation``       yearly      the increase of all rights
 ``Company.choose_cut``              yearly      the cut of all rights in a shortfall
 ``Manager.choose_mix``              quarterly   the share of the assets in equities
@@ -14,9 +15,11 @@ yearly pension, paid for life. The *coverage* is the ratio of assets to *provisi
 ``Client.choose_to_join``  once                 whether to become a client
 ``Client.choose_extra``    yearly               the contribution beyond the standard
 ``Client.choose_to_leave`` with a new job       whether to transfer the rights to another fund
-========================= ==================== =====================================================================
+========================= ====================
+=====================================================================
 
-``python -m examples.fin_base.pension --clients 10000 --years 40`` prints the fund's results, and how fast it runs.
+``python -m examples.fin_base.pension --clients 10000 --years 40`` prints the fund's results, and
+how fast it runs.
 """
 
 from __future__ import annotations
@@ -31,7 +34,15 @@ from .blocks import World
 from .company import Company
 from .economy import OLDEST, Climate, Market, Mortality
 from .law import ACCRUAL, RETIREMENT
-from .people import Admission, Client, Contribution, PensionContract, PremiumContract, Transfer, clients_of
+from .people import (
+    Admission,
+    Client,
+    Contribution,
+    PensionContract,
+    PremiumContract,
+    Transfer,
+    clients_of,
+)
 
 
 @dataclass(frozen=True)
@@ -44,7 +55,8 @@ class Parameters:
     tables: Mortality = field(default_factory=Mortality)  # the mortality that the company assumes
     mortality: Mortality = field(default_factory=Mortality)  # the actual mortality
     job_change: float = 0.008  # the monthly probability that a worker changes jobs
-    entry: float = 0.025  # the yearly number of candidates, relative to the initial number of clients
+    # the yearly number of candidates, relative to the initial number of clients
+    entry: float = 0.025
 
 
 class Fund:
@@ -53,7 +65,8 @@ class Fund:
     def __init__(self, seed: int | None = None, parameters: Parameters | None = None) -> None:
         """Create a fund, with clients of all ages who have paid since they were 25.
 
-        Market and people have separate generators, so decisions about people do not change the market.
+        Market and people have separate generators, so decisions about people do not change the
+        market.
         """
         self.parameters = parameters = parameters or Parameters()
         self.world = world = World(seed)
@@ -82,10 +95,14 @@ class Fund:
         ages = self.people.choices(range(25 * 12, 100 * 12), weights, k=self.parameters.clients)
         for age in ages:
             client = self._candidate(age)
-            client.accrue(round(ACCRUAL * client.wage * (min(age, RETIREMENT) - 25 * 12) / 12 * 0.8))
+            client.accrue(
+                round(ACCRUAL * client.wage * (min(age, RETIREMENT) - 25 * 12) / 12 * 0.8)
+            )
             if age >= RETIREMENT:
                 client.status = "retired"
-                client.contract = PensionContract(self.company, client, client.accrued // 12, "pension")
+                client.contract = PensionContract(
+                    self.company, client, client.accrued // 12, "pension"
+                )
             else:
                 client.status = "working"
                 client.contract = PremiumContract(client, self.company, 0, "premium")
@@ -120,9 +137,17 @@ class Fund:
         self.company.measure()
 
     def _live(self) -> None:
-        """Let people earn, change jobs and die; one draw per person and month decides between death and a new job."""
+        """Let people earn, change jobs and die.
+
+        One draw per person and month decides between death and a new job.
+        """
         world, deaths, change = self.world, self._deaths, self.parameters.job_change
-        draw, move, outside, month = self.people.random, world.ledger.move, world.outside, world.month
+        draw, move, outside, month = (
+            self.people.random,
+            world.ledger.move,
+            world.outside,
+            world.month,
+        )
         last = OLDEST - 1
         for client in clients_of(world):
             chance = draw()
@@ -165,7 +190,10 @@ class Fund:
                 candidate.vanish(world.outside)
 
     def review_year(self, client: Client) -> None:
-        """Review a client on the birthday: spend surplus savings; workers get a raise and next year's premium."""
+        """Review a client on the birthday: spend surplus savings.
+
+        Workers get a raise and next year's premium.
+        """
         if client.status == "gone":
             return
         world = self.world
@@ -193,10 +221,18 @@ class Fund:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a fund, and print its results and the speed of the computation."""
-    parser = argparse.ArgumentParser(description="Run a pension fund by its own rules, and print its results.")
-    parser.add_argument("--clients", type=int, default=10_000, help="initial number of clients (default: 10000)")
-    parser.add_argument("--years", type=int, default=40, help="how many years to simulate (default: 40)")
-    parser.add_argument("--seed", type=int, help="seed of all randomness (default: a new one each time)")
+    parser = argparse.ArgumentParser(
+        description="Run a pension fund by its own rules, and print its results."
+    )
+    parser.add_argument(
+        "--clients", type=int, default=10_000, help="initial number of clients (default: 10000)"
+    )
+    parser.add_argument(
+        "--years", type=int, default=40, help="how many years to simulate (default: 40)"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="seed of all randomness (default: a new one each time)"
+    )
     options = parser.parse_args(arguments)
     fund = Fund(options.seed, Parameters(clients=options.clients))
     start = perf_counter()
@@ -206,8 +242,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         company, market = fund.company, fund.market
         if year % 5 == 0 or year == options.years:
             print(
-                f"{year:4} {len(clients_of(fund.world)):7} {company.coverage():8.3f} {market.bond_yield:5.2%} "
-                f"{market.inflation:9.2%} {company.manager.equities:8.0%} {company.indexed / market.price_level:13.2f}"
+                f"{year:4} {len(clients_of(fund.world)):7} {company.coverage():8.3f}"
+                f" {market.bond_yield:5.2%} {market.inflation:9.2%}"
+                f" {company.manager.equities:8.0%} {company.indexed / market.price_level:13.2f}"
             )
     for event, count in sorted(fund.world.counts.items()):
         print(f"{count:8} {event}")

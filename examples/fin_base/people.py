@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 
 
 class PremiumContract(Contract):
-    """A contract by which a client pays a premium each month; each payment adds to the client's rights."""
+    """A contract by which a client pays a premium each month.
+
+    Each payment adds to the client's rights.
+    """
 
     __slots__ = ()
     debtor: Client
@@ -33,7 +36,10 @@ class PensionContract(Contract):
     debtor: Company
 
     def perform(self) -> bool:
-        """Pay the pension; if the money does not suffice for all pensions, pay its share of the money."""
+        """Pay the pension.
+
+        If the money does not suffice for all pensions, pay its share of the money.
+        """
         rations = self.debtor.ration()
         if not rations:
             return super().perform()
@@ -122,7 +128,8 @@ class Client(Entity):
     Attributes:
         born: The month of birth, which may be before the first month.
         wage: The yearly wage of the current or last job, in cents.
-        status: "candidate", "working", "away" (in a job without pension, or in none), "retired" or "gone".
+        status: "candidate", "working", "away" (in a job without pension, or in none), "retired" or
+            "gone".
         accrued: The accrued right to a yearly pension, in cents.
         accrual: The cents that a month's premium adds to it.
         extra: The contribution beyond the standard, as a share of the standard: one of ``EXTRAS``.
@@ -140,8 +147,19 @@ class Client(Entity):
     def __init__(self, company: Company, age: int, wage: int, caution: float) -> None:
         """Create a candidate of an age in months."""
         super().__init__(company.world)
-        self.company, self.born, self.wage, self.caution = company, company.world.month - age, wage, caution
-        self.status, self.accrued, self.accrual, self.extra, self.premium = "candidate", 0, 0, 0.0, 0.0
+        self.company, self.born, self.wage, self.caution = (
+            company,
+            company.world.month - age,
+            wage,
+            caution,
+        )
+        self.status, self.accrued, self.accrual, self.extra, self.premium = (
+            "candidate",
+            0,
+            0,
+            0.0,
+            0.0,
+        )
         self.disposable = 0
         self.contract: Contract | None = None
 
@@ -155,11 +173,18 @@ class Client(Entity):
         return self.company.policy_coverage() >= 0.75 + 0.3 * self.caution
 
     def choose_extra(self) -> float:
-        """Choose the extra contribution: more from 45 on, with savings in a sound company; less after a default."""
+        """Choose the extra contribution: more from 45 on, with savings in a sound company.
+
+        Less after a default.
+        """
         step = EXTRAS.index(self.extra)
         if self.contract is not None and self.contract.missed:
             step = max(0, step - 1)
-        elif self.age >= 45 * 12 and self.cents * 12 > self.wage and self.company.policy_coverage() >= MINIMUM:
+        elif (
+            self.age >= 45 * 12
+            and self.cents * 12 > self.wage
+            and self.company.policy_coverage() >= MINIMUM
+        ):
             step = min(step + 1, len(EXTRAS) - 1)
         return EXTRAS[step]
 
@@ -211,7 +236,10 @@ class Client(Entity):
         return round(self.accrued * self.company.factor(self.age))
 
     def vanish(self, heir: Entity, reason: str = "estate") -> None:
-        """Remove the client: after death, a transfer, or a candidate's refusal or denial. All rights end."""
+        """Remove the client: after death, a transfer, or a candidate's refusal or denial.
+
+        All rights end.
+        """
         self.end_contract()
         self.accrue(-self.accrued)
         self.status = "gone"

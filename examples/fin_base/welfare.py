@@ -1,12 +1,13 @@
 """The welfare of a fund's members: the utility by which policies are compared.
 
-In each year a pensioner lives on the pension, and a worker on the wage less the premium. Each is measured relative to
-full income: a pension that has kept up with prices, or a wage without a premium. The utility of a year is the mean,
-over all members, of the logarithm of that ratio. So a loss of the same percentage counts the same for all members, and
-a loss of the same amount counts more for a member who is poorer already.
+In each year a pensioner lives on the pension, and a worker on the wage less the premium. Each is
+measured relative to full income: a pension that has kept up with prices, or a wage without a
+premium. The utility of a year is the mean, over all members, of the logarithm of that ratio. So a
+loss of the same percentage counts the same for all members, and a loss of the same amount counts
+more for a member who is poorer already.
 
-The time after the last year counts as ``AFTER`` more years, in which rights keep their purchasing power, as far as
-assets cover them. So it does not pay to spend today what later pensions need.
+The time after the last year counts as ``AFTER`` more years, in which rights keep their purchasing
+power, as far as assets cover them. So it does not pay to spend today what later pensions need.
 
 One point of welfare is one per cent of a year's income, for each member.
 """
@@ -25,7 +26,8 @@ LEAST: Final = 0.05  # the minimum income of a member, from other sources, as a 
 class Year(NamedTuple):
     """The results of a year, at its end."""
 
-    right: float  # the purchasing power of a right that was 1 in the first month, in prices of that month
+    # the purchasing power of a right that was 1 in the first month, in prices of that month
+    right: float
     coverage: float
     premium: float  # its mean, as a share of the wage
     utility: float  # the mean logarithm of the members' incomes, relative to full income
@@ -45,7 +47,10 @@ class Account:
         return self.fund.company.indexed / self.fund.company.market.price_level
 
     def close_year(self) -> None:
-        """Account for the year that ends now. The run time is proportional to the number of clients."""
+        """Account for the year that ends now.
+
+        The run time is proportional to the number of clients.
+        """
         company, right = self.fund.company, self.right()
         premiums = [client.premium for client in self.fund.clients if client.status == "working"]
         retired = sum(client.status == "retired" for client in self.fund.clients)

@@ -1,24 +1,28 @@
 """Environments made from the greenhouse: two of its decisions become agents that share one reward.
 
-This follows supplement S2 of the Sim-Env paper, with the two agents that its outlook suggests: ``waterer_0`` decides
-how many litres to pour, ``ventilator_0`` how much air to exchange. The model itself does not refer to this module: the
-module names the model's functions as decision points, and they stay unchanged for all other uses.
+This follows supplement S2 of the Sim-Env paper, with the two agents that its outlook suggests:
+``waterer_0`` decides how many litres to pour, ``ventilator_0`` how much air to exchange. The model
+itself does not refer to this module: the module names the model's functions as decision points, and
+they stay unchanged for all other uses.
 
-- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, without and with PettingZoo's wrappers.
+- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, without and with
+  PettingZoo's wrappers.
 - ``parallel_env``: both agents, as a PettingZoo parallel environment, with one round per day.
-- ``joint_env``: one agent that takes both decisions, as a Gymnasium environment; its reward is the sum of the two.
+- ``joint_env``: one agent that takes both decisions, as a Gymnasium environment; its reward is the
+  sum of the two.
 - ``watering_env``: the waterer alone, as a Gymnasium environment; ventilation follows its rule.
 - ``ventilation_env``: the ventilator alone; watering follows its rule.
 
-Importing this module registers them: ``pettingzoo.make("aec", "greenhouse_coop/coop_v0")``, the same with
-``"parallel"``, and ``gymnasium.make`` of ``"greenhouse_coop/Watering-v0"``, ``"greenhouse_coop/Ventilation-v0"`` and
-``"greenhouse_coop/Joint-v0"``.
+Importing this module registers them: ``pettingzoo.make("aec", "greenhouse_coop/coop_v0")``, the
+same with ``"parallel"``, and ``gymnasium.make`` of ``"greenhouse_coop/Watering-v0"``,
+``"greenhouse_coop/Ventilation-v0"`` and ``"greenhouse_coop/Joint-v0"``.
 
-Both agents get the same reward once a day: the share of living plants, less a thousandth per litre poured since their
-decision of the day before. As the reward is shared, the return of the team is the return of *one* agent, not the sum:
-here the ventilator's, whose return is the sum over all days. (The waterer decides after the plants' daily update. It
-gets no reward for the first day, when all plants are alive, and two for the last day, so its return is less by the
-share of plants that are dead in the end.)
+Both agents get the same reward once a day: the share of living plants, less a thousandth per litre
+poured since their decision of the day before. As the reward is shared, the return of the team is
+the return of *one* agent, not the sum: here the ventilator's, whose return is the sum over all
+days. (The waterer decides after the plants' daily update. It gets no reward for the first day, when
+all plants are alive, and two for the last day, so its return is less by the share of plants that
+are dead in the end.)
 """
 
 from __future__ import annotations
@@ -33,8 +37,21 @@ from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import ClipOutOfBoundsWrapper, OrderEnforcingWrapper
 
 import simenv_marl
-from simenv_marl import TRUNCATED, Definition, SimulationInterface, aec_env, difference, make_step, single_env
-from simenv_marl.envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
+from simenv_marl import (
+    TRUNCATED,
+    Definition,
+    SimulationInterface,
+    aec_env,
+    difference,
+    make_step,
+    single_env,
+)
+from simenv_marl.envs import (
+    SimulationAECEnv,
+    SimulationEnv,
+    SimulationJointEnv,
+    SimulationParallelEnv,
+)
 
 from .model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, POT_CAPACITY, Greenhouse
 
@@ -52,7 +69,10 @@ OBSERVED: Final = (
     "share of the plants that are alive",
     "share of the days that are gone",
     "water in the pots of living plants: its mean, by what a pot holds",
-    "the same, each pot counted by what its plant lacks in health: are the weak too dry or too wet?",
+    (
+        "the same, each pot counted by what its plant lacks in health: are the weak too dry or too"
+        " wet?"
+    ),
 )
 """The observation of both agents."""
 
@@ -63,8 +83,8 @@ OBSERVED: Final = (
 def observe(greenhouse: Greenhouse) -> NDArray[np.float32]:
     """Observe the greenhouse, as ``OBSERVED`` lists it.
 
-    All values are clipped to [0, 1], because the model does not bound the humidity: bad decisions can drive it, and the
-    water with it, to infinity.
+    All values are clipped to [0, 1], because the model does not bound the humidity: bad decisions
+    can drive it, and the water with it, to infinity.
     """
     living = 0
     water = lack = water_by_lack = 0.0
@@ -121,7 +141,9 @@ def from_litres(litres: float) -> list[float]:
 def exchange_air(action: Any, greenhouse: Greenhouse) -> None:
     """Exchange the fraction of the air that the ventilator's action says, in place of the model's fixed 20 %."""
     fraction = to_fraction(action)
-    greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
+    greenhouse.humidity = (
+        1 - fraction
+    ) * greenhouse.humidity + fraction * greenhouse.outside_humidity
 
 
 def usual_exchange(nothing: None, greenhouse: Greenhouse) -> list[float]:
@@ -247,7 +269,10 @@ def parallel_env(**options: Any) -> SimulationParallelEnv:
 
 
 def joint_env(**options: Any) -> SimulationJointEnv:
-    """Make the environment of one agent that takes both decisions; ``flatten=True`` makes them one vector."""
+    """Make the environment of one agent that takes both decisions.
+
+    ``flatten=True`` makes them one vector.
+    """
     return simenv_marl.joint_env(GreenhouseSim, **options)
 
 
@@ -257,7 +282,8 @@ def _register() -> None:
         if f"greenhouse_coop/{name}-v0" not in gymnasium.registry:
             gymnasium.register(f"greenhouse_coop/{name}-v0", f"{__name__}:{name.lower()}_env")
     for kind, maker in (("aec", "env"), ("parallel", "parallel_env")):
-        known = getattr(pettingzoo, f"{kind}_registry", None)  # missing in the oldest supported PettingZoo
+        # missing in the oldest supported PettingZoo
+        known = getattr(pettingzoo, f"{kind}_registry", None)
         if known is not None and "greenhouse_coop/coop-v0" not in known:
             pettingzoo.register(kind, "greenhouse_coop/coop_v0", f"{__name__}:{maker}")
 

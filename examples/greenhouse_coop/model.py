@@ -1,7 +1,7 @@
 """The domain model: a greenhouse whose rule overwaters the plants.
 
-This follows supplement S1 of the Sim-Env paper, with its parameters and its order of events. The model contains no
-reinforcement learning and no environments: only the rules below decide.
+This follows supplement S1 of the Sim-Env paper, with its parameters and its order of events. The
+model contains no reinforcement learning and no environments: only the rules below decide.
 
 As a script, it prints the numbers of living and dead plants day by day::
 
@@ -25,7 +25,8 @@ POT_CAPACITY = 3.0  # litres; more water drowns the plant
 class Greenhouse:
     """A greenhouse with potted plants and weather.
 
-    It has its own random number generator, so greenhouses with the same seed develop alike, whatever else runs.
+    It has its own random number generator, so greenhouses with the same seed develop alike,
+    whatever else runs.
 
     Attributes:
         pots: The plants.
@@ -146,8 +147,12 @@ class Plant:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the numbers of living and dead plants day by day."""
     parser = argparse.ArgumentParser(description="Run the greenhouse by its own rules.")
-    parser.add_argument("--days", type=int, default=10, help="how many days to simulate (default: 10)")
-    parser.add_argument("--seed", type=int, help="seed of plants and weather (default: a new one each time)")
+    parser.add_argument(
+        "--days", type=int, default=10, help="how many days to simulate (default: 10)"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="seed of plants and weather (default: a new one each time)"
+    )
     options = parser.parse_args(arguments)
     greenhouse = Greenhouse(options.seed)
     for day in range(options.days):

@@ -1,12 +1,12 @@
 """Planning in the greenhouse, without training.
 
-``python -m examples.greenhouse_coop.plan`` lets the waterer try out nine amounts of water each day, in branches of a
-few days with newly drawn weather, before it pours the best one. One planner continues its branches with the model's own
-rule, another with the best constant amount. The script prints a table, and writes the results to a file; ``make plan``
-draws a figure of them, too.
+``python -m examples.greenhouse_coop.plan`` lets the waterer try out nine amounts of water each day,
+in branches of a few days with newly drawn weather, before it pours the best one. One planner
+continues its branches with the model's own rule, another with the best constant amount. The script
+prints a table, and writes the results to a file; ``make plan`` draws a figure of them, too.
 
-Branches run on all cores, so the greenhouses run one after another. The cost of a branch is mostly the start of its
-process, which grows with the number of imported modules.
+Branches run on all cores, so the greenhouses run one after another. The cost of a branch is mostly
+the start of its process, which grows with the number of imported modules.
 """
 
 from __future__ import annotations
@@ -53,11 +53,16 @@ class CountingPlanner(RolloutPolicy):
             horizon: The number of days for which they are tried out.
             **options: The options of ``RolloutPolicy``.
         """
-        super().__init__([np.array([action], np.float32) for action in actions], horizon=horizon, **options)
+        super().__init__(
+            [np.array([action], np.float32) for action in actions], horizon=horizon, **options
+        )
         self.days = horizon
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
-        """Choose an action. In a branch of another planner, this tries nothing out and returns the action alone."""
+        """Choose an action.
+
+        In a branch of another planner, this tries nothing out and returns the action alone.
+        """
         values = self.choose(_environment)
         if not values.counts.any():
             return values.best
@@ -66,7 +71,10 @@ class CountingPlanner(RolloutPolicy):
 
 
 def water_planner(
-    base: Any = RULE, horizon: int = 3, futures: int = 2, rest: Callable[[Any], float] | None = days_left
+    base: Any = RULE,
+    horizon: int = 3,
+    futures: int = 2,
+    rest: Callable[[Any], float] | None = days_left,
 ) -> CountingPlanner:
     """Make a waterer that plans.
 
@@ -116,22 +124,36 @@ def keep(policies: Mapping[str, Any], seeds: Sequence[int], *, progress: bool = 
     alive[air.episodes, air.steps] = air.observations[:, share] * PLANTS
     alive[range(len(seeds)), air.lengths] = air.last_observations[:, share] * PLANTS
     poured[water.episodes, water.steps] = water.actions[:, 0] * MOST_WATER
-    simulated = sum(float(each.extras["days"].sum()) for each in found.values() if "days" in each.extras)
+    simulated = sum(
+        float(each.extras["days"].sum()) for each in found.values() if "days" in each.extras
+    )
     return Kept(air.returns, alive, poured, simulated / len(seeds))
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, Kept]:
     """Run greenhouses with each team, print the results as a table, and write them to a file."""
     parser = argparse.ArgumentParser(description="Run a greenhouse by plans, without training.")
-    parser.add_argument("--seeds", type=int, default=32, help="number of greenhouses (default: %(default)s)")
-    parser.add_argument("--futures", type=int, default=2, help="futures per amount of water (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for the results (default: beside this file)")
+    parser.add_argument(
+        "--seeds", type=int, default=32, help="number of greenhouses (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--futures", type=int, default=2, help="futures per amount of water (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="folder for the results (default: beside this file)"
+    )
     options = parser.parse_args(arguments)
     teams: dict[str, Mapping[str, Any]] = {
         "rule": {},
         "best constant pair": BEST,
-        "watering planned over the rule": {**BEST, WATERER: water_planner(RULE, 3, options.futures)},
-        "watering planned over the pair": {**BEST, WATERER: water_planner(BEST[WATERER], 3, options.futures)},
+        "watering planned over the rule": {
+            **BEST,
+            WATERER: water_planner(RULE, 3, options.futures),
+        },
+        "watering planned over the pair": {
+            **BEST,
+            WATERER: water_planner(BEST[WATERER], 3, options.futures),
+        },
     }
     kept = {}
     for title, policies in teams.items():
@@ -139,8 +161,16 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Kept]:
         kept[title] = keep(policies, range(HELD_OUT, HELD_OUT + options.seeds), progress=True)
     tabulate(
         f"{options.seeds} greenhouses of make demo: mean ± standard deviation",
-        {"return": ".1f", f"alive, day {DAYS}": ".0f", "litres poured": ".0f", "days in branches": ",.0f"},
-        {who: (own.returns, own.alive[:, -1], own.poured.sum(axis=1), own.simulated) for who, own in kept.items()},
+        {
+            "return": ".1f",
+            f"alive, day {DAYS}": ".0f",
+            "litres poured": ".0f",
+            "days in branches": ",.0f",
+        },
+        {
+            who: (own.returns, own.alive[:, -1], own.poured.sum(axis=1), own.simulated)
+            for who, own in kept.items()
+        },
     )
     options.out.mkdir(parents=True, exist_ok=True)
     told = {

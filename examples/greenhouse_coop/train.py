@@ -1,9 +1,11 @@
 """Two agents learn to keep a greenhouse together, and what that is worth.
 
-``python -m examples.greenhouse_coop.train`` trains the waterer and the ventilator by evolution (CMA-ES), looks for the
-best constant decisions to compare them with, and lets all of them keep greenhouses that they have never seen. It prints
-a table, and writes the results to a file; ``make demo`` draws a picture of them, too. All of it happens in ``raw_env``,
-the PettingZoo environment of both agents, in which ``RULE`` answers for agents that are to follow the model's rule.
+``python -m examples.greenhouse_coop.train`` trains the waterer and the ventilator by evolution
+(CMA-ES), looks for the best constant decisions to compare them with, and lets all of them keep
+greenhouses that they have never seen. It prints a table, and writes the results to a file;
+``make demo`` draws a picture of them, too. All of it happens in ``raw_env``, the PettingZoo
+environment of both agents, in which ``RULE`` answers for agents that are to follow the model's
+rule.
 
 The same options bring the same result, on any number of processes.
 """
@@ -75,7 +77,8 @@ class Linear:
     """Weighs what it observes; the logistic function makes an action of the sum.
 
     Attributes:
-        weights: One for each part of the observation, and the sum in the middle of the observation space.
+        weights: One for each part of the observation, and the sum in the middle of the observation
+            space.
     """
 
     weights: NDArray[np.float64]
@@ -95,8 +98,8 @@ class Outcome:
 
     Attributes:
         value: Its return: that of one agent, because all are rewarded for the same.
-        alive: How many plants were alive at the beginning of each day, and at the end. All are dead in the days
-            after an early end.
+        alive: How many plants were alive at the beginning of each day, and at the end. All are dead
+            in the days after an early end.
         poured: The litres poured on each day.
     """
 
@@ -134,7 +137,10 @@ Run = Callable[[Callable[..., Outcome], Sequence[Team], Sequence[int]], Iterable
 
 
 def play_all(teams: Sequence[Team], seeds: Iterable[int], run: Run = map) -> list[list[Outcome]]:
-    """Let every team play every seed; return a list for each team, with an outcome for each seed."""
+    """Let every team play every seed.
+
+    Return a list for each team, with an outcome for each seed.
+    """
     seeds = list(seeds)
     outcomes = list(run(play, [team for team in teams for _ in seeds], seeds * len(teams)))
     return [outcomes[start : start + len(seeds)] for start in range(0, len(outcomes), len(seeds))]
@@ -160,7 +166,9 @@ Rate = Callable[[Sequence[Team], Iterable[int]], NDArray[np.float64]]
 """Rates every team by its mean return over seeds."""
 
 
-def learn(rate: Rate, start: Mapping[str, Constant], generations: int, rng: np.random.Generator) -> dict[str, Linear]:
+def learn(
+    rate: Rate, start: Mapping[str, Constant], generations: int, rng: np.random.Generator
+) -> dict[str, Linear]:
     """Train linear policies together, by evolution of their weights.
 
     Args:
@@ -198,12 +206,14 @@ Curves = dict[str, list[NDArray[np.float64]]]
 """By the title of each team that was trained, the mean return of each candidate of each generation."""
 
 
-def compare(budget: int, seeds: int, seed: int, workers: int) -> tuple[dict[str, list[Outcome]], Curves]:
+def compare(
+    budget: int, seeds: int, seed: int, workers: int
+) -> tuple[dict[str, list[Outcome]], Curves]:
     """Search, train, and let all policies keep the greenhouses of the held-out seeds.
 
     Args:
-        budget: The episodes to learn from: a tenth, a quarter, a fifth and 45 % of them go to constant watering,
-            constant pairs, the waterer's training and the training of both.
+        budget: The episodes to learn from: a tenth, a quarter, a fifth and 45 % of them go to
+            constant watering, constant pairs, the waterer's training and the training of both.
         seeds: The number of held-out seeds.
         seed: Determines everything.
         workers: The number of processes.
@@ -215,12 +225,20 @@ def compare(budget: int, seeds: int, seed: int, workers: int) -> tuple[dict[str,
 
     curves: Curves = {ONE_TRAINED: [], BOTH_TRAINED: []}
     rng = np.random.default_rng(seed)
-    spawned = multiprocessing.get_context("spawn")  # forks of a process that may have threads are no good
-    with ProcessPoolExecutor(workers, spawned) as pool, tqdm(total=budget + 6 * seeds, unit="episode") as bar:
+    # forks of a process that may have threads are no good
+    spawned = multiprocessing.get_context("spawn")
+    with (
+        ProcessPoolExecutor(workers, spawned) as pool,
+        tqdm(total=budget + 6 * seeds, unit="episode") as bar,
+    ):
 
-        def run(function: Callable[..., Outcome], teams: Sequence[Team], seeds: Sequence[int]) -> Iterable[Outcome]:
+        def run(
+            function: Callable[..., Outcome], teams: Sequence[Team], seeds: Sequence[int]
+        ) -> Iterable[Outcome]:
             # Several chunks for each process, because episodes that end early would leave it idle.
-            for outcome in pool.map(function, teams, seeds, chunksize=max(1, len(seeds) // (6 * workers))):
+            for outcome in pool.map(
+                function, teams, seeds, chunksize=max(1, len(seeds) // (6 * workers))
+            ):
                 bar.update()
                 yield outcome
 
@@ -234,11 +252,20 @@ def compare(budget: int, seeds: int, seed: int, workers: int) -> tuple[dict[str,
                 return curves[title][-1]
 
             bar.set_description_str(title)
-            return learn(rated, start, max(1, int(budget * share) // (POPULATION * EPISODES_EACH)), rng)
+            return learn(
+                rated, start, max(1, int(budget * share) // (POPULATION * EPISODES_EACH)), rng
+            )
 
         waterers = [{WATERER: Constant(amount / MOST_WATER)} for amount in LITRES]
         alone = best(waterers, 0.1)
-        pair = best([team | {VENTILATOR: Constant(fraction)} for team in waterers for fraction in EXCHANGES], 0.25)
+        pair = best(
+            [
+                team | {VENTILATOR: Constant(fraction)}
+                for team in waterers
+                for fraction in EXCHANGES
+            ],
+            0.25,
+        )
         poured, exchanged = pair[WATERER].value * MOST_WATER, 100 * pair[VENTILATOR].value
         teams: dict[str, Team] = {
             "rule": {},
@@ -259,7 +286,8 @@ def tabulate(title: str, columns: Mapping[str, str], rows: Mapping[str, Sequence
     Args:
         title: Its title.
         columns: The title and the format of each column.
-        rows: By the title of each team, the values of each column, one for each greenhouse, or a number.
+        rows: By the title of each team, the values of each column, one for each greenhouse, or a
+            number.
     """
     from rich.console import Console
     from rich.table import Table
@@ -270,7 +298,9 @@ def tabulate(title: str, columns: Mapping[str, str], rows: Mapping[str, Sequence
         table.add_column(column, justify="right")
     for who, values in rows.items():
         cells = [
-            f"{own:{form}}" if isinstance(own, float) else f"{np.mean(own):{form}} ± {np.std(own):<4{form}}"
+            f"{own:{form}}"
+            if isinstance(own, float)
+            else f"{np.mean(own):{form}} ± {np.std(own):<4{form}}"
             for own, form in zip(values, columns.values(), strict=True)
         ]
         table.add_row(who, *cells, style="bold" if who == BOTH_TRAINED else None)
@@ -280,33 +310,58 @@ def tabulate(title: str, columns: Mapping[str, str], rows: Mapping[str, Sequence
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compare, print the result as a table, and write it to a file."""
     parser = argparse.ArgumentParser(description="Train two agents to keep a greenhouse together.")
-    parser.add_argument("--budget", type=int, default=3600, help="episodes to learn from (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="determines everything (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for the results (default: beside this file)")
+    parser.add_argument(
+        "--budget", type=int, default=3600, help="episodes to learn from (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="determines everything (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="processes (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="folder for the results (default: beside this file)"
+    )
     options = parser.parse_args(arguments)
     if min(options.budget, options.seeds, options.workers) < 1:
         parser.error("--budget, --seeds and --workers must be at least 1")
     results, curves = compare(options.budget, options.seeds, options.seed, options.workers)
-    returns = {title: [outcome.value for outcome in outcomes] for title, outcomes in results.items()}
+    returns = {
+        title: [outcome.value for outcome in outcomes] for title, outcomes in results.items()
+    }
     alive = {title: [outcome.alive for outcome in outcomes] for title, outcomes in results.items()}
-    poured = {title: [outcome.poured for outcome in outcomes] for title, outcomes in results.items()}
+    poured = {
+        title: [outcome.poured for outcome in outcomes] for title, outcomes in results.items()
+    }
     tabulate(
         f"{options.seeds} greenhouses that no policy was trained on: mean ± standard deviation",
         {"return": ".1f", f"alive, day {DAYS}": ".0f", "litres poured": ".0f"},
-        {who: (returns[who], np.array(alive[who])[:, -1], np.sum(poured[who], axis=1)) for who in results},
+        {
+            who: (returns[who], np.array(alive[who])[:, -1], np.sum(poured[who], axis=1))
+            for who in results
+        },
     )
     _, _, _, pair, _, both = returns.values()
     gains = np.subtract(both, pair)
     better = f"better in {np.sum(gains > 0)} of {len(gains)}"
     print(f"Both trained against the best constant pair: {np.mean(gains):+.1f} ({better})")
     most, days = np.max(poured["rule"]), np.max(np.sum(np.array(alive["rule"]) > 0, axis=1))
-    because = f"{most:.0f} litres a day drown all plants within {days} days, and dead plants earn nothing"
+    because = (
+        f"{most:.0f} litres a day drown all plants within {days} days, and dead plants earn nothing"
+    )
     print(f"Why the rule earns {np.mean(returns['rule']):.1f}: {because}.")
     options.out.mkdir(parents=True, exist_ok=True)
     learnt = {title: np.array(own).tolist() for title, own in curves.items()}
-    told = {"returns": returns, "alive": alive, "poured": poured, "notes": {"rule": because}, "curves": learnt}
+    told = {
+        "returns": returns,
+        "alive": alive,
+        "poured": poured,
+        "notes": {"rule": because},
+        "curves": learnt,
+    }
     (options.out / "greenhouse.json").write_text(json.dumps(told), encoding="utf-8")
     print(f"Results: {options.out / 'greenhouse.json'}")
     print(NEXT)

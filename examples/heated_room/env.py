@@ -1,7 +1,8 @@
 """An environment made from the heated room: the agent sets the power of the heater every quarter of an hour.
 
-Observations and actions have the names of the unit's variables. The reward is minus the cost since the previous
-decision: of energy, which is half as expensive at night, and of each degree below 20 °C during the day.
+Observations and actions have the names of the unit's variables. The reward is minus the cost since
+the previous decision: of energy, which is half as expensive at night, and of each degree below 20
+°C during the day.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ BOUNDS: Final = {"power": (0.0, 2.0), "temperature": (-40.0, 60.0), "outside": (
 
 
 class HeatedRoom(Master):
-    """A room with a thermostat: the model. ``chance`` makes the weather; ``cost`` grows with each step."""
+    """A room with a thermostat: the model.
+
+    ``chance`` makes the weather; ``cost`` grows with each step.
+    """
 
     hour = cost = 0.0
 
@@ -57,7 +61,10 @@ _cost_since = difference(lambda room: room.cost)
 
 
 class RoomSim(SimulationInterface):
-    """The simulation of a room for two days in winter. The model description tells the spaces of ``points``."""
+    """The simulation of a room for two days in winter.
+
+    The model description tells the spaces of ``points``.
+    """
 
     def __init__(self, kind: str = "c") -> None:
         """Take a unit, one of ``units.UNITS``."""
@@ -67,8 +74,12 @@ class RoomSim(SimulationInterface):
         hour = spaces.Box(0.0, 24.0, (1,), np.float64)
         self.points = {
             HeatedRoom.decide: make_step(
-                observation_space=spaces.Dict({**spaces_of(description, OBSERVED, bounds), "hour": hour}),
-                observation_space_mapping=lambda room: {n: [room.read(n)] for n in OBSERVED} | {"hour": [room.hour]},
+                observation_space=spaces.Dict(
+                    {**spaces_of(description, OBSERVED, bounds), "hour": hour}
+                ),
+                observation_space_mapping=lambda room: (
+                    {n: [room.read(n)] for n in OBSERVED} | {"hour": [room.hour]}
+                ),
                 observation_labels=labels_of(description, OBSERVED) | {"hour": "hour"},
                 action_space=spaces_of(description, ["power"], bounds),
                 action_space_mapping=lambda action: {"power": float(action["power"][0])},

@@ -15,7 +15,9 @@ from gymnasium import spaces
 class Master:
     """Runs a unit, and decides on the unit's inputs before each step. ``time`` is in seconds."""
 
-    def __init__(self, folder: Path, description: ModelDescription, step: float, stop: float, **start: float) -> None:
+    def __init__(
+        self, folder: Path, description: ModelDescription, step: float, stop: float, **start: float
+    ) -> None:
         """Initialize the unit in a folder; ``start`` contains values of its variables by name."""
         self.step, self.stop, self.time = step, stop, 0.0
         self._variables = {variable.name: variable for variable in description.modelVariables}
@@ -62,19 +64,23 @@ class Master:
 
 
 def spaces_of(
-    description: ModelDescription, names: Collection[str], bounds: Mapping[str, tuple[float, float]] | None = None
+    description: ModelDescription,
+    names: Collection[str],
+    bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> spaces.Dict:
     """Return the spaces of scalar variables by name, from the bounds of the variables or of their declared types.
 
-    ``bounds`` contains the bounds of variables that have none, or others. A real variable has a ``Box`` of shape
-    ``(1,)``, in its unit, and any other one a ``Discrete``.
+    ``bounds`` contains the bounds of variables that have none, or others. A real variable has a
+    ``Box`` of shape ``(1,)``, in its unit, and any other one a ``Discrete``.
 
     Raises:
         ValueError: A variable does not exist, is not a scalar number, or has no bounds.
     """
     variables = {variable.name: variable for variable in description.modelVariables}
     if unknown := set(names) - set(variables):
-        raise ValueError(f"the unit has no variable {', '.join(sorted(unknown))}, but {', '.join(variables)}")
+        raise ValueError(
+            f"the unit has no variable {', '.join(sorted(unknown))}, but {', '.join(variables)}"
+        )
     return spaces.Dict({name: _space(variables[name], (bounds or {}).get(name)) for name in names})
 
 
@@ -82,14 +88,18 @@ def _space(variable: ModelVariable, bounds: tuple[float, float] | None) -> space
     kind, declared = variable.type, variable.declaredType
     if kind in ("String", "Binary", "Clock") or variable.dimensions:
         raise ValueError(f"{variable.name} is not a scalar number")
-    ends: list[Any] = [getattr(variable, end) or getattr(declared, end, None) for end in ("min", "max")]
+    ends: list[Any] = [
+        getattr(variable, end) or getattr(declared, end, None) for end in ("min", "max")
+    ]
     if kind == "Boolean":
         ends = [0, 1]
     elif kind == "Enumeration" and declared is not None:
         ends = [pick(int(item.value) for item in declared.items) for pick in (min, max)]
     low, high = bounds or ends
     if low is None or high is None:
-        raise ValueError(f"{variable.name} has no bounds; give them: bounds={{{variable.name!r}: (low, high)}}")
+        raise ValueError(
+            f"{variable.name} has no bounds; give them: bounds={{{variable.name!r}: (low, high)}}"
+        )
     if kind == "Real" or kind.startswith("Float"):
         return spaces.Box(float(low), float(high), (1,), np.float64)
     return spaces.Discrete(int(high) - int(low) + 1, start=int(low))
@@ -97,5 +107,8 @@ def _space(variable: ModelVariable, bounds: tuple[float, float] | None) -> space
 
 def labels_of(description: ModelDescription, names: Collection[str]) -> dict[str, str]:
     """Return a label for each variable: its name, and its unit where it has one."""
-    found = {each.name: each.unit or getattr(each.declaredType, "unit", None) for each in description.modelVariables}
+    found = {
+        each.name: each.unit or getattr(each.declaredType, "unit", None)
+        for each in description.modelVariables
+    }
     return {name: f"{name} ({found[name]})" if found[name] else name for name in names}

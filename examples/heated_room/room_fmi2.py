@@ -1,4 +1,7 @@
-"""The heated room as a unit of FMI 2, with the equation of ``room.c``. pythonfmu writes neither bounds nor units."""
+"""The heated room as a unit of FMI 2, with the equation of ``room.c``.
+
+pythonfmu writes neither bounds nor units.
+"""
 
 from math import exp
 

@@ -19,7 +19,10 @@ BUILDERS: Final = {"fmi2": "pythonfmu", "fmi3": "pythonfmu3"}
 
 
 def unit(kind: str) -> Path:
-    """Return the folder of an unpacked unit, one of ``UNITS``. Build it, unless it is up to date."""
+    """Return the folder of an unpacked unit, one of ``UNITS``.
+
+    Build it, unless it is up to date.
+    """
     out = HERE / "out"
     sources = [HERE / "room.c", HERE / "room.xml"] if kind == "c" else [HERE / f"room_{kind}.py"]
     target = out / f"{kind}-{max(source.stat().st_mtime_ns for source in sources)}"
@@ -35,9 +38,28 @@ def unit(kind: str) -> Path:
 def _build(kind: str, sources: list[Path], folder: Path) -> None:
     library = folder / f"room{sysconfig.get_config_var('SHLIB_SUFFIX')}"
     headers = Path(fmpy.__file__).parent / "c-code"
-    command = ["gcc", "-O2", "-shared", "-fPIC", f"-I{headers}", str(sources[0]), "-o", str(library), "-lm"]
+    command = [
+        "gcc",
+        "-O2",
+        "-shared",
+        "-fPIC",
+        f"-I{headers}",
+        str(sources[0]),
+        "-o",
+        str(library),
+        "-lm",
+    ]
     if kind != "c":
-        command = [sys.executable, "-m", BUILDERS[kind], "build", "-f", str(sources[0]), "-d", str(folder)]
+        command = [
+            sys.executable,
+            "-m",
+            BUILDERS[kind],
+            "build",
+            "-f",
+            str(sources[0]),
+            "-d",
+            str(folder),
+        ]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} has failed:\n{done.stderr[-4000:]}")

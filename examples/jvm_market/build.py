@@ -42,7 +42,8 @@ def java() -> tuple[str, str]:
             raise RuntimeError(f"{name} is not found on the PATH; {remedy}")
         found.append(command)
     said = subprocess.run([found[1], "-version"], capture_output=True, text=True, timeout=60)
-    version = (said.stdout + said.stderr).removeprefix("javac ").strip()  # older versions print it to stderr
+    # older versions print it to stderr
+    version = (said.stdout + said.stderr).removeprefix("javac ").strip()
     if not version.split(".")[0].isdecimal() or int(version.split(".")[0]) < VERSION:
         raise RuntimeError(f"{found[1]} is of version {version}; {remedy}")
     return found[0], found[1]
@@ -59,13 +60,16 @@ def build(out: Path = OUT, sources: Iterable[Path] = SOURCES) -> Path:
         The folder of the classes.
 
     Raises:
-        RuntimeError: There is no JDK, or the sources do not compile; the message contains the compiler's output.
+        RuntimeError: There is no JDK, or the sources do not compile; the message contains the
+            compiler's output.
     """
     sources = list(sources)
     with sources[0].open() as locked:  # parallel builds wait here
         fcntl.flock(locked, fcntl.LOCK_EX)
         done = out / "done"
-        if not done.exists() or done.stat().st_mtime < max(source.stat().st_mtime for source in sources):
+        if not done.exists() or done.stat().st_mtime < max(
+            source.stat().st_mtime for source in sources
+        ):
             _compile(sources, out)
     return out
 
@@ -76,7 +80,16 @@ def _compile(sources: list[Path], out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".java-") as folder:
         classes = Path(folder) / "classes"
-        command = [javac, "-Xlint:all", "-Werror", "-encoding", "UTF-8", "-d", str(classes), *map(str, sources)]
+        command = [
+            javac,
+            "-Xlint:all",
+            "-Werror",
+            "-encoding",
+            "UTF-8",
+            "-d",
+            str(classes),
+            *map(str, sources),
+        ]
         said = subprocess.run(command, capture_output=True, text=True, timeout=300)
         if said.returncode:
             raise RuntimeError(f"{' '.join(command)} has failed:\n{said.stdout}{said.stderr}")

@@ -1,10 +1,12 @@
 """Compare the farms' rule with two simple policies, on the same seeds.
 
-By their rule, farms sow much while the price of wheat is high. All farms do so at once, and four weeks later the price
-is low: prices oscillate, and the farms that sowed most give up. If farms always sow the same amount, prices oscillate
-less; if they sow by the stock of the granary, hardly at all.
+By their rule, farms sow much while the price of wheat is high. All farms do so at once, and four
+weeks later the price is low: prices oscillate, and the farms that sowed most give up. If farms
+always sow the same amount, prices oscillate less; if they sow by the stock of the granary, hardly
+at all.
 
-``python -m examples.jvm_market.compare --seeds 20`` prints the total earnings of farms and shops, and other metrics.
+``python -m examples.jvm_market.compare --seeds 20`` prints the total earnings of farms and shops,
+and other metrics.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ CONTENDERS: Final[Mapping[str, Mapping[str, Any]]] = {
 METRICS: Final[Mapping[str, Callable[[ProcessSimulation], float]]] = {
     "loaves": lambda simulation: simulation.result["fed"],
     "gave up": lambda simulation: simulation.result["closed"],
-    "swing": lambda simulation: float(np.std([wheat for _, _, wheat, _ in simulation.result["trace"]])),
+    "swing": lambda simulation: float(
+        np.std([wheat for _, _, wheat, _ in simulation.result["trace"]])
+    ),
 }
 """The metrics: loaves sold, farms and shops that gave up, and the standard deviation of the price of wheat."""
 
@@ -59,11 +63,17 @@ def compare(seeds: Sequence[int], weeks: int = WEEKS) -> Evaluation:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compare the policies, and print the results."""
-    parser = argparse.ArgumentParser(description="Compare the farms' rule with two simple policies.")
+    parser = argparse.ArgumentParser(
+        description="Compare the farms' rule with two simple policies."
+    )
     parser.add_argument("--seeds", type=int, default=20, help="number of seeds (default: 20)")
     found = compare(range(parser.parse_args(arguments).seeds))
     print("total earnings of farms and shops:", found.summary().round(1).to_string(), sep="\n")
-    print("means:", *(f"{metric}: {found.values(metric).mean().round(2).to_dict()}" for metric in METRICS), sep="\n")
+    print(
+        "means:",
+        *(f"{metric}: {found.values(metric).mean().round(2).to_dict()}" for metric in METRICS),
+        sep="\n",
+    )
 
 
 if __name__ == "__main__":

@@ -1,16 +1,18 @@
 """Environments made from a market town in Java: farms decide how much to sow, shops decide on their price of bread.
 
-The model, ``Market.java``, has its own main loop in its own JVM; farms and shops enter and leave the market. The client
-``clients/java/SimEnv.java`` is its only connection to environments, and it runs without them: ``java market.Market 7``.
+The model, ``Market.java``, has its own main loop in its own JVM; farms and shops enter and leave
+the market. The client ``clients/java/SimEnv.java`` is its only connection to environments, and it
+runs without them: ``java market.Market 7``.
 
 - ``market``: the simulation.
 - ``plain``: the result of the model when it runs without an environment.
-- ``raw_env`` and ``env``: all farms and shops, as a PettingZoo AEC environment, without and with PettingZoo's wrapper.
+- ``raw_env`` and ``env``: all farms and shops, as a PettingZoo AEC environment, without and with
+  PettingZoo's wrapper.
 - ``parallel_env``: the same as a PettingZoo parallel environment.
 
-Farms (``farm_1``, ...) choose a number of plots of wheat every fourth week, a ``Discrete``; shops (``shop_9``, ...) set
-a price every week, a ``Box``. The reward of each is its earnings since its last decision. The episode is truncated
-after two years, and terminates when no shop is left.
+Farms (``farm_1``, ...) choose a number of plots of wheat every fourth week, a ``Discrete``; shops
+(``shop_9``, ...) set a price every week, a ``Box``. The reward of each is its earnings since its
+last decision. The episode is truncated after two years, and terminates when no shop is left.
 """
 
 from __future__ import annotations

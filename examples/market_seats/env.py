@@ -1,10 +1,11 @@
 """Two conditions of the market, in which four agents, or four people, decide how many crates they bring.
 
-``python -m simenv_marl play examples.market_seats.env:Free --seat trader_0 trader_1 trader_2 trader_3`` serves a page
-with a seat for each trader.
+``python -m simenv_marl play examples.market_seats.env:Free --seat trader_0 trader_1 trader_2
+trader_3`` serves a page with a seat for each trader.
 
-**Observations.** What a trader knows when it decides, as ``OBSERVED`` lists it. All traders see everything, as on the
-page, so the conditions differ in a rule of the market, and not in what is known.
+**Observations.** What a trader knows when it decides, as ``OBSERVED`` lists it. All traders see
+everything, as on the page, so the conditions differ in a rule of the market, and not in what is
+known.
 
 **Rewards.** The trader's profit of the round.
 """
@@ -38,7 +39,14 @@ OBSERVED: Final = (
 def look(trader: Trader) -> NDArray[np.float32]:
     """Observe the market, as ``OBSERVED`` lists it."""
     market = trader.market
-    seen = (market.round, market.price, trader.gain, trader.crates, trader.crates_of_others(), market.decided)
+    seen = (
+        market.round,
+        market.price,
+        trader.gain,
+        trader.crates,
+        trader.crates_of_others(),
+        market.decided,
+    )
     return np.array(seen, np.float32)
 
 
@@ -88,8 +96,13 @@ class MarketSim(SimulationInterface):
     def render(self, mode: str) -> str:
         """Return the levy, the latest price, and each trader's crates and profit."""
         market = self.market
-        rows = [f"{AGENTS[one.number]}: {one.crates} crates, profit so far {one.profit:g}" for one in market.traders]
-        return "\n".join([f"Levy {market.levy:g}, round {market.round}, latest price {market.price:g}", *rows])
+        rows = [
+            f"{AGENTS[one.number]}: {one.crates} crates, profit so far {one.profit:g}"
+            for one in market.traders
+        ]
+        return "\n".join(
+            [f"Levy {market.levy:g}, round {market.round}, latest price {market.price:g}", *rows]
+        )
 
 
 class Free(MarketSim):

@@ -1,8 +1,9 @@
 """A market: each round, four traders decide in turn how many crates to bring, and all crates sell at one price.
 
-A crate that is brought lowers the price of all others. So four traders who each do the best for themselves bring more
-than the number at which they together earn most: 8 crates each in place of 5. A levy on each crate can mend that; it
-is paid back to all traders, in equal parts. With a levy of 20 each does best with 5 crates, if all others do so.
+A crate that is brought lowers the price of all others. So four traders who each do the best for
+themselves bring more than the number at which they together earn most: 8 crates each in place of 5.
+A levy on each crate can mend that; it is paid back to all traders, in equal parts. With a levy of
+20 each does best with 5 crates, if all others do so.
 
 ``python -m examples.market_seats.model`` runs the model without any environment.
 """
@@ -34,7 +35,8 @@ class Trader:
     Attributes:
         market: Its market.
         number: Its number, from 0.
-        crates: The crates that it brings in this round, if it has decided, or brought in the round before.
+        crates: The crates that it brings in this round, if it has decided, or brought in the round
+            before.
         gain: Its profit of the round before.
         profit: Its profit so far.
     """
@@ -83,7 +85,9 @@ class Market:
         brought = sum(trader.crates for trader in self.traders)
         self.price = float(max(0, DEMAND + self.random.randint(-SPREAD, SPREAD) - brought))
         for trader in self.traders:
-            trader.gain = trader.crates * (self.price - COST - self.levy) + self.levy * brought / TRADERS
+            trader.gain = (
+                trader.crates * (self.price - COST - self.levy) + self.levy * brought / TRADERS
+            )
             trader.profit += trader.gain
         self.round, self.decided = self.round + 1, 0
 
@@ -97,4 +101,6 @@ if __name__ == "__main__":
     for levy in (0.0, 20.0):
         market = Market(levy, seed=1)
         market.run()
-        print(f"levy {levy:g}: profits {', '.join(f'{trader.profit:g}' for trader in market.traders)}")
+        print(
+            f"levy {levy:g}: profits {', '.join(f'{trader.profit:g}' for trader in market.traders)}"
+        )

@@ -1,20 +1,23 @@
 """Environments made from senders in a simulated network: each sender is an agent. The simulator is ns-3, in C++.
 
-``senders.cpp`` is the model, which runs in a process of its own and does not depend on environments: at an
-acknowledgement or a timeout, a sender chooses its rate by a rule like TCP's. The model asks for decisions through the
-client ``clients/cpp/simenv.hpp``.
+``senders.cpp`` is the model, which runs in a process of its own and does not depend on
+environments: at an acknowledgement or a timeout, a sender chooses its rate by a rule like TCP's.
+The model asks for decisions through the client ``clients/cpp/simenv.hpp``.
 
 - ``program``: the compiled model.
 - ``senders``: the simulation.
 - ``raw_env`` and ``parallel_env``: the PettingZoo environments.
 
-**Actions.** A sender chooses the factor of its rate, from one half to two: the action is its exponent to base two.
+**Actions.** A sender chooses the factor of its rate, from one half to two: the action is its
+exponent to base two.
 
-**Observations.** A sender sees its rate, the ratio of the latest round-trip time to the shortest so far, the share of
-lost packets among those sent at this rate, and whether the decision comes from a timeout.
+**Observations.** A sender sees its rate, the ratio of the latest round-trip time to the shortest so
+far, the share of lost packets among those sent at this rate, and whether the decision comes from a
+timeout.
 
-**Rewards.** Each second brings the logarithm of the throughput, so that capacity that moves from a fast sender to a
-slow one is a gain. Each 0.1 s of queueing delay costs as much as half the throughput.
+**Rewards.** Each second brings the logarithm of the throughput, so that capacity that moves from a
+fast sender to a slow one is a gain. Each 0.1 s of queueing delay costs as much as half the
+throughput.
 """
 
 from __future__ import annotations
@@ -56,14 +59,19 @@ def missing() -> str:
 
 
 def program(folder: Path = HERE / "out") -> Path:
-    """Compile the model, unless the program is up to date: see ``compiled``. ``folder`` is that of the program."""
+    """Compile the model, unless the program is up to date: see ``compiled``.
+
+    ``folder`` is that of the program.
+    """
     return compiled(folder / "senders", SOURCES, missing, command)
 
 
 def command() -> list[str]:
     """Return the command of the compiler, with the flags of ns-3."""
     asked = ["pkg-config", "--cflags", "--libs", *MODULES]
-    flags = shlex.split(subprocess.run(asked, check=True, capture_output=True, text=True, timeout=60).stdout)
+    flags = shlex.split(
+        subprocess.run(asked, check=True, capture_output=True, text=True, timeout=60).stdout
+    )
     return ["g++", "-std=c++17", "-O2", f"-I{SOURCES[1].parent}", str(SOURCES[0]), *flags]
 
 
@@ -115,7 +123,10 @@ POINTS: Final[dict[str, Definition]] = {
 
 
 def senders() -> ProcessSimulation:
-    """Make the simulation. Options of ``reset``: the simulated ``seconds``, and the number of ``hosts``."""
+    """Make the simulation.
+
+    Options of ``reset``: the simulated ``seconds``, and the number of ``hosts``.
+    """
     return ProcessSimulation([str(program())], POINTS)
 
 

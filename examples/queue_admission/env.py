@@ -1,13 +1,14 @@
 """The queue as an environment: who admits a job decides at irregular times, and discounts by time.
 
-The agent ``admission_0`` decides whether an arriving job comes in. It is not asked if the queue is full.
+The agent ``admission_0`` decides whether an arriving job comes in. It is not asked if the queue is
+full.
 
-**Observations.** The kind of the job and the kind in service, each as two indicators, and the numbers of waiting jobs.
-All times are exponential, so nothing else helps to foresee the future.
+**Observations.** The kind of the job and the kind in service, each as two indicators, and the
+numbers of waiting jobs. All times are exponential, so nothing else helps to foresee the future.
 
-**Rewards.** What the queue earns until the next decision, discounted to the decision: jobs that are done pay somewhere
-within that interval, and holding costs run all along. The discount of the interval itself, exp(-INTEREST * elapsed), is
-``info["discount"]``.
+**Rewards.** What the queue earns until the next decision, discounted to the decision: jobs that are
+done pay somewhere within that interval, and holding costs run all along. The discount of the
+interval itself, exp(-INTEREST * elapsed), is ``info["discount"]``.
 """
 
 from __future__ import annotations
@@ -19,7 +20,14 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from simenv_marl import TRUNCATED, SimulationInterface, difference, make_step, reseed_generators, single_env
+from simenv_marl import (
+    TRUNCATED,
+    SimulationInterface,
+    difference,
+    make_step,
+    reseed_generators,
+    single_env,
+)
 
 from .exact import Decision
 from .model import INTEREST, PLACES, Queue

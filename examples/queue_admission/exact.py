@@ -1,8 +1,8 @@
 """Exact values of the queue: all its times are exponential, so it is a Markov chain with few states.
 
-A *state* is the number of waiting jobs of each kind, and the kind in service (None: the server is idle). A *decision*
-is the kind of an arriving job and the state that it finds. A *table* tells for each decision whether the job is
-admitted.
+A *state* is the number of waiting jobs of each kind, and the kind in service (None: the server is
+idle). A *decision* is the kind of an arriving job and the state that it finds. A *table* tells for
+each decision whether the job is admitted.
 """
 
 from __future__ import annotations
@@ -23,10 +23,17 @@ EMPTY: Final[State] = (0, 0, None)
 
 STATES: Final[list[State]] = [
     EMPTY,
-    *((a, b, serving) for serving in (0, 1) for a, b in product(range(PLACES + 1), repeat=2) if a + b <= PLACES),
+    *(
+        (a, b, serving)
+        for serving in (0, 1)
+        for a, b in product(range(PLACES + 1), repeat=2)
+        if a + b <= PLACES
+    ),
 ]
 
-DECISIONS: Final[list[Decision]] = [(kind, x) for kind in range(len(KINDS)) for x in STATES if x[0] + x[1] < PLACES]
+DECISIONS: Final[list[Decision]] = [
+    (kind, x) for kind in range(len(KINDS)) for x in STATES if x[0] + x[1] < PLACES
+]
 
 ADMIT_ALL: Final[Table] = dict.fromkeys(DECISIONS, True)
 
@@ -57,7 +64,8 @@ def values(
         gamma: A further discount for each decision.
     """
     number = {state: i for i, state in enumerate(STATES)}
-    moves, decided = np.zeros((2, len(STATES), len(STATES)))  # rates of moves without a decision, and by a decision
+    # rates of moves without a decision, and by a decision
+    moves, decided = np.zeros((2, len(STATES), len(STATES)))
     gain = np.zeros(len(STATES))
     for state, i in number.items():
         a, b, serving = state
@@ -71,7 +79,9 @@ def values(
                 decided[i, number[after]] += about.arrivals
     leaving = np.diag((moves + decided).sum(1))
     unit = np.eye(len(STATES))
-    rewards = np.linalg.solve(leaving + unit * (rate if reward_rate is None else reward_rate) - moves, gain)
+    rewards = np.linalg.solve(
+        leaving + unit * (rate if reward_rate is None else reward_rate) - moves, gain
+    )
     weights = gamma * np.linalg.solve(leaving + unit * rate - moves, decided)
     found: NDArray[np.float64] = np.linalg.solve(unit - weights, rewards)
     return dict(zip(STATES, found.tolist(), strict=True))
@@ -89,5 +99,7 @@ def best_table(**discounts: float) -> Table:
     while better != table:
         table = better
         known = values(table, **discounts)
-        better = {(kind, state): known[admitted(kind, state)] > known[state] for kind, state in DECISIONS}
+        better = {
+            (kind, state): known[admitted(kind, state)] > known[state] for kind, state in DECISIONS
+        }
     return table

@@ -54,7 +54,10 @@ class Queue:
             self.clock.process(self._arrive(kind, generator))
 
     def admit(self, kind: int) -> bool:
-        """Decide whether an arriving job comes in; only asked if there is room. The rule admits all."""
+        """Decide whether an arriving job comes in; only asked if there is room.
+
+        The rule admits all.
+        """
         return True
 
     def waiting(self, kind: int) -> int:
@@ -70,7 +73,9 @@ class Queue:
     def present_value(self) -> float:
         """Return the rewards minus the holding costs so far, discounted to the beginning of the run."""
         cost = HOLDING_COST * self._jobs / INTEREST
-        return self._earned - cost * (exp(-INTEREST * self._booked) - exp(-INTEREST * self.clock.now))
+        return self._earned - cost * (
+            exp(-INTEREST * self._booked) - exp(-INTEREST * self.clock.now)
+        )
 
     def take(self, kind: int, work: float) -> None:
         """Let a job arrive, which comes in if there is room and it is admitted."""
@@ -78,7 +83,10 @@ class Queue:
             self.clock.process(self._serve(kind, work))
 
     def _arrive(self, kind: int, generator: Any) -> Generator[Any, Any, Any]:
-        """Let jobs of a kind arrive. A job has the same work in each run of a seed, whichever jobs are admitted."""
+        """Let jobs of a kind arrive.
+
+        A job has the same work in each run of a seed, whichever jobs are admitted.
+        """
         for _ in count():
             yield self.clock.timeout(generator.exponential(1 / KINDS[kind].arrivals))
             work = generator.exponential(1 / KINDS[kind].services)

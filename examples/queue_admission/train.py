@@ -1,8 +1,9 @@
 """Train the admission of jobs with DQN and PPO of Stable-Baselines3, discounting by time and by decision.
 
-``python -m examples.queue_admission.train`` trains each learner three times by time, and DQN once for each discount by
-decision. It evaluates each trained table of decisions exactly, and by simulation, and writes ``out/results.csv`` beside
-this file, and ``docs/figures/queue-admission.png``. It needs Stable-Baselines3 2.7 or newer and SimPy (the extra
+``python -m examples.queue_admission.train`` trains each learner three times by time, and DQN once
+for each discount by decision. It evaluates each trained table of decisions exactly, and by
+simulation, and writes ``out/results.csv`` beside this file, and
+``docs/figures/queue-admission.png``. It needs Stable-Baselines3 2.7 or newer and SimPy (the extra
 ``clients``), and ten to thirty minutes.
 """
 
@@ -47,7 +48,15 @@ class TimedReplay(ReplayBuffer):
         super().__init__(*args, **kwargs)
         self.discounts = np.ones((self.buffer_size, 1), np.float32)
 
-    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: Any,
+        reward: Any,
+        done: Any,
+        infos: list[dict[str, Any]],
+    ) -> None:
         """Store a transition of the one environment."""
         self.discounts[self.pos] = infos[0]["discount"]
         super().add(obs, next_obs, action, reward, done, infos)
@@ -58,7 +67,10 @@ class TimedReplay(ReplayBuffer):
 
 
 class TimedRollout(RolloutBuffer):
-    """A rollout buffer that discounts each transition by its own time. ``Times`` fills its ``discounts``."""
+    """A rollout buffer that discounts each transition by its own time.
+
+    ``Times`` fills its ``discounts``.
+    """
 
     def reset(self) -> None:
         """Begin a rollout."""
@@ -93,8 +105,13 @@ def _world() -> Any:
 
 
 def train_dqn(seed: int, steps: int = 60_000, gamma: float | None = None) -> Any:
-    """Train DQN. ``gamma`` is a discount for each decision; None: the discount of the elapsed time."""
-    timed: dict[str, Any] = {"replay_buffer_class": TimedReplay} if gamma is None else {"gamma": gamma}
+    """Train DQN.
+
+    ``gamma`` is a discount for each decision; None: the discount of the elapsed time.
+    """
+    timed: dict[str, Any] = (
+        {"replay_buffer_class": TimedReplay} if gamma is None else {"gamma": gamma}
+    )
     learner = DQN(
         "MlpPolicy",
         _world(),
@@ -158,7 +175,10 @@ def draw(tables: dict[str, Table], path: Path) -> None:
     rows = [[table[decision] for decision in DECISIONS] for table in tables.values()]
     axes.pcolormesh(rows, cmap="Blues", vmin=-0.2, vmax=1.4, edgecolors="white", linewidth=2)
     axes.invert_yaxis()
-    axes.set_yticks(np.arange(len(tables)) + 0.5, [f"{name}: {worth(table):.2f}" for name, table in tables.items()])
+    axes.set_yticks(
+        np.arange(len(tables)) + 0.5,
+        [f"{name}: {worth(table):.2f}" for name, table in tables.items()],
+    )
     labels = [
         f"{'AB'[kind]} comes\n{'idle' if serving is None else 'AB'[serving] + ' served'}\n"
         + " ".join([*["A waits"] * a, *["B waits"] * b])
@@ -173,11 +193,21 @@ def draw(tables: dict[str, Table], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train, evaluate, and write the results."""
     parser = argparse.ArgumentParser(description="Train the admission of jobs.")
-    parser.add_argument("--seeds", type=int, default=3, help="trainings of each learner (default: %(default)s)")
-    parser.add_argument("--steps", type=int, help="decisions of a training (default: 60,000 of DQN, 120,000 of PPO)")
-    parser.add_argument("--runs", type=int, default=200, help="paired simulations of each (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="file for the results (default: %(default)s)")
-    parser.add_argument("--figure", type=Path, default=FIGURE, help="file for the figure (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="trainings of each learner (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--steps", type=int, help="decisions of a training (default: 60,000 of DQN, 120,000 of PPO)"
+    )
+    parser.add_argument(
+        "--runs", type=int, default=200, help="paired simulations of each (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="file for the results (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--figure", type=Path, default=FIGURE, help="file for the figure (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     steps = {} if options.steps is None else {"steps": options.steps}
@@ -188,16 +218,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for gamma in GAMMAS:
         trainings.append((f"DQN, {gamma} a decision", partial(train_dqn, gamma=gamma, **steps), 1))
     rows, tables, optimum = [], {"optimum": best_table()}, worth(best_table())
-    print(f"optimum {optimum:.3f}; all admitted {worth(ADMIT_ALL):.3f}, {worth(ADMIT_ALL) / optimum:.3f} of it")
+    print(
+        f"optimum {optimum:.3f}; all admitted {worth(ADMIT_ALL):.3f},"
+        f" {worth(ADMIT_ALL) / optimum:.3f} of it"
+    )
     for name, train, number in trainings:
         learners = [train(seed) for seed in range(number)]
-        found = simulated({str(seed): policy_of(learner) for seed, learner in enumerate(learners)}, options.runs)
+        found = simulated(
+            {str(seed): policy_of(learner) for seed, learner in enumerate(learners)}, options.runs
+        )
         made = [table_of(learner) for learner in learners]
         for seed, table in enumerate(made):
             exact = {"exact": round(worth(table), 4), "share": round(worth(table) / optimum, 4)}
             admitted = "".join(str(int(answer)) for answer in table.values())
-            paired = found.loc[str(seed), ["mean", "difference", "difference_low", "difference_high"]].astype(float)
-            rows.append({"training": name, "seed": seed, **exact, "admitted": admitted, **paired.round(3)})
+            paired = found.loc[
+                str(seed), ["mean", "difference", "difference_low", "difference_high"]
+            ].astype(float)
+            rows.append(
+                {"training": name, "seed": seed, **exact, "admitted": admitted, **paired.round(3)}
+            )
             print(rows[-1], flush=True)
         tables[name] = sorted(made, key=worth)[len(made) // 2]
     options.out.parent.mkdir(parents=True, exist_ok=True)

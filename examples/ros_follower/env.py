@@ -1,9 +1,10 @@
 """Environments made from a robot in ROS 1 that follows a leader: the agent chooses the robot's velocity.
 
-``follower.py`` is the robot's controller, a ROS node, and ``world.py`` a simulated world on simulated time. Both are
-ordinary ROS nodes, in the system's Python.
+``follower.py`` is the robot's controller, a ROS node, and ``world.py`` a simulated world on
+simulated time. Both are ordinary ROS nodes, in the system's Python.
 
-The reward is minus the error of the distance to the leader, which should be one metre, for each step of 0.1 s.
+The reward is minus the error of the distance to the leader, which should be one metre, for each
+step of 0.1 s.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ def missing() -> str:
     packages = "python3-rospy python3-rosmaster python3-geometry-msgs python3-rosgraph-msgs"
     imports = "import geometry_msgs, rosgraph_msgs, rosmaster, rospy"
     try:
-        found = subprocess.run([COMMAND[0], "-c", imports], check=False, capture_output=True, timeout=60).returncode
+        found = subprocess.run(
+            [COMMAND[0], "-c", imports], check=False, capture_output=True, timeout=60
+        ).returncode
     except OSError:
         found = 1
     return f"ROS 1 (Debian: apt-get install {packages})" if found else ""

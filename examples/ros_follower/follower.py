@@ -1,7 +1,8 @@
 """A ROS node that controls a robot which follows a leader. Its control callback is the decision.
 
-``python3 follower.py [SEED]`` starts a ROS master on a free port and the simulated world, follows the leader for 20
-simulated seconds, and prints the result. rospy belongs to the system's Python, and needs the client for other Pythons.
+``python3 follower.py [SEED]`` starts a ROS master on a free port and the simulated world, follows
+the leader for 20 simulated seconds, and prints the result. rospy belongs to the system's Python,
+and needs the client for other Pythons.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class Follower:
     """The controller of the robot."""
 
     def __init__(self) -> None:
-        # rospy calls back in threads of its own. They hand the messages over to the main thread, which makes decisions.
+        # rospy calls back in threads of its own. They hand the messages over to the main thread,
+        # which makes decisions.
         self.sights: queue.Queue[PointStamped] = queue.Queue()
         rospy.Subscriber("leader", PointStamped, self.sights.put)
         self.commands = rospy.Publisher("cmd_vel", Twist, queue_size=10)
@@ -58,7 +60,10 @@ class Follower:
                 break
             self.commands.publish(self.control(sight))
         client.update(POINT, ahead=sight.point.x, left=sight.point.y, time=now)
-        result = {"digest": digest.hexdigest(), "distance": math.hypot(sight.point.x, sight.point.y)}
+        result = {
+            "digest": digest.hexdigest(),
+            "distance": math.hypot(sight.point.x, sight.point.y),
+        }
         client.end(result, truncated=True)
         if not client.connected:
             print(json.dumps(result))
@@ -66,7 +71,9 @@ class Follower:
     def control(self, sight: PointStamped) -> Twist:
         """Choose the velocity: the decision."""
         ahead, left, now = sight.point.x, sight.point.y, sight.header.stamp.to_sec()
-        velocity = client.decide(POINT, rule=lambda: rule(ahead, left), time=now, ahead=ahead, left=left)
+        velocity = client.decide(
+            POINT, rule=lambda: rule(ahead, left), time=now, ahead=ahead, left=left
+        )
         command = Twist()
         command.linear.x, command.angular.z = velocity
         return command
@@ -92,8 +99,11 @@ def main() -> None:
         found.bind(("127.0.0.1", 0))
         port = found.getsockname()[1]
     os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1")
-    # The master alone: children of roscore leave the process group, and would outlive a simulator that is killed.
-    started = [subprocess.Popen(["rosmaster", "--core", "-p", str(port)], stdout=subprocess.DEVNULL)]
+    # The master alone: children of roscore leave the process group, and would outlive a simulator
+    # that is killed.
+    started = [
+        subprocess.Popen(["rosmaster", "--core", "-p", str(port)], stdout=subprocess.DEVNULL)
+    ]
     try:
         wait_for("the ROS master", rosgraph.is_master_online)
         rospy.set_param("/use_sim_time", True)

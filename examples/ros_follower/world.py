@@ -1,6 +1,7 @@
 """A ROS node that simulates a leader and the robot that follows it: it publishes what the robot sees, and the clock.
 
-It waits for a command on ``cmd_vel`` before each step, so that the run does not depend on the speed of the nodes.
+It waits for a command on ``cmd_vel`` before each step, so that the run does not depend on the speed
+of the nodes.
 """
 
 from __future__ import annotations
@@ -36,7 +37,10 @@ class World:
     def step(self, command: Twist) -> None:
         """Move both for a step."""
         self.turn += self.chance.gauss(-0.1 * self.turn, 0.2)
-        for body, speed, turn in ((self.leader, 0.5, self.turn), (self.robot, command.linear.x, command.angular.z)):
+        for body, speed, turn in (
+            (self.leader, 0.5, self.turn),
+            (self.robot, command.linear.x, command.angular.z),
+        ):
             body[2] += turn * STEP
             body[0] += speed * STEP * math.cos(body[2])
             body[1] += speed * STEP * math.sin(body[2])
@@ -45,7 +49,11 @@ class World:
 
     def publish(self) -> None:
         """Publish the time, and where the robot sees the leader: metres ahead and to the left."""
-        east, north, heading = self.leader[0] - self.robot[0], self.leader[1] - self.robot[1], self.robot[2]
+        east, north, heading = (
+            self.leader[0] - self.robot[0],
+            self.leader[1] - self.robot[1],
+            self.robot[2],
+        )
         sight = PointStamped()
         sight.header.stamp = rospy.Time.from_sec(self.steps * STEP)
         sight.point.x = east * math.cos(heading) + north * math.sin(heading)

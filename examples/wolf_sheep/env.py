@@ -1,29 +1,31 @@
 """Environments made from Mesa's own model of wolves, sheep and grass: each sheep decides where to go.
 
-The model is unchanged and undecorated. This module names ``Sheep.move`` as a decision point, and each sheep is an
-agent from its birth to its death. The wolves, and the rest of the sheep's behaviour, follow the model.
+The model is unchanged and undecorated. This module names ``Sheep.move`` as a decision point, and
+each sheep is an agent from its birth to its death. The wolves, and the rest of the sheep's
+behaviour, follow the model.
 
 - ``Meadow``: the simulation: the model over a number of ticks, with Mesa's default parameters.
 - ``sheep_points``: the decision point, for sheep with a given range of sight.
 - ``numbers``: the numbers of sheep, wolves and grown patches of grass after each tick.
 
-**Actions.** A sheep goes to one of the four neighbouring cells, as by the model's rule. (By the rule it stays where it
-is if there are wolves on all four; the actions do not include staying.)
+**Actions.** A sheep goes to one of the four neighbouring cells, as by the model's rule. (By the
+rule it stays where it is if there are wolves on all four; the actions do not include staying.)
 
-**Observations.** A sheep sees its energy, and for each cell up to ``sight`` steps away, its own included: whether the
-grass is grown, the number of wolves, and the number of other sheep. The rule looks one step ahead. But wolves move
-after all sheep, to a neighbouring cell: the danger comes from wolves next to a sheep after its move, which may be two
-steps away before it.
+**Observations.** A sheep sees its energy, and for each cell up to ``sight`` steps away, its own
+included: whether the grass is grown, the number of wolves, and the number of other sheep. The rule
+looks one step ahead. But wolves move after all sheep, to a neighbouring cell: the danger comes from
+wolves next to a sheep after its move, which may be two steps away before it.
 
-**Rewards.** Each turn of a sheep's life brings a reward of 1, the last turn included. This measures success in this
-model: a sheep has the same chance of a lamb in each tick that it survives, so the longest lives bring the most
-offspring. Energy is only a means and brings no reward: otherwise a lamb, which takes half of it, would be a punishment.
-As the reward is constant, everything depends on how a trajectory ends. After a death (termination), the value is zero.
-After the last tick (truncation), the sheep would have lived on, so its last observation determines the value
+**Rewards.** Each turn of a sheep's life brings a reward of 1, the last turn included. This measures
+success in this model: a sheep has the same chance of a lamb in each tick that it survives, so the
+longest lives bring the most offspring. Energy is only a means and brings no reward: otherwise a
+lamb, which takes half of it, would be a punishment. As the reward is constant, everything depends
+on how a trajectory ends. After a death (termination), the value is zero. After the last tick
+(truncation), the sheep would have lived on, so its last observation determines the value
 (bootstrapping).
 
-The reward is individual. It does not imply that the herd does well if each sheep maximises its own reward: what one
-sheep eats, the others cannot.
+The reward is individual. It does not imply that the herd does well if each sheep maximises its own
+reward: what one sheep eats, the others cannot.
 """
 
 from __future__ import annotations
@@ -59,7 +61,8 @@ def ways(sight: int) -> tuple[tuple[int, tuple[int, int]], ...]:
     """List the paths to the visible cells: for each but the own one, the index of the previous cell, and a step."""
     found = [(0, 0)]
     steps = []
-    for number, (row, column) in enumerate(found):  # the list grows in the loop: a breadth-first search
+    # the list grows in the loop: a breadth-first search
+    for number, (row, column) in enumerate(found):
         for direction in DIRECTIONS:
             cell = (row + direction[0], column + direction[1])
             if abs(cell[0]) + abs(cell[1]) <= sight and cell not in found:
@@ -123,7 +126,11 @@ def sheep_moves(sight: int = SIGHT) -> Definition:
         action_labels=["row - 1", "column + 1", "row + 1", "column - 1"],
         observation_labels=[
             "energy",
-            *(f"{what} at {cell}" for what in ("grass", "wolves", "other sheep") for cell in cells(sight)),
+            *(
+                f"{what} at {cell}"
+                for what in ("grass", "wolves", "other sheep")
+                for cell in cells(sight)
+            ),
         ],
         removed_by="mesa.agent.Agent.remove",  # called for sheep that starve or are eaten
     )
@@ -149,14 +156,17 @@ class Meadow(SimulationInterface):
 
     points = sheep_points()
 
-    def __init__(self, ticks: int = TICKS, *, only_with_sheep: bool = False, **parameters: Any) -> None:
+    def __init__(
+        self, ticks: int = TICKS, *, only_with_sheep: bool = False, **parameters: Any
+    ) -> None:
         """Make a simulation.
 
         Args:
             ticks: The number of ticks after which an episode is truncated.
-            only_with_sheep: Whether an episode ends when the last sheep dies. After that there is nothing to learn, but
-                it takes the wolves many ticks to starve.
-            **parameters: Parameters of Mesa's model: ``initial_wolves``, ``grass_regrowth_time`` and so on.
+            only_with_sheep: Whether an episode ends when the last sheep dies. After that there is
+                nothing to learn, but it takes the wolves many ticks to starve.
+            **parameters: Parameters of Mesa's model: ``initial_wolves``, ``grass_regrowth_time``
+                and so on.
         """
         self.ticks = ticks
         self.only_with_sheep = only_with_sheep
@@ -167,7 +177,9 @@ class Meadow(SimulationInterface):
     def reset(self, seed: int | None = None) -> None:
         """Create a new model."""
         if hasattr(wolf_sheep, "WolfSheepScenario"):  # from Mesa 3.5 on
-            self.model = wolf_sheep.WolfSheep(wolf_sheep.WolfSheepScenario(rng=seed, **self.parameters))
+            self.model = wolf_sheep.WolfSheep(
+                wolf_sheep.WolfSheepScenario(rng=seed, **self.parameters)
+            )
             self._runner = self.model
             return
         from mesa.experimental.devs import ABMSimulator  # before Mesa 3.5
@@ -179,7 +191,8 @@ class Meadow(SimulationInterface):
         """Run the ticks.
 
         Returns:
-            ``TRUNCATED`` after the last tick, because the model itself has no end; None without sheep.
+            ``TRUNCATED`` after the last tick, because the model itself has no end; None without
+            sheep.
         """
         for _ in range(self.ticks):
             if self.only_with_sheep and not self.sheep:

@@ -1,12 +1,13 @@
 """Train one shared policy for all sheep, by PPO with TorchRL's losses on the trajectories of ``collect_episodes``.
 
-``python -m examples.wolf_sheep.train`` trains it with several seeds, for sheep with the sight of the model's rule and
-for sheep that see one step farther. It writes the policies to ``out/`` beside this file and the learning curves to
-``docs/figures/shared-policy-training.csv``. It needs TorchRL (the extra ``clients``).
+``python -m examples.wolf_sheep.train`` trains it with several seeds, for sheep with the sight of
+the model's rule and for sheep that see one step farther. It writes the policies to ``out/`` beside
+this file and the learning curves to ``docs/figures/shared-policy-training.csv``. It needs TorchRL
+(the extra ``clients``).
 
-Hundreds of sheep, most of them born during the episode, need no more code than one: each call of the policy answers all
-waiting decisions, and each sheep's life is one trajectory. The same seed gives the same policy, on the same machine
-with the same versions.
+Hundreds of sheep, most of them born during the episode, need no more code than one: each call of
+the policy answers all waiting decisions, and each sheep's life is one trajectory. The same seed
+gives the same policy, on the same machine with the same versions.
 """
 
 from __future__ import annotations
@@ -66,7 +67,12 @@ def network(sight: int, outputs: int) -> Any:
     """Make a network from sheep's observations to a number of outputs."""
     inputs = 1 + 3 * len(cells(sight))
     return nn.Sequential(
-        Compressed(), nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs)
+        Compressed(),
+        nn.Linear(inputs, 64),
+        nn.Tanh(),
+        nn.Linear(64, 64),
+        nn.Tanh(),
+        nn.Linear(64, outputs),
     )
 
 
@@ -169,7 +175,12 @@ class Learner:
         critic = ValueOperator(herd.values, ["observation"])
         self._advantage = GAE(gamma=DISCOUNT, lmbda=0.95, value_network=critic)
         self._loss = ClipPPOLoss(
-            actor, critic, entropy_coeff=0.005, critic_coeff=1.0, normalize_advantage=True, loss_critic_type="l2"
+            actor,
+            critic,
+            entropy_coeff=0.005,
+            critic_coeff=1.0,
+            normalize_advantage=True,
+            loss_critic_type="l2",
         )
         self._loss.set_keys(sample_log_prob="log_prob")
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=1e-3, eps=1e-5)
@@ -243,7 +254,9 @@ def train(
     number = 32
     while lived < decisions:
         seeds = drawn.integers(HELD_OUT, size=number)
-        found = collect_episodes(meadow, {MOVE: herd.explore}, points=sheep_points(sight), seeds=seeds)[MOVE]
+        found = collect_episodes(
+            meadow, {MOVE: herd.explore}, points=sheep_points(sight), seeds=seeds
+        )[MOVE]
         learner.learn(found)
         survivors = np.unique(found.episodes[found.truncations])
         course.append(
@@ -274,43 +287,72 @@ def path_of(sight: int, seed: int, folder: Path = OUT) -> Path:
 
 def policies_of(sight: int, folder: Path = OUT) -> list[Path]:
     """Return the files of all policies for a range of sight, in the order of their seeds."""
-    return sorted(folder.glob(f"sight-{sight}-seed-*.pt"), key=lambda path: int(path.stem.rpartition("-")[2]))
+    return sorted(
+        folder.glob(f"sight-{sight}-seed-*.pt"), key=lambda path: int(path.stem.rpartition("-")[2])
+    )
 
 
 def write(course: Iterable[Progress], path: Path = CURVES) -> None:
     """Write the learning curves as CSV."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Progress)], lineterminator="\n")
+        writer = csv.DictWriter(
+            file, [field.name for field in fields(Progress)], lineterminator="\n"
+        )
         writer.writeheader()
         for progress in course:
             row = asdict(progress)
             writer.writerow(
-                {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in row.items()}
+                {
+                    name: f"{value:.4g}" if isinstance(value, float) else value
+                    for name, value in row.items()
+                }
             )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train all policies."""
     parser = argparse.ArgumentParser(description="Train one shared policy for all sheep.")
-    parser.add_argument("--seeds", type=int, default=3, help="number of training runs (default: %(default)s)")
-    parser.add_argument("--decisions", type=int, default=300_000, help="decisions per training (default: %(default)s)")
-    parser.add_argument("--ticks", type=int, default=TICKS, help="ticks per episode (default: %(default)s)")
-    parser.add_argument("--sight", type=int, nargs="+", default=SIGHTS, help="ranges of sight (default: 1 2)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for the policies (default: beside this file)")
-    parser.add_argument("--curves", type=Path, default=CURVES, help="file for learning curves (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="number of training runs (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--decisions",
+        type=int,
+        default=300_000,
+        help="decisions per training (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--ticks", type=int, default=TICKS, help="ticks per episode (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--sight", type=int, nargs="+", default=SIGHTS, help="ranges of sight (default: 1 2)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="folder for the policies (default: beside this file)"
+    )
+    parser.add_argument(
+        "--curves",
+        type=Path,
+        default=CURVES,
+        help="file for learning curves (default: %(default)s)",
+    )
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     course: list[Progress] = []
     for seed in range(options.seeds):
         for sight in options.sight:
-            with tqdm(total=options.decisions, unit="decision", desc=f"sight {sight}, seed {seed}") as bar:
+            with tqdm(
+                total=options.decisions, unit="decision", desc=f"sight {sight}, seed {seed}"
+            ) as bar:
 
                 def tell(progress: Progress, bar: Any = bar) -> None:
                     bar.set_postfix(sheep=f"{progress.sheep:.1f}", life=f"{progress.life:.1f}")
                     bar.update(progress.decisions - bar.n)
 
-                herd, own = train(sight, seed, decisions=options.decisions, ticks=options.ticks, tell=tell)
+                herd, own = train(
+                    sight, seed, decisions=options.decisions, ticks=options.ticks, tell=tell
+                )
             herd.save(path_of(sight, seed, options.out))
             course += own
             write(course, options.curves)

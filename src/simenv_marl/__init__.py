@@ -1,7 +1,7 @@
 """Turns a simulation into reinforcement learning environments, without a change to its main loop.
 
-The functions in which it decides something become the agents of a PettingZoo environment, or one of them becomes the
-agent of a Gymnasium environment::
+The functions in which it decides something become the agents of a PettingZoo environment, or one of
+them becomes the agent of a Gymnasium environment::
 
     from simenv_marl import RULE, aec_env, make_step
 
@@ -9,7 +9,8 @@ agent of a Gymnasium environment::
 
 To begin with:
 
-- ``make_step`` defines the observations, actions and rewards of an agent that decides in a function of the model;
+- ``make_step`` defines the observations, actions and rewards of an agent that decides in a function
+  of the model;
 - ``aec_env``, ``parallel_env``, ``single_env``, ``joint_env`` and ``vector_env`` make environments;
 - ``RULE`` as an action lets the model's own function decide;
 - ``simulate`` and ``evaluate`` run the simulation with policies, and compare these with the rule;
@@ -28,8 +29,8 @@ All other names are in rooms, which are imported when they are first used:
 - ``simenv_marl.testing``: checks of a simulation;
 - ``simenv_marl.errors``: the exception classes.
 
-``core/episode.py`` alone determines the order of events. ``docs/contributing.md`` follows one decision through the
-package.
+``core/episode.py`` alone determines the order of events. ``docs/contributing.md`` follows one
+decision through the package.
 """
 
 from importlib import import_module
@@ -54,7 +55,17 @@ __all__ = [
     "register_simulation", "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
 ]  # fmt: skip
 
-ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote", "seats", "testing")
+ROOMS = (
+    "data",
+    "envs",
+    "errors",
+    "experiments",
+    "planning",
+    "plugins",
+    "remote",
+    "seats",
+    "testing",
+)
 """The modules in which all other public names are."""
 
 _MODULES = {
@@ -82,7 +93,9 @@ def __getattr__(name: str) -> Any:
     if not name.startswith("_"):
         for room in ROOMS:
             if name in getattr(import_module(f".{room}", __name__), "__all__", ()):
-                raise AttributeError(f"{name} is in simenv_marl.{room}: from simenv_marl.{room} import {name}")
+                raise AttributeError(
+                    f"{name} is in simenv_marl.{room}: from simenv_marl.{room} import {name}"
+                )
     raise AttributeError(f"module 'simenv_marl' has no attribute {name!r}")
 
 

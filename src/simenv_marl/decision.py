@@ -1,8 +1,9 @@
 """Decision points: functions of a model that decide something, and definitions of how an environment decides it.
 
-``make_step`` makes a ``Definition``. Applied to a function, the definition gives a *decision function*. It looks and
-behaves like the function, whose body is the *rule*. But if the calling simulation runs in an environment, it asks the
-environment for its decision. One function is one decision point, its hook, with any number of definitions.
+``make_step`` makes a ``Definition``. Applied to a function, the definition gives a *decision
+function*. It looks and behaves like the function, whose body is the *rule*. But if the calling
+simulation runs in an environment, it asks the environment for its decision. One function is one
+decision point, its hook, with any number of definitions.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -35,8 +36,8 @@ Labels = Mapped | Mapping[Any, str] | Sequence[str] | None
 class Definition:
     """The definition of a decision point: how an environment observes, decides and rewards it.
 
-    Made by ``make_step``; immutable. Apply it to a function, staticmethod, classmethod or method of a class to get the
-    decision function. Its attributes are the arguments of ``make_step``.
+    Made by ``make_step``; immutable. Apply it to a function, staticmethod, classmethod or method of
+    a class to get the decision function. Its attributes are the arguments of ``make_step``.
     """
 
     _: KW_ONLY
@@ -86,8 +87,8 @@ class Definition:
         """Make the decision function.
 
         Args:
-            function: The model's function that decides: a function, a staticmethod, a classmethod, or any of these as
-                an attribute of its class.
+            function: The model's function that decides: a function, a staticmethod, a classmethod,
+                or any of these as an attribute of its class.
 
         Returns:
             The decision function, bound like ``function``. A staticmethod or classmethod stays one.
@@ -126,53 +127,66 @@ def make_step(
 ) -> Definition:
     """Define a decision point: what its agent observes, may do and is rewarded with (paper, section 3.3).
 
-    Callables other than ``compute_reward`` may have a keyword-only parameter ``_simulation``: it gets the simulation.
+    Callables other than ``compute_reward`` may have a keyword-only parameter ``_simulation``: it
+    gets the simulation.
 
     Args:
         observation_space: The space of the agent's observations.
-        observation_space_mapping: A callable of the decision call's arguments (``self`` first for a method). However
-            the model writes the call, it gets all arguments that can be passed by position so, the others by keyword,
-            and defaults for those left out. It returns the observation, which is cast to the dtype of the space.
+        observation_space_mapping: A callable of the decision call's arguments (``self`` first for a
+            method). However the model writes the call, it gets all arguments that can be passed by
+            position so, the others by keyword, and defaults for those left out. It returns the
+            observation, which is cast to the dtype of the space.
         action_space: The space of the agent's actions.
-        action_space_mapping: The decision for an action: a callable of the action, or a dict with an entry for each
-            action of a ``Discrete`` space. Its value is what the decision function returns.
-        reward_mapping: A callable like ``observation_space_mapping``, called at each decision of the agent and at its
-            end. It returns the reward of the agent's previous action.
-        apply: An alternative to ``action_space_mapping``: a callable of the action and the call's arguments, which runs
-            in the simulation instead of the rule. The decision function returns its result. With a keyword-only
-            parameter ``_rule`` it gets the rule, to run it with other arguments or under other parameters of the model.
-            Calls of the same decision point by the same agent inside ``apply`` run the rule.
-        choices: A callable of the call's arguments that returns the sequence of legal answers. The action is an index
-            into it, ``action_space`` a ``Discrete`` (from 0) of the largest length. The action mask follows from it.
-            The decision function returns the chosen answer; with ``apply``, that gets the answer instead of the action.
-        split: For a call that decides for many entities at once: a callable of the call's arguments that returns the
-            items, each of which is a decision. All other callables get the item before the call's arguments (``apply``
-            after the action). The function must return what it decides, and not act in place.
-        gather: With ``split``: a callable of the items, their decisions and the call's arguments. It returns the value
-            of the call. Default: a list of the decisions.
-        part: With ``split``: a callable of the rule's result, an item and the call's arguments. It returns the part of
-            the result that is for the item, where the rule decides for this item only. Default: by position.
-        rule_action_mapping: The action that corresponds to a decision of the rule, for learning from the rule: a
-            callable of the decision (and the call's arguments, if it takes more than one), which returns an action or
-            None; or a dict from decision to action. After a decision of the rule, the agent's next info has it as
-            ``"rule_action"``.
-        agent: The name of the deciding agent, or a callable of the call's arguments that returns it (None: the rule
-            decides). Default: the letters of the function's name in lower case and a number, such as
-            ``choosewateramount_0``.
-        action_mask_mapping: A callable of the call's arguments that returns the action mask of a ``Discrete`` or
-            ``MultiDiscrete``: 1 for each legal action, 0 for others.
-        removed_by: The functions of the model whose calls end an agent's episode: a dotted name, several, or a dict
-            from dotted name to a callable of that call's arguments that returns the agent's name. Without a callable,
-            it is the agent that ``agent`` names for the call's first argument, or that it named for it last.
-        goal_space: The space of goals. With it and the next three arguments, the single view is goal-based.
-        achieved_goal_mapping: A callable like ``observation_space_mapping`` that returns the achieved goal.
-        desired_goal_mapping: A callable like ``observation_space_mapping`` that returns the desired goal.
-        compute_reward: A callable of achieved goals, desired goals and infos, of one step or stacked (shape ``(n,
-            *goal_space.shape)``). It returns the reward of each, for learners that replay with other goals.
-        action_labels: What people and language models read instead of numbers: for a ``Discrete`` a sequence of texts,
-            or a dict from action to text; for a space with one dimension a sequence, with a text for each component;
-            for a ``Dict`` a dict; or a callable of the call's arguments that returns one of these. Default: choices
-            and decisions as text, else numbers.
+        action_space_mapping: The decision for an action: a callable of the action, or a dict with
+            an entry for each action of a ``Discrete`` space. Its value is what the decision
+            function returns.
+        reward_mapping: A callable like ``observation_space_mapping``, called at each decision of
+            the agent and at its end. It returns the reward of the agent's previous action.
+        apply: An alternative to ``action_space_mapping``: a callable of the action and the call's
+            arguments, which runs in the simulation instead of the rule. The decision function
+            returns its result. With a keyword-only parameter ``_rule`` it gets the rule, to run it
+            with other arguments or under other parameters of the model. Calls of the same decision
+            point by the same agent inside ``apply`` run the rule.
+        choices: A callable of the call's arguments that returns the sequence of legal answers. The
+            action is an index into it, ``action_space`` a ``Discrete`` (from 0) of the largest
+            length. The action mask follows from it. The decision function returns the chosen
+            answer; with ``apply``, that gets the answer instead of the action.
+        split: For a call that decides for many entities at once: a callable of the call's arguments
+            that returns the items, each of which is a decision. All other callables get the item
+            before the call's arguments (``apply`` after the action). The function must return what
+            it decides, and not act in place.
+        gather: With ``split``: a callable of the items, their decisions and the call's arguments.
+            It returns the value of the call. Default: a list of the decisions.
+        part: With ``split``: a callable of the rule's result, an item and the call's arguments. It
+            returns the part of the result that is for the item, where the rule decides for this
+            item only. Default: by position.
+        rule_action_mapping: The action that corresponds to a decision of the rule, for learning
+            from the rule: a callable of the decision (and the call's arguments, if it takes more
+            than one), which returns an action or None; or a dict from decision to action. After a
+            decision of the rule, the agent's next info has it as ``"rule_action"``.
+        agent: The name of the deciding agent, or a callable of the call's arguments that returns it
+            (None: the rule decides). Default: the letters of the function's name in lower case and
+            a number, such as ``choosewateramount_0``.
+        action_mask_mapping: A callable of the call's arguments that returns the action mask of a
+            ``Discrete`` or ``MultiDiscrete``: 1 for each legal action, 0 for others.
+        removed_by: The functions of the model whose calls end an agent's episode: a dotted name,
+            several, or a dict from dotted name to a callable of that call's arguments that returns
+            the agent's name. Without a callable, it is the agent that ``agent`` names for the
+            call's first argument, or that it named for it last.
+        goal_space: The space of goals. With it and the next three arguments, the single view is
+            goal-based.
+        achieved_goal_mapping: A callable like ``observation_space_mapping`` that returns the
+            achieved goal.
+        desired_goal_mapping: A callable like ``observation_space_mapping`` that returns the desired
+            goal.
+        compute_reward: A callable of achieved goals, desired goals and infos, of one step or
+            stacked (shape ``(n, *goal_space.shape)``). It returns the reward of each, for learners
+            that replay with other goals.
+        action_labels: What people and language models read instead of numbers: for a ``Discrete`` a
+            sequence of texts, or a dict from action to text; for a space with one dimension a
+            sequence, with a text for each component; for a ``Dict`` a dict; or a callable of the
+            call's arguments that returns one of these. Default: choices and decisions as text, else
+            numbers.
         observation_labels: The same for the parts of observations.
 
     Returns:
@@ -186,7 +200,12 @@ def make_step(
 
 _GOAL: Final = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
 
-_REQUIRED: Final = ("observation_space", "observation_space_mapping", "action_space", "reward_mapping")
+_REQUIRED: Final = (
+    "observation_space",
+    "observation_space_mapping",
+    "action_space",
+    "reward_mapping",
+)
 
 
 def _problems(definition: Definition) -> Iterator[str]:
@@ -203,14 +222,21 @@ def _problems(definition: Definition) -> Iterator[str]:
             fits, kind = fits or isinstance(part, Mapping), "a callable or a dict"
         elif name.endswith("_labels"):
             space = getattr(definition, name.removesuffix("_labels") + "_space")
-            fits, kind = fits or fit_labels(space, part), f"texts for the parts of {short_repr(space)}, or a callable"
+            fits, kind = (
+                fits or fit_labels(space, part),
+                f"texts for the parts of {short_repr(space)}, or a callable",
+            )
         if not fits:
             yield f"{name} must be {kind}, not {short_repr(part)}"
-    given = [name for name in ("action_space_mapping", "apply", "choices") if getattr(definition, name) is not None]
+    given = [
+        name
+        for name in ("action_space_mapping", "apply", "choices")
+        if getattr(definition, name) is not None
+    ]
     if len(given) != 1 and given != ["apply", "choices"]:
         yield (
-            "give one of action_space_mapping, apply and choices (or both apply and choices), to say what an action"
-            f" decides; given: {', '.join(given) or 'none'}"
+            "give one of action_space_mapping, apply and choices (or both apply and choices), to"
+            f" say what an action decides; given: {', '.join(given) or 'none'}"
         )
     space, has_mask = definition.action_space, definition.action_mask_mapping is not None
     if has_mask and not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
@@ -235,8 +261,8 @@ def _problems(definition: Definition) -> Iterator[str]:
     surplus = [action for action in answers if action not in actions]
     if absent or surplus:
         yield (
-            f"the dict action_space_mapping must have just the actions of {space}; missing: {absent}, not in the space:"
-            f" {surplus}"
+            f"the dict action_space_mapping must have just the actions of {space}; missing:"
+            f" {absent}, not in the space: {surplus}"
         )
 
 
@@ -252,16 +278,27 @@ def fit_labels(space: Any, labels: Any) -> bool:
     texts: list[Any] | None = None
     if isinstance(labels, Mapping) and set(labels) == set(parts):
         texts = list(labels.values())
-    elif isinstance(labels, Sequence) and not isinstance(labels, str) and not isinstance(space, spaces.Dict):
+    elif (
+        isinstance(labels, Sequence)
+        and not isinstance(labels, str)
+        and not isinstance(space, spaces.Dict)
+    ):
         texts = list(labels)
-    if texts is None or len(texts) != len(parts) or not all(isinstance(text, str) for text in texts):
+    if (
+        texts is None
+        or len(texts) != len(parts)
+        or not all(isinstance(text, str) for text in texts)
+    ):
         return False
     # The parts of arrays and dicts are told apart by their labels.
     return isinstance(space, spaces.Discrete) or len(set(texts)) == len(texts)
 
 
 def _answers(mapping: Any) -> Mapping[Any, Any] | None:
-    """Return the dict from action to decision that was given as ``action_space_mapping``; None for a callable."""
+    """Return the dict from action to decision that was given as ``action_space_mapping``.
+
+    None for a callable.
+    """
     if isinstance(mapping, Mapping):
         return mapping
     owner = getattr(mapping, "__self__", None)
@@ -294,18 +331,26 @@ def point_for(hook: Hook) -> DecisionPoint:
         PatchError: The hook's function is not written in Python.
     """
     if not isinstance(hook.function, FunctionType):
-        raise PatchError(f"{hook.name} cannot be a decision point: it is not a function written in Python")
+        raise PatchError(
+            f"{hook.name} cannot be a decision point: it is not a function written in Python"
+        )
     return hook
 
 
 def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
-    """Return the point of a decision function, also as an attribute of a class, and its definition; or None."""
+    """Return the point of a decision function, also as an attribute of a class, and its definition.
+
+    Or None.
+    """
     hook = hook_of(function)
     return None if hook is None else (hook, made_with(unbind(function)))
 
 
 def registered() -> dict[str, DecisionPoint]:
-    """Return the decorated points, by dotted name. Nothing keeps them, so that a model is collected with its points."""
+    """Return the decorated points, by dotted name.
+
+    Nothing keeps them, so that a model is collected with its points.
+    """
     return {hook.name: hook for hook in hooks() if hook.definition is not None}
 
 
@@ -320,10 +365,10 @@ def decision_points() -> list[str]:
 class difference:  # noqa: N801 - it is used like a function
     """A mapping that returns the change of ``function(*arguments)``.
 
-    The change is the difference from its value at the last call for the same agent in the same episode; it is 0.0 at
-    the first call, and wherever the mapping is not called for an environment. It can be used as a mapping, or be called
-    in one. It replaces the global variable that a reward such as "water used since the last decision" would need
-    (paper, supplement S2).
+    The change is the difference from its value at the last call for the same agent in the same
+    episode; it is 0.0 at the first call, and wherever the mapping is not called for an environment.
+    It can be used as a mapping, or be called in one. It replaces the global variable that a reward
+    such as "water used since the last decision" would need (paper, supplement S2).
     """
 
     def __init__(self, function: Mapped) -> None:
@@ -343,7 +388,8 @@ class difference:  # noqa: N801 - it is used like a function
         update_wrapper(self, function)
 
     def __reduce__(self) -> Any:
-        return difference, (self._function,)  # which notes, in another process too, that there are differences
+        # which notes, in another process too, that there are differences
+        return difference, (self._function,)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Return the change of the function's value for these arguments."""
@@ -353,5 +399,6 @@ class difference:  # noqa: N801 - it is used like a function
         if memory is None:
             return 0.0
         before = memory.get(self, value)
-        memory[self] = copy(value) if isinstance(value, np.ndarray) else value  # an array may change in place
+        # an array may change in place
+        memory[self] = copy(value) if isinstance(value, np.ndarray) else value
         return value - before

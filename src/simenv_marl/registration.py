@@ -20,20 +20,27 @@ _RECIPES: dict[str, tuple[Any, Any, Any]] = {}
 
 
 def register_simulation(
-    simulation: Any, points: Points = None, *, name: str | None = None, version: int = 0, **options: Unpack[ViewOptions]
+    simulation: Any,
+    points: Points = None,
+    *,
+    name: str | None = None,
+    version: int = 0,
+    **options: Unpack[ViewOptions],
 ) -> list[str]:
     """Register the environments of a simulation with Gymnasium and PettingZoo.
 
-    Gymnasium ids: ``name/<Point>-v0`` is the single view of a decision point whose agent has a fixed name (the
-    function's name in CamelCase; all other points follow their rule), and ``name/Joint-v0`` is the joint view.
-    PettingZoo id: ``name/coop_v0``, as AEC and parallel environment. Call this where the simulation's module is
-    imported, so that ``gymnasium.make("module:name/Joint-v0")`` finds it.
+    Gymnasium ids: ``name/<Point>-v0`` is the single view of a decision point whose agent has a
+    fixed name (the function's name in CamelCase; all other points follow their rule), and
+    ``name/Joint-v0`` is the joint view. PettingZoo id: ``name/coop_v0``, as AEC and parallel
+    environment. Call this where the simulation's module is imported, so that
+    ``gymnasium.make("module:name/Joint-v0")`` finds it.
 
     Args:
-        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a
+            ``Variant``.
         points: The decision points, as ``generate_env`` takes them.
-        name: The namespace of the ids, made of letters, digits, ``_`` and ``-``. None: the name of the variant, if the
-            simulation is one.
+        name: The namespace of the ids, made of letters, digits, ``_`` and ``-``. None: the name of
+            the variant, if the simulation is one.
         version: The version in the ids.
         **options: The options of ``aec_env``.
 
@@ -48,7 +55,9 @@ def register_simulation(
             raise OptionValueError("register_simulation needs a name= for the ids")
         name = simulation.name
     if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
-        raise OptionValueError(f"name must consist of letters, digits, _ and -, not {short_repr(name)}")
+        raise OptionValueError(
+            f"name must consist of letters, digits, _ and -, not {short_repr(name)}"
+        )
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
     plan = Plan(simulation, points, options)
@@ -64,7 +73,8 @@ def register_simulation(
     made: list[str] = []
     for title, kwargs in {**views, "Joint": {"view": "joint"}}.items():
         made.append(f"{name}/{title}-v{version}")
-        gymnasium.registry.pop(made[-1], None)  # it may be registered again, as when a notebook's cell is rerun
+        # it may be registered again, as when a notebook's cell is rerun
+        gymnasium.registry.pop(made[-1], None)
         gymnasium.register(made[-1], entry, vector_entry_point=vector_entry, kwargs=where | kwargs)
     register: Any = getattr(pettingzoo, "register", None)
     if register is not None:  # PettingZoo has a registry since 1.26
@@ -97,19 +107,28 @@ def _camel(point: str, parts: int) -> str:
 def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
     """Make an environment of a registered simulation.
 
-    Gymnasium reads render modes from the metadata of a class, which an entry point for many simulations lacks.
-    Therefore this applies the wrapper by which Gymnasium shows the pictures of a simulation without the mode "human".
+    Gymnasium reads render modes from the metadata of a class, which an entry point for many
+    simulations lacks. Therefore this applies the wrapper by which Gymnasium shows the pictures of a
+    simulation without the mode "human".
     """
     simulation, points, options = _recall(recipe, module, view, options)
     plan = Plan(simulation, points, {**options, "render_mode": None})
     mode, modes = options.get("render_mode"), plan.render_modes
-    if view in ("single", "joint") and mode == "human" and mode not in modes and "rgb_array" in modes:
+    if (
+        view in ("single", "joint")
+        and mode == "human"
+        and mode not in modes
+        and "rgb_array" in modes
+    ):
         return HumanRendering(view_class(plan, view)(plan.amended({"render_mode": "rgb_array"})))
     return view_class(plan, view)(plan.amended({"render_mode": mode}))
 
 
 def make_vector_view(recipe: str, module: str, view: str, **options: Any) -> Any:
-    """Make a vector environment. ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``."""
+    """Make a vector environment.
+
+    ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``.
+    """
     simulation, points, options = _recall(recipe, module, view, options)
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
     options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
@@ -122,7 +141,8 @@ def _recall(recipe: str, module: str, view: str, options: Any) -> tuple[Any, Any
         importlib.import_module(module)  # as in a process that has only the spec
     if recipe not in _RECIPES:
         raise UnknownPointError(
-            f"no simulation is registered as {recipe!r} in this process; import the module that registers it, or"
+            f"no simulation is registered as {recipe!r} in this process; import the module that"
+            " registers it, or"
             ' make the environment by "module:id"'
         )
     simulation, points, registered = _RECIPES[recipe]

@@ -1,18 +1,19 @@
 """Credit assignment: the advantage of an agent's action, by branches and by returns less a learned baseline.
 
-``python -m studies.credit.estimators`` goes to decisions of the greenhouse's two agents and of the sheep on Mesa's
-meadow, and draws an action for each. The advantage of the action is the difference between its value and the value of
-the base policy's action, where the base policy continues after both. The script compares several estimators of it with
-the same ground truth, the mean over many futures to the end, and counts their cost in simulated days (ticks of the
-meadow):
+``python -m studies.credit.estimators`` goes to decisions of the greenhouse's two agents and of the
+sheep on Mesa's meadow, and draws an action for each. The advantage of the action is the difference
+between its value and the value of the base policy's action, where the base policy continues after
+both. The script compares several estimators of it with the same ground truth, the mean over many
+futures to the end, and counts their cost in simulated days (ticks of the meadow):
 
-- the return of one future after the action, less a baseline that was learned from episodes of the base policy: the
-  estimator of policy gradients;
-- the difference between two branches of ``action_values``, in the same future or in two independent ones;
+- the return of one future after the action, less a baseline that was learned from episodes of the
+  base policy: the estimator of policy gradients;
+- the difference between two branches of ``action_values``, in the same future or in two independent
+  ones;
 - the same, cut off after a few days, with the baseline as terminal value.
 
-It prints a table in Markdown. The cost does not include the days for learning the baseline, as all estimators can use
-it.
+It prints a table in Markdown. The cost does not include the days for learning the baseline, as all
+estimators can use it.
 """
 
 from __future__ import annotations
@@ -75,11 +76,14 @@ def worlds() -> Iterator[World]:
     yield World("one of the sheep", lambda: Meadow(TICKS), sheep_points(), MOVE, RULE, 100)
 
 
-def decisions(world: World, number: int, rng: np.random.Generator) -> Iterator[tuple[Any, list[Any]]]:
+def decisions(
+    world: World, number: int, rng: np.random.Generator
+) -> Iterator[tuple[Any, list[Any]]]:
     """Go to decisions, each in another episode.
 
     Yields:
-        The environment with the decision pending, and two candidates: a random action, and that of the base policy.
+        The environment with the decision pending, and two candidates: a random action, and that of
+        the base policy.
     """
     while number:
         env = aec_env(world.make(), world.points)
@@ -102,7 +106,8 @@ def decisions(world: World, number: int, rng: np.random.Generator) -> Iterator[t
         else:
             usual = world.base[world.key](observation)
             spread = 0.04 if world.key == WATERER else 0.4
-            drawn = 1 - np.abs(1 - np.abs(usual + rng.normal(0, spread, 1)))  # reflected at 0 and at 1
+            # reflected at 0 and at 1
+            drawn = 1 - np.abs(1 - np.abs(usual + rng.normal(0, spread, 1)))
             yield env, [np.clip(drawn, 0, 1).astype(np.float32), usual]
         env.close()
 
@@ -110,7 +115,9 @@ def decisions(world: World, number: int, rng: np.random.Generator) -> Iterator[t
 def learn_baseline(world: World, episodes: int) -> Baseline:
     """Learn a baseline: least squares on squares and products of the observations."""
     policies = {MOVE: RULE} if world.base is RULE else world.base
-    found = collect_episodes(world.make, policies, points=world.points, seeds=range(10**6, 10**6 + episodes))[world.key]
+    found = collect_episodes(
+        world.make, policies, points=world.points, seeds=range(10**6, 10**6 + episodes)
+    )[world.key]
     rest = np.concatenate(
         [np.cumsum(found.rewards[start : start + length][::-1])[::-1]
          for start, length in zip(found.starts, found.lengths, strict=True)]
@@ -135,10 +142,12 @@ class Way:
 
     Attributes:
         title: Its name.
-        bias: The root mean square, over decisions, of the difference between its mean and the truth.
+        bias: The root mean square, over decisions, of the difference between its mean and the
+            truth.
         deviation: The root mean square, over decisions, of the standard deviation of one estimate.
         days: The cost of one estimate, in simulated days.
-        a_decision: The cost per decision where all decisions of an episode are assigned credit, in simulated days.
+        a_decision: The cost per decision where all decisions of an episode are assigned credit, in
+            simulated days.
     """
 
     title: str
@@ -153,7 +162,9 @@ class Way:
         return float(np.sqrt(self.bias**2 + self.deviation**2 * self.days / DAYS_SPENT))
 
 
-def measure(world: World, number: int, futures: int, episodes: int, seed: int) -> tuple[list[Way], float]:
+def measure(
+    world: World, number: int, futures: int, episodes: int, seed: int
+) -> tuple[list[Way], float]:
     """Measure the errors of all estimators.
 
     Args:
@@ -168,7 +179,11 @@ def measure(world: World, number: int, futures: int, episodes: int, seed: int) -
     """
     rng = np.random.default_rng(seed)
     baseline = learn_baseline(world, episodes)
-    titles = ["return less baseline", "two branches, independent futures", "two branches, the same future"]
+    titles = [
+        "return less baseline",
+        "two branches, independent futures",
+        "two branches, the same future",
+    ]
     titles += [f"the same, cut off after {horizon}" for horizon in HORIZONS]
     biases: list[list[float]] = [[] for _ in titles]
     variances: list[list[float]] = [[] for _ in titles]
@@ -179,9 +194,14 @@ def measure(world: World, number: int, futures: int, episodes: int, seed: int) -
         taken, usual = action_values(env, candidates, base=world.base, futures=futures).returns
         truth = float(np.mean(taken - usual))
         truths.append(truth)
-        # the sampling error of the truth does not count as a bias of the estimators that are cut off
+        # the sampling error of the truth does not count as a bias of the estimators that are cut
+        # off
         unsure = float(np.var(taken - usual, ddof=1)) / futures
-        whole = float(np.mean(taken)) if world.base is RULE else float(DAYS - env.simulation.greenhouse.day)
+        whole = (
+            float(np.mean(taken))
+            if world.base is RULE
+            else float(DAYS - env.simulation.greenhouse.day)
+        )
         other = float(np.mean(usual)) if world.base is RULE else whole
         found = [(taken - expected, whole, 0.0), (taken - np.roll(usual, 1), whole + other, 0.0)]
         found.append((taken - usual, whole + other, 0.0))
@@ -219,8 +239,8 @@ def table(world: World, ways: Sequence[Way], truth: float) -> str:
         one = (way.deviation / first.deviation) ** 2 * way.days / first.days
         every = (way.deviation / first.deviation) ** 2 * way.a_decision / first.a_decision
         lines.append(
-            f"| {way.title} | {way.bias:.2f} | {way.deviation:.2f} | {way.days:.1f} | {way.error:.2f} | {one:.2g} x |"
-            f" {every:.2g} x |"
+            f"| {way.title} | {way.bias:.2f} | {way.deviation:.2f} | {way.days:.1f} |"
+            f" {way.error:.2f} | {one:.2g} x | {every:.2g} x |"
         )
     return "\n".join(lines)
 
@@ -228,14 +248,27 @@ def table(world: World, ways: Sequence[Way], truth: float) -> str:
 def main(arguments: Sequence[str] | None = None) -> dict[str, list[Way]]:
     """Measure the errors, and print a table for each simulation."""
     parser = argparse.ArgumentParser(description="Compare estimators of the advantage of actions.")
-    parser.add_argument("--decisions", type=int, default=24, help="decisions of each kind (default: %(default)s)")
-    parser.add_argument("--futures", type=int, default=48, help="futures per estimator (default: %(default)s)")
-    parser.add_argument("--episodes", type=int, default=100, help="episodes for each baseline (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all randomness (default: %(default)s)")
+    parser.add_argument(
+        "--decisions", type=int, default=24, help="decisions of each kind (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--futures", type=int, default=48, help="futures per estimator (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--episodes",
+        type=int,
+        default=100,
+        help="episodes for each baseline (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of all randomness (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     found = {}
     for world in worlds():
-        ways, truth = measure(world, options.decisions, options.futures, options.episodes, options.seed)
+        ways, truth = measure(
+            world, options.decisions, options.futures, options.episodes, options.seed
+        )
         found[world.title] = ways
         print(table(world, ways, truth), end="\n\n", flush=True)
     return found

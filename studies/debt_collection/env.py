@@ -1,14 +1,18 @@
 """Environments made from the agency of ``model``. The model itself does not refer to this module.
 
-- ``CASES``: each debtor is an agent, from the first decision on its case until the case is closed. All agents have the
-  same spaces, so they can share one policy. The reward is the debtor's payments less the costs of the case.
-- ``COLLECTOR``: one agent, ``collector_0``, decides on all cases. The reward is the agency's profit.
-- ``NAMED_CASES`` and ``NAMED_COLLECTOR``: the same with fixed actions, those of ``CHOICES``, and a mask.
+- ``CASES``: each debtor is an agent, from the first decision on its case until the case is closed.
+  All agents have the same spaces, so they can share one policy. The reward is the debtor's payments
+  less the costs of the case.
+- ``COLLECTOR``: one agent, ``collector_0``, decides on all cases. The reward is the agency's
+  profit.
+- ``NAMED_CASES`` and ``NAMED_COLLECTOR``: the same with fixed actions, those of ``CHOICES``, and a
+  mask.
 - ``CollectionSim``: the simulation: an agency over a number of days.
 
-In the first two, the action is an index into the lawful choices that the call gets, so 2 can mean "call" today and
-"sue" tomorrow. The last three numbers of an observation tell which choices are lawful, and ``lawful`` lists them. In
-the parallel view, the lawful choices can change between the observation and the decision: use fixed actions there.
+In the first two, the action is an index into the lawful choices that the call gets, so 2 can mean
+"call" today and "sue" tomorrow. The last three numbers of an observation tell which choices are
+lawful, and ``lawful`` lists them. In the parallel view, the lawful choices can change between the
+observation and the decision: use fixed actions there.
 
 Rewards are in hundreds of dollars.
 """
@@ -23,7 +27,14 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from simenv_marl import TRUNCATED, Definition, SimulationInterface, difference, make_step, reseed_generators
+from simenv_marl import (
+    TRUNCATED,
+    Definition,
+    SimulationInterface,
+    difference,
+    make_step,
+    reseed_generators,
+)
 
 from .model import ACTIVE, CHOICES, KEPT, Agency, Debtor, Parameters
 

@@ -1,41 +1,46 @@
 """A model of a debt collection agency, in steps of a day. It contains no reinforcement learning.
 
-The agency owns debts of consumers. Each debtor owes one amount. Wages, living costs, savings and the willingness to pay
-are unknown to the agency. Debtors pay in full, ask for instalments, dispute the debt, or become insolvent. The agency
-sends letters, makes calls and goes to court. One step of the ``World`` is one day here, not one month.
+The agency owns debts of consumers. Each debtor owes one amount. Wages, living costs, savings and
+the willingness to pay are unknown to the agency. Debtors pay in full, ask for instalments, dispute
+the debt, or become insolvent. The agency sends letters, makes calls and goes to court. One step of
+the ``World`` is one day here, not one month.
 
-**Decision.** ``Agency.choose_contact(debtor, choices)`` is called for each case that is due on a working day. It
-returns one of the ``choices``, which ``Agency.lawful`` lists: what the law, today's staff and the agency's money allow.
+**Decision.** ``Agency.choose_contact(debtor, choices)`` is called for each case that is due on a
+working day. It returns one of the ``choices``, which ``Agency.lawful`` lists: what the law, today's
+staff and the agency's money allow.
 
-========= ==================================== ============================================================
-choice    cost                                 the case is due again
-========= ==================================== ============================================================
-"leave"   none                                 after a week
+========= ====================================
+============================================================ choice    cost                                 the case is due again
+========= ====================================
+============================================================ "leave"   none                                 after a week
 "write"   ``POSTAGE``                          after two weeks
 "call"    ``CALL`` and one of the day's calls  after a week; without an answer, later on the same day
 "sue"     ``FEE``                              never: the court decides
-========= ==================================== ============================================================
+========= ====================================
+============================================================
 
-**Utility.** ``Agency.profit``: the money collected less all costs, when all cases are closed or after two years. The
-agency buys debts in the first half year only, so two years show how their cases end. The price of the debts is a sunk
-cost and does not count.
+**Utility.** ``Agency.profit``: the money collected less all costs, when all cases are closed or
+after two years. The agency buys debts in the first half year only, so two years show how their
+cases end. The price of the debts is a sunk cost and does not count.
 
 **The law** is that of the United States, simplified: Regulation F of the CFPB (12 CFR part 1006).
 
-- At most seven calls about a debt in seven days, and none within seven days after a conversation, whose day is the
-  first of the seven (1006.14(b)(2); more calls are presumed to be a violation).
-- The collector sends a notice with the first communication or within five days of it (1006.34(a)(1)). Here the first
-  letter is the notice, and the agency does not call before it.
-- A consumer who disputes the debt in writing within the validation period stops the collection until the debt is
-  verified (1006.38(d)(2)). The period ends 30 days after receipt; the mail may be assumed to take five working days
-  (1006.34(b)(5)). Here the agency does not sue before the period has ended.
+- At most seven calls about a debt in seven days, and none within seven days after a conversation,
+  whose day is the first of the seven (1006.14(b)(2); more calls are presumed to be a violation).
+- The collector sends a notice with the first communication or within five days of it
+  (1006.34(a)(1)). Here the first letter is the notice, and the agency does not call before it.
+- A consumer who disputes the debt in writing within the validation period stops the collection
+  until the debt is verified (1006.38(d)(2)). The period ends 30 days after receipt; the mail may be
+  assumed to take five working days (1006.34(b)(5)). Here the agency does not sue before the period
+  has ended.
 - A consumer can ask in writing for no further communication. The agency can still sue (1006.6(c)).
-- No lawsuits for time-barred debts (1006.26(b)). The limit is four years here, as for written contracts in California
-  (Code of Civil Procedure, section 337).
+- No lawsuits for time-barred debts (1006.26(b)). The limit is four years here, as for written
+  contracts in California (Code of Civil Procedure, section 337).
 - A garnishment takes at most a quarter of the disposable wages (15 U.S.C. 1673).
 
-All other numbers are assumptions: the debtors' wages and debts, their reactions, and the half-life of the probability
-of a payment, which is ``HALF_LIFE`` days. The model leaves out interest, taxes and several debts of one person.
+All other numbers are assumptions: the debtors' wages and debts, their reactions, and the half-life
+of the probability of a payment, which is ``HALF_LIFE`` days. The model leaves out interest, taxes
+and several debts of one person.
 
 As a script, the module prints the agency's results::
 
@@ -130,8 +135,8 @@ class Plan(Request):
 class Debtor(Entity):
     """A person who owes a debt to the agency.
 
-    Each debtor has two streams of random numbers, so the agency's decisions change neither the random events of a
-    debtor's life nor those of other debtors.
+    Each debtor has two streams of random numbers, so the agency's decisions change neither the
+    random events of a debtor's life nor those of other debtors.
 
     Attributes:
         balance: The amount still owed, in cents.
@@ -149,11 +154,12 @@ class Debtor(Entity):
         collected: The money that the debtor has paid to the agency, in cents.
         spent: The agency's costs of the case, in cents.
         contract: The latest plan or garnishment.
-        wage, living, cushion: Monthly wage and living costs, and the maximum of savings, in cents. The agency does not
-            know these, nor the attributes below.
+        wage, living, cushion: Monthly wage and living costs, and the maximum of savings, in cents.
+            The agency does not know these, nor the attributes below.
         employed: Whether the debtor earns the wage at present.
         willingness, reach: How likely the debtor is to pay, and to answer a call, from 0 to 1.
-        court: The outcome of a lawsuit, from 0 to 1: a low number means wages that can be garnished.
+        court: The outcome of a lawsuit, from 0 to 1: a low number means wages that can be
+            garnished.
         payday: The day of the next wage.
     """
 
@@ -292,7 +298,11 @@ class Agency(Entity):
         """Create an agency in a world of its own; the seed determines all randomness."""
         super().__init__(World(seed))
         self.parameters = parameters = parameters or Parameters()
-        world, self.random, self.calls_left = self.world, self.world.stream("purchases"), parameters.calls
+        world, self.random, self.calls_left = (
+            self.world,
+            self.world.stream("purchases"),
+            parameters.calls,
+        )
         self.cases: dict[int, Debtor] = {}
         self.queue: deque[Debtor] = deque()
         world.ledger.move(world.outside, self, parameters.capital, "capital")
@@ -320,7 +330,10 @@ class Agency(Entity):
         return self.cents - self.parameters.capital
 
     def lawful(self, debtor: Debtor) -> tuple[str, ...]:
-        """List the choices that are lawful for a case now, in the order of ``CHOICES``; "leave" always is."""
+        """List the choices that are lawful for a case now, in the order of ``CHOICES``.
+
+        "leave" always is.
+        """
         day, choices = self.world.month, ["leave"]
         if debtor.status != "open":
             return ("leave",)
@@ -330,7 +343,11 @@ class Agency(Entity):
             rare = len(debtor.calls) < CALL_LIMIT or day - debtor.calls[0] >= QUIET
             if debtor.notified is not None and quiet and rare and self.calls_left:
                 choices.append("call")
-        if debtor.notified is not None and day - debtor.notified >= VALIDATION and debtor.age < LIMITATION:
+        if (
+            debtor.notified is not None
+            and day - debtor.notified >= VALIDATION
+            and debtor.age < LIMITATION
+        ):
             choices.append("sue")
         return tuple(choice for choice in choices if COSTS[choice] <= self.cents)
 
@@ -342,8 +359,8 @@ class Agency(Entity):
             choices: The lawful choices.
 
         Returns:
-            One of the choices, by a dunning sequence: two letters, then up to six calls until there is a conversation,
-            then a lawsuit for debts of 500 dollars and more.
+            One of the choices, by a dunning sequence: two letters, then up to six calls until there
+            is a conversation, then a lawsuit for debts of 500 dollars and more.
         """
         if debtor.letters < 2 and "write" in choices:
             return "write"
@@ -352,12 +369,19 @@ class Agency(Entity):
         return "sue" if "sue" in choices and debtor.balance >= 500_00 else "leave"
 
     def work(self) -> None:
-        """Decide on all cases that are due, those due longest first; there is no work on weekends."""
+        """Decide on all cases that are due, those due longest first.
+
+        There is no work on weekends.
+        """
         day = self.world.month
         if day % 7 >= 5:
             return
         self.calls_left = self.parameters.calls
-        opened = [debtor for debtor in self.cases.values() if debtor.status == "open" and debtor.due <= day]
+        opened = [
+            debtor
+            for debtor in self.cases.values()
+            if debtor.status == "open" and debtor.due <= day
+        ]
         self.queue.extend(sorted(opened, key=lambda debtor: debtor.due))
         while self.queue:
             debtor = self.queue.popleft()
@@ -400,10 +424,18 @@ class Agency(Entity):
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run an agency, and print its results."""
-    parser = argparse.ArgumentParser(description="Run a debt collection agency by its own rule, and print its results.")
-    parser.add_argument("--days", type=int, default=720, help="how many days to simulate (default: 720)")
-    parser.add_argument("--calls", type=int, default=Parameters.calls, help="calls per working day (default: 4)")
-    parser.add_argument("--seed", type=int, help="seed of all randomness (default: a new one each time)")
+    parser = argparse.ArgumentParser(
+        description="Run a debt collection agency by its own rule, and print its results."
+    )
+    parser.add_argument(
+        "--days", type=int, default=720, help="how many days to simulate (default: 720)"
+    )
+    parser.add_argument(
+        "--calls", type=int, default=Parameters.calls, help="calls per working day (default: 4)"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="seed of all randomness (default: a new one each time)"
+    )
     options = parser.parse_args(arguments)
     agency = Agency(options.seed, Parameters(calls=options.calls))
     print(" day  cases   owed, dollars  profit, dollars")

@@ -52,14 +52,17 @@ def draw(
         path: The file to write.
         title: The title of the picture.
         notes: By the title of a team, what to write beside its return.
-        curves: By the title of each team that was trained, the mean return of each candidate of each generation.
+        curves: By the title of each team that was trained, the mean return of each candidate of
+            each generation.
     """
     colours = dict(zip(returns, (COLOURS[0], *COLOURS[1 - len(returns) :]), strict=True))
     figure = Figure(figsize=(12, 6.6), layout=ConstrainedLayoutEngine(h_pad=0.1, w_pad=0.1))
     FigureCanvasAgg(figure)  # no window, no state of pyplot
     figure.suptitle(title, x=0.01, ha="left", fontsize=14, fontweight="bold", color=INK)
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.05), height_ratios=(1.4, 1))
-    _draw_returns(figure.add_subplot(grid[0 if curves else slice(None), 0]), returns, colours, notes or {})
+    _draw_returns(
+        figure.add_subplot(grid[0 if curves else slice(None), 0]), returns, colours, notes or {}
+    )
     if curves:
         _draw_learning(figure.add_subplot(grid[1, 0]), curves, colours)
     _draw_alive(days := figure.add_subplot(grid[0, 1]), alive, colours)
@@ -68,13 +71,23 @@ def draw(
 
 
 def _draw_returns(
-    axes: Axes, returns: Mapping[str, Sequence[float]], colours: Mapping[str, str], notes: Mapping[str, str]
+    axes: Axes,
+    returns: Mapping[str, Sequence[float]],
+    colours: Mapping[str, str],
+    notes: Mapping[str, str],
 ) -> None:
     jitter = np.random.default_rng(0)
     for row, (title, values) in enumerate(returns.items()):
         mean, spread = float(np.mean(values)), float(np.std(values))
         axes.barh(row, mean, height=0.62, color=colours[title], xerr=spread, ecolor=INK, capsize=3)
-        axes.scatter(values, row + jitter.uniform(-0.2, 0.2, len(values)), s=7, color=INK, alpha=0.35, linewidths=0)
+        axes.scatter(
+            values,
+            row + jitter.uniform(-0.2, 0.2, len(values)),
+            s=7,
+            color=INK,
+            alpha=0.35,
+            linewidths=0,
+        )
         text = axes.annotate(
             f"{mean:.1f}",
             (max(*values, mean + spread), row),
@@ -99,12 +112,18 @@ def _draw_returns(
     axes.invert_yaxis()
     axes.set_xlim(min(0.0, axes.get_xlim()[0]), 107)
     axes.axvline(0, color=INK, linewidth=0.8)
-    axes.set_title("Return of the team in greenhouses that it was not trained on", loc="left", fontsize=11)
-    axes.set_xlabel("share of plants alive minus litres poured / 1000, summed over 100 days", fontsize=9)
+    axes.set_title(
+        "Return of the team in greenhouses that it was not trained on", loc="left", fontsize=11
+    )
+    axes.set_xlabel(
+        "share of plants alive minus litres poured / 1000, summed over 100 days", fontsize=9
+    )
     _tidy(axes, "x")
 
 
-def _draw_learning(axes: Axes, curves: Mapping[str, Sequence[NDArray[np.float64]]], colours: Mapping[str, str]) -> None:
+def _draw_learning(
+    axes: Axes, curves: Mapping[str, Sequence[NDArray[np.float64]]], colours: Mapping[str, str]
+) -> None:
     for title, generations in curves.items():
         numbers = range(1, len(generations) + 1)
         mean, best = np.mean(generations, axis=1), np.max(generations, axis=1)
@@ -130,11 +149,18 @@ def _draw_alive(axes: Axes, alive: Mapping[str, NDArray[Any]], colours: Mapping[
     _tidy(axes, "y")
 
 
-def _draw_poured(axes: Axes, poured: Mapping[str, NDArray[Any]], colours: Mapping[str, str]) -> None:
+def _draw_poured(
+    axes: Axes, poured: Mapping[str, NDArray[Any]], colours: Mapping[str, str]
+) -> None:
     for title, litres in poured.items():
-        axes.plot(np.arange(litres.shape[1]), litres.mean(axis=0), color=colours[title], linewidth=1.6)
-    axes.set_yscale("function", functions=(lambda litres: np.sqrt(np.maximum(litres, 0)), np.square))
-    axes.set_yticks([0, 25, 50, 100, 200, 400, 600])  # random actions pour 500 on the first days, the others below 100
+        axes.plot(
+            np.arange(litres.shape[1]), litres.mean(axis=0), color=colours[title], linewidth=1.6
+        )
+    axes.set_yscale(
+        "function", functions=(lambda litres: np.sqrt(np.maximum(litres, 0)), np.square)
+    )
+    # random actions pour 500 on the first days, the others below 100
+    axes.set_yticks([0, 25, 50, 100, 200, 400, 600])
     axes.set_ylim(0, None)
     axes.set_title("Litres poured on each day (mean; square-root scale)", loc="left", fontsize=11)
     axes.set_xlabel("day", fontsize=9)

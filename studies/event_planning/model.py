@@ -15,7 +15,10 @@ JOBS: Final = 16
 """The number of jobs, and of decisions, of an episode. It ends when all are done."""
 
 MEANS: Final = (0.9, 1.8, 3.6)
-"""The mean processing times of the machines, the fastest first. Jobs arrive once in a unit of time in the mean."""
+"""The mean processing times of the machines, the fastest first.
+
+Jobs arrive once in a unit of time in the mean.
+"""
 
 STATIONS: Final = (0.8, 0.9)
 """The mean service times of the two stations."""
@@ -31,7 +34,10 @@ class Work:
     """A SimPy model in which jobs arrive. The costs are the times that all jobs are there."""
 
     separate = True
-    """Whether arrivals and each server have a random generator for themselves; else all have the same one."""
+    """Whether arrivals and each server have a random generator for themselves.
+
+    Else all have the same one.
+    """
 
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode."""
@@ -79,7 +85,10 @@ class Work:
 
 
 class Factory(Work):
-    """Three machines of unequal speed, each with a queue. The rule sends each job to the shortest queue."""
+    """Three machines of unequal speed, each with a queue.
+
+    The rule sends each job to the shortest queue.
+    """
 
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode."""
@@ -122,7 +131,10 @@ class SharedFactory(Factory):
 
 
 class Network(Work):
-    """Two stations in series. The rule admits each job, unless very many are there; a job that is refused costs."""
+    """Two stations in series.
+
+    The rule admits each job, unless very many are there; a job that is refused costs.
+    """
 
     def reset(self, seed: int | None = None) -> None:
         """Begin an episode."""

@@ -1,7 +1,8 @@
 """An experiment: one model, five questions, three learning libraries.
 
-The five questions concern the same greenhouse. They differ in which decisions learn, and in what the other decision
-does meanwhile. Neither the model nor its definitions change between questions, only the view of the simulation.
+The five questions concern the same greenhouse. They differ in which decisions learn, and in what
+the other decision does meanwhile. Neither the model nor its definitions change between questions,
+only the view of the simulation.
 
     questions           the five questions, and the evaluation of trained policies
     runs                shared by all scripts: command line, workers, files

@@ -2,8 +2,8 @@
 
 ``python -m studies.greenhouse_experiment.baselines``
 
-Searches and evolution are those of the module ``train``. They run once with the number of episodes of ``make demo``,
-and once with the learners' budget, at a hundred days per episode.
+Searches and evolution are those of the module ``train``. They run once with the number of episodes
+of ``make demo``, and once with the learners' budget, at a hundred days per episode.
 """
 
 from __future__ import annotations
@@ -25,7 +25,14 @@ from .runs import RUNS, each, write
 
 LIBRARY: Final = "baselines"
 
-TEAMS: Final = ("rule", "random actions", "constant watering", "constant pair", "CMA-ES, watering", "CMA-ES, both")
+TEAMS: Final = (
+    "rule",
+    "random actions",
+    "constant watering",
+    "constant pair",
+    "CMA-ES, watering",
+    "CMA-ES, both",
+)
 """The teams that ``compare`` compares, in its order."""
 
 BESIDE_CURVES: Final[dict[str, Team]] = {
@@ -59,11 +66,23 @@ def search(out: Path, job: tuple[int, int]) -> str:
     if path.exists():
         return f"{path.name} is there already"
     outcomes, _ = compare(episodes, len(FINAL), seed, workers=1)
-    found = {team: asdict(Verdict.of(played)) for team, played in zip(TEAMS, outcomes.values(), strict=True)}
+    found = {
+        team: asdict(Verdict.of(played))
+        for team, played in zip(TEAMS, outcomes.values(), strict=True)
+    }
     found["constant ventilation"] = asdict(constant_ventilation(seed))
     titles = list(outcomes)
     constants = {"constant watering": titles[2], "constant pair": titles[3]}
-    write(path, {"library": LIBRARY, "episodes": episodes, "seed": seed, "constants": constants, "teams": found})
+    write(
+        path,
+        {
+            "library": LIBRARY,
+            "episodes": episodes,
+            "seed": seed,
+            "constants": constants,
+            "teams": found,
+        },
+    )
     return f"{path.name}: CMA-ES pair {found['CMA-ES, both']['value']:.1f}"
 
 
@@ -82,10 +101,26 @@ def beside_curves(out: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the missing searches."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", nargs="+", type=int, default=[600, 3600], help="default: 600 and 3600")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)), metavar="SEED", help="default: 0 to 4")
-    parser.add_argument("--workers", type=int, default=1, help="number of parallel searches, in processes (default: 1)")
-    parser.add_argument("--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)")
+    parser.add_argument(
+        "--episodes", nargs="+", type=int, default=[600, 3600], help="default: 600 and 3600"
+    )
+    parser.add_argument(
+        "--seeds",
+        nargs="+",
+        type=int,
+        default=list(range(5)),
+        metavar="SEED",
+        help="default: 0 to 4",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        help="number of parallel searches, in processes (default: 1)",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     beside_curves(options.out)

@@ -1,8 +1,8 @@
 """The five questions, and the evaluation of the policies that answer them.
 
-Learners see the greenhouse through different views: one agent or two, in turns or in rounds. The evaluation is the
-same for all: as a team in the AEC environment of both agents, on held-out greenhouses, by ``play`` of the module
-``train``, whose return is that of one agent.
+Learners see the greenhouse through different views: one agent or two, in turns or in rounds. The
+evaluation is the same for all: as a team in the AEC environment of both agents, on held-out
+greenhouses, by ``play`` of the module ``train``, whose return is that of one agent.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class Question:
     Attributes:
         title: A short description.
         learners: The agents that learn.
-        fixed: The fixed policies of other agents. Agents that neither learn nor have one follow their rule.
+        fixed: The fixed policies of other agents. Agents that neither learn nor have one follow
+            their rule.
         needs: The question whose trained policy, from the same seed, is a fixed policy here.
     """
 
@@ -71,8 +72,8 @@ Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 def in_turns(agent: str, act: Act) -> Team:
     """Make the team of one learner, which decides on its own observation.
 
-    Its policy also serves ``simenv_marl.simulate`` and the option ``policies``, which pass an info where ``play``
-    passes a space.
+    Its policy also serves ``simenv_marl.simulate`` and the option ``policies``, which pass an info
+    where ``play`` passes a space.
     """
 
     def policy(observation: NDArray[np.float32], _: Any = None) -> NDArray[np.float32]:

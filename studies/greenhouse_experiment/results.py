@@ -1,8 +1,8 @@
 """Learning curves and a table of all runs.
 
-``python -m studies.greenhouse_experiment.results --runs FOLDER`` collects the results of all runs in a folder
-into two CSV files under version control, ``data/curves.csv`` and ``data/finals.csv``, and draws them. Without
-``--runs`` it draws the data of these files, without any training.
+``python -m studies.greenhouse_experiment.results --runs FOLDER`` collects the results of all runs
+in a folder into two CSV files under version control, ``data/curves.csv`` and ``data/finals.csv``,
+and draws them. Without ``--runs`` it draws the data of these files, without any training.
 
 Curves and table show the median and the quartiles over seeds.
 """
@@ -32,7 +32,11 @@ LIBRARIES: Final = {
     "torchrl": "TorchRL: PPO",
     "rllib": "RLlib: PPO",
 }
-NAMES: Final = {("torchrl", "4a"): "TorchRL: IPPO", ("torchrl", "4b"): "TorchRL: MAPPO", ("rllib", "4a"): "RLlib: IPPO"}
+NAMES: Final = {
+    ("torchrl", "4a"): "TorchRL: IPPO",
+    ("torchrl", "4b"): "TorchRL: MAPPO",
+    ("rllib", "4a"): "RLlib: IPPO",
+}
 """The names of a library's PPO in these cases."""
 
 MEASURED: Final = ("value", "alive", "litres")
@@ -107,7 +111,11 @@ def _baselines(searches: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         seed, episodes = search["seed"], search["episodes"]
         for team, verdict in search["teams"].items():
             if team.startswith("CMA-ES"):
-                row = {"question": f"{team}, {episodes} episodes", "seed": seed, "days": episodes * DAYS}
+                row = {
+                    "question": f"{team}, {episodes} episodes",
+                    "seed": seed,
+                    "days": episodes * DAYS,
+                }
             elif episodes == most:
                 row = {"question": team, "seed": seed, "days": 0}
             else:
@@ -141,7 +149,11 @@ def table(finals: pd.DataFrame) -> str:
                 (
                     title(library, question),
                     name(library, question),
-                    "" if not days else f"at most {days:,}" if library == "baselines" else f"{days:,}",
+                    ""
+                    if not days
+                    else f"at most {days:,}"
+                    if library == "baselines"
+                    else f"{days:,}",
                     str(len(runs)),
                     f"{median:.1f}",
                     f"{low:.1f} to {high:.1f}",
@@ -151,7 +163,17 @@ def table(finals: pd.DataFrame) -> str:
                 ),
             )
         )
-    head = ("who decides", "learner", "days", "seeds", "return", "quartiles", "worst", "alive in the end", "litres")
+    head = (
+        "who decides",
+        "learner",
+        "days",
+        "seeds",
+        "return",
+        "quartiles",
+        "worst",
+        "alive in the end",
+        "litres",
+    )
     lines = ["| " + " | ".join(head) + " |", "| --- | --- |" + " ---: |" * (len(head) - 2)]
     lines += ["| " + " | ".join(cells) + " |" for _, cells in sorted(rows)]
     return "\n".join(lines) + "\n"
@@ -175,7 +197,9 @@ def draw_curves(curves: pd.DataFrame, path: Path) -> None:
             runs = curves[(curves.library == library) & (curves.question == question)]
             if runs.empty:
                 continue
-            low, median, high = (runs.groupby("days").value.quantile(share) for share in (0.25, 0.5, 0.75))
+            low, median, high = (
+                runs.groupby("days").value.quantile(share) for share in (0.25, 0.5, 0.75)
+            )
             axes.fill_between(median.index, low, high, color=colour, alpha=0.2, linewidth=0)
             label = f"({question}) {QUESTIONS[question].title}"
             if axes is right:
@@ -188,7 +212,9 @@ def draw_curves(curves: pd.DataFrame, path: Path) -> None:
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, frameon=False, loc="center right", bbox_to_anchor=(1, 0.36))
         _tidy(axes, "y")
-    left.set_ylabel("return of the team on 8 greenhouses: median and quartiles over seeds", fontsize=9)
+    left.set_ylabel(
+        "return of the team on 8 greenhouses: median and quartiles over seeds", fontsize=9
+    )
     _save(figure, path)
 
 
@@ -201,14 +227,23 @@ def _draw_lines(axes: Axes, curves: pd.DataFrame) -> None:
             axes.axhline(median, color=colour, linewidth=1.1, linestyle=(0, (4, 3)))
             place: Any = ("axes fraction", "data")
             axes.annotate(
-                label, (1, median), (0, 2), place, textcoords="offset points", ha="right", fontsize=7.5, color=colour
+                label,
+                (1, median),
+                (0, 2),
+                place,
+                textcoords="offset points",
+                ha="right",
+                fontsize=7.5,
+                color=colour,
             )
 
 
 def draw_finals(finals: pd.DataFrame, path: Path) -> None:
     """Draw the final results: a dot for each seed, a line for the median, and a bar between the quartiles."""
     groups = list(finals.groupby(["library", "question"], sort=False))
-    groups.sort(key=lambda group: _place(group[0][0], group[0][1], group[1].value.median()), reverse=True)
+    groups.sort(
+        key=lambda group: _place(group[0][0], group[0][1], group[1].value.median()), reverse=True
+    )
     figure = new_figure(12, 0.8 + 0.34 * len(groups))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.6))
     for axes in (left, right):
@@ -217,7 +252,9 @@ def draw_finals(finals: pd.DataFrame, path: Path) -> None:
             low, median, high = runs.value.quantile([0.25, 0.5, 0.75])
             axes.barh(row, high - low, left=low, height=0.56, color=colour, alpha=0.3)
             axes.plot([median, median], [row - 0.33, row + 0.33], color=colour, linewidth=2)
-            axes.scatter(runs.value, [row] * len(runs), s=13, color=INK, alpha=0.6, linewidths=0, zorder=3)
+            axes.scatter(
+                runs.value, [row] * len(runs), s=13, color=INK, alpha=0.6, linewidths=0, zorder=3
+            )
         axes.set_xlabel("return of the team", fontsize=9)
         _tidy(axes, "x")
     most = finals.value.max()
@@ -233,7 +270,9 @@ def draw_finals(finals: pd.DataFrame, path: Path) -> None:
             va="center",
             color=INK,
         )
-    left.set_yticks(range(len(groups)), [f"{title(*key)}  {name(*key)}".rstrip() for key, _ in groups])
+    left.set_yticks(
+        range(len(groups)), [f"{title(*key)}  {name(*key)}".rstrip() for key, _ in groups]
+    )
     left.set_title("Held-out greenhouses", loc="left", fontsize=11)
     right.set_title("The same, above three quarters of the best return", loc="left", fontsize=11)
     _save(figure, path)
@@ -256,10 +295,19 @@ def _save(figure: Figure, path: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Collect the results, print the table, draw the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--runs", type=Path, help="first collect the runs in this folder")
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the CSV files (default: %(default)s)")
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for the figures (default: %(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=DATA, help="folder of the CSV files (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--figures",
+        type=Path,
+        default=FIGURES,
+        help="folder for the figures (default: %(default)s)",
+    )
     options = parser.parse_args(arguments)
     files = {kind: options.data / f"{kind}.csv" for kind in ("curves", "finals")}
     if options.runs is not None:

@@ -1,14 +1,15 @@
 """Question 4a, answered by RLlib's PPO (new API stack), with one module per agent.
 
-Run ``python -m studies.greenhouse_experiment.rllib`` in a virtual environment with ``ray[rllib]``, whose
-dependencies conflict with those of the other libraries.
+Run ``python -m studies.greenhouse_experiment.rllib`` in a virtual environment with ``ray[rllib]``,
+whose dependencies conflict with those of the other libraries.
 
-RLlib's own wrapper contains the PettingZoo parallel environment. Learning is, as far as the libraries allow, the same
-as in ``sb3`` and ``torchrl``:
+RLlib's own wrapper contains the PettingZoo parallel environment. Learning is, as far as the
+libraries allow, the same as in ``sb3`` and ``torchrl``:
 
 - RLlib itself rescales actions from [-1, 1]. Their standard deviation is a parameter of each module
   (``free_log_std``), and starts at 0.37.
-- Rewards are divided by 20, about the standard deviation of returns, and the critic's error is not clipped.
+- Rewards are divided by 20, about the standard deviation of returns, and the critic's error is not
+  clipped.
 """
 
 from __future__ import annotations
@@ -75,7 +76,11 @@ class ScaledRewards(BaseParallelWrapper):
     def step(self, actions: Mapping[str, Any]) -> Any:
         """Step the environment, and scale the rewards."""
         observations, rewards, *others = super().step(actions)
-        return observations, {agent: reward * REWARD_SCALE for agent, reward in rewards.items()}, *others
+        return (
+            observations,
+            {agent: reward * REWARD_SCALE for agent, reward in rewards.items()},
+            *others,
+        )
 
 
 def environment(_: Mapping[str, Any]) -> ParallelPettingZooEnv:
@@ -114,7 +119,14 @@ def learn(run: Run) -> Verdict:
     modules = [algorithm.get_module(agent) for agent in BOTH]
     team = team_of(run.asked, partial(act, modules))
     log = Log(
-        run, {"greenhouses": GREENHOUSES, **SETTINGS, "cells": CELLS, "reward_scale": REWARD_SCALE, "log_std": LOG_STD}
+        run,
+        {
+            "greenhouses": GREENHOUSES,
+            **SETTINGS,
+            "cells": CELLS,
+            "reward_scale": REWARD_SCALE,
+            "log_std": LOG_STD,
+        },
     )
     log.judge(0, team)
     size = SETTINGS["train_batch_size_per_learner"]
@@ -135,7 +147,9 @@ def start() -> None:
     """Start Ray, within this process alone."""
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     if not ray.is_initialized():
-        ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        ray.init(
+            num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR
+        )
 
 
 def act(modules: Sequence[RLModule], observation: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -147,14 +161,19 @@ def act(modules: Sequence[RLModule], observation: NDArray[np.float32]) -> NDArra
     """
     batch = {"obs": torch.from_numpy(observation)[None]}
     with torch.no_grad():
-        means = [float(module.forward_inference(batch)["action_dist_inputs"][0, 0]) for module in modules]
+        means = [
+            float(module.forward_inference(batch)["action_dist_inputs"][0, 0]) for module in modules
+        ]
     return np.asarray((np.clip(means, -1, 1) + 1) / 2, np.float32)
 
 
 def load(run: Run) -> Team:
     """Load the team that a run has trained."""
     if not run.stem.is_dir():
-        raise SystemExit(f"{run.stem} is missing: question {run.question} of seed {run.seed} has to be answered first")
+        raise SystemExit(
+            f"{run.stem} is missing: question {run.question} of seed {run.seed} has to be answered"
+            " first"
+        )
     modules = [RLModule.from_checkpoint((run.stem / agent).absolute()) for agent in BOTH]
     return team_of(run.asked, partial(act, modules))
 

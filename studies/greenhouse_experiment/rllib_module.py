@@ -1,7 +1,8 @@
 """RLlib's default module with less initial exploration.
 
-A checkpoint of RLlib contains the name of the module's class and of its Python module. So the class is not in a
-script, whose name is ``__main__``, or ``__mp_main__`` in a worker, and something else where the checkpoint is loaded.
+A checkpoint of RLlib contains the name of the module's class and of its Python module. So the class
+is not in a script, whose name is ``__main__``, or ``__mp_main__`` in a worker, and something else
+where the checkpoint is loaded.
 """
 
 from __future__ import annotations

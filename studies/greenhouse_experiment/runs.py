@@ -1,8 +1,9 @@
 """Shared by all scripts of the experiment: command line, processes, files.
 
-A run is one question, answered by one library from one seed. It writes a JSON file with its results, and beside it the
-files from which the library can load the policy. A run whose JSON file exists is not repeated: an interrupted script
-resumes with the run that it was at, which starts from the beginning.
+A run is one question, answered by one library from one seed. It writes a JSON file with its
+results, and beside it the files from which the library can load the policy. A run whose JSON file
+exists is not repeated: an interrupted script resumes with the run that it was at, which starts from
+the beginning.
 """
 
 from __future__ import annotations
@@ -123,7 +124,9 @@ def write(path: Path, found: Any) -> None:
     unfinished.replace(path)
 
 
-def parser(description: str, *, budget: int, questions: Iterable[str] = ()) -> argparse.ArgumentParser:
+def parser(
+    description: str, *, budget: int, questions: Iterable[str] = ()
+) -> argparse.ArgumentParser:
     """Make the command line parser of a script.
 
     Args:
@@ -133,11 +136,29 @@ def parser(description: str, *, budget: int, questions: Iterable[str] = ()) -> a
     """
     made = argparse.ArgumentParser(description=description)
     if questions := list(questions):
-        made.add_argument("--questions", nargs="+", choices=questions, default=questions, metavar="QUESTION")
-    made.add_argument("--seeds", nargs="+", type=int, default=list(range(5)), metavar="SEED", help="default: 0 to 4")
-    made.add_argument("--budget", type=int, default=budget, help="simulated days for each run (default: %(default)s)")
-    made.add_argument("--workers", type=int, default=1, help="parallel runs, in processes (default: %(default)s)")
-    made.add_argument("--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)")
+        made.add_argument(
+            "--questions", nargs="+", choices=questions, default=questions, metavar="QUESTION"
+        )
+    made.add_argument(
+        "--seeds",
+        nargs="+",
+        type=int,
+        default=list(range(5)),
+        metavar="SEED",
+        help="default: 0 to 4",
+    )
+    made.add_argument(
+        "--budget",
+        type=int,
+        default=budget,
+        help="simulated days for each run (default: %(default)s)",
+    )
+    made.add_argument(
+        "--workers", type=int, default=1, help="parallel runs, in processes (default: %(default)s)"
+    )
+    made.add_argument(
+        "--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)"
+    )
     return made
 
 
@@ -146,7 +167,8 @@ def carry_out(library: str, learn: Callable[[Run], Verdict], options: argparse.N
 
     Args:
         library: The learning library.
-        learn: The function that carries out one run; at module level, so that other processes can import it.
+        learn: The function that carries out one run; at module level, so that other processes can
+            import it.
         options: The options of the command line.
     """
     options.out.mkdir(parents=True, exist_ok=True)
@@ -156,7 +178,10 @@ def carry_out(library: str, learn: Callable[[Run], Verdict], options: argparse.N
         for seed in options.seeds
     ]
     # runs that need the policy of another run come last
-    for stage in ([run for run in runs if not run.asked.needs], [run for run in runs if run.asked.needs]):
+    for stage in (
+        [run for run in runs if not run.asked.needs],
+        [run for run in runs if run.asked.needs],
+    ):
         pending = [run for run in stage if not _done(run)]
         for run, verdict in zip(pending, each(learn, pending, options.workers), strict=True):
             _tell(run, verdict)
@@ -168,8 +193,8 @@ def each(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
     Args:
         function: The function that runs a job; it must be picklable.
         jobs: The arguments of the function.
-        workers: The number of processes. The calling process is none of them, because the hash seed is fixed in the
-            workers: RLlib's results depend on the order of sets of strings.
+        workers: The number of processes. The calling process is none of them, because the hash seed
+            is fixed in the workers: RLlib's results depend on the order of sets of strings.
     """
     os.environ["PYTHONHASHSEED"] = "0"
     context = multiprocessing.get_context("spawn")  # a process with threads should not fork
@@ -183,8 +208,8 @@ def _done(run: Run) -> bool:
     budget = json.loads(run.file.read_text(encoding="utf-8"))["budget"]
     if budget != run.budget:
         raise SystemExit(
-            f"{run.file} is of a run with a budget of {budget} days, not {run.budget}: give --budget {budget},"
-            " or another folder as --out"
+            f"{run.file} is of a run with a budget of {budget} days, not {run.budget}: give"
+            f" --budget {budget}, or another folder as --out"
         )
     print(f"{run.file.name} is there already")
     return True
@@ -192,7 +217,8 @@ def _done(run: Run) -> bool:
 
 def _tell(run: Run, verdict: Verdict) -> None:
     print(
-        f"{run.library} {run.question} ({run.asked.title}), seed {run.seed}: return {verdict.value:.1f},"
+        f"{run.library} {run.question} ({run.asked.title}), seed {run.seed}: return"
+        f" {verdict.value:.1f},"
         f" {verdict.alive:.0f} plants alive, {verdict.litres:.0f} litres",
         flush=True,
     )

@@ -5,10 +5,10 @@
 Questions differ in their environment alone. Learning is the same for all of them:
 
 - Gymnasium's wrapper rescales actions from [-1, 1], as the library recommends.
-- The library's ``VecNormalize`` divides rewards by the standard deviation of returns. Observations stay as they are,
-  between 0 and 1.
-- The standard deviation of actions starts at 0.37 instead of 1 (``log_std_init``). With 1, nearly a third of all
-  actions would lie outside the space and be clipped to its bounds.
+- The library's ``VecNormalize`` divides rewards by the standard deviation of returns. Observations
+  stay as they are, between 0 and 1.
+- The standard deviation of actions starts at 0.37 instead of 1 (``log_std_init``). With 1, nearly a
+  third of all actions would lie outside the space and be clipped to its bounds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,14 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 import torch
-from examples.greenhouse_coop.env import VENTILATION, WATERING, GreenhouseSim, joint_env, ventilation_env, watering_env
+from examples.greenhouse_coop.env import (
+    VENTILATION,
+    WATERING,
+    GreenhouseSim,
+    joint_env,
+    ventilation_env,
+    watering_env,
+)
 from examples.greenhouse_coop.train import Team
 from gymnasium.wrappers import RescaleAction
 from numpy.typing import NDArray
@@ -86,14 +93,17 @@ def learn(run: Run) -> Verdict:
     def make() -> gymnasium.Env[Any, Any]:
         return RescaleAction(environment(run, fixed), np.float32(-1), np.float32(1))
 
-    greenhouses = VecNormalize(DummyVecEnv([make] * GREENHOUSES), norm_obs=False, gamma=SETTINGS["gamma"])
+    greenhouses = VecNormalize(
+        DummyVecEnv([make] * GREENHOUSES), norm_obs=False, gamma=SETTINGS["gamma"]
+    )
     model = PPO("MlpPolicy", greenhouses, seed=run.seed, device="cpu", **SETTINGS)
     team = {**fixed, **team_of(run.asked, partial(act, model))}
     log = Log(run, {"greenhouses": GREENHOUSES, **SETTINGS})
     log.judge(0, team)
     while model.num_timesteps < run.budget:
         days = min(DAYS_A_POINT, run.budget - model.num_timesteps)
-        model.learn(days, reset_num_timesteps=False)  # in whole rollouts: the last one may exceed the budget
+        # in whole rollouts: the last one may exceed the budget
+        model.learn(days, reset_num_timesteps=False)
         log.judge(model.num_timesteps, team)
     model.save(run.stem.with_suffix(".zip"))
     greenhouses.close()
@@ -105,8 +115,8 @@ def act(model: PPO, observation: NDArray[np.float32]) -> NDArray[np.float32]:
 
     Args:
         model: The model.
-        observation: The observation of one agent, float32 ``(6,)``. The joint agent decides at the beginning of a day,
-            when both of its parts observe the same.
+        observation: The observation of one agent, float32 ``(6,)``. The joint agent decides at the
+            beginning of a day, when both of its parts observe the same.
     """
     (size,) = model.observation_space.shape
     actions, _ = model.predict(np.tile(observation, size // len(observation)), deterministic=True)
@@ -117,7 +127,10 @@ def load(run: Run) -> Team:
     """Load the team that a run has trained."""
     path = run.stem.with_suffix(".zip")
     if not path.exists():
-        raise SystemExit(f"{path} is missing: question {run.question} of seed {run.seed} has to be answered first")
+        raise SystemExit(
+            f"{path} is missing: question {run.question} of seed {run.seed} has to be answered"
+            " first"
+        )
     learnt: Act = partial(act, PPO.load(path, device="cpu"))
     return {**fixed_in(run), **team_of(run.asked, learnt)}
 

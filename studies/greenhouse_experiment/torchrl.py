@@ -2,18 +2,21 @@
 
 ``python -m studies.greenhouse_experiment.torchrl``
 
-Two agents, each with its own network, decide in rounds in the PettingZoo parallel environment. In 4a each agent has its
-own critic, which sees the agent's observation (IPPO). In 4b there is one centralised critic (MAPPO), which sees the
-simulation's ``state()``; a subclass defines it here, outside of the model. The concatenated observations would not do
-as a state: in a round both agents observe the same, so they contain no more than each agent knows.
+Two agents, each with its own network, decide in rounds in the PettingZoo parallel environment. In
+4a each agent has its own critic, which sees the agent's observation (IPPO). In 4b there is one
+centralised critic (MAPPO), which sees the simulation's ``state()``; a subclass defines it here,
+outside of the model. The concatenated observations would not do as a state: in a round both agents
+observe the same, so they contain no more than each agent knows.
 
-Networks, advantages and losses are TorchRL's. TorchRL also has a wrapper for PettingZoo environments and a collector,
-but as the greenhouse is fast, they would take most of the time. Instead, sixteen environments run in parallel here, and
-one call of the networks decides for all of them.
+Networks, advantages and losses are TorchRL's. TorchRL also has a wrapper for PettingZoo
+environments and a collector, but as the greenhouse is fast, they would take most of the time.
+Instead, sixteen environments run in parallel here, and one call of the networks decides for all of
+them.
 
 Learning is, as far as the libraries allow, the same as in ``sb3``:
 
-- Actions are normally distributed, clipped to [-1, 1] and rescaled; their standard deviation starts at 0.37.
+- Actions are normally distributed, clipped to [-1, 1] and rescaled; their standard deviation starts
+  at 0.37.
 - Rewards are divided by 20, about the standard deviation of returns.
 """
 
@@ -78,10 +81,17 @@ class WholeGreenhouse(GreenhouseSim):
     def state(self) -> NDArray[np.float64]:
         """Weather and day, and the deciles of water, health and thirst of all plants: ``(36,)``."""
         greenhouse = self.greenhouse
-        plants = np.array([(plant.water / POT_CAPACITY, plant.health, plant.req_water) for plant in greenhouse.pots])
+        plants = np.array(
+            [
+                (plant.water / POT_CAPACITY, plant.health, plant.req_water)
+                for plant in greenhouse.pots
+            ]
+        )
         warmth = (greenhouse.temp - LOWEST_TEMPERATURE) / (HIGHEST_TEMPERATURE - LOWEST_TEMPERATURE)
         weather = (warmth, min(greenhouse.humidity, 2.0), greenhouse.day / DAYS)
-        return np.concatenate([weather, np.quantile(np.minimum(plants, 2.0), LEVELS, axis=0).ravel()])
+        return np.concatenate(
+            [weather, np.quantile(np.minimum(plants, 2.0), LEVELS, axis=0).ravel()]
+        )
 
 
 class Greenhouses:
@@ -91,22 +101,30 @@ class Greenhouses:
         """Create the environments.
 
         Args:
-            question: The key of the question: the environments have a state for a centralised critic alone.
+            question: The key of the question: the environments have a state for a centralised
+                critic alone.
             seed: The seed of the greenhouses.
         """
         self._central = question == "4b"
         self._environments = [self._furnished() for _ in range(GREENHOUSES)]
         seeds = np.random.SeedSequence(seed).generate_state(GREENHOUSES) % 2**31
-        self._seen = [self._reset(each, int(own)) for each, own in zip(self._environments, seeds, strict=True)]
+        self._seen = [
+            self._reset(each, int(own)) for each, own in zip(self._environments, seeds, strict=True)
+        ]
 
     def _furnished(self) -> SimulationParallelEnv:
-        return parallel_env(WholeGreenhouse, state_space=STATE) if self._central else parallel_env(GreenhouseSim)
+        return (
+            parallel_env(WholeGreenhouse, state_space=STATE)
+            if self._central
+            else parallel_env(GreenhouseSim)
+        )
 
     def collect(self, actor: ProbabilisticActor) -> TensorDict:
         """Collect a batch with an actor that explores.
 
         Returns:
-            A batch of shape ``(greenhouses, days)``, with the keys that TorchRL's losses and value estimators expect.
+            A batch of shape ``(greenhouses, days)``, with the keys that TorchRL's losses and value
+            estimators expect.
         """
         days = []
         for _ in range(SETTINGS["days"]):
@@ -114,7 +132,9 @@ class Greenhouses:
             with torch.no_grad():
                 actor(day)
             actions = rescaled(day["agents", "action"])
-            played = [self._play(each, own) for each, own in zip(self._environments, actions, strict=True)]
+            played = [
+                self._play(each, own) for each, own in zip(self._environments, actions, strict=True)
+            ]
             day["next"] = self._stacked([seen for seen, *_ in played])
             for number, name in enumerate(("reward", "terminated", "done"), 1):
                 values = np.array([row[number] for row in played])
@@ -126,8 +146,12 @@ class Greenhouses:
             ]
         return torch.stack(days, dim=1)
 
-    def _play(self, environment: SimulationParallelEnv, actions: NDArray[np.float32]) -> tuple[Any, ...]:
-        observations, rewards, terminations, truncations, _ = environment.step(dict(zip(BOTH, actions, strict=True)))
+    def _play(
+        self, environment: SimulationParallelEnv, actions: NDArray[np.float32]
+    ) -> tuple[Any, ...]:
+        observations, rewards, terminations, truncations, _ = environment.step(
+            dict(zip(BOTH, actions, strict=True))
+        )
         terminated = np.array([terminations[agent] for agent in BOTH])
         truncated = np.array([truncations[agent] for agent in BOTH])
         scaled = np.array([rewards[agent] for agent in BOTH], np.float32) * SETTINGS["reward_scale"]
@@ -143,7 +167,9 @@ class Greenhouses:
         return np.stack([observations[agent] for agent in BOTH]), state
 
     def _stacked(self, seen: Sequence[Any]) -> TensorDict:
-        observations, states = (torch.from_numpy(np.stack(parts)) for parts in zip(*seen, strict=True))
+        observations, states = (
+            torch.from_numpy(np.stack(parts)) for parts in zip(*seen, strict=True)
+        )
         agents = TensorDict({"observation": observations}, [len(seen), 2])
         return TensorDict({"agents": agents, "state": states}, [len(seen)])
 
@@ -156,7 +182,8 @@ class Networks:
     """The networks that learn.
 
     Attributes:
-        means: Maps observations, ``(..., 2, 6)``, to the means of actions before rescaling, ``(..., 2, 1)``.
+        means: Maps observations, ``(..., 2, 6)``, to the means of actions before rescaling,
+            ``(..., 2, 1)``.
         actor: TorchRL's actor on top of these means: distributions of actions.
         critic: The estimate of the value, ``(..., 2, 1)``.
     """
@@ -171,14 +198,17 @@ class Networks:
         cells: dict[str, Any] = {"num_cells": SETTINGS["cells"], "activation_class": nn.Tanh}
         own: dict[str, Any] = {"n_agents": 2, "centralized": False, "share_params": False, **cells}
         observation, loc, scale, action, log_prob, value = (
-            ("agents", name) for name in ("observation", "loc", "scale", "action", "log_prob", "state_value")
+            ("agents", name)
+            for name in ("observation", "loc", "scale", "action", "log_prob", "state_value")
         )
         means = MultiAgentMLP(len(OBSERVED), 1, **own)
         if question == "4b":
             whole = nn.Sequential(MLP(STATE.shape[0], 2, **cells), nn.Unflatten(-1, (2, 1)))
             critic = TensorDictModule(whole, ["state"], [value])
         else:
-            critic = TensorDictModule(MultiAgentMLP(len(OBSERVED), 1, **own), [observation], [value])
+            critic = TensorDictModule(
+                MultiAgentMLP(len(OBSERVED), 1, **own), [observation], [value]
+            )
         deviation = AddStateIndependentNormalScale((2, 1))
         nn.init.constant_(deviation.state_independent_scale, SETTINGS["log_std"])
         actor = ProbabilisticActor(
@@ -186,14 +216,18 @@ class Networks:
             in_keys={"loc": loc, "scale": scale},
             out_keys=[action],
             distribution_class=IndependentNormal,
-            default_interaction_type=ExplorationType.RANDOM,  # outside TorchRL's collectors, the default is the mean
+            # outside TorchRL's collectors, the default is the mean
+            default_interaction_type=ExplorationType.RANDOM,
             return_log_prob=True,
             log_prob_key=log_prob,
         )
         return cls(means, actor, critic)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Compute the agents' actions without exploration. At the beginning of a day, both observe the same."""
+        """Compute the agents' actions without exploration.
+
+        At the beginning of a day, both observe the same.
+        """
         with torch.no_grad():
             means = self.means(torch.from_numpy(observation).expand(2, -1)).reshape(2)
         return rescaled(means)
@@ -242,11 +276,24 @@ class Teacher:
             normalize_advantage=True,
             normalize_advantage_exclude_dims=(-2,),  # separately for each agent
         )
-        names = ("reward", "action", "value", "done", "terminated", "advantage", "value_target", "sample_log_prob")
+        names = (
+            "reward",
+            "action",
+            "value",
+            "done",
+            "terminated",
+            "advantage",
+            "value_target",
+            "sample_log_prob",
+        )
         own = {"value": "state_value", "sample_log_prob": "log_prob"}
         self._loss.set_keys(**{name: ("agents", own.get(name, name)) for name in names})
-        self._loss.make_value_estimator(ValueEstimators.GAE, gamma=SETTINGS["gamma"], lmbda=SETTINGS["lmbda"])
-        self._optimiser = torch.optim.Adam(self._loss.parameters(), SETTINGS["learning_rate"], eps=1e-5)
+        self._loss.make_value_estimator(
+            ValueEstimators.GAE, gamma=SETTINGS["gamma"], lmbda=SETTINGS["lmbda"]
+        )
+        self._optimiser = torch.optim.Adam(
+            self._loss.parameters(), SETTINGS["learning_rate"], eps=1e-5
+        )
 
     def __call__(self, batch: TensorDict) -> None:
         """Learn from a batch, ``(greenhouses, days)``."""
@@ -270,7 +317,10 @@ def load(run: Run) -> Team:
     """Load the team that a run has trained."""
     path = run.stem.with_suffix(".pt")
     if not path.exists():
-        raise SystemExit(f"{path} is missing: question {run.question} of seed {run.seed} has to be answered first")
+        raise SystemExit(
+            f"{path} is missing: question {run.question} of seed {run.seed} has to be answered"
+            " first"
+        )
     networks = Networks.of(run.question)
     networks.means.load_state_dict(torch.load(path))
     return team_of(run.asked, networks.act)

@@ -1,9 +1,9 @@
 """The paper's matrix of experiments: policies that water, over numbers of plants, climates and plugins.
 
-``python -m studies.greenhouse_matrix.matrix`` (or ``make matrix``) trains waterers. They, the model's rule and a
-planner then run the same greenhouses in every combination of the factors, which are those of ``variants.greenhouse``. A
-folder keeps the runs, so that a second call runs only what is missing. The table of all runs gives the figures of
-``docs/greenhouse-matrix.md``.
+``python -m studies.greenhouse_matrix.matrix`` (or ``make matrix``) trains waterers. They, the
+model's rule and a planner then run the same greenhouses in every combination of the factors, which
+are those of ``variants.greenhouse``. A folder keeps the runs, so that a second call runs only what
+is missing. The table of all runs gives the figures of ``docs/greenhouse-matrix.md``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def train(school: Levels, generations: int, seed: int, workers: int) -> Linear:
     """Train a waterer by evolution (CMA-ES).
 
     Args:
-        school: The levels of each factor to train on. All candidates of a generation get the same greenhouses.
+        school: The levels of each factor to train on. All candidates of a generation get the same
+            greenhouses.
         generations: The number of generations.
         seed: The seed of the training.
         workers: The number of processes.
@@ -72,7 +73,9 @@ def train(school: Levels, generations: int, seed: int, workers: int) -> Linear:
     def rate(teams: Sequence[Team], seeds: Iterable[int]) -> NDArray[np.float64]:
         contenders = {str(number): team for number, team in enumerate(teams)}
         played = [
-            evaluate(greenhouse(**rows[seed % len(rows)]), contenders, seeds=[seed], workers=workers).values()
+            evaluate(
+                greenhouse(**rows[seed % len(rows)]), contenders, seeds=[seed], workers=workers
+            ).values()
             for seed in seeds
         ]
         returns: NDArray[np.float64] = np.mean(played, axis=(0, 1))
@@ -97,9 +100,14 @@ def learned(folder: Path, learners: int, generations: int, workers: int) -> dict
             if not path.exists():
                 began = time.monotonic()
                 weights = train(school, generations, number, workers).weights.tolist()
-                print(f"{name} {number}: {generations} generations, {time.monotonic() - began:.0f} s", flush=True)
+                print(
+                    f"{name} {number}: {generations} generations, {time.monotonic() - began:.0f} s",
+                    flush=True,
+                )
                 path.write_text(json.dumps(weights), encoding="utf-8")
-            found[f"{name} {number}"] = Linear(np.array(json.loads(path.read_text(encoding="utf-8"))))
+            found[f"{name} {number}"] = Linear(
+                np.array(json.loads(path.read_text(encoding="utf-8")))
+            )
     return found
 
 
@@ -113,7 +121,8 @@ PORTIONS: Final = tuple(tenths / 10 for tenths in range(7))
 class PortionPlanner:
     """A waterer that plans for any number of pots: it tries out portions per pot, for one day, in one future.
 
-    The terminal value after that day is ``days_left``, so the portion itself is the only decision in a branch.
+    The terminal value after that day is ``days_left``, so the portion itself is the only decision
+    in a branch.
 
     Attributes:
         portions: The portions to try out, in litres per pot.
@@ -127,7 +136,9 @@ class PortionPlanner:
         """Choose an action."""
         pots = len(_environment.simulation.greenhouse.pots)
         actions = [np.array([portion * pots / MOST_WATER], np.float32) for portion in self.portions]
-        planner = RolloutPolicy(actions, base=self.base, futures=1, horizon=1, terminal_value=days_left)
+        planner = RolloutPolicy(
+            actions, base=self.base, futures=1, horizon=1, terminal_value=days_left
+        )
         return planner(observation, info, _environment=_environment)
 
 
@@ -182,23 +193,39 @@ def main(arguments: Sequence[str] | None = None) -> Any:
         The table of all runs.
     """
     parser = argparse.ArgumentParser(description="Which policies water best, and where?")
-    parser.add_argument("--seeds", type=int, default=8, help="greenhouses in each row (default: %(default)s)")
-    parser.add_argument("--learners", type=int, default=5, help="learners per training set (default: %(default)s)")
-    parser.add_argument("--generations", type=int, default=GENERATIONS, help="of learning (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", type=int, default=8, help="greenhouses in each row (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--learners", type=int, default=5, help="learners per training set (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--generations", type=int, default=GENERATIONS, help="of learning (default: %(default)s)"
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for results (default: %(default)s)")
-    parser.add_argument("--figures", type=Path, help="folder for figures and tables (default: the same)")
-    parser.add_argument("--quick", action="store_true", help="a small run, to check that everything works")
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="folder for results (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--figures", type=Path, help="folder for figures and tables (default: the same)"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="a small run, to check that everything works"
+    )
     if parser.parse_args(arguments).quick:
         parser.set_defaults(seeds=2, learners=1, generations=2, out=OUT / "quick")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     waterers = learned(options.out, options.learners, options.generations, options.workers)
     factors = {name: levels[:2] for name, levels in FACTORS.items()} if options.quick else FACTORS
-    contenders = {**waterers, "planned": PortionPlanner(PORTIONS[::3]) if options.quick else PortionPlanner()}
+    contenders = {
+        **waterers,
+        "planned": PortionPlanner(PORTIONS[::3]) if options.quick else PortionPlanner(),
+    }
     table = run(options.out / "runs", factors, contenders, options.seeds, options.workers)
 
-    from . import figures  # imported here, so that forked processes do not load the plotting libraries
+    # imported here, so that forked processes do not load the plotting libraries
+    from . import figures
 
     figures.show(table, options.figures or options.out)
     return table

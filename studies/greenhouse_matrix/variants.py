@@ -1,11 +1,14 @@
 """Variants of the greenhouse: named changes that an experiment makes to the model from outside.
 
-The Sim-Env paper extends its greenhouse twice. ``WARM_EXCHANGE`` is the paper's ``new_air_exchange``: the warmer it is,
-the faster the air is exchanged. ``VENTILATED`` is the extension that the paper suggests: the air exchange calls a newly
-defined decision function, so that a plugin adds a second agent. The model, and environments without these variants,
-stay unchanged. ``greenhouse`` makes the air exchange, the number of plants and the climate factors of an experiment.
+The Sim-Env paper extends its greenhouse twice. ``WARM_EXCHANGE`` is the paper's
+``new_air_exchange``: the warmer it is, the faster the air is exchanged. ``VENTILATED`` is the
+extension that the paper suggests: the air exchange calls a newly defined decision function, so that
+a plugin adds a second agent. The model, and environments without these variants, stay unchanged.
+``greenhouse`` makes the air exchange, the number of plants and the climate factors of an
+experiment.
 
-As a script, the module prints the plants' numbers in each variant, and the provenance of the last one::
+As a script, the module prints the plants' numbers in each variant, and the provenance of the last
+one::
 
     python -m studies.greenhouse_matrix.variants
 """
@@ -73,14 +76,19 @@ def choose_air_exchange(greenhouse: Greenhouse) -> float:
 def decided_air_exchange(greenhouse: Greenhouse) -> None:
     """Exchange the chosen fraction of the air."""
     fraction = choose_air_exchange(greenhouse)
-    greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
+    greenhouse.humidity = (
+        1 - fraction
+    ) * greenhouse.humidity + fraction * greenhouse.outside_humidity
 
 
 BASE = Variant("base", GreenhouseSim, points=WATERING)
 """The unchanged model, watered by an agent."""
 
 WARM_EXCHANGE = Variant(
-    "warm_exchange", GreenhouseSim, points=WATERING, plugins=[(new_air_exchange, AIR_EXCHANGE, "instead")]
+    "warm_exchange",
+    GreenhouseSim,
+    points=WATERING,
+    plugins=[(new_air_exchange, AIR_EXCHANGE, "instead")],
 )
 """Watered by an agent; the warmer it is, the faster the air is exchanged."""
 
@@ -97,7 +105,10 @@ VENTILATED = Variant(
 
 
 def new_temperature(greenhouse: Greenhouse) -> None:
-    """Draw each day's temperature uniformly between its bounds, as in the paper's text; in its code, it is a walk."""
+    """Draw each day's temperature uniformly between its bounds, as in the paper's text.
+
+    In its code, it is a walk.
+    """
     greenhouse.temp = greenhouse.random.randint(LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE)
 
 
@@ -135,7 +146,10 @@ EXCHANGES: Final[Mapping[str, Variant]] = {
     "warm": WARM_EXCHANGE,
     "decided": replace(VENTILATED, policies={VENTILATOR: BEST[VENTILATOR]}),
 }
-"""The air exchange: a fixed fifth of the air; more on warm days; or a decision, here for all of the air."""
+"""The air exchange: a fixed fifth of the air.
+
+More on warm days; or a decision, here for all of the air.
+"""
 
 
 def greenhouse(plants: int, climate: str, exchange: str) -> Variant:

@@ -1,7 +1,8 @@
 """Figures of the value of plans for the greenhouse, by their cost and their horizon.
 
-``python -m studies.greenhouse_plans.figures`` writes the figures ``plan-budget.png`` and ``plan-horizon.png`` and
-the table ``plan.md`` to ``docs/figures``. It takes about ten minutes on two cores.
+``python -m studies.greenhouse_plans.figures`` writes the figures ``plan-budget.png`` and
+``plan-horizon.png`` and the table ``plan.md`` to ``docs/figures``. It takes about ten minutes on
+two cores.
 """
 
 from __future__ import annotations
@@ -14,7 +15,15 @@ from typing import Any, Final
 
 from examples.greenhouse_coop.env import VENTILATOR, WATERER
 from examples.greenhouse_coop.model import Greenhouse
-from examples.greenhouse_coop.plan import BEST, LITRES, CountingPlanner, Kept, days_left, keep, water_planner
+from examples.greenhouse_coop.plan import (
+    BEST,
+    LITRES,
+    CountingPlanner,
+    Kept,
+    days_left,
+    keep,
+    water_planner,
+)
 from examples.greenhouse_coop.train import HELD_OUT
 
 from simenv_marl import RULE
@@ -68,9 +77,17 @@ def share_alive(env: Any) -> float:
 
 LINES: Final = (
     Line("over the pair, all days left", water(BEST[WATERER], days_left), {"color": "#1b6f5f"}),
-    Line("over the pair, one more day", water(BEST[WATERER], share_alive), {"color": "#1b6f5f", "linestyle": "--"}),
+    Line(
+        "over the pair, one more day",
+        water(BEST[WATERER], share_alive),
+        {"color": "#1b6f5f", "linestyle": "--"},
+    ),
     Line("over the rule, all days left", water(RULE, days_left), {"color": "#d1812c"}),
-    Line("over the rule, one more day", water(RULE, share_alive), {"color": "#d1812c", "linestyle": "--"}),
+    Line(
+        "over the rule, one more day",
+        water(RULE, share_alive),
+        {"color": "#d1812c", "linestyle": "--"},
+    ),
     Line("both planned over the rules, all days left", both, {"color": "#8c8c8c"}),
 )
 
@@ -78,14 +95,19 @@ Point = tuple[str, int, int, Kept]
 """The title of a line, the horizon, the number of futures, and the results."""
 
 
-def sweep(lines: Sequence[Line], horizons: Sequence[int], futures: Sequence[int], seeds: Sequence[int]) -> list[Point]:
+def sweep(
+    lines: Sequence[Line], horizons: Sequence[int], futures: Sequence[int], seeds: Sequence[int]
+) -> list[Point]:
     """Run greenhouses with plans of each kind, and print the mean returns."""
     found = []
     for line in lines:
         for horizon in horizons:
             for number in futures:
                 kept = keep(line.make(horizon, number), seeds)
-                print(f"{line.title}; {horizon} days, {number} futures: {kept.returns.mean():.1f}", flush=True)
+                print(
+                    f"{line.title}; {horizon} days, {number} futures: {kept.returns.mean():.1f}",
+                    flush=True,
+                )
                 found.append((line.title, horizon, number, kept))
     return found
 
@@ -107,7 +129,14 @@ def draw(points: Sequence[Point], along: Callable[[Point], float], label: str, p
         own = [point for point in points if point[0] == line.title]
         if own:
             means = [point[3].returns.mean() for point in own]
-            axes.plot([along(point) for point in own], means, marker="o", markersize=4, label=line.title, **line.style)
+            axes.plot(
+                [along(point) for point in own],
+                means,
+                marker="o",
+                markersize=4,
+                label=line.title,
+                **line.style,
+            )
     axes.axhline(BEST_TRAINED, color="#7fb3d3", linewidth=1, label="best trained policy")
     axes.set_xscale("log")
     ticks = sorted({along(point) for point in points})
@@ -130,18 +159,28 @@ def table(points: Sequence[Point]) -> str:
     ]
     for title, horizon, number, kept in points:
         lines.append(
-            f"| {title} | {horizon} | {number * len(LITRES)} | {kept.returns.mean():.1f} | {kept.simulated:,.0f} |"
+            f"| {title} | {horizon} | {number * len(LITRES)} | {kept.returns.mean():.1f} |"
+            f" {kept.simulated:,.0f} |"
         )
     return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run greenhouses, draw both figures and write the table."""
-    parser = argparse.ArgumentParser(description="Draw the value of plans by their cost and their horizon.")
-    parser.add_argument("--seeds", type=int, default=3, help="greenhouses for each point (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        description="Draw the value of plans by their cost and their horizon."
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="greenhouses for each point (default: %(default)s)"
+    )
     parser.add_argument("--horizons", type=int, nargs="+", default=[1, 2, 3, 6, 12], metavar="DAYS")
     parser.add_argument("--futures", type=int, nargs="+", default=[1, 2, 4, 8], metavar="NUMBER")
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for the results (default: %(default)s)")
+    parser.add_argument(
+        "--figures",
+        type=Path,
+        default=FIGURES,
+        help="folder for the results (default: %(default)s)",
+    )
     options = parser.parse_args(arguments)
     seeds = range(HELD_OUT, HELD_OUT + options.seeds)
     reaching = sweep(LINES, options.horizons, [1], seeds)
@@ -153,7 +192,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.figures / "plan-horizon.png",
     )
     branches = f"branches per decision ({len(LITRES)} amounts, horizon of three days)"
-    draw(spending, lambda point: point[2] * len(LITRES), branches, options.figures / "plan-budget.png")
+    draw(
+        spending,
+        lambda point: point[2] * len(LITRES),
+        branches,
+        options.figures / "plan-budget.png",
+    )
     (options.figures / "plan.md").write_text(table([*reaching, *spending]) + "\n", encoding="utf-8")
 
 

@@ -1,26 +1,27 @@
 """Expert iteration: a network learns from a planner, and the planner uses the network as its base policy.
 
-``python -m studies.imitation.plans`` does so in rounds (Anthony, Tian and Barber, 2017) until a budget
-of simulated days is spent. Then the network runs the greenhouses of ``make demo`` without planning. It needs
-``pip install "simenv-marl[many]" torch``.
+``python -m studies.imitation.plans`` does so in rounds (Anthony, Tian and Barber, 2017) until a
+budget of simulated days is spent. Then the network runs the greenhouses of ``make demo`` without
+planning. It needs ``pip install "simenv-marl[many]" torch``.
 
-The planner uses the full state of the greenhouse, because it simulates branches. The network sees six numbers. A
-network that imitates the planner's actions fails: the planner pours as late as each plant can bear, and the network
-cannot see when that is. So the network learns the value of every candidate, and pours what is best given its
-observation:
+The planner uses the full state of the greenhouse, because it simulates branches. The network sees
+six numbers. A network that imitates the planner's actions fails: the planner pours as late as each
+plant can bear, and the network cannot see when that is. So the network learns the value of every
+candidate, and pours what is best given its observation:
 
-- The network acts, so that it learns in the states that it reaches itself (Ross, Gordon and Bagnell, 2011). In a tenth
-  of its decisions, a random amount replaces its own.
-- In a quarter of its decisions, ``action_values`` tries out all candidates, with the network as the base policy.
-- The network gives each candidate a probability, and is trained to maximise the expected value. It pours the expected
-  amount.
+- The network acts, so that it learns in the states that it reaches itself (Ross, Gordon and
+  Bagnell, 2011). In a tenth of its decisions, a random amount replaces its own.
+- In a quarter of its decisions, ``action_values`` tries out all candidates, with the network as the
+  base policy.
+- The network gives each candidate a probability, and is trained to maximise the expected value. It
+  pours the expected amount.
 
-``--plainly`` is for comparison: the planner gives demonstrations for the same budget, and the network imitates its
-actions by the behaviour cloning of the module ``rule``.
+``--plainly`` is for comparison: the planner gives demonstrations for the same budget, and the
+network imitates its actions by the behaviour cloning of the module ``rule``.
 
-The budget counts all simulated days: the days of the episodes, and for the branches the number of candidates times
-futures times the horizon, or the remaining days if they are fewer. Ventilation runs at 100 %, as in question 5a of the
-experiment.
+The budget counts all simulated days: the days of the episodes, and for the branches the number of
+candidates times futures times the horizon, or the remaining days if they are fewer. Ventilation
+runs at 100 %, as in question 5a of the experiment.
 """
 
 from __future__ import annotations
@@ -35,7 +36,14 @@ from unittest.mock import patch
 from zlib import crc32
 
 import numpy as np
-from examples.greenhouse_coop.env import DAYS, MOST_WATER, OBSERVED, VENTILATOR, WATERER, GreenhouseSim
+from examples.greenhouse_coop.env import (
+    DAYS,
+    MOST_WATER,
+    OBSERVED,
+    VENTILATOR,
+    WATERER,
+    GreenhouseSim,
+)
 from examples.greenhouse_coop.plan import BEST, LITRES, days_left, keep, water_planner
 from examples.greenhouse_coop.train import HELD_OUT, Constant
 from numpy.typing import NDArray
@@ -72,7 +80,8 @@ FIRST: Final = Constant(LITRES[len(LITRES) // 2] / MOST_WATER)
 class Network:
     """A network that pours the expected amount, for one observation or a batch, without the library that trained it.
 
-    Branches use it as the base policy, and forks are slow in a process that has imported a large library.
+    Branches use it as the base policy, and forks are slow in a process that has imported a large
+    library.
 
     Attributes:
         layers: For each network, the weights and biases of each layer.
@@ -102,7 +111,8 @@ class Network:
 class Learner:
     """A waterer that acts by its base policy or at random, and sometimes values all candidates.
 
-    Its extras are the candidates' ``values``, whether it has computed them (``asked``), and the ``days`` in branches.
+    Its extras are the candidates' ``values``, whether it has computed them (``asked``), and the
+    ``days`` in branches.
 
     Attributes:
         base: The policy that acts, also in branches.
@@ -124,7 +134,12 @@ class Learner:
         if asked:
             candidates = [np.array([amount], np.float32) for amount in CANDIDATES]
             found = action_values(
-                _environment, candidates, base=self.base, futures=1, horizon=self.horizon, terminal_value=days_left
+                _environment,
+                candidates,
+                base=self.base,
+                futures=1,
+                horizon=self.horizon,
+                terminal_value=days_left,
             )
             values = found.means
             day = _environment.simulation.greenhouse.day
@@ -135,7 +150,9 @@ class Learner:
 # -- learning -------------------------------------------------------------------------------------
 
 
-def teach(observations: NDArray[np.float32], values: NDArray[np.float64], steps: int, seed: int) -> Network:
+def teach(
+    observations: NDArray[np.float32], values: NDArray[np.float64], steps: int, seed: int
+) -> Network:
     """Train networks to prefer the candidates with the highest value.
 
     Args:
@@ -170,7 +187,9 @@ def teach(observations: NDArray[np.float32], values: NDArray[np.float64], steps:
         with torch.no_grad():
             left = float((network(seen).softmax(dim=1) * losses).sum(dim=1).mean())
         linear = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
-        layers = tuple((layer.weight.detach().numpy().T, layer.bias.detach().numpy()) for layer in linear)
+        layers = tuple(
+            (layer.weight.detach().numpy().T, layer.bias.detach().numpy()) for layer in linear
+        )
         found.append((left, layers))
     return Network(tuple(layers for _, layers in sorted(found, key=lambda pair: pair[0])[:KEPT]))
 
@@ -182,7 +201,8 @@ class Course:
     Attributes:
         policy: The trained policy.
         days: The number of simulated days.
-        rounds: After each round, the days so far and the mean return of the policy; empty unless requested.
+        rounds: After each round, the days so far and the mean return of the policy; empty unless
+            requested.
     """
 
     policy: Any
@@ -190,16 +210,19 @@ class Course:
     rounds: list[tuple[int, float]]
 
 
-def iterate(budget: int, seed: int, *, steps: int = 1500, workers: int = 2, watched: Sequence[int] = ()) -> Course:
+def iterate(
+    budget: int, seed: int, *, steps: int = 1500, workers: int = 2, watched: Sequence[int] = ()
+) -> Course:
     """Run expert iteration.
 
     Args:
-        budget: The number of days to simulate at most. The last round is the one after which another round, as long
-            as the longest so far, would exceed the budget.
+        budget: The number of days to simulate at most. The last round is the one after which
+            another round, as long as the longest so far, would exceed the budget.
         seed: The seed of the run.
         steps: The number of training batches in each round.
         workers: The number of processes that plan.
-        watched: Seeds of greenhouses for the evaluation after each round; they are not used for training.
+        watched: Seeds of greenhouses for the evaluation after each round; they are not used for
+            training.
     """
     rng = np.random.default_rng(seed)
     course = Course(FIRST, 0, [])
@@ -208,7 +231,10 @@ def iterate(budget: int, seed: int, *, steps: int = 1500, workers: int = 2, watc
     longest = 0
     while course.days + longest <= budget:
         drawn = [int(number) for number in rng.integers(HELD_OUT, size=EPISODES)]
-        team = {WATERER: Learner(course.policy, int(rng.integers(2**31)), HORIZON), VENTILATOR: BEST[VENTILATOR]}
+        team = {
+            WATERER: Learner(course.policy, int(rng.integers(2**31)), HORIZON),
+            VENTILATOR: BEST[VENTILATOR],
+        }
         found = collect_episodes(GreenhouseSim, team, seeds=drawn, workers=workers)[WATERER]
         asked = found.extras["asked"]
         observations.append(found.observations[asked])
@@ -216,7 +242,9 @@ def iterate(budget: int, seed: int, *, steps: int = 1500, workers: int = 2, watc
         spent = len(found) + int(found.extras["days"].sum())
         course.days += spent
         longest = max(longest, spent)
-        course.policy = teach(np.concatenate(observations), np.concatenate(values), steps, int(rng.integers(2**31)))
+        course.policy = teach(
+            np.concatenate(observations), np.concatenate(values), steps, int(rng.integers(2**31))
+        )
         if watched:
             course.rounds.append((course.days, worth(course.policy, watched)))
     return course
@@ -242,11 +270,16 @@ def imitate_plainly(budget: int, seed: int, *, steps: int = 3000, workers: int =
     episodes = budget // (DAYS * (1 + 3 * len(CANDIDATES)))
     drawn = np.random.default_rng(seed).integers(HELD_OUT, size=episodes).tolist()
     name = "greenhouse/waterer-plan-v0"
-    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, MINARI_DATASETS_PATH=folder):
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        patch.dict(os.environ, MINARI_DATASETS_PATH=folder),
+    ):
         team = {WATERER: planner, VENTILATOR: BEST[VENTILATOR]}
         record_dataset({WATERER: name}, GreenhouseSim, team, seeds=drawn, workers=workers)
         dataset = minari.load_dataset(name)
-        days = sum(int(episode.infos["days"].sum()) for episode in dataset) + int(dataset.total_steps)
+        days = sum(int(episode.infos["days"].sum()) for episode in dataset) + int(
+            dataset.total_steps
+        )
         return Course(clone(dataset, steps), days, [])
 
 
@@ -262,25 +295,49 @@ def main(arguments: Sequence[str] | None = None) -> list[float]:
         The final mean return of each policy.
     """
     parser = argparse.ArgumentParser(description="Train a network from plans by expert iteration.")
-    parser.add_argument("--budget", type=int, default=60_000, help="days to simulate (default: %(default)s)")
-    parser.add_argument("--learners", type=int, nargs="+", default=[0, 1, 2], help="seeds of learners (default: 0 1 2)")
-    parser.add_argument("--steps", type=int, default=1500, help="batches in each round (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)")
+    parser.add_argument(
+        "--budget", type=int, default=60_000, help="days to simulate (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--learners",
+        type=int,
+        nargs="+",
+        default=[0, 1, 2],
+        help="seeds of learners (default: 0 1 2)",
+    )
+    parser.add_argument(
+        "--steps", type=int, default=1500, help="batches in each round (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)"
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--watch", action="store_true", help="evaluate each round, on other greenhouses")
-    parser.add_argument("--plainly", action="store_true", help="imitate the planner's actions, for comparison")
+    parser.add_argument(
+        "--watch", action="store_true", help="evaluate each round, on other greenhouses"
+    )
+    parser.add_argument(
+        "--plainly", action="store_true", help="imitate the planner's actions, for comparison"
+    )
     options = parser.parse_args(arguments)
     watched = range(HELD_OUT + 10_000, HELD_OUT + 10_008) if options.watch else ()
     found = []
     for seed in options.learners:
         if options.plainly:
-            course = imitate_plainly(options.budget, seed, steps=options.steps, workers=options.workers)
+            course = imitate_plainly(
+                options.budget, seed, steps=options.steps, workers=options.workers
+            )
         else:
-            course = iterate(options.budget, seed, steps=options.steps, workers=options.workers, watched=watched)
+            course = iterate(
+                options.budget, seed, steps=options.steps, workers=options.workers, watched=watched
+            )
         found.append(worth(course.policy, range(HELD_OUT, HELD_OUT + options.seeds)))
         rounds = "".join(f" {days:,}: {value:.1f}" for days, value in course.rounds)
         print(
-            f"learner {seed}: {course.days:,} days, return {found[-1]:.1f}{';' if rounds else ''}{rounds}", flush=True
+            (
+                f"learner {seed}: {course.days:,} days, return"
+                f" {found[-1]:.1f}{';' if rounds else ''}{rounds}"
+            ),
+            flush=True,
         )
     return found
 

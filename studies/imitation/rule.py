@@ -1,12 +1,13 @@
 """Behaviour cloning: a network learns the model's own ventilation rule, and ventilates greenhouses in its place.
 
-``python -m studies.imitation.rule`` lets the rule ventilate some greenhouses, records its decisions as a
-Minari data set, and clones its behaviour with TorchRL. It then compares rule and clone in held-out greenhouses:
-decision by decision, by return, and in the model's own loop. It needs ``pip install "simenv-marl[minari]" torchrl``.
+``python -m studies.imitation.rule`` lets the rule ventilate some greenhouses, records its decisions
+as a Minari data set, and clones its behaviour with TorchRL. It then compares rule and clone in
+held-out greenhouses: decision by decision, by return, and in the model's own loop. It needs
+``pip install "simenv-marl[minari]" torchrl``.
 
-The rule is that of the paper's plugin, which exchanges more air at higher temperatures; a fixed 20 % would be too easy
-to learn. The waterer pours a constant amount that the plants can take, because with the model's rule all plants die
-within days.
+The rule is that of the paper's plugin, which exchanges more air at higher temperatures; a fixed 20
+% would be too easy to learn. The waterer pours a constant amount that the plants can take, because
+with the model's rule all plants die within days.
 """
 
 from __future__ import annotations
@@ -74,7 +75,9 @@ def choose_air_exchange(greenhouse: Greenhouse) -> float:
 def decided_air_exchange(greenhouse: Greenhouse) -> None:
     """Exchange the chosen fraction of the air."""
     fraction = choose_air_exchange(greenhouse)
-    greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
+    greenhouse.humidity = (
+        1 - fraction
+    ) * greenhouse.humidity + fraction * greenhouse.outside_humidity
 
 
 WARM: Final = Variant(
@@ -107,7 +110,9 @@ def clone(dataset: minari.MinariDataset, steps: int) -> Policy:
     episodes = list(dataset)
     data = TensorDict(
         {
-            "observation": torch.as_tensor(np.concatenate([episode.observations[:-1] for episode in episodes])),
+            "observation": torch.as_tensor(
+                np.concatenate([episode.observations[:-1] for episode in episodes])
+            ),
             "action": torch.as_tensor(np.concatenate([episode.actions for episode in episodes])),
         },
         [dataset.total_steps],
@@ -124,7 +129,9 @@ def clone(dataset: minari.MinariDataset, steps: int) -> Policy:
 
     def policy(observations: NDArray[np.float32]) -> NDArray[np.float32]:
         with torch.no_grad():
-            actions: NDArray[np.float32] = network(torch.as_tensor(observations)).clamp(0, 1).numpy()
+            actions: NDArray[np.float32] = (
+                network(torch.as_tensor(observations)).clamp(0, 1).numpy()
+            )
         return actions
 
     return policy
@@ -139,16 +146,32 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     Returns:
         The share of decisions in which both agree, and the mean return with each.
     """
-    parser = argparse.ArgumentParser(description="Clone the ventilation rule from a data set, and compare.")
-    parser.add_argument("--episodes", type=int, default=50, help="greenhouses to learn from (default: %(default)s)")
-    parser.add_argument("--steps", type=int, default=3000, help="batches to learn from (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        description="Clone the ventilation rule from a data set, and compare."
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=50, help="greenhouses to learn from (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=3000, help="batches to learn from (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     torch.manual_seed(0)
     torch.set_num_threads(1)
     # a temporary folder; leave this line out to keep the data set
-    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, MINARI_DATASETS_PATH=folder):
-        record_dataset({VENTILATOR: DATASET}, WARM, {WATERER: sparing, VENTILATOR: RULE}, seeds=range(options.episodes))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        patch.dict(os.environ, MINARI_DATASETS_PATH=folder),
+    ):
+        record_dataset(
+            {VENTILATOR: DATASET},
+            WARM,
+            {WATERER: sparing, VENTILATOR: RULE},
+            seeds=range(options.episodes),
+        )
         learned = clone(minari.load_dataset(DATASET), options.steps)
 
     unseen = range(HELD_OUT, HELD_OUT + options.seeds)
@@ -156,15 +179,21 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
         WARM, {VENTILATOR: learned}, others={WATERER: sparing}, seeds=unseen, tolerance=TOLERANCE
     )[VENTILATOR]
     differences = np.abs(compared.policy_actions - compared.trajectories.actions)
-    print(f"agreement: {compared.agreement:.1%} of the decisions; largest difference: {differences.max():.3f}")
+    print(
+        f"agreement: {compared.agreement:.1%} of the decisions; largest difference:"
+        f" {differences.max():.3f}"
+    )
     results = {"agreement": compared.agreement}
     for title, ventilate in (("rule", RULE), ("imitation", learned)):
         collected = collect_episodes(WARM, {WATERER: sparing, VENTILATOR: ventilate}, seeds=unseen)
-        values = collected[VENTILATOR].returns  # the team's return, as both agents get the same reward
+        # the team's return, as both agents get the same reward
+        values = collected[VENTILATOR].returns
         results[title] = float(values.mean())
         print(f"{title}: return {values.mean():.2f} ± {values.std():.2f}")
     for title, alone in (("rule", RULE), ("imitation", one_by_one(learned))):
-        simulation = simulate(WARM, {WATERER: one_by_one(sparing), VENTILATOR: alone}, seed=HELD_OUT)
+        simulation = simulate(
+            WARM, {WATERER: one_by_one(sparing), VENTILATOR: alone}, seed=HELD_OUT
+        )
         print(f"{title}, in the model itself, seed {HELD_OUT}: {simulation.render('ansi')}")
     return results
 

@@ -1,12 +1,12 @@
 """Hyperparameters as factors: a sweep that resumes, and a search with Optuna over the same hyperparameters.
 
-A training run is a simulation like any other: its factors are the learner's hyperparameters, its seed is the seed of
-the training, and a metric evaluates it after its end. So ``run_experiment`` can sweep learners without changes. Here
-Stable-Baselines3's PPO learns to water the greenhouse.
+A training run is a simulation like any other: its factors are the learner's hyperparameters, its
+seed is the seed of the training, and a metric evaluates it after its end. So ``run_experiment`` can
+sweep learners without changes. Here Stable-Baselines3's PPO learns to water the greenhouse.
 
-``python -m studies.learner_sweep.sweep`` needs the extra ``clients``. It runs the sweep, then the search, and then
-trains anew with the best hyperparameters and with PPO's defaults, on new seeds. A folder keeps all results, so that a
-second call runs only what is missing.
+``python -m studies.learner_sweep.sweep`` needs the extra ``clients``. It runs the sweep, then the
+search, and then trains anew with the best hyperparameters and with PPO's defaults, on new seeds. A
+folder keeps all results, so that a second call runs only what is missing.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 OUT: Final = Path(__file__).parent / "out"
 
 LEVELS: Final = {"learning_rate": [3e-4, 1e-3, 3e-3], "gamma": [0.8, 0.9, 0.99]}
-"""The levels of the sweep. PPO's defaults are the first learning rate and the last discount factor."""
+"""The levels of the sweep.
+
+PPO's defaults are the first learning rate and the last discount factor.
+"""
 
 SEEDS: Final = range(3)
 """The seeds of training runs."""
@@ -127,7 +130,9 @@ def search(folder: Path, days: int, trials: int, seeds: Sequence[int] = SEEDS) -
     return study
 
 
-def confirm(folder: Path, days: int, settings: dict[str, float], seeds: Sequence[int], workers: int = 0) -> DataFrame:
+def confirm(
+    folder: Path, days: int, settings: dict[str, float], seeds: Sequence[int], workers: int = 0
+) -> DataFrame:
     """Train and evaluate on new seeds, because the best of many trials is partly best by chance."""
     rows = [{"learning_rate": 3e-4, "gamma": 0.99}, settings]
     fresh = [{**row, "days": days, "held_out": 2 * HELD_OUT} for row in rows]
@@ -137,11 +142,21 @@ def confirm(folder: Path, days: int, settings: dict[str, float], seeds: Sequence
 def main(arguments: Sequence[str] | None = None) -> None:
     """Sweep, search, and confirm."""
     parser = argparse.ArgumentParser(description="Search for the hyperparameters of a learner.")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for results (default: %(default)s)")
-    parser.add_argument("--days", type=int, default=3000, help="days per training (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=3, help="trainings per setting (default: %(default)s)")
-    parser.add_argument("--trials", type=int, default=12, help="trials of Optuna (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=0, help="worker processes of the sweep (default: none)")
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="folder for results (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--days", type=int, default=3000, help="days per training (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="trainings per setting (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--trials", type=int, default=12, help="trials of Optuna (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=0, help="worker processes of the sweep (default: none)"
+    )
     options = parser.parse_args(arguments)
     folder, days, seeds = options.out, options.days, range(options.seeds)
     folder.mkdir(parents=True, exist_ok=True)
@@ -150,7 +165,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(found.main.round(1), found.cells("learning_rate", "gamma").round(1), sep="\n\n")
     study = search(folder, days, options.trials, seeds)
     print(f"\nfound by Optuna: {study.best_params}, worth {study.best_value:.1f}")
-    fresh = confirm(folder, days, study.best_params, range(100, 100 + options.seeds), options.workers)
+    fresh = confirm(
+        folder, days, study.best_params, range(100, 100 + options.seeds), options.workers
+    )
     print(fresh.groupby(list(LEVELS))["gain"].agg(["mean", "min", "max"]).round(1))
 
 

@@ -46,7 +46,13 @@ def compared(table: Any) -> str:
     for name, found in summary.iterrows():
         own = others.loc[name]
         better = "" if name == "rule" else _difference(found, "+.1f")
-        told = (f"{own.right:.1%}", f"{own.coverage:.0%}", f"{own.premium:.1%}", f"{own.short:.1f}", f"{own.cuts:.1f}")
+        told = (
+            f"{own.right:.1%}",
+            f"{own.coverage:.0%}",
+            f"{own.premium:.1%}",
+            f"{own.short:.1f}",
+            f"{own.cuts:.1f}",
+        )
         rows.append((name, f"{found['mean']:.0f}", better, *told))
     outcomes = ("purchasing power", "coverage", "premium", "years short", "years with cuts")
     return markdown(("policy", "welfare", "gain over the rule", *outcomes), rows)
@@ -62,7 +68,9 @@ def everywhere(worlds: Mapping[str, Any]) -> str:
     """Tabulate how much better than the rule each contender is, in each world of ``in_worlds``."""
     rows = []
     for levels, summary in worlds.items():
-        differences = [_difference(found, "+.0f") for name, found in summary.iterrows() if name != "rule"]
+        differences = [
+            _difference(found, "+.0f") for name, found in summary.iterrows() if name != "rule"
+        ]
         rows.append((levels, f"{summary.loc['rule', 'mean']:.0f}", *differences))
     names = next(iter(worlds.values())).index.drop("rule")
     return markdown((", ".join(FACTORS), "rule", *names), rows)
@@ -72,22 +80,37 @@ def moved(table: Any) -> str:
     """Tabulate the effect of each factor on the mean welfare of each contender."""
     rows = []
     for name in dict.fromkeys(table.contender):
-        found = effects(table, metric="welfare", contender=name).main["mean"].groupby("factor", sort=False)
+        found = (
+            effects(table, metric="welfare", contender=name)
+            .main["mean"]
+            .groupby("factor", sort=False)
+        )
         rows.append((name, *(f"{own.iloc[1] - own.iloc[0]:+.0f}" for _, own in found)))
-    return markdown(("policy", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
+    return markdown(
+        ("policy", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows
+    )
 
 
 def sizes(at_home: Any, large: Any) -> str:
     """Tabulate how much better than the rule contenders are in small and in large funds, on the same seeds."""
     few = at_home[at_home.seed.isin(set(large.seed)) & at_home.contender.isin(set(large.contender))]
     small, big = (_against_rule(own).summary("welfare") for own in (few, large))
-    rows = [(name, *(_difference(own.loc[name], "+.0f") for own in (small, big))) for name in big.index[1:]]
-    return markdown((f"{len(set(large.seed))} seeds", f"{CLIENTS} clients", f"{LARGE:,} clients"), rows)
+    rows = [
+        (name, *(_difference(own.loc[name], "+.0f") for own in (small, big)))
+        for name in big.index[1:]
+    ]
+    return markdown(
+        (f"{len(set(large.seed))} seeds", f"{CLIENTS} clients", f"{LARGE:,} clients"), rows
+    )
 
 
 def _against_rule(table: Any) -> Evaluation:
     order = {name: number for number, name in enumerate(COLOURS)}
-    return Evaluation(table.sort_values("contender", key=lambda names: names.map(order), kind="stable"), "rule", 0.95)
+    return Evaluation(
+        table.sort_values("contender", key=lambda names: names.map(order), kind="stable"),
+        "rule",
+        0.95,
+    )
 
 
 def _difference(found: Any, form: str) -> str:
@@ -102,7 +125,12 @@ def draw_worlds(worlds: Mapping[str, Any]) -> Figure:
     """Draw how much better than the rule each contender is in each world of ``in_worlds``, with intervals."""
     without_rule = {levels: summary.drop("rule") for levels, summary in worlds.items()}
     better = DataFrame({levels: own["difference"] for levels, own in without_rule.items()}).T
-    told = DataFrame({levels: own.apply(_difference, axis=1, form="+.0f") for levels, own in without_rule.items()}).T
+    told = DataFrame(
+        {
+            levels: own.apply(_difference, axis=1, form="+.0f")
+            for levels, own in without_rule.items()
+        }
+    ).T
     figure = new_figure(11, 4.2)
     axes = figure.subplots()
     most = float(np.nanmax(abs(better.to_numpy())))
@@ -110,7 +138,11 @@ def draw_worlds(worlds: Mapping[str, Any]) -> Figure:
         better, annot=told, fmt="", vmin=-most, vmax=most, cmap="BrBG", linewidths=1.5, ax=axes, cbar=False,
         annot_kws={"fontsize": 8},
     )  # fmt: skip
-    axes.set(xlabel="", ylabel=", ".join(FACTORS), title="gain over the rule, in per cent of a year's income")
+    axes.set(
+        xlabel="",
+        ylabel=", ".join(FACTORS),
+        title="gain over the rule, in per cent of a year's income",
+    )
     axes.tick_params(left=False, bottom=False, labelrotation=0)
     return figure
 
@@ -140,7 +172,9 @@ def draw_learned(found: Mapping[str, Policies]) -> Figure:
     ages = np.arange(25, 67)
     for of, style in ((1.0, ":"), (1.2, "-"), (1.5, "--")):
         asked = [_surcharge(shared, int(age), of) for age in ages]
-        premium.plot(ages, asked, style, color=COLOURS["trained premiums"], label=f"coverage {of:.0%}")
+        premium.plot(
+            ages, asked, style, color=COLOURS["trained premiums"], label=f"coverage {of:.0%}"
+        )
     premium.axhline(1.05, color=COLOURS["rule"])
     premium.set_title("premium, divided by the cost of the accrual", fontsize=9)
     premium.set(xlabel="age")
@@ -158,7 +192,8 @@ def _surcharge(policy: Any, age: int, coverage: float) -> float:
     observed[0] = observed[1] = coverage
     observed[names.index("age / 100 years")] = age / 100
     observed[names.index("rights / wage")] = 0.0175 * (age - 25)
-    # the cost of an accrual is discounted by the years until retirement, at 2.5 % a year; from 67 on it is 14 pensions
+    # the cost of an accrual is discounted by the years until retirement, at 2.5 % a year; from 67
+    # on it is 14 pensions
     observed[names.index("cost of the standard accrual / wage")] = 0.0175 * 14 * 1.025 ** (age - 67)
     lowest = SURCHARGES[0] if coverage >= REQUIRED else 1.0
     return max(SURCHARGES[round(policy.share(observed) * (len(SURCHARGES) - 1))], lowest)
@@ -169,7 +204,9 @@ def draw_years(found: Mapping[str, Policies], home: Callable[[], Any], seeds: in
     figure = new_figure(9.5, 3.4)
     rights, coverages = figure.subplots(1, 2)
     for name, policies in (("rule", {}), ("trained pair", found["trained pair"])):
-        funds = [simulate(home(), policies, seed=HELD_OUT + seed, points=POINTS) for seed in range(seeds)]
+        funds = [
+            simulate(home(), policies, seed=HELD_OUT + seed, points=POINTS) for seed in range(seeds)
+        ]
         for axes, of in ((rights, "right"), (coverages, "coverage")):
             # a fund that could not pay all pensions ended early; its later years count as 0
             values = np.zeros((seeds, funds[0].years))
@@ -191,7 +228,9 @@ def draw_years(found: Mapping[str, Policies], home: Callable[[], Any], seeds: in
     return figure
 
 
-def show(table: Any, large: Any, found: Mapping[str, Policies], home: Callable[[], Any], folder: Path) -> None:
+def show(
+    table: Any, large: Any, found: Mapping[str, Policies], home: Callable[[], Any], folder: Path
+) -> None:
     """Write all figures and tables to a folder, and print the tables.
 
     Args:

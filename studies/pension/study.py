@@ -1,9 +1,10 @@
 """A study of the pension fund: which policies decide best, and in which worlds?
 
-``python -m studies.pension.study`` (or ``make pension``) searches constant policies and trains others in one world.
-They, the model's rules and a planner then run the same funds in eight worlds: a full factorial design of returns,
-mortality and population. The criterion was chosen beforehand: ``welfare``. A folder keeps the policies and the runs, so
-that a second call computes only what is missing. The table of all runs gives the figures of ``docs/pension.md``.
+``python -m studies.pension.study`` (or ``make pension``) searches constant policies and trains
+others in one world. They, the model's rules and a planner then run the same funds in eight worlds:
+a full factorial design of returns, mortality and population. The criterion was chosen beforehand:
+``welfare``. A folder keeps the policies and the runs, so that a second call computes only what is
+missing. The table of all runs gives the figures of ``docs/pension.md``.
 """
 
 from __future__ import annotations
@@ -20,9 +21,27 @@ from typing import Any, Final
 
 import numpy as np
 from examples.fin_base.economy import Climate, Mortality
-from examples.fin_base.env import INDEXATIONS, MIXES, OBSERVED, OF_A_CLIENT, PREMIUMS, SURCHARGES, TEAM, FundSim
+from examples.fin_base.env import (
+    INDEXATIONS,
+    MIXES,
+    OBSERVED,
+    OF_A_CLIENT,
+    PREMIUMS,
+    SURCHARGES,
+    TEAM,
+    FundSim,
+)
 from examples.fin_base.pension import Parameters
-from examples.fin_base.train import HELD_OUT, PAIR, Linear, Policies, Rate, nearest_lawful, rate, train
+from examples.fin_base.train import (
+    HELD_OUT,
+    PAIR,
+    Linear,
+    Policies,
+    Rate,
+    nearest_lawful,
+    rate,
+    train,
+)
 from numpy.typing import NDArray
 
 from simenv_marl import RULE
@@ -118,9 +137,13 @@ def learned(
         The contenders, by name.
     """
     # returns of other decision points than these would only take time
-    of_team, of_premiums = (partial(rate, partial(world, **size), points, workers) for points in (TEAM, PREMIUMS))
+    of_team, of_premiums = (
+        partial(rate, partial(world, **size), points, workers) for points in (TEAM, PREMIUMS)
+    )
     pairs = [
-        {MANAGER: Constant(mix), INDEXER: Constant(by)} for mix in range(len(MIXES)) for by in range(len(INDEXATIONS))
+        {MANAGER: Constant(mix), INDEXER: Constant(by)}
+        for mix in range(len(MIXES))
+        for by in range(len(INDEXATIONS))
     ]
     surcharges = [{PREMIUM: Constant(level)} for level in range(len(SURCHARGES))]
     premiums = {PREMIUM: Linear.start(0.5, len(OBSERVED) + len(OF_A_CLIENT))}
@@ -167,7 +190,9 @@ METRICS: Final = {
 """The metrics of each fund at its end."""
 
 
-def run(folder: Path, rows: Any, contenders: Mapping[str, Policies], seeds: int, workers: int) -> Any:
+def run(
+    folder: Path, rows: Any, contenders: Mapping[str, Policies], seeds: int, workers: int
+) -> Any:
     """Run the missing runs of a table.
 
     Args:
@@ -198,14 +223,28 @@ def run(folder: Path, rows: Any, contenders: Mapping[str, Policies], seeds: int,
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Learn, run, and show the results."""
-    parser = argparse.ArgumentParser(description="Which policies decide best for a pension fund, and in which worlds?")
-    parser.add_argument("--seeds", type=int, default=32, help="funds in each world (default: %(default)s)")
-    parser.add_argument("--large", type=int, default=0, help="funds of 10,000 clients (default: %(default)s)")
-    parser.add_argument("--generations", type=int, default=24, help="generations of learning (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        description="Which policies decide best for a pension fund, and in which worlds?"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=32, help="funds in each world (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--large", type=int, default=0, help="funds of 10,000 clients (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--generations", type=int, default=24, help="generations of learning (default: %(default)s)"
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for all results (default: %(default)s)")
-    parser.add_argument("--figures", type=Path, help="folder for figures and tables (default: the same)")
-    parser.add_argument("--quick", action="store_true", help="a small run, to check that everything works")
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="folder for all results (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--figures", type=Path, help="folder for figures and tables (default: the same)"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="a small run, to check that everything works"
+    )
     size: dict[str, Any] = {}
     if parser.parse_args(arguments).quick:
         parser.set_defaults(seeds=2, generations=1, out=OUT / "quick")
@@ -219,10 +258,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     large = None
     if options.large:
         rows = [{**HOME, **size, "clients": LARGE}]
-        without_plans = {name: found[name] for name in ("trained pair", "trained premiums", "both trained")}
+        without_plans = {
+            name: found[name] for name in ("trained pair", "trained premiums", "both trained")
+        }
         large = run(options.out / "large", rows, without_plans, options.large, options.workers)
 
-    from . import figures  # imported here, so that forked processes do not load the plotting libraries
+    # imported here, so that forked processes do not load the plotting libraries
+    from . import figures
 
     figures.show(table, large, found, partial(world, **size), options.figures or options.out)
 

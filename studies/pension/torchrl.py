@@ -1,7 +1,7 @@
 """One network for the two agents that decide on rights in the pension fund, trained with TorchRL's PPO.
 
-``python -m studies.pension.torchrl`` needs the extra ``clients``. It trains for 7,000 years, and compares the network
-with the model's rule on seeds that the training has not seen.
+``python -m studies.pension.torchrl`` needs the extra ``clients``. It trains for 7,000 years, and
+compares the network with the model's rule on seeds that the training has not seen.
 """
 
 from __future__ import annotations
@@ -26,8 +26,11 @@ from simenv_marl import evaluate, parallel_env
 
 AGENTS: Final = ["indexer_0", "planner_0"]
 
-POINTS: Final = {point: definition for point, definition in TEAM.items() if definition.agent in AGENTS}
-for point, definition in POINTS.items():  # TorchRL requires masks for all agents of a group, or for none
+POINTS: Final = {
+    point: definition for point, definition in TEAM.items() if definition.agent in AGENTS
+}
+# TorchRL requires masks for all agents of a group, or for none
+for point, definition in POINTS.items():
     if definition.action_mask_mapping is None:
         POINTS[point] = replace(definition, action_mask_mapping=lambda *_: [1] * 5)
 

@@ -1,10 +1,11 @@
 """Two queues in a row: who admits jobs to each learns by itself, from the times between its own decisions.
 
-``python -m studies.queue_network.study`` trains both by semi-Markov Q-learning with a table, in one AEC environment,
-and compares them with the rule, which admits all.
+``python -m studies.queue_network.study`` trains both by semi-Markov Q-learning with a table, in one
+AEC environment, and compares them with the rule, which admits all.
 
-Jobs that the first queue has finished go on to the second one, which also has arrivals of its own. Each queue earns for
-itself. The first one is the queue of ``examples/queue_admission``, so that its optimum is known.
+Jobs that the first queue has finished go on to the second one, which also has arrivals of its own.
+Each queue earns for itself. The first one is the queue of ``examples/queue_admission``, so that its
+optimum is known.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class Station(Queue):
     Attributes:
         name: Its name.
         following: The queue to which its finished jobs go on. None: they leave.
-        onward: The random generator of the work that is left for these jobs, so that its own arrivals do not depend on
-            them.
+        onward: The random generator of the work that is left for these jobs, so that its own
+            arrivals do not depend on them.
     """
 
     def __init__(self, name: str, seed: int, clock: simpy.Environment, following: Any) -> None:
@@ -67,9 +68,14 @@ AGENTS: Final = ("first", "second")
 
 
 class NetworkSimulation(QueueSimulation):
-    """The network for a limited time. An agent for each queue decides at the times of its own arrivals."""
+    """The network for a limited time.
 
-    points: ClassVar[Any] = {Queue.admit: replace(admission, agent=lambda station, kind: station.name)}
+    An agent for each queue decides at the times of its own arrivals.
+    """
+
+    points: ClassVar[Any] = {
+        Queue.admit: replace(admission, agent=lambda station, kind: station.name)
+    }
 
     def reset(self, seed: int | None = None) -> None:
         """Begin with empty queues."""
@@ -158,7 +164,9 @@ def compare(tables: dict[str, Table], by_decision: dict[str, Table], seeds: Iter
         metric={
             "first": lambda simulation: simulation.model.first.present_value(),
             "second": lambda simulation: simulation.model.second.present_value(),
-            "both": lambda simulation: simulation.model.first.present_value() + simulation.model.second.present_value(),
+            "both": lambda simulation: (
+                simulation.model.first.present_value() + simulation.model.second.present_value()
+            ),
         },
         baseline="both rules",
         batched=True,
@@ -168,18 +176,37 @@ def compare(tables: dict[str, Table], by_decision: dict[str, Table], seeds: Iter
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train, and print what the learners are worth."""
     parser = argparse.ArgumentParser(description="Train a learner for each of two queues.")
-    parser.add_argument("--episodes", type=int, default=2_000, help="episodes of training (default: %(default)s)")
-    parser.add_argument("--trainings", type=int, default=3, help="number of trainings (default: %(default)s)")
-    parser.add_argument("--runs", type=int, default=400, help="simulations of each policy (default: %(default)s)")
+    parser.add_argument(
+        "--episodes", type=int, default=2_000, help="episodes of training (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--trainings", type=int, default=3, help="number of trainings (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--runs", type=int, default=400, help="simulations of each policy (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     optimum = worth(best_table())
-    print(f"The first queue alone: optimum {optimum:.3f}, rule {worth(ADMIT_ALL) / optimum:.3f} of it")
+    print(
+        f"The first queue alone: optimum {optimum:.3f}, rule {worth(ADMIT_ALL) / optimum:.3f} of it"
+    )
     for training in range(options.trainings):
         seed = training * options.episodes
-        tables = {agent: learner.table() for agent, learner in train(options.episodes, seed).items()}
-        by_decision = {agent: learner.table() for agent, learner in train(options.episodes, seed, gamma=0.9).items()}
-        print(f"\nTraining {training}: the first learner has {worth(tables['first']) / optimum:.3f} of its optimum;")
-        print(f"with a discount of 0.9 for each decision, {worth(by_decision['first']) / optimum:.3f}.")
+        tables = {
+            agent: learner.table() for agent, learner in train(options.episodes, seed).items()
+        }
+        by_decision = {
+            agent: learner.table()
+            for agent, learner in train(options.episodes, seed, gamma=0.9).items()
+        }
+        print(
+            f"\nTraining {training}: the first learner has {worth(tables['first']) / optimum:.3f}"
+            " of its optimum;"
+        )
+        print(
+            "with a discount of 0.9 for each decision,"
+            f" {worth(by_decision['first']) / optimum:.3f}."
+        )
         found = compare(tables, by_decision, range(1_000_000, 1_000_000 + options.runs))
         for metric in ("first", "second", "both"):
             print(f"Present value, {metric}:\n{found.summary(metric=metric).round(2).to_string()}")

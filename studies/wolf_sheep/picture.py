@@ -1,7 +1,8 @@
 """Figures and a table of the results of ``train`` and ``results``.
 
-``python -m studies.wolf_sheep.picture`` draws ``docs/figures/shared-policy-training.png`` (the learning curves) and
-``docs/figures/shared-policy.png`` (the evaluation of the policies), and prints the table. It runs no simulation.
+``python -m studies.wolf_sheep.picture`` draws ``docs/figures/shared-policy-training.png`` (the
+learning curves) and ``docs/figures/shared-policy.png`` (the evaluation of the policies), and prints
+the table. It runs no simulation.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ LEARNERS: Final = {1: "trained, one step of sight", 2: "trained, two steps of si
 # -- learning curves ------------------------------------------------------------------------------
 
 
-def draw_training(course: Sequence[Mapping[str, str]], results: Mapping[str, Any], path: Path) -> None:
+def draw_training(
+    course: Sequence[Mapping[str, str]], results: Mapping[str, Any], path: Path
+) -> None:
     """Draw the learning curves.
 
     Args:
@@ -58,7 +61,9 @@ def draw_training(course: Sequence[Mapping[str, str]], results: Mapping[str, Any
         axes.margins(x=0)
         axes.spines[["top", "right"]].set_visible(False)
     rule = "the model's rule"
-    left.axhline(results["results"][rule]["sheep while training"], label=rule, linewidth=1.5, **STYLES[rule])
+    left.axhline(
+        results["results"][rule]["sheep while training"], label=rule, linewidth=1.5, **STYLES[rule]
+    )
     left.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.0, 0.95))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
@@ -70,7 +75,14 @@ def _draw_course(axes: Axes, course: Sequence[Mapping[str, str]], what: str, nam
     for seed in sorted({row["seed"] for row in course}, key=int):
         own = [row for row in course if row["seed"] == seed]
         decisions = [int(row["decisions"]) / 1000 for row in own]
-        axes.plot(decisions, [float(row[what]) for row in own], label=label, linewidth=1.4, alpha=0.85, **STYLES[name])
+        axes.plot(
+            decisions,
+            [float(row[what]) for row in own],
+            label=label,
+            linewidth=1.4,
+            alpha=0.85,
+            **STYLES[name],
+        )
         label = None
 
 
@@ -111,7 +123,10 @@ def draw_results(results: Mapping[str, Any], path: Path) -> None:
 def table(results: Mapping[str, Any]) -> str:
     """Make the table, in Markdown."""
     lines = [
-        "| policy of the sheep | meadows with sheep at the end | sheep at the end | turns per death | starved |",
+        (
+            "| policy of the sheep | meadows with sheep at the end | sheep at the end | turns per"
+            " death | starved |"
+        ),
         "| --- | --- | --- | --- | --- |",
     ]
     for name, own in results["results"].items():
@@ -121,8 +136,8 @@ def table(results: Mapping[str, Any]) -> str:
             survived += f" ({min(shares):.0%} to {max(shares):.0%} of {len(shares)})"
         low, middle, high = own["sheep at the end"]
         lines.append(
-            f"| {name} | {survived} | {middle:.0f} ({low:.0f} to {high:.0f}) | {own['turns per death']:.1f} |"
-            f" {own['starved']:.0%} |"
+            f"| {name} | {survived} | {middle:.0f} ({low:.0f} to {high:.0f}) |"
+            f" {own['turns per death']:.1f} | {own['starved']:.0%} |"
         )
     return "\n".join(lines)
 
@@ -130,7 +145,12 @@ def table(results: Mapping[str, Any]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Draw both figures, and print the table."""
     parser = argparse.ArgumentParser(description="Draw the results of the sheep's policies.")
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder with the results (default: %(default)s)")
+    parser.add_argument(
+        "--figures",
+        type=Path,
+        default=FIGURES,
+        help="folder with the results (default: %(default)s)",
+    )
     folder = parser.parse_args(arguments).figures
     results = json.loads((folder / "shared-policy.json").read_text())
     with (folder / "shared-policy-training.csv").open(newline="") as file:

@@ -1,9 +1,9 @@
 """One sheep of a herd plans over the model's own rule: how long does it live, compared with the others?
 
-``python -m studies.wolf_sheep.plan`` lets one sheep in each of many herds try out the four directions at each turn, in
-branches of a few turns in which all animals follow the rule and all random numbers are drawn anew. There is no
-training. The comparison is with the other initial sheep of its herd, which follow the rule, and with the same sheep
-under the rule on the same meadow.
+``python -m studies.wolf_sheep.plan`` lets one sheep in each of many herds try out the four
+directions at each turn, in branches of a few turns in which all animals follow the rule and all
+random numbers are drawn anew. There is no training. The comparison is with the other initial sheep
+of its herd, which follow the rule, and with the same sheep under the rule on the same meadow.
 """
 
 from __future__ import annotations
@@ -60,13 +60,23 @@ def lives(seed: int, planner: Any, ticks: int) -> tuple[int, int, float]:
         team = {name: policy, MOVE: RULE}
         played = collect_episodes(Meadow(ticks), team, points=sheep_points(), seeds=[seed])
         herd = played[MOVE]
-        turns = dict(zip((herd.names[herd.agents[start]] for start in herd.starts), herd.lengths.tolist(), strict=True))
-        found.append((len(played[name]), float(np.mean([turns[other] for other in names if other != name]))))
+        turns = dict(
+            zip(
+                (herd.names[herd.agents[start]] for start in herd.starts),
+                herd.lengths.tolist(),
+                strict=True,
+            )
+        )
+        found.append(
+            (len(played[name]), float(np.mean([turns[other] for other in names if other != name])))
+        )
     (own, others), (same, _) = found
     return own, same, others
 
 
-def watch(herds: Sequence[int], *, horizon: int, futures: int, ticks: int = TICKS, workers: int = 2) -> Lives:
+def watch(
+    herds: Sequence[int], *, horizon: int, futures: int, ticks: int = TICKS, workers: int = 2
+) -> Lives:
     """Measure the lives in several herds.
 
     Args:
@@ -87,10 +97,18 @@ def watch(herds: Sequence[int], *, horizon: int, futures: int, ticks: int = TICK
 def main(arguments: Sequence[str] | None = None) -> Lives:
     """Run herds, and print the lengths of the sheep's lives."""
     parser = argparse.ArgumentParser(description="Let one sheep of a herd plan.")
-    parser.add_argument("--herds", type=int, default=200, help="number of herds (default: %(default)s)")
-    parser.add_argument("--horizon", type=int, default=6, help="turns to simulate per branch (default: %(default)s)")
-    parser.add_argument("--futures", type=int, default=2, help="futures per direction (default: %(default)s)")
-    parser.add_argument("--ticks", type=int, default=TICKS, help="ticks per herd (default: %(default)s)")
+    parser.add_argument(
+        "--herds", type=int, default=200, help="number of herds (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--horizon", type=int, default=6, help="turns to simulate per branch (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--futures", type=int, default=2, help="futures per direction (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--ticks", type=int, default=TICKS, help="ticks per herd (default: %(default)s)"
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
     options = parser.parse_args(arguments)
     found = watch(
@@ -103,11 +121,18 @@ def main(arguments: Sequence[str] | None = None) -> Lives:
         ("others of its herd", found.others),
     ):
         error = turns.std(ddof=1) / np.sqrt(len(turns)) if len(turns) > 1 else np.nan
-        alive = f", {np.mean(turns >= options.ticks):.0%} to the end" if title != "others of its herd" else ""
-        print(f"{title}: {turns.mean():.1f} ± {error:.1f} turns, median {np.median(turns):.0f}{alive}")
+        alive = (
+            f", {np.mean(turns >= options.ticks):.0%} to the end"
+            if title != "others of its herd"
+            else ""
+        )
+        print(
+            f"{title}: {turns.mean():.1f} ± {error:.1f} turns, median {np.median(turns):.0f}{alive}"
+        )
     gained = found.own - found.same
     print(
-        f"plans longer than by the rule in {np.mean(gained > 0):.0%} of the herds, shorter in {np.mean(gained < 0):.0%}"
+        f"plans longer than by the rule in {np.mean(gained > 0):.0%} of the herds, shorter in"
+        f" {np.mean(gained < 0):.0%}"
     )
     return found
 

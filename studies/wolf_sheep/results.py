@@ -1,8 +1,8 @@
 """Evaluation of the trained policies on held-out meadows.
 
-``python -m studies.wolf_sheep.results`` evaluates the policies of ``train`` and several baselines, and writes the
-results to ``docs/figures/shared-policy.json``. It needs TorchRL (the extra ``clients``);
-``python -m studies.wolf_sheep.picture``, which draws the results, does not.
+``python -m studies.wolf_sheep.results`` evaluates the policies of ``train`` and several baselines,
+and writes the results to ``docs/figures/shared-policy.json``. It needs TorchRL (the extra
+``clients``); ``python -m studies.wolf_sheep.picture``, which draws the results, does not.
 """
 
 from __future__ import annotations
@@ -51,10 +51,13 @@ def at_random(seed: int) -> Policy:
 
 
 def by_hand(observations: NDArray[np.float32]) -> Any:
-    """Go to the cell with the fewest wolves next to it; of several, to one with grass; else to the first.
+    """Go to the cell with the fewest wolves next to it.
 
-    This needs two steps of sight, and follows from the model's code: wolves move to neighbouring cells. So a sheep is
-    in danger next to a wolf, and safe in the wolf's own cell, which is the cell that the model's rule avoids.
+    Of several, to one with grass; else to the first.
+
+    This needs two steps of sight, and follows from the model's code: wolves move to neighbouring
+    cells. So a sheep is in danger next to a wolf, and safe in the wolf's own cell, which is the
+    cell that the model's rule avoids.
     """
     seen = cells(2)
     grass, wolves, _ = np.split(observations[:, 1:], 3, axis=1)
@@ -84,12 +87,15 @@ def play(policy: Policy, sight: int, seeds: Sequence[int], **parameters: Any) ->
     return found[MOVE]
 
 
-def lives(lengths: NDArray[np.int64], died: NDArray[np.bool_], turns: int = LIVES) -> NDArray[np.float64]:
+def lives(
+    lengths: NDArray[np.int64], died: NDArray[np.bool_], turns: int = LIVES
+) -> NDArray[np.float64]:
     """Estimate the survival curve of sheep by Kaplan and Meier's method, as some lives are censored.
 
     Args:
         lengths: The number of turns of each sheep.
-        died: Whether each sheep died in its last turn; the others lived until the end of the episode.
+        died: Whether each sheep died in its last turn; the others lived until the end of the
+            episode.
         turns: The number of turns of the curve.
 
     Returns:
@@ -106,29 +112,42 @@ def summary(played: Sequence[Trajectories]) -> dict[str, Any]:
     """Summarise the results for sheep and wolves.
 
     Args:
-        played: The trajectories on the same meadows under each of several policies of the same training; or one.
+        played: The trajectories on the same meadows under each of several policies of the same
+            training; or one.
     """
     counts = {
-        kind: np.array([one[kind] for found in played for one in found.collected or ()]) for kind in ("sheep", "wolves")
+        kind: np.array([one[kind] for found in played for one in found.collected or ()])
+        for kind in ("sheep", "wolves")
     }
     lengths = np.concatenate([found.lengths for found in played])
     ends = [found.starts + found.lengths - 1 for found in played]
-    died = np.concatenate([found.terminations[own] for found, own in zip(played, ends, strict=True)])
+    died = np.concatenate(
+        [found.terminations[own] for found, own in zip(played, ends, strict=True)]
+    )
     energies = np.concatenate([found.last_observations[:, 0] for found in played])
     deaths = max(1, int(died.sum()))
-    shares = [float(np.mean([one["sheep"][-1] > 0 for one in found.collected or ()])) for found in played]
+    shares = [
+        float(np.mean([one["sheep"][-1] > 0 for one in found.collected or ()])) for found in played
+    ]
     return {
         "survived": [round(share, 3) for share in shares],
-        "sheep at the end": [float(value) for value in np.percentile(counts["sheep"][:, -1], (25, 50, 75))],
+        "sheep at the end": [
+            float(value) for value in np.percentile(counts["sheep"][:, -1], (25, 50, 75))
+        ],
         "wolves survived": round(float((counts["wolves"][:, -1] > 0).mean()), 3),
         "turns per death": round(float(lengths.sum()) / deaths, 2),
         "starved": round(float((energies[died] < 0).sum()) / deaths, 3),
         "sheep while training": round(float(counts["sheep"][:, :TRAINED_FOR].mean()), 2),
         "numbers": {
-            kind: {str(part): np.percentile(values, part, axis=0).round(1).tolist() for part in (25, 50, 75)}
+            kind: {
+                str(part): np.percentile(values, part, axis=0).round(1).tolist()
+                for part in (25, 50, 75)
+            }
             for kind, values in counts.items()
         },
-        "lives": [None if np.isnan(share) else round(float(share), 4) for share in lives(lengths, died)],
+        "lives": [
+            None if np.isnan(share) else round(float(share), 4) for share in lives(lengths, died)
+        ],
     }
 
 
@@ -148,7 +167,9 @@ def compare(folder: Path, seeds: Sequence[int], **parameters: Any) -> dict[str, 
     }
     for sight in SIGHTS:
         title = f"trained, {'one step' if sight == 1 else 'two steps'} of sight"
-        contenders[title] = [(Herd.load(path, sight).decide, sight) for path in policies_of(sight, folder)]
+        contenders[title] = [
+            (Herd.load(path, sight).decide, sight) for path in policies_of(sight, folder)
+        ]
     results: dict[str, Any] = {}
     with tqdm(total=sum(map(len, contenders.values())), unit="policy") as bar:
         for title, policies in contenders.items():
@@ -163,17 +184,27 @@ def compare(folder: Path, seeds: Sequence[int], **parameters: Any) -> dict[str, 
 
 def write(results: Mapping[str, Any], path: Path) -> None:
     """Write the results as JSON, with one line for each list of numbers."""
-    text = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), json.dumps(results, indent=1))
+    text = re.sub(
+        r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), json.dumps(results, indent=1)
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text + "\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Evaluate all policies, and write the results."""
-    parser = argparse.ArgumentParser(description="Evaluate the sheep's policies on held-out meadows.")
-    parser.add_argument("--meadows", type=int, default=16, help="number of meadows (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder of the policies (default: beside this file)")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="file to write (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        description="Evaluate the sheep's policies on held-out meadows."
+    )
+    parser.add_argument(
+        "--meadows", type=int, default=16, help="number of meadows (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=OUT, help="folder of the policies (default: beside this file)"
+    )
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS, help="file to write (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     write(compare(options.out, range(HELD_OUT, HELD_OUT + options.meadows)), options.results)

@@ -11,7 +11,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def python(*arguments: object, **environment: str) -> str:
-    """Let another Python run something, with more variables in its environment; return what it has printed."""
+    """Let another Python run something, with more variables in its environment; return what it has
+    printed.
+    """
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
         cwd=ROOT,

@@ -11,7 +11,9 @@ torch = pytest.importorskip("torch")
 
 
 def pytest_configure(config) -> None:
-    """Learners warn of much that is theirs; what this library warns of, and what nobody could catch, is an error."""
+    """Learners warn of much that is theirs; what this library warns of, and what nobody could
+    catch, is an error.
+    """
     for line in (
         "default",
         "error:::simenv_marl",

@@ -1,4 +1,6 @@
-"""The code of the page on clients, ready to be run as its reader would run it: one block after the other."""
+"""The code of the page on clients, ready to be run as its reader would run it: one block after the
+other.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def blocks(name: str, section: str | None = None) -> list[CodeType]:
-    """Compile all python blocks of a file in ``docs``, or of a section or a tab of it, in their order."""
+    """Compile all python blocks of a file in ``docs``, or of a section or a tab of it, in their
+    order.
+    """
     text = (DOCS / name).read_text(encoding="utf-8")
     tab = f"{{tab-item}} {section}\n"
     if tab in text:
@@ -26,11 +30,15 @@ def blocks(name: str, section: str | None = None) -> list[CodeType]:
     found = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert found, f"docs/{name} has no python under {section!r}"
     where = f"docs/{name}: {section}" if section else f"docs/{name}"
-    return [compile(block, f"{where}, block {number}", "exec") for number, block in enumerate(found)]
+    return [
+        compile(block, f"{where}, block {number}", "exec") for number, block in enumerate(found)
+    ]
 
 
 def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
-    """Run the python blocks of a section of ``docs/clients.md``; after each, yield the names that it has left."""
+    """Run the python blocks of a section of ``docs/clients.md``; after each, yield the names that
+    it has left.
+    """
     monkeypatch.syspath_prepend(DOCS)
     names: dict[str, Any] = {"__name__": "__main__"}
     with models_of_pages_forgotten():

@@ -1,4 +1,6 @@
-"""The experiment: every script from its command line to its files, with a budget that teaches nobody anything."""
+"""The experiment: every script from its command line to its files, with a budget that teaches
+nobody anything.
+"""
 
 import json
 import shutil
@@ -20,9 +22,24 @@ QUESTIONS = {"sb3": ["1", "2", "3", "5a", "5b", "5c"], "torchrl": ["4a", "4b"], 
 
 
 def carry_out(library, out, *, questions, seeds, hashes):
-    """In a process of its own, as ``make experiment`` does; by ``hashes`` its sets of strings are in another order."""
-    options = ["--questions", *questions, "--seeds", *seeds, "--budget", 1024, "--workers", len(seeds), "--out", out]
-    commands.python("-m", f"studies.greenhouse_experiment.{library}", *options, PYTHONHASHSEED=hashes)
+    """In a process of its own, as ``make experiment`` does; by ``hashes`` its sets of strings are
+    in another order.
+    """
+    options = [
+        "--questions",
+        *questions,
+        "--seeds",
+        *seeds,
+        "--budget",
+        1024,
+        "--workers",
+        len(seeds),
+        "--out",
+        out,
+    ]
+    commands.python(
+        "-m", f"studies.greenhouse_experiment.{library}", *options, PYTHONHASHSEED=hashes
+    )
 
 
 def found(out, name):
@@ -47,7 +64,12 @@ def runs(library, tmp_path_factory):
 def test_every_question_is_answered_and_judged_on_the_way(library, runs):
     for question in QUESTIONS[library]:
         run = found(runs, f"{library}-{question}-3")
-        assert (run["library"], run["question"], run["seed"], run["budget"]) == (library, question, 3, 1024)
+        assert (run["library"], run["question"], run["seed"], run["budget"]) == (
+            library,
+            question,
+            3,
+            1024,
+        )
         assert [point["days"] for point in run["curve"]] == [0, 1024]
         assert run["days"] == 1024
         assert run["curve"][0] != run["curve"][1]
@@ -73,7 +95,13 @@ def test_figures_and_table_are_made_of_whatever_runs_there_are(library, runs, tm
     rows = drawn["experiment.md"].decode().splitlines()
     for question in QUESTIONS[library]:
         assert sum(row.startswith(f"| ({question}) ") for row in rows) == 1
-    for team in ("rule", "random actions", "constant ventilation", "constant pair", "CMA-ES, both, 60 episodes"):
+    for team in (
+        "rule",
+        "random actions",
+        "constant ventilation",
+        "constant pair",
+        "CMA-ES, both, 60 episodes",
+    ):
         assert sum(row.startswith(f"| {team} |") for row in rows) == 1
 
     results.main(options)  # out of the CSV files alone

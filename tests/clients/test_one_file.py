@@ -18,7 +18,11 @@ def test_the_script_of_the_page_learns(monkeypatch):
 
         def act(agent, observation, info):
             with torch.no_grad():
-                return script.Categorical(logits=script.actor(script.seen(observation))).sample().item()
+                return (
+                    script.Categorical(logits=script.actor(script.seen(observation)))
+                    .sample()
+                    .item()
+                )
 
         before = mean_return(script.FourWeeks, script.points, act)
         script.train(21)

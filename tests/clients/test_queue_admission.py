@@ -11,6 +11,19 @@ def test_a_short_training_by_time_beats_all_trainings_by_decision():
 
 def test_the_command_writes_a_row_for_each_training_and_a_figure(tmp_path):
     results, figure = tmp_path / "results.csv", tmp_path / "figure.png"
-    train.main(["--seeds", "1", "--steps", "500", "--runs", "3", "--out", str(results), "--figure", str(figure)])
+    train.main(
+        [
+            "--seeds",
+            "1",
+            "--steps",
+            "500",
+            "--runs",
+            "3",
+            "--out",
+            str(results),
+            "--figure",
+            str(figure),
+        ]
+    )
     assert len(results.read_text().splitlines()) == 1 + 2 + len(train.GAMMAS)
     assert figure.stat().st_size > 10_000

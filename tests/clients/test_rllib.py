@@ -1,4 +1,6 @@
-"""RLlib's new API stack: its own wrappers, its own checker, its own training, and its modules in our loop."""
+"""RLlib's new API stack: its own wrappers, its own checker, its own training, and its modules in
+our loop.
+"""
 
 import os
 import random
@@ -48,7 +50,9 @@ def _also_without_torch():
 
 @pytest.mark.parametrize("view", HIVES)
 def test_its_checker_finds_nothing_and_its_episodes_end_when_ours_do(view):
-    """A death and a time limit in the same step are neither ``terminated`` nor ``truncated`` for all, unless padded."""
+    """A death and a time limit in the same step are neither ``terminated`` nor ``truncated`` for
+    all, unless padded.
+    """
     env = hive(view)
     check_multiagent_environments(env)
     assert set(env.possible_agents) == set(BEES)
@@ -74,7 +78,14 @@ def hive_config(view, definition, **environment):
         .env_runners(num_env_runners=0)
         .multi_agent(policies={"bee"}, policy_mapping_fn=lambda agent, episode, **_: "bee")
         .rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[32, 32]))
-        .training(train_batch_size_per_learner=512, minibatch_size=128, num_epochs=8, lr=3e-3, gamma=0.9, grad_clip=1.0)
+        .training(
+            train_batch_size_per_learner=512,
+            minibatch_size=128,
+            num_epochs=8,
+            lr=3e-3,
+            gamma=0.9,
+            grad_clip=1.0,
+        )
         .debugging(seed=0)
     )
 
@@ -87,7 +98,11 @@ def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
 
     def worth():
         exec(take_out, names)
-        return mean_return(names["FourWeeks"], names["points"], lambda agent, seen, _: names["policies"][agent](seen))
+        return mean_return(
+            names["FourWeeks"],
+            names["points"],
+            lambda agent, seen, _: names["policies"][agent](seen),
+        )
 
     names["checkpoint"] = names["algorithm"].save_to_path()
     before = worth()
@@ -108,7 +123,9 @@ def test_one_policy_for_all_who_are_born(view):
     policy = names["policy_of"](algorithm.get_module("bee"))
 
     def worth():
-        return mean_return(HiveSim, points(DEFINITION), lambda bee, seen, _: policy(seen), possible_agents=BEES)
+        return mean_return(
+            HiveSim, points(DEFINITION), lambda bee, seen, _: policy(seen), possible_agents=BEES
+        )
 
     before = worth()
     for _ in range(8):

@@ -1,4 +1,6 @@
-"""TorchRL: one policy for all sheep of Mesa's model, learnt from the episodes that ``collect_episodes`` returns."""
+"""TorchRL: one policy for all sheep of Mesa's model, learnt from the episodes that
+``collect_episodes`` returns.
+"""
 
 from functools import partial
 
@@ -14,7 +16,9 @@ SMALL = {"width": 10, "height": 10, "initial_sheep": 30, "initial_wolves": 12}
 def test_a_seed_determines_everything():
     def run(seed):
         herd, course = train.train(2, seed, decisions=5000, each=1000, ticks=20, **SMALL)
-        return herd.logits.state_dict(), [(one.decisions, one.sheep, one.life, one.survived) for one in course]
+        return herd.logits.state_dict(), [
+            (one.decisions, one.sheep, one.life, one.survived) for one in course
+        ]
 
     (one, course), (another, again), (other, _) = run(0), run(0), run(1)
     assert len(course) >= 2
@@ -24,10 +28,15 @@ def test_a_seed_determines_everything():
 
 
 def test_sheep_learn_to_live_longer():
-    """Of the default meadow, on seeds that nobody was trained on: more turns for each sheep than before."""
+    """Of the default meadow, on seeds that nobody was trained on: more turns for each sheep than
+    before.
+    """
 
     def turns(policy):
-        meadow, seeds = partial(Meadow, 40, only_with_sheep=True), range(train.HELD_OUT, train.HELD_OUT + 8)
+        meadow, seeds = (
+            partial(Meadow, 40, only_with_sheep=True),
+            range(train.HELD_OUT, train.HELD_OUT + 8),
+        )
         found = collect_episodes(meadow, {MOVE: policy}, points=sheep_points(2), seeds=seeds)[MOVE]
         return len(found) / len(found.starts)
 

@@ -13,7 +13,9 @@ from . import page
 
 def test_agents_that_are_born_and_die_are_all_there_all_the_time():
     options = {"possible_agents": BEES, "state_space": "observations"}
-    env = wrap_env(pad_agents(parallel_env(HiveSim, points(DEFINITION), **options)), wrapper="pettingzoo")
+    env = wrap_env(
+        pad_agents(parallel_env(HiveSim, points(DEFINITION), **options)), wrapper="pettingzoo"
+    )
     observations, _ = env.reset()
     days = 0
     while env.agents:
@@ -58,7 +60,9 @@ def test_single_views_and_vectors_of_them_are_wrapped():
     assert observation.shape == (1, 6)
     assert env.step(torch.tensor([[0.25]]))[1].shape == (1, 1)
     env.close()
-    envs = wrap_env(vector_env(GreenhouseSim, WATERING, num_envs=3), wrapper="gymnasium", verbose=False)
+    envs = wrap_env(
+        vector_env(GreenhouseSim, WATERING, num_envs=3), wrapper="gymnasium", verbose=False
+    )
     observations, _ = envs.reset()
     assert observations.shape == (3, 6)
     assert envs.step(torch.zeros(3, 1))[1].isfinite().all()

@@ -38,7 +38,11 @@ def test_learner_sweep_resumes(tmp_path):
 
 
 def test_learner_sweep_has_the_table_of_its_page(tmp_path, monkeypatch):
-    pytest.importorskip("optuna"), pytest.importorskip("seaborn"), pytest.importorskip("statsmodels")
+    (
+        pytest.importorskip("optuna"),
+        pytest.importorskip("seaborn"),
+        pytest.importorskip("statsmodels"),
+    )
     from studies.learner_sweep import sweep
 
     monkeypatch.setattr(sweep, "LEVELS", {"learning_rate": [1e-3, 3e-3], "gamma": [0.8, 0.9]})
@@ -59,8 +63,12 @@ def test_wolf_sheep_from_training_to_the_pictures(tmp_path):
     options = "--seeds", 2, "--decisions", 1, "--ticks", 5, "--out", tmp_path, "--curves", curves
     commands.python("-m", "examples.wolf_sheep.train", *options)
     with curves.open(newline="") as file:
-        assert {(row["sight"], row["seed"]) for row in csv.DictReader(file)} == {(s, n) for s in "12" for n in "01"}
-    commands.python("-m", "studies.wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
+        assert {(row["sight"], row["seed"]) for row in csv.DictReader(file)} == {
+            (s, n) for s in "12" for n in "01"
+        }
+    commands.python(
+        "-m", "studies.wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path
+    )
     compared = json.loads(path.read_text())
     assert list(compared["results"]) == list(picture.STYLES)
     told = commands.python("-m", "studies.wolf_sheep.picture", "--figures", tmp_path)

@@ -1,4 +1,6 @@
-"""SuperSuit, whose wrappers people bring along: around our views they do what they do around those written by hand."""
+"""SuperSuit, whose wrappers people bring along: around our views they do what they do around those
+written by hand.
+"""
 
 import copy
 import importlib
@@ -20,7 +22,8 @@ from tests.worlds.dials import ACTIONS, DialEnv, DialSim, points
 from . import page
 from .returns import mean_return
 
-suit = vars(importlib.import_module("supersuit"))  # asked for what it has not, the module itself raises ImportErrors
+# asked for what it has not, the module itself raises ImportErrors
+suit = vars(importlib.import_module("supersuit"))
 HANDS = ["hand_0"]
 
 
@@ -56,7 +59,9 @@ class HandEnv(pettingzoo.ParallelEnv):
 
 
 def hive(clip_actions=False, **changes):
-    return parallel_env(HiveSim, bees(DEFINITION | changes), possible_agents=BEES, clip_actions=clip_actions)
+    return parallel_env(
+        HiveSim, bees(DEFINITION | changes), possible_agents=BEES, clip_actions=clip_actions
+    )
 
 
 def halved(value, *space):
@@ -64,7 +69,10 @@ def halved(value, *space):
 
 
 WRAPPERS = {
-    "action_lambda_v1": ({"change_action_fn": halved, "change_space_fn": lambda space: space}, "numbers"),
+    "action_lambda_v1": (
+        {"change_action_fn": halved, "change_space_fn": lambda space: space},
+        "numbers",
+    ),
     "agent_indicator_v0": ({}, "numbers"),
     "clip_actions_v0": ({}, "numbers"),
     "clip_reward_v0": ({}, "numbers"),
@@ -93,7 +101,9 @@ WRAPPERS = {
 
 def story_around(env):
     """Its spaces, and what it tells in some episodes of sampled actions."""
-    found = [env.observation_space(agent) for agent in HANDS] + [env.action_space(agent) for agent in HANDS]
+    found = [env.observation_space(agent) for agent in HANDS] + [
+        env.action_space(agent) for agent in HANDS
+    ]
     sampled = copy.deepcopy(env.action_space("hand_0"))
     sampled.seed(1)
     told = [found, env.reset(seed=3)]
@@ -113,7 +123,9 @@ def test_wrappers_do_in_turns_and_rounds_what_they_do_around_environments_writte
 
     api_test(make(), num_cycles=20)
     seed_test(make, num_cycles=20)
-    wrapped, by_hand = (suit[name](env, **arguments) for env in (parallel_env(DialSim, points(seen)), HandEnv(seen)))
+    wrapped, by_hand = (
+        suit[name](env, **arguments) for env in (parallel_env(DialSim, points(seen)), HandEnv(seen))
+    )
     assert alike(story_around(wrapped), story_around(by_hand))
 
 
@@ -121,7 +133,8 @@ def test_one_policy_of_stable_baselines3_for_all_agents():
     """As PettingZoo's tutorial has it."""
     envs = suit["pettingzoo_env_to_vec_env_v1"](suit["black_death_v3"](hive()))
     envs = suit["concat_vec_envs_v1"](envs, 4, num_cpus=1, base_class="stable_baselines3")
-    envs.venv.reset(seed=0)  # PPO's own seed=0 asks SuperSuit's vectors for a method that they have not
+    # PPO's own seed=0 asks SuperSuit's vectors for a method that they have not
+    envs.venv.reset(seed=0)
     np.random.seed(0)
     model = PPO("MlpPolicy", envs, n_steps=64, batch_size=256, gamma=0.5, learning_rate=3e-3)
     model.learn(10_000)
@@ -130,17 +143,29 @@ def test_one_policy_of_stable_baselines3_for_all_agents():
         return mean_return(HiveSim, bees(DEFINITION), act, possible_agents=BEES)
 
     by_rule = worth(lambda bee, seen, info: RULE)
-    assert worth(lambda bee, seen, info: int(model.predict(seen, deterministic=True)[0])) > by_rule + 3
+    assert (
+        worth(lambda bee, seen, info: int(model.predict(seen, deterministic=True)[0])) > by_rule + 3
+    )
 
 
 def test_options_replace_wrappers():
-    boxes = {"action_space": Box(0, 1, (1,)), "action_space_mapping": lambda action: int(2.9 * action[0])}
+    boxes = {
+        "action_space": Box(0, 1, (1,)),
+        "action_space_mapping": lambda action: int(2.9 * action[0]),
+    }
     wrapped = suit["clip_reward_v0"](suit["clip_actions_v0"](hive(**boxes)), 0, 0.5)
     halves = Box(0, 0.5, (4,))
-    wrapped = suit["observation_lambda_v0"](wrapped, lambda seen, space: halved(seen), lambda space: halves)
+    wrapped = suit["observation_lambda_v0"](
+        wrapped, lambda seen, space: halved(seen), lambda space: halves
+    )
     wrapped = suit["black_death_v3"](wrapped)
-    boxes |= {"observation_space": halves, "observation_space_mapping": lambda bee: halved(np.array(bee.observed()))}
-    ours = pad_agents(hive(reward_mapping=lambda bee: min(bee.brought, 0.5), clip_actions=True, **boxes))
+    boxes |= {
+        "observation_space": halves,
+        "observation_space_mapping": lambda bee: halved(np.array(bee.observed())),
+    }
+    ours = pad_agents(
+        hive(reward_mapping=lambda bee: min(bee.brought, 0.5), clip_actions=True, **boxes)
+    )
     told = []
     for env in (wrapped, ours):
         drawn = np.random.default_rng(3)
@@ -152,7 +177,8 @@ def test_options_replace_wrappers():
             told[-1].append(({name: observations[name] for name in sorted(alive)}, rewards))
     by_wrappers, by_options = told
     assert alike(by_wrappers[: len(by_options)], by_options)
-    assert 3 < len(by_options) == len(by_wrappers) - 1  # black_death_v3 notices the end a step later
+    # black_death_v3 notices the end a step later
+    assert 3 < len(by_options) == len(by_wrappers) - 1
     assert max(rewards["bee_0"] for _, rewards in by_options[1:]) == 0.5
 
 

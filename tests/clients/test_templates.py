@@ -1,4 +1,6 @@
-"""The template of a plain loop, with Stable-Baselines3: it trains where it was written, in half a minute, and gains."""
+"""The template of a plain loop, with Stable-Baselines3: it trains where it was written, in half a
+minute, and gains.
+"""
 
 from simenv_marl.testing.templates import write_template
 

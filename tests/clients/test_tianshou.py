@@ -36,8 +36,16 @@ def test_masks_in_observations_reach_the_policy(monkeypatch):
         "observation_space": spaces.Dict(
             observation=spaces.Box(0, 1, (2,), np.float32), action_mask=spaces.MultiBinary(5)
         ),
-        "observation_space_mapping": lambda shop: {"observation": [shop.day % 7 / 7, shop.asked / 60]},
-        "action_mask_mapping": lambda shop: [True, shop.day % 2 == 0, False, shop.day % 3 == 0, True],
+        "observation_space_mapping": lambda shop: {
+            "observation": [shop.day % 7 / 7, shop.asked / 60]
+        },
+        "action_mask_mapping": lambda shop: [
+            True,
+            shop.day % 2 == 0,
+            False,
+            shop.day % 3 == 0,
+            True,
+        ],
     }
     for point, definition in names["points"].items():
         names["points"][point] = replace(definition, **masked)
@@ -72,4 +80,6 @@ def test_the_code_of_the_page_runs(monkeypatch):
     before = mean_return(names["FourWeeks"], names["points"], greedy(names["algorithm"]))
     names = next(steps)
     assert mean_return(names["FourWeeks"], names["points"], greedy(names["algorithm"])) > before + 3
-    assert names["baker"](Batch(obs=np.array([[0, 0.5]]), info=Batch())).act[0] in spaces.Discrete(5)
+    assert names["baker"](Batch(obs=np.array([[0, 0.5]]), info=Batch())).act[0] in spaces.Discrete(
+        5
+    )

@@ -55,7 +55,9 @@ def test_agents_that_are_born_and_die_pass_the_checks(view, definition, grouped,
 @EVERY_VIEW
 def test_the_state_is_part_of_the_tensors(view):
     options = {"possible_agents": BEES, "state_space": spaces.Box(0, 1, (4,), np.float32)}
-    env = PettingZooWrapper(pad_agents(view(HiveSim, points(), **options)), use_mask=True, return_state=True)
+    env = PettingZooWrapper(
+        pad_agents(view(HiveSim, points(), **options)), use_mask=True, return_state=True
+    )
     check_env_specs(env)
     assert env.rollout(5)["state"].shape == (5, 4)
 
@@ -63,7 +65,9 @@ def test_the_state_is_part_of_the_tensors(view):
 def worth(policy):
     """The nectar that all bees bring home."""
     decide = hive_torchrl.single(policy)
-    return mean_return(HiveSim, points(), lambda bee, seen, info: decide(seen, info), possible_agents=BEES)
+    return mean_return(
+        HiveSim, points(), lambda bee, seen, info: decide(seen, info), possible_agents=BEES
+    )
 
 
 @EVERY_VIEW
@@ -73,5 +77,7 @@ def test_one_policy_for_all_who_are_born(view):
     before = worth(policy)
     hive_torchrl.train(env, policy, loss)
     assert worth(policy) > before + 4
-    learnt = simulate(HiveSim, {Bee.choose_meadow: hive_torchrl.single(policy)}, points=points(), seed=1)
+    learnt = simulate(
+        HiveSim, {Bee.choose_meadow: hive_torchrl.single(policy)}, points=points(), seed=1
+    )
     assert learnt.hive.day == DAYS

@@ -1,7 +1,8 @@
-"""Spread many simulations over a local cluster, and compare with this process alone. Run by ``make test-clusters``.
+"""Spread many simulations over a local cluster, and compare with this process alone. Run by ``make
+test-clusters``.
 
-``python -m tests.clusters.check dask`` or ``... ray``, each in an environment of its own, because of what it pins.
-Everything listens on the loopback address alone.
+``python -m tests.clusters.check dask`` or ``... ray``, each in an environment of its own, because
+of what it pins. Everything listens on the loopback address alone.
 """
 
 import argparse
@@ -57,7 +58,9 @@ def dask_cluster():
     from dask.distributed import Client, LocalCluster
 
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster,
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        ) as cluster,
         Client(cluster),
         joblib.parallel_config(backend="dask"),
     ):
@@ -84,11 +87,19 @@ def check():
     alone = simulate_many(Model, policies, seeds=seeds, collect=lambda model: model.log)
     for workers in (2, -1):
         found = simulate_many(
-            Model, policies, seeds=seeds, workers=workers, progress=True, collect=lambda model: (model.log, os.getpid())
+            Model,
+            policies,
+            seeds=seeds,
+            workers=workers,
+            progress=True,
+            collect=lambda model: (model.log, os.getpid()),
         )
         assert [log for log, _ in found] == alone
         assert os.getpid() not in {process for _, process in found}
-    one, other = (collect_episodes(Model, policies, seeds=seeds, workers=workers)[Model.decide] for workers in (0, 2))
+    one, other = (
+        collect_episodes(Model, policies, seeds=seeds, workers=workers)[Model.decide]
+        for workers in (0, 2)
+    )
     assert np.array_equal(one.rewards, other.rewards)
     assert np.array_equal(one.observations, other.observations)
     assert one.seeds == other.seeds
@@ -100,7 +111,10 @@ def check():
     assert raised is not None
     assert raised.args == ("on purpose",)
     assert "seed" in "".join(raised.__notes__)
-    assert simulate_many(Model, policies, seeds=seeds, workers=2, collect=lambda model: model.log) == alone
+    assert (
+        simulate_many(Model, policies, seeds=seeds, workers=2, collect=lambda model: model.log)
+        == alone
+    )
 
 
 def check_experiment():

@@ -1,4 +1,6 @@
-"""Mappings get the call's arguments bound to the function's signature, however the model writes the call."""
+"""Mappings get the call's arguments bound to the function's signature, however the model writes
+the call.
+"""
 
 import pytest
 

@@ -18,7 +18,9 @@ from tests.worlds.models import culprits, decision, notes, script, stacks
 COMPARE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_int), ctypes.POINTER(ctypes.c_int))
 EACH = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int)
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="libc is looked for in the process itself")
+pytestmark = pytest.mark.skipif(
+    sys.platform == "win32", reason="libc is looked for in the process itself"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -52,7 +54,9 @@ def sorting(ask, log, stop=None):
         guard = CallbackGuard(stop)
         try:
             with guard:
-                simulation.log.append(sort(guard.callback(lambda one, other: ask(one[0], other[0]))))
+                simulation.log.append(
+                    sort(guard.callback(lambda one, other: ask(one[0], other[0])))
+                )
         finally:
             log.append("finally")
 

@@ -1,4 +1,6 @@
-"""The simulation's ``close``: once for each reset that has succeeded, after the last observations."""
+"""The simulation's ``close``: once for each reset that has succeeded, after the last
+observations.
+"""
 
 import threading
 from contextlib import nullcontext
@@ -7,7 +9,16 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from simenv_marl import aec_env, branch, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl import (
+    aec_env,
+    branch,
+    joint_env,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
 from simenv_marl.data import collect_episodes
 from simenv_marl.experiments import evaluate
 from tests.worlds.models import define, notes
@@ -17,7 +28,9 @@ LOG = []
 
 
 class Shop:
-    """Keeps books, which the last observation reads; only the thread that has opened them may close them."""
+    """Keeps books, which the last observation reads; only the thread that has opened them may
+    close them.
+    """
 
     fails = False
 
@@ -59,7 +72,9 @@ def _log():
 
 BOOKS = {
     BOOK: define(
-        observation_space_mapping=lambda shop: [shop.sold(), 0], reward_mapping=lambda shop: shop.sold(), agent="clerk"
+        observation_space_mapping=lambda shop: [shop.sold(), 0],
+        reward_mapping=lambda shop: shop.sold(),
+        agent="clerk",
     )
 }
 
@@ -98,7 +113,11 @@ def test_close_is_called_before_the_next_reset_and_when_the_environment_is_close
 def test_an_environment_that_is_gone_closes_its_simulation_and_warns_of_an_error(view, shop):
     envs = [view(shop, BOOKS)]
     envs[0].reset(seed=1)
-    with pytest.warns(ResourceWarning, match="books cannot be closed") if shop is Broken else nullcontext():
+    with (
+        pytest.warns(ResourceWarning, match="books cannot be closed")
+        if shop is Broken
+        else nullcontext()
+    ):
         envs.clear()
     assert LOG == [("reset", 1), ("unwound", 1), ("close", 1)]
 

@@ -1,4 +1,7 @@
-"""What PettingZoo and Gymnasium check, on shapes of simulations that are awkward for them. Warnings are errors."""
+"""What PettingZoo and Gymnasium check, on shapes of simulations that are awkward for them.
+
+Warnings are errors.
+"""
 
 import random
 from functools import partial
@@ -24,7 +27,10 @@ STEPS = {
     "action_space_mapping": {0: -1.0, 1: 0.0, 2: 1.0},
     "reward_mapping": lambda walk: walk.place / 10,
 }
-PUSHES = {"action_space": spaces.Box(-1, 1, (1,), np.float32), "action_space_mapping": lambda action: float(action[0])}
+PUSHES = {
+    "action_space": spaces.Box(-1, 1, (1,), np.float32),
+    "action_space_mapping": lambda action: float(action[0]),
+}
 MASKED = {"action_mask_mapping": lambda walk: [1, walk.moves % 2, 1]}
 
 
@@ -102,16 +108,27 @@ def test_pettingzoos_tests_pass(shape):
         parallel_seed_test(partial(made, shape, "parallel"), num_cycles=100)
 
 
-@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")  # of those who have not been called yet
+# of those who have not been called yet
+@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
 def test_pettingzoos_conversions_pass_its_tests():
     api_test(parallel_to_aec(made(SHAPES["twice in a row"], "parallel")), num_cycles=20)
-    parallel_api_test(turn_based_aec_to_parallel(aec_env(walk("ant", "bee"), [ANT, BEE])), num_cycles=20)
+    parallel_api_test(
+        turn_based_aec_to_parallel(aec_env(walk("ant", "bee"), [ANT, BEE])), num_cycles=20
+    )
 
 
 def test_clones_pass_pettingzoos_and_gymnasiums_tests():
-    kits = {"aec": api_test, "parallel": parallel_api_test, "single": partial(check_env, skip_render_check=True)}
+    kits = {
+        "aec": api_test,
+        "parallel": parallel_api_test,
+        "single": partial(check_env, skip_render_check=True),
+    }
     for view, kit in kits.items():
-        env = made(SHAPES["twice in a row"], view) if view != "single" else single_env(walk("ant"), ANT)
+        env = (
+            made(SHAPES["twice in a row"], view)
+            if view != "single"
+            else single_env(walk("ant"), ANT)
+        )
         env.reset(seed=1)
         kit(clone(env))
 
@@ -121,8 +138,12 @@ def test_clones_pass_pettingzoos_and_gymnasiums_tests():
 @pytest.mark.filterwarnings("ignore:Observation space for each agent probably should be")
 def test_pettingzoos_tests_pass_with_masks_in_observations():
     seen = {
-        "observation_space": spaces.Dict({"observation": OBSERVATION, "action_mask": spaces.Box(0, 1, (3,), np.int8)}),
-        "observation_space_mapping": lambda walk: {"observation": [walk.place, walk.moves % 10, 1.0]},
+        "observation_space": spaces.Dict(
+            {"observation": OBSERVATION, "action_mask": spaces.Box(0, 1, (3,), np.int8)}
+        ),
+        "observation_space_mapping": lambda walk: {
+            "observation": [walk.place, walk.moves % 10, 1.0]
+        },
     }
     shape = walk("bee", "cat"), {CAT: define(agent="cat_0", **STEPS | seen, **MASKED)}, {}
     api_test(made(shape, "aec"), num_cycles=100)
@@ -130,9 +151,11 @@ def test_pettingzoos_tests_pass_with_masks_in_observations():
     parallel_api_test(made(shape, "parallel"), num_cycles=100)
 
 
-@pytest.mark.filterwarnings(r"ignore:\s*This environment does not have possible_agents")  # where none are declared
+# where none are declared
+@pytest.mark.filterwarnings(r"ignore:\s*This environment does not have possible_agents")
 @pytest.mark.filterwarnings("ignore:No agents present")  # after the end, where there is none
-@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")  # all that there is to see of the absent
+# all that there is to see of the absent
+@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
 @pytest.mark.parametrize("roster", ["unknown", "declared", "padded"])
 def test_pettingzoos_tests_pass_where_agents_are_born_and_die(roster):
     declared = {"possible_agents": {f"{HERE}.Creature.act": ROSTER[:6]}, "undeclared": "rule"}

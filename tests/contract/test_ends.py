@@ -42,7 +42,9 @@ def ended_by(trigger, held):
 @ALL_VIEWS
 @TRIGGERS
 @pytest.mark.parametrize("max_steps", [None, 1])
-def test_an_end_in_mid_episode_or_after_max_steps_unwinds_and_answers_no_decision(view, trigger, max_steps):
+def test_an_end_in_mid_episode_or_after_max_steps_unwinds_and_answers_no_decision(
+    view, trigger, max_steps
+):
     log, rewarded = [], []
 
     def main(simulation):
@@ -124,9 +126,13 @@ def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
 
 @pytest.mark.usefixtures("_collected")
 @ALL_VIEWS
-@pytest.mark.parametrize("when", ["never reset", "suspended", "ended", "truncated", "closed", "action refused"])
+@pytest.mark.parametrize(
+    "when", ["never reset", "suspended", "ended", "truncated", "closed", "action refused"]
+)
 @pytest.mark.parametrize("where", ["here", "elsewhere"])
-def test_an_environment_that_is_dropped_unwinds_at_once_and_takes_everything_along(view, when, where):
+def test_an_environment_that_is_dropped_unwinds_at_once_and_takes_everything_along(
+    view, when, where
+):
     def main(simulation):
         witness = Witness()
         try:
@@ -154,7 +160,8 @@ def test_an_environment_that_is_dropped_unwinds_at_once_and_takes_everything_alo
     held = [env]
     del env
     in_a_thread(held.clear) if where == "elsewhere" else held.clear()
-    greenlet.greenlet(lambda: None).switch()  # a stack of another thread unwinds when something switches
+    # a stack of another thread unwinds when something switches
+    greenlet.greenlet(lambda: None).switch()
     assert log == ([] if when == "never reset" else ["unwound"])
     gc.collect()
     assert [reference() for reference in references] == [None] * 3
@@ -302,7 +309,10 @@ class EngineError(Exception):
 
 
 def wrap(decide, how):
-    """Decide in an engine that raises an error of its own. Only a cleanup that fails is an error of the model."""
+    """Decide in an engine that raises an error of its own.
+
+    Only a cleanup that fails is an error of the model.
+    """
     kept = None
     try:
         decide()

@@ -64,7 +64,9 @@ def test_environments_have_spaces_of_their_own(make):
         return env.observation_space("pump_0"), env.action_space("pump_0")
 
     assert spaces_of(env) == (seeing, acting)
-    assert [space is again for space, again in zip(spaces_of(env), spaces_of(env), strict=True)] == [True, True]
+    assert [
+        space is again for space, again in zip(spaces_of(env), spaces_of(env), strict=True)
+    ] == [True, True]
     assert len({id(space) for space in (*spaces_of(env), *spaces_of(other), seeing, acting)}) == 6
 
 
@@ -82,7 +84,11 @@ class Rendering(Script):
 @EVERY_VIEW
 def test_environments_have_metadata_and_a_generator(make):
     plain = make(calling(PUMP), PUMP)
-    assert (plain.metadata["render_fps"], list(plain.metadata["render_modes"]), plain.render_mode) == (4, [], None)
+    assert (
+        plain.metadata["render_fps"],
+        list(plain.metadata["render_modes"]),
+        plain.render_mode,
+    ) == (4, [], None)
     env = make(Rendering, PUMP)
     assert str(env)
     assert env.unwrapped is env
@@ -113,12 +119,24 @@ def test_environments_have_metadata_and_a_generator(make):
         ),
         *(({"max_steps": wrong}, OptionValueError, "max_steps") for wrong in (0, -1, 2.0, "3")),
         *(({"driver": wrong}, OptionValueError, "driver") for wrong in ("magic", None)),
-        *(({"plugins": wrong}, OptionValueError, "plugins") for wrong in ("text", 3, {PUMP: print})),
-        *(({"policies": wrong}, OptionValueError, "polic") for wrong in (3, [PUMP], {"pump_0": 3}, {"pump_0": None})),
+        *(
+            ({"plugins": wrong}, OptionValueError, "plugins")
+            for wrong in ("text", 3, {PUMP: print})
+        ),
+        *(
+            ({"policies": wrong}, OptionValueError, "polic")
+            for wrong in (3, [PUMP], {"pump_0": 3}, {"pump_0": None})
+        ),
         ({"render_mode": 3}, OptionValueError, "render_mode"),
         *(
             ({"policies": {key: lambda observation: 1}}, UnknownPointError, "known are pump")
-            for key in ("fan_0", "tests.contract.test_environments.Nobody.decides", "no.where", 3, None)
+            for key in (
+                "fan_0",
+                "tests.contract.test_environments.Nobody.decides",
+                "no.where",
+                3,
+                None,
+            )
         ),
         ({"policies": {PUMP: RULE}}, UnknownPointError, "no decision point is left"),
     ],
@@ -127,7 +145,11 @@ def test_environments_have_metadata_and_a_generator(make):
 def test_options_that_cannot_be_are_refused(make, options, error, match):
     with pytest.raises(error, match=match) as caught:
         make(BOTH, PUMP, **options)
-    builtin = {UnknownOptionError: TypeError, OptionValueError: ValueError, UnknownPointError: LookupError}[error]
+    builtin = {
+        UnknownOptionError: TypeError,
+        OptionValueError: ValueError,
+        UnknownPointError: LookupError,
+    }[error]
     assert isinstance(caught.value, builtin)
 
 
@@ -171,7 +193,9 @@ def test_max_steps_runs_on_to_the_next_decision_and_truncates(actions):
 
 
 def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
-    env = aec_env(calling(*[PUMP, FAN] * 5), [PUMP, FAN], max_steps=3, policies={FAN: lambda observation: 1})
+    env = aec_env(
+        calling(*[PUMP, FAN] * 5), [PUMP, FAN], max_steps=3, policies={FAN: lambda observation: 1}
+    )
     env.reset()
     for _ in range(3):
         with pytest.raises(InvalidActionError, match="is not in its action space"):
@@ -188,7 +212,8 @@ def test_max_steps_count_neither_illegal_actions_nor_dead_steps_nor_policies():
 
 @pytest.mark.parametrize("key", ["fan_0", FAN])
 @pytest.mark.parametrize(
-    ("policy", "answer"), [(lambda observation: 4, 4), (RULE, "rule"), (lambda observation: RULE, "rule")]
+    ("policy", "answer"),
+    [(lambda observation: 4, 4), (RULE, "rule"), (lambda observation: RULE, "rule")],
 )
 def test_points_that_policies_answer_are_no_agents(key, policy, answer):
     env = aec_env(BOTH, [PUMP, FAN], policies={key: policy})
@@ -208,7 +233,12 @@ def first_legal(observation, info=None):
 
 @pytest.mark.parametrize(
     ("policy", "answer"),
-    [(first_legal, 3), (lambda observation, scale=2: scale, 2), (lambda *arguments: len(arguments[0]), 2), (len, 2)],
+    [
+        (first_legal, 3),
+        (lambda observation, scale=2: scale, 2),
+        (lambda *arguments: len(arguments[0]), 2),
+        (len, 2),
+    ],
 )
 def test_policies_are_callables_of_the_observation_or_of_observation_and_info(policy, answer):
     masks = {"action_mask_mapping": lambda: [0] * 3 + [1] * 7} if answer == 3 else {}
@@ -231,7 +261,9 @@ def test_a_policys_action_is_checked_and_mapped():
 
 
 def test_policies_of_agents_that_a_callable_names_by_any_name():
-    calls = calling(*[lambda name=name: NAMED(name) for name in ("herd.1", "Sheep 2", "herd.1", "c")])
+    calls = calling(
+        *[lambda name=name: NAMED(name) for name in ("herd.1", "Sheep 2", "herd.1", "c")]
+    )
     env = aec_env(calls, NAMED, policies={"herd.1": lambda observation: 7, "c": RULE})
     assert decisions(play(env, 1)) == ["Sheep 2"]
     assert env.simulation.log == [7, 1, 7, "rule"]
@@ -264,7 +296,9 @@ class Hut:
 
 class Housed(Script):
     points = {  # noqa: RUF012 - as simulations have it
-        f"{__name__}.Hut.heat": define(agent="heat_0", action_space_mapping=lambda action: 10 * action),
+        f"{__name__}.Hut.heat": define(
+            agent="heat_0", action_space_mapping=lambda action: 10 * action
+        ),
         f"{__name__}.Hut.air": define(agent="air_0"),
     }
 
@@ -272,7 +306,9 @@ class Housed(Script):
         super().__init__(lambda simulation: simulation.log.extend([Hut().heat(), Hut().air()]))
 
 
-@pytest.mark.parametrize("source", [Housed, lambda: Housed(), Housed()], ids=["class", "factory", "instance"])
+@pytest.mark.parametrize(
+    "source", [Housed, lambda: Housed(), Housed()], ids=["class", "factory", "instance"]
+)
 def test_a_point_that_is_named_has_the_simulations_own_definition(source):
     for named in (f"{__name__}.Hut.heat", [Hut.heat]):
         env = single_env(source, named)

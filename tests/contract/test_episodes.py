@@ -29,7 +29,9 @@ NESTED = spaces.Dict({"row": ROW, "parts": spaces.Tuple((spaces.Discrete(2), spa
 
 @pytest.mark.parametrize("at", range(3), ids=["first", "second", "at the end"])
 @pytest.mark.parametrize(
-    ("space", "value"), [(ROW, [1, 2, 3]), (spaces.Discrete(5), 1.5), (NESTED, {"row": [0] * 4})], ids=str
+    ("space", "value"),
+    [(ROW, [1, 2, 3]), (spaces.Discrete(5), 1.5), (NESTED, {"row": [0] * 4})],
+    ids=str,
 )
 @VIEWS
 def test_observations_that_do_not_fit_are_errors(view, space, value, at):
@@ -59,17 +61,25 @@ KINDS = {
     "own": (ROW, lambda array, parts: array, lambda row: row),
     "copy": (ROW, lambda array, parts: array.copy(), lambda row: row),
     "view": (ROW, lambda array, parts: array[:], lambda row: row),
-    "parts": (NESTED, lambda array, parts: parts, lambda row: {"row": row, "parts": (np.int64(1), "abc")}),
+    "parts": (
+        NESTED,
+        lambda array, parts: parts,
+        lambda row: {"row": row, "parts": (np.int64(1), "abc")},
+    ),
 }
 """What a model may give: its own array, one that it has just made, a view, or parts of these."""
 
 
 @pytest.mark.parametrize(("space", "observe", "expected"), KINDS.values(), ids=KINDS)
 @VIEWS
-def test_observations_are_never_shared_between_calls_or_with_the_model(view, space, observe, expected):
+def test_observations_are_never_shared_between_calls_or_with_the_model(
+    view, space, observe, expected
+):
     array = np.array([5, 6, 7, 8], np.float32)
     parts = {"row": array, "parts": [1, "abc"]}
-    decide = decision(observation_space=space, observation_space_mapping=lambda: observe(array, parts))
+    decide = decision(
+        observation_space=space, observation_space_mapping=lambda: observe(array, parts)
+    )
 
     def main(simulation):
         for level in (1, 2, 3):
@@ -84,7 +94,11 @@ def test_observations_are_never_shared_between_calls_or_with_the_model(view, spa
     result = env.reset()
     held, kept = [], []
     for level in (1, 2, 3):
-        seen = [env.last()[0], env.observe("choose_0"), env.last()[0]] if view is aec_env else [result[0]]
+        seen = (
+            [env.last()[0], env.observe("choose_0"), env.last()[0]]
+            if view is aec_env
+            else [result[0]]
+        )
         for observation in seen:
             assert same(observation, expected(np.float32([level, 6, 7, 8])))
             assert observation in space
@@ -119,8 +133,8 @@ def test_an_array_with_one_reference_to_it_is_copied(place):
 
 def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity_is_still_there():
     program = (
-        "0 health 1, 0 acts, 0 health 2, 1 health 3, 1 acts, 0 health 4, 0 acts, 2 acts, 0 health 6, 1 health 5,"
-        " 2 forgotten"
+        "0 health 1, 0 acts, 0 health 2, 1 health 3, 1 acts, 0 health 4, 0 acts, 2 acts, 0 health"
+        " 6, 1 health 5, 2 forgotten"
     )
     env = aec_env(life(program), beings())
     env.reset()
@@ -135,7 +149,9 @@ def test_observations_are_computed_at_each_decision_and_at_the_end_if_the_entity
         ("being_2", [2, 0], [0, 4]),
     ]
     env.observe("being_0")[:] = 0  # a copy
-    ended = {turn.agent: (turn.observation.tolist(), turn.reward) for turn in play(env, reset=False)}
+    ended = {
+        turn.agent: (turn.observation.tolist(), turn.reward) for turn in play(env, reset=False)
+    }
     assert ended == {"being_0": ([0, 6], 6.0), "being_1": ([1, 5], 5.0), "being_2": ([2, 0], 0.0)}
 
 
@@ -200,7 +216,9 @@ def test_rewards_are_finite_python_floats(view, before, paid, told):
     "space",
     [
         spaces.Discrete(3, start=2),
-        spaces.Dict({"a": spaces.Tuple((spaces.MultiBinary(3), spaces.Text(4))), "b": spaces.Box(0, np.inf)}),
+        spaces.Dict(
+            {"a": spaces.Tuple((spaces.MultiBinary(3), spaces.Text(4))), "b": spaces.Box(0, np.inf)}
+        ),
         spaces.OneOf((spaces.Sequence(spaces.Discrete(3)), spaces.Box(0, 1))),
     ],
     ids=str,
@@ -238,17 +256,29 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(choices
                 del being
 
     changes = {"choices": choices} if choices else {}
-    env = aec_env(script(main), beings(removed_by=(), **changes), policies=policy and {"being_2": policy})
+    env = aec_env(
+        script(main), beings(removed_by=(), **changes), policies=policy and {"being_2": policy}
+    )
     turns = play(env, actions)
-    assert env.unwrapped.simulation.log == [[True, False, False], [True, True, False], [True, True, True]]
+    assert env.unwrapped.simulation.log == [
+        [True, False, False],
+        [True, True, False],
+        [True, True, True],
+    ]
     asked = [0, 1, 2, 1, 2, 2] if policy is None else [0, 1, 1]
     assert decisions(turns) == [f"being_{number}" for number in asked]
-    assert sorted(turn.agent for turn in turns if turn.terminated) == [f"being_{n}" for n in sorted(set(asked))]
+    assert sorted(turn.agent for turn in turns if turn.terminated) == [
+        f"being_{n}" for n in sorted(set(asked))
+    ]
 
 
 @pytest.mark.parametrize(
     ("view", "action", "gone"),
-    [(single_env, RULE, [True, False]), (single_env, 0, [True, False]), (aec_env, 1, [False, True])],
+    [
+        (single_env, RULE, [True, False]),
+        (single_env, 0, [True, False]),
+        (aec_env, 1, [False, True]),
+    ],
 )
 def test_a_choice_that_the_model_lets_go_is_not_kept_alive(view, action, gone):
     flock = []
@@ -288,10 +318,14 @@ def test_a_choice_that_the_model_lets_go_is_not_kept_alive(view, action, gone):
     ids=str,
 )
 @VIEWS
-def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(view, space, legal, illegal):
+def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(
+    view, space, legal, illegal
+):
     moved = []
     decide = decision(
-        action_space=space, agent="a_0", action_space_mapping=lambda action: moved.append(action) or "done"
+        action_space=space,
+        agent="a_0",
+        action_space_mapping=lambda action: moved.append(action) or "done",
     )
     env = view(calling(decide, decide), decide)
     env.reset(seed=3)
@@ -308,5 +342,7 @@ def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(view, sp
                 assert after[1:] == before[1:]
                 assert np.array_equal(after[0], before[0])
         env.step(right)
-        assert np.array_equal(np.asarray(moved[-1]), np.asarray(right).astype(space.dtype or object))
+        assert np.array_equal(
+            np.asarray(moved[-1]), np.asarray(right).astype(space.dtype or object)
+        )
     assert env.unwrapped.simulation.log == ["done", "done"]

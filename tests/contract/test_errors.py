@@ -1,4 +1,6 @@
-"""Sections 5.8 and 11 of the contract: the library's own errors, and who may catch those of a model."""
+"""Sections 5.8 and 11 of the contract: the library's own errors, and who may catch those of a
+model.
+"""
 
 import gc
 import inspect
@@ -33,7 +35,11 @@ VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, join
 
 # -- the tree -------------------------------------------------------------------------------------
 
-LEAVES = [value for value in vars(errors).values() if inspect.isclass(value) and issubclass(value, SimEnvError)]
+LEAVES = [
+    value
+    for value in vars(errors).values()
+    if inspect.isclass(value) and issubclass(value, SimEnvError)
+]
 BUILTINS = (ValueError, TypeError, LookupError, RuntimeError, AssertionError, ImportError, OSError)
 
 
@@ -48,7 +54,11 @@ def test_all_errors_are_public_survive_pickling_and_have_one_root():
         made.add_note("decision 3")
         copied = pickle.loads(pickle.dumps(made))
         assert type(copied) is error
-        assert (copied.args, str(copied), copied.__notes__) == (made.args, str(made), made.__notes__)
+        assert (copied.args, str(copied), copied.__notes__) == (
+            made.args,
+            str(made),
+            made.__notes__,
+        )
 
 
 # -- using an environment at the wrong time -------------------------------------------------------
@@ -137,7 +147,8 @@ def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_n
     with pytest.raises(WrongThreadError, match='driver="thread"') as caught:
         in_a_thread(use)
     assert isinstance(caught.value, RuntimeError)
-    # Else the collector crashes in greenlet. So it does if a variable has the root: here is only a weak reference.
+    # Else the collector crashes in greenlet. So it does if a variable has the root: here is only a
+    # weak reference.
     (root,) = roots
     assert root() is None or not gc.get_referrers(root())
     assert not unwound
@@ -192,7 +203,14 @@ def test_any_value_is_shown_in_short(make):
 
 
 def test_short_values_and_errors_are_shown_as_they_are():
-    for value in (1.5, "text", [1, 2.0, None], {"b": 1, "a": (2,)}, np.arange(3), spaces.Discrete(3)):
+    for value in (
+        1.5,
+        "text",
+        [1, 2.0, None],
+        {"b": 1, "a": (2,)},
+        np.arange(3),
+        spaces.Discrete(3),
+    ):
         assert sorted(short_repr(value)) == sorted(repr(value))  # keys may be sorted
     assert describe_error(ValueError("bad")) == "ValueError: bad"
     assert describe_error(BrokenError()) == f"BrokenError: {error_text(BrokenError())}"
@@ -213,7 +231,11 @@ def test_an_action_that_is_none_is_refused_in_short_whatever_it_looks_like(view,
 @unwieldy
 @pytest.mark.parametrize(
     ("name", "error"),
-    [("observation_space_mapping", ObservationError), ("reward_mapping", RewardError), ("agent", AgentError)],
+    [
+        ("observation_space_mapping", ObservationError),
+        ("reward_mapping", RewardError),
+        ("agent", AgentError),
+    ],
 )
 def test_invalid_results_of_mappings_are_refused_with_short_messages(name, error, make):
     if name == "agent" and isinstance(make(), str):

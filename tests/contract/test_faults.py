@@ -1,4 +1,6 @@
-"""Whatever fails, wherever: it surfaces as itself, nothing hangs or stays behind, and the next episode is as ever."""
+"""Whatever fails, wherever: it surfaces as itself, nothing hangs or stays behind, and the next
+episode is as ever.
+"""
 
 import gc
 import os
@@ -13,7 +15,15 @@ import greenlet
 import pytest
 
 import simenv_marl
-from simenv_marl import aec_env, joint_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl import (
+    aec_env,
+    joint_env,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
 from simenv_marl.core import threads
 from simenv_marl.errors import NotResetError, ReentrancyError, ResetNeededError
 from simenv_marl.hooks.stacks import EVALUATING
@@ -88,7 +98,10 @@ def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
     env, farm = farm_env(view, place)
     kinds = list(ERRORS.items())
     later = [] if place in farms.ONCE else kinds[:6]
-    for time, (kind, make) in [*product([1], kinds[: None if view is aec_env else 6]), *product([3], later)]:
+    for time, (kind, make) in [
+        *product([1], kinds[: None if view is aec_env else 6]),
+        *product([3], later),
+    ]:
         error = make()
         cause = error.__cause__
         farm.let(partial(throw, error), place, time)
@@ -106,7 +119,9 @@ def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
         if place not in ("render", "action"):  # after which the episode goes on
             with pytest.raises(ResetNeededError, match=r"call reset\(\)"):
                 take(env, 0)
-            assert view is not aec_env or not (env.agents or env.rewards or env.terminations or env.infos)
+            assert view is not aec_env or not (
+                env.agents or env.rewards or env.terminations or env.infos
+            )
         env.close()
         del caught, error, cause, farm.happen
         nothing_is_left()
@@ -140,7 +155,9 @@ def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
     ],
 )
 @pytest.mark.parametrize("seed", [31, None])  # None: it is drawn
-def test_one_note_says_at_which_decision_of_whom_it_was_and_the_seed(view, place, time, where, seed):
+def test_one_note_says_at_which_decision_of_whom_it_was_and_the_seed(
+    view, place, time, where, seed
+):
     env, farm = farm_env(view, place)
     farm.let(partial(throw, ValueError("told")), place, time)
     with pytest.raises(ValueError, match="told") as caught:
@@ -212,7 +229,9 @@ def act(env):
 
 
 def interrupt_at(number, function, *args):
-    """Call a function; raise a KeyboardInterrupt where Python looks for signals in this package, the given time.
+    """Call a function.
+
+    Raise a KeyboardInterrupt where Python looks for signals in this package, the given time.
 
     That is where a function begins, and where a call of a builtin has returned.
 
@@ -225,7 +244,8 @@ def interrupt_at(number, function, *args):
         if event not in ("call", "c_return") or not frame.f_code.co_filename.startswith(_PACKAGE):
             return
         if frame.f_code.co_name in ("__exit__", "__del__"):
-            return  # where a ``with`` ends: there nobody can help it; and where Python itself swallows it
+            # where a ``with`` ends: there nobody can help it; and where Python itself swallows it
+            return
         left -= 1
         if left == 0:
             sys.setprofile(None)
@@ -245,7 +265,8 @@ def interrupt_at(number, function, *args):
 
 @EACH_VIEW
 def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_complete(view):
-    # In a process of its own: where greenlets were interrupted amid a switch, the collector may crash later.
+    # In a process of its own: where greenlets were interrupted amid a switch, the collector may
+    # crash later.
     alone(interrupt_anywhere, view.__name__)
 
 
@@ -272,7 +293,8 @@ def interrupt_anywhere(name):
         del raised
         assert nobody_is_asked(), where
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ResourceWarning)  # a thread that was never begun cannot be unwound
+            # a thread that was never begun cannot be unwound
+            warnings.simplefilter("ignore", ResourceWarning)
             whole_run(env)
             env.reset(seed=1)
             act(env)
@@ -286,7 +308,9 @@ USES = {
     "aec_env": lambda: cut_short(farm_env(aec_env, "before")[0]),
     "vector_env": lambda: vector_env(Small, {PLAN: POINTS[PLAN]}, num_envs=2).close(),
     "simulate": lambda: simulate(Small, points=POINTS),
-    "simulate_many": lambda: simulate_many(Small, {"planner": lambda o: [0] * len(o)}, points=POINTS, seeds=[1, 2]),
+    "simulate_many": lambda: simulate_many(
+        Small, {"planner": lambda o: [0] * len(o)}, points=POINTS, seeds=[1, 2]
+    ),
 }
 
 

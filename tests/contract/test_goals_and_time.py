@@ -42,7 +42,11 @@ class Walk:
     """Walks on a plane, and wants to come to some place."""
 
     def reset(self, seed=None):
-        self.place, self.goal, self.steps = np.zeros(2), np.random.default_rng(seed).integers(-3, 4, 2).astype(float), 0
+        self.place, self.goal, self.steps = (
+            np.zeros(2),
+            np.random.default_rng(seed).integers(-3, 4, 2).astype(float),
+            0,
+        )
 
     def run(self):
         for self.steps in range(1, 9):
@@ -63,7 +67,9 @@ GOAL = {
     "observation_space_mapping": lambda walk, pace: [*walk.place, walk.steps],
     "action_space": spaces.Box(-1, 1, (2,), np.float32),
     "action_space_mapping": lambda action: action.astype(float),
-    "reward_mapping": lambda walk, pace: distance(np.float32(walk.place), np.float32(walk.goal), None),
+    "reward_mapping": lambda walk, pace: distance(
+        np.float32(walk.place), np.float32(walk.goal), None
+    ),
     "goal_space": spaces.Box(-20, 20, (2,), np.float32),
     "achieved_goal_mapping": lambda walk, pace: walk.place,
     "desired_goal_mapping": lambda walk, pace: walk.goal,
@@ -79,7 +85,11 @@ def test_goal_based_observations_are_dicts_of_the_users_own():
     env = single_env(Walk, goals())
     assert isinstance(env.observation_space, spaces.Dict)
     assert set(env.observation_space.spaces) == {"observation", "achieved_goal", "desired_goal"}
-    assert env.observation_space["achieved_goal"] == env.observation_space["desired_goal"] == GOAL["goal_space"]
+    assert (
+        env.observation_space["achieved_goal"]
+        == env.observation_space["desired_goal"]
+        == GOAL["goal_space"]
+    )
     first, info = env.reset(seed=3)
     assert info == {}
     assert first in env.observation_space
@@ -108,7 +118,10 @@ def test_rewards_are_computed_anew_for_other_goals():
         *[env.step(env.action_space.sample()) for _ in range(8)], strict=True
     )
     assert truncations[-1]
-    achieved, desired = (np.stack([seen[part] for seen in observations]) for part in ("achieved_goal", "desired_goal"))
+    achieved, desired = (
+        np.stack([seen[part] for seen in observations])
+        for part in ("achieved_goal", "desired_goal")
+    )
     assert env.compute_reward(achieved, desired, infos).tolist() == list(rewards)
     relabelled = env.compute_reward(achieved, np.repeat(achieved[-1:], 8, 0), infos)
     assert relabelled.shape == (8,)
@@ -138,13 +151,19 @@ def test_masks_stay_where_they_belong_beside_goals():
         "action_space": spaces.Discrete(3),
         "action_space_mapping": lambda action: np.array([action - 1.0, 0]),
         "action_mask_mapping": lambda walk, pace: [1, 0, 1],
-        "observation_space": spaces.Dict(place=GOAL["goal_space"], action_mask=spaces.MultiBinary(3)),
+        "observation_space": spaces.Dict(
+            place=GOAL["goal_space"], action_mask=spaces.MultiBinary(3)
+        ),
         "observation_space_mapping": lambda walk, pace: {"place": walk.place},
     }
     env = single_env(Walk, goals(**changes))
     observation, info = env.reset()
     assert observation in env.observation_space
-    assert info["action_mask"].tolist() == observation["observation"]["action_mask"].tolist() == [1, 0, 1]
+    assert (
+        info["action_mask"].tolist()
+        == observation["observation"]["action_mask"].tolist()
+        == [1, 0, 1]
+    )
     with pytest.raises(InvalidActionError, match="is masked"):
         env.step(1)
     assert env.step(2)[0]["achieved_goal"].tolist() == [1, 0]
@@ -164,7 +183,10 @@ def test_masks_on_request_are_flat_and_pass_through_wrappers():
         masks()
     env.reset()
     assert masks().dtype == np.bool_
-    for action, expected in (([0, 1], [True, False, False, True, True]), ([1, 0], [False, True, True, False, False])):
+    for action, expected in (
+        ([0, 1], [True, False, False, True, True]),
+        ([1, 0], [False, True, True, False, False]),
+    ):
         assert masks().tolist() == expected
         env.step(np.array(action))
     assert masks().tolist() == [True] * 5
@@ -184,7 +206,13 @@ MASKED = {"action_mask_mapping": lambda: ONE_MASK}
     ("changes", "mask", "illegal", "legal", "log"),
     [
         (MASKED, [[1] * 4 + [0] * 6], [4, 9], [3, 0], [3, 0]),
-        ({"choices": lambda: "ab", "action_space": spaces.Discrete(3)}, [[1, 1, 0]], [2], [1, 0], ["b", "a"]),
+        (
+            {"choices": lambda: "ab", "action_space": spaces.Discrete(3)},
+            [[1, 1, 0]],
+            [2],
+            [1, 0],
+            ["b", "a"],
+        ),
         (
             {
                 "action_space": spaces.MultiDiscrete([2, 3]),
@@ -224,7 +252,10 @@ def test_masked_actions_are_illegal_in_every_view(make, changes, mask, illegal, 
 
 def test_a_mask_that_the_model_itself_observes_is_no_mask_of_its_decisions():
     space = spaces.Dict({"action_mask": spaces.MultiBinary(10)})
-    own = {"observation_space": space, "observation_space_mapping": lambda: {"action_mask": [0, 1] * 5}}
+    own = {
+        "observation_space": space,
+        "observation_space_mapping": lambda: {"action_mask": [0, 1] * 5},
+    }
     ant = decision(agent="ant_0", **own)
     env = single_env(calling(ant), ant)
     observation, info = env.reset()
@@ -261,7 +292,9 @@ def times(turns, agent):
 
 def test_the_time_and_what_has_gone_by_since_the_agents_decision_before():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    env = aec_env(lambda: Clock((0, ant), (2, bee), (2.5, ant), (7, ant), (7, bee), end=11), [ant, bee])
+    env = aec_env(
+        lambda: Clock((0, ant), (2, bee), (2.5, ant), (7, ant), (7, bee), end=11), [ant, bee]
+    )
     for _ in range(2):
         turns = play(env, 1)
         assert times(turns, "ant_0") == [(0, 0), (2.5, 2.5), (7, 4.5), (11, 4)]
@@ -271,10 +304,17 @@ def test_the_time_and_what_has_gone_by_since_the_agents_decision_before():
 
 def test_the_time_of_the_announced_and_of_the_dead():
     program = "0 acts, 3 o'clock, 1 acts, 5 o'clock, 0 leaves, 8 o'clock, 1 acts"
-    env = aec_env(life(program, announced=[0, 1], timed=True), beings(action_mask_mapping=lambda being: ONE_MASK))
+    env = aec_env(
+        life(program, announced=[0, 1], timed=True),
+        beings(action_mask_mapping=lambda being: ONE_MASK),
+    )
     env.reset()
     told = env.infos["being_1"]
-    assert (told["time"], told["elapsed"], told["action_mask"].tolist()) == (0.0, 0.0, ONE_MASK.tolist())
+    assert (told["time"], told["elapsed"], told["action_mask"].tolist()) == (
+        0.0,
+        0.0,
+        ONE_MASK.tolist(),
+    )
     turns = play(env, 1)
     assert times(turns, "being_0") == [(0, 0), (5, 5)]
     assert times(turns, "being_1") == [(3, 0), (8, 5), (8, 0)]
@@ -285,7 +325,12 @@ def test_rounds_have_the_time_of_the_simulation():
     env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
     *_, infos = env.reset()
     assert (infos["ant_0"]["time"], infos["ant_0"]["elapsed"]) == (0, 0)
-    for agent, time, *elapsed in (("ant_0", 2, 2, 0), ("bee_0", 3, 3, 1), ("ant_0", 7, 4, 5), ("bee_0", 11, 8, 4)):
+    for agent, time, *elapsed in (
+        ("ant_0", 2, 2, 0),
+        ("bee_0", 3, 3, 1),
+        ("ant_0", 7, 4, 5),
+        ("bee_0", 11, 8, 4),
+    ):
         assert infos[agent]["deciding"]
         *_, infos = env.step({agent: 1})
         assert [info["time"] for info in infos.values()] == [time, time]
@@ -294,7 +339,8 @@ def test_rounds_have_the_time_of_the_simulation():
     *_, infos = env.step({"ant_0": 1, "bee_0": 1})
     assert [info["time"] for info in infos.values()] == [3, 3]
     assert infos["ant_0"]["elapsed"] == 3
-    assert infos["bee_0"]["elapsed"] > 0  # since 2, when it decided, or since 0, when its action was chosen
+    # since 2, when it decided, or since 0, when its action was chosen
+    assert infos["bee_0"]["elapsed"] > 0
 
 
 @pytest.mark.parametrize("action", [1, RULE])
@@ -334,7 +380,12 @@ def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discou
     env = make(clock, ant, discount_rate=rate)
     for _ in range(2):
         infos = told(env)
-        assert [(info["time"], info["elapsed"]) for info in infos] == [(1.0, 0.0), (3.0, 2.0), (7.0, 4.0), (8.0, 1.0)]
+        assert [(info["time"], info["elapsed"]) for info in infos] == [
+            (1.0, 0.0),
+            (3.0, 2.0),
+            (7.0, 4.0),
+            (8.0, 1.0),
+        ]
         expected = [None if rate is None else exp(-rate * info["elapsed"]) for info in infos]
         assert [info.get("discount") for info in infos] == expected
 
@@ -342,16 +393,23 @@ def test_every_view_tells_the_time_how_much_has_gone_by_and_at_a_rate_its_discou
 def test_forced_moves_are_discounted_with_the_decision_after_them():
     masks = iter([[1, 1], [1, 0], [1, 1], [1, 1]])
     ant = decision(
-        agent="ant_0", action_space=spaces.Discrete(2), action_mask_mapping=lambda: np.array(next(masks), np.int8)
+        agent="ant_0",
+        action_space=spaces.Discrete(2),
+        action_mask_mapping=lambda: np.array(next(masks), np.int8),
     )
-    env = single_env(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, skip_forced=True, discount_rate=0.5)
+    env = single_env(
+        lambda: Clock((1, ant), (3, ant), (7, ant), end=8), ant, skip_forced=True, discount_rate=0.5
+    )
     env.reset()
     assert env.step(1)[-1]["discount"] == exp(-3.0)
 
 
 @pytest.mark.parametrize("rate", [-0.1, np.nan, np.inf, True, "fast", [0.1]])
 def test_rates_that_do_not_discount_are_refused(rate):
-    with pytest.raises(OptionValueError, match="discount_rate must be a finite number that is not negative, or None"):
+    with pytest.raises(
+        OptionValueError,
+        match="discount_rate must be a finite number that is not negative, or None",
+    ):
         aec_env(lambda: Clock(end=1), decision(agent="ant_0"), discount_rate=rate)
 
 
@@ -369,10 +427,18 @@ def test_a_rate_needs_a_simulation_that_has_a_time():
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_infos_have_the_same_keys_from_the_reset_to_the_end(make):
     """There are learners that ask for them once and for all."""
-    ant, bee, elk = decision(agent="ant_0", **MASKED), decision(agent="bee_0", **MASKED), decision(agent="elk_0")
+    ant, bee, elk = (
+        decision(agent="ant_0", **MASKED),
+        decision(agent="bee_0", **MASKED),
+        decision(agent="elk_0"),
+    )
     env = make(Clock((0, ant), (1, bee), (2, ant), (3, ant), (4, bee), end=5), [ant, bee, elk])
     always = {"time", "elapsed"} | ({"deciding", "acted"} if make is parallel_env else set())
-    expected = {"ant_0": always | {"action_mask"}, "bee_0": always | {"action_mask"}, "elk_0": always}
+    expected = {
+        "ant_0": always | {"action_mask"},
+        "bee_0": always | {"action_mask"},
+        "elk_0": always,
+    }
     told = env.reset()
     infos = env.infos if told is None else told[1]
     assert infos.keys() == expected.keys()
@@ -404,15 +470,22 @@ def test_everything_is_legal_for_those_who_have_not_decided_yet():
 @pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
 def test_a_mask_in_an_observation_without_a_decision_is_open(make):
     """A mask of zeros would leave a policy nothing to choose from."""
-    seen = spaces.Dict(observations=spaces.Box(0, 9, (1,), np.float32), action_mask=spaces.MultiBinary(10))
-    given = {"observation_space": seen, "observation_space_mapping": lambda: {"observations": [1.0]}}
+    seen = spaces.Dict(
+        observations=spaces.Box(0, 9, (1,), np.float32), action_mask=spaces.MultiBinary(10)
+    )
+    given = {
+        "observation_space": seen,
+        "observation_space_mapping": lambda: {"observations": [1.0]},
+    }
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **MASKED, **given)
     env = make(calling(ant, bee), [ant, bee])
     told = env.reset()
     observation = env.observe("bee_0") if told is None else told[0]["bee_0"]
     assert observation["action_mask"].tolist() == [1] * 10
     assert observation["observations"].tolist() == [0.0]
-    assert observation in (env.observation_space["bee_0"] if make is joint_env else env.observation_space("bee_0"))
+    assert observation in (
+        env.observation_space["bee_0"] if make is joint_env else env.observation_space("bee_0")
+    )
     if make is parallel_env:
         observations, *_, infos = env.step({"ant_0": 1})
         seen, told = observations["bee_0"]["action_mask"], infos["bee_0"]["action_mask"]
@@ -471,7 +544,12 @@ def test_the_state_is_a_copy_of_the_simulations_in_its_space(make):
 def test_states_that_cannot_be_are_refused():
     ant = decision(agent="ant_0")
     for make, options, error, match in (
-        (lambda: Counted(ant), {"state_space": spaces.Box(-9, 9, (3,))}, ObservationError, "the observation has shape"),
+        (
+            lambda: Counted(ant),
+            {"state_space": spaces.Box(-9, 9, (3,))},
+            ObservationError,
+            "the observation has shape",
+        ),
         (calling(ant), {}, NotImplementedError, None),
     ):
         env = parallel_env(make, ant, **options)
@@ -490,9 +568,14 @@ def test_states_that_cannot_be_are_refused():
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_the_state_may_be_what_all_observe(make):
     ant = decision(agent="ant_0", observation_space=spaces.Box(0, 9, (2,), np.float32))
-    bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 2)
+    bee = decision(
+        agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 2
+    )
     env = make(calling(ant, bee), [ant, bee], state_space="observations")
-    assert (env.state_space.low.tolist(), env.state_space.high.tolist()) == ([0] * 5, [9, 9, 1, 1, 1])
+    assert (env.state_space.low.tolist(), env.state_space.high.tolist()) == (
+        [0] * 5,
+        [9, 9, 1, 1, 1],
+    )
     assert env.state_space is env.state_space
     with pytest.raises(NotResetError, match="no episode yet"):
         env.state()
@@ -519,7 +602,8 @@ def test_the_state_may_be_what_all_observe(make):
 def test_the_simulation_renders_in_its_modes(make, capsys):
     ant = decision(agent="ant_0")
     ansi, array, human, none = (
-        make(lambda: Counted(ant), ant, render_mode=mode) for mode in ("ansi", "rgb_array", "human", None)
+        make(lambda: Counted(ant), ant, render_mode=mode)
+        for mode in ("ansi", "rgb_array", "human", None)
     )
     assert ansi.render_mode == "ansi"
     assert ansi.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
@@ -549,7 +633,9 @@ def test_the_simulation_renders_in_its_modes(make, capsys):
 @pytest.mark.parametrize("mode", ["human", "rgb_array", "rgb_array_list"])
 def test_a_mode_that_the_simulation_lacks_is_a_warning(make, mode):
     ant = decision(agent="ant_0")
-    with pytest.warns(UserWarning, match=f"render_mode '{mode}' is not one of the simulation's .it has none."):
+    with pytest.warns(
+        UserWarning, match=f"render_mode '{mode}' is not one of the simulation's .it has none."
+    ):
         env = make(calling(ant), ant, render_mode=mode)
     assert env.render_mode is None
 
@@ -566,7 +652,9 @@ def test_lists_of_pictures_have_those_since_the_last_reset_or_render(registered_
             identity = register_simulation(lambda: Counted(ant), ant, name="drawn")[0]
         else:
             identity = "ByFunction-v0"
-            gymnasium.register(identity, lambda **options: single_env(lambda: Counted(ant), ant, **options))
+            gymnasium.register(
+                identity, lambda **options: single_env(lambda: Counted(ant), ant, **options)
+            )
         env = gymnasium.make(identity, render_mode="rgb_array_list")
         envs = gymnasium.make_vec(identity, num_envs=2, render_mode="rgb_array_list")
     for _ in range(2):

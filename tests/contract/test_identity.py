@@ -1,4 +1,6 @@
-"""An environment never changes what it is made of: random models of processes, in random use, in all views."""
+"""An environment never changes what it is made of: random models of processes, in random use, in
+all views.
+"""
 
 import gc
 
@@ -10,7 +12,17 @@ from hypothesis import strategies as st
 from simenv_marl import RULE, SimEnvError, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.errors import InvalidActionError, ResetNeededError
 from tests.worlds.models import follow_the_rule
-from tests.worlds.random_worlds import HERE, PLAN, POINTS, ROSTER, Yard, designs, outcome, plain, seeds
+from tests.worlds.random_worlds import (
+    HERE,
+    PLAN,
+    POINTS,
+    ROSTER,
+    Yard,
+    designs,
+    outcome,
+    plain,
+    seeds,
+)
 
 VIEWS = (aec_env, parallel_env, joint_env, single_env)
 
@@ -26,14 +38,18 @@ PLUGINS = [
         ("Machine.pace", "before"), ("Machine.work", "before_next"), ("Yard.manage", "after_next"),
     )
 ]  # fmt: skip
-OPTIONS = st.sampled_from([{}, {"plugins": PLUGINS}, {"global_rng": True}, {"state_space": spaces.Box(0, 1e4, (2,))}])
+OPTIONS = st.sampled_from(
+    [{}, {"plugins": PLUGINS}, {"global_rng": True}, {"state_space": spaces.Box(0, 1e4, (2,))}]
+)
 
 
 def made(view, design, **options):
     """An environment of a yard."""
     if view is joint_env:
         options["possible_agents"] = ROSTER
-    return view(lambda: Yard(design), PLAN if view is single_env else POINTS, render_mode="ansi", **options)
+    return view(
+        lambda: Yard(design), PLAN if view is single_env else POINTS, render_mode="ansi", **options
+    )
 
 
 # -- one model, many readings ---------------------------------------------------------------------
@@ -48,7 +64,10 @@ def test_with_rule_throughout_every_view_is_the_plain_run(design, seed, options)
         assert outcome(follow_the_rule(env, seed)) == expected, view
         env.close()
     assert outcome(simulate(lambda: Yard(design), points=POINTS, seed=seed, **options)) == expected
-    assert outcome(simulate(lambda: Yard(design), dict.fromkeys(POINTS, RULE), seed=seed, **options)) == expected
+    assert (
+        outcome(simulate(lambda: Yard(design), dict.fromkeys(POINTS, RULE), seed=seed, **options))
+        == expected
+    )
 
 
 # -- random use -----------------------------------------------------------------------------------
@@ -84,7 +103,10 @@ class Player:
 
     def ended(self):
         """Whether the episode of the agent that is selected has ended."""
-        return self.env.terminations[self.env.agent_selection] or self.env.truncations[self.env.agent_selection]
+        return (
+            self.env.terminations[self.env.agent_selection]
+            or self.env.truncations[self.env.agent_selection]
+        )
 
     def look(self):
         """Look at everything that there is to be seen; nothing changes for that."""
@@ -110,7 +132,9 @@ class Player:
             self.env.step(RULE)
 
     def check(self):
-        """Everything is as in an environment of its own, where nobody looks and nothing else happens."""
+        """Everything is as in an environment of its own, where nobody looks and nothing else
+        happens.
+        """
         if self.seed is None:
             return
         other = Player(*self.given)
@@ -126,7 +150,9 @@ class Player:
 uses = st.lists(
     st.tuples(
         st.integers(0, 2),
-        st.sampled_from(["step", "step", "step", "rule", "rule", "reset", "close", "look", "err", "plain", "gc"]),
+        st.sampled_from(
+            ["step", "step", "step", "rule", "rule", "reset", "close", "look", "err", "plain", "gc"]
+        ),
         st.integers(0, 9),
     ),
     min_size=5,
@@ -136,7 +162,9 @@ uses = st.lists(
 
 @given(designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses)
 @settings(max_examples=120)
-def test_whatever_is_done_with_some_environments_each_is_as_if_it_were_alone(design, kinds, sequence):
+def test_whatever_is_done_with_some_environments_each_is_as_if_it_were_alone(
+    design, kinds, sequence
+):
     players = [Player(view, design, options) for view, options in kinds]
     for which, what, number in sequence:
         player = players[which]

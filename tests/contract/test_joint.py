@@ -24,19 +24,30 @@ from tests.worlds.models import calling, decision, unwinding
 
 def points(number=2, **changes):
     """Decision functions of so many agents, ``ant_0``, ``bee_0`` and so on."""
-    return [decision(agent=f"{name}_0", **changes) for name in ("ant", "bee", "cat", "dog")[:number]]
+    return [
+        decision(agent=f"{name}_0", **changes) for name in ("ant", "bee", "cat", "dog")[:number]
+    ]
 
 
-BOX = {"action_space": spaces.Box(0, 1, (1,), np.float32), "action_space_mapping": lambda action: float(action[0])}
+BOX = {
+    "action_space": spaces.Box(0, 1, (1,), np.float32),
+    "action_space_mapping": lambda action: float(action[0]),
+}
 
 
 # -- dicts ----------------------------------------------------------------------------------------
 
 
 def test_spaces_are_dicts_keyed_by_agent():
-    ant, bee, cat = points(3, action_space=spaces.Discrete(10), observation_space=spaces.Box(-9, 9, (2,)))
-    env = joint_env(calling(ant, cat, bee), [ant, bee, cat], policies={"cat_0": lambda observation: 7})
-    assert env.action_space == spaces.Dict({"ant_0": spaces.Discrete(10), "bee_0": spaces.Discrete(10)})
+    ant, bee, cat = points(
+        3, action_space=spaces.Discrete(10), observation_space=spaces.Box(-9, 9, (2,))
+    )
+    env = joint_env(
+        calling(ant, cat, bee), [ant, bee, cat], policies={"cat_0": lambda observation: 7}
+    )
+    assert env.action_space == spaces.Dict(
+        {"ant_0": spaces.Discrete(10), "bee_0": spaces.Discrete(10)}
+    )
     assert list(env.observation_space.spaces) == ["ant_0", "bee_0"]
     for space in (env.observation_space, env.action_space):
         assert space["ant_0"] is not space["bee_0"]  # each has its own generator
@@ -58,7 +69,10 @@ def test_an_action_that_is_illegal_by_its_turn_counts_as_missing_and_infos_have_
     env.step({"ant_0": 2, "bee_0": 1, "cat_0": 0})
     *_, info = env.step({"ant_0": 2, "bee_0": 2, "cat_0": 0})
     assert env.simulation.log == [2, "y", 0, 2]
-    assert (info["deciding"], info["acted"]) == ("bee_0", {"ant_0": True, "bee_0": False, "cat_0": False})
+    assert (info["deciding"], info["acted"]) == (
+        "bee_0",
+        {"ant_0": True, "bee_0": False, "cat_0": False},
+    )
     masks = {name: given.tolist() for name, given in info["action_mask"].items()}
     assert masks == {"ant_0": mask.tolist(), "bee_0": [1, 1, 0]}
 
@@ -94,7 +108,10 @@ def test_a_step_is_a_round(max_steps):
         (False, {"ant_0": 0.5, "bee_0": 10}, "bee_0"),
         (False, {"ant_0": 0.5, "bee_0": None}, "bee_0"),
         *((False, given, f"given: {given!r}") for given in (None, np.array([1, 1]), "ant_0")),
-        *((True, np.array(row, np.float32), "action") for row in ([0.5], [[0.5, 0.5]], [0.5, 1.5], [0.5, np.nan])),
+        *(
+            (True, np.array(row, np.float32), "action")
+            for row in ([0.5], [[0.5, 0.5]], [0.5, 1.5], [0.5, np.nan])
+        ),
         *((True, given, "action") for given in (None, 0.5, {"ant_0": [0.5], "bee_0": [0.5]})),
     ],
     ids=repr,
@@ -122,8 +139,9 @@ def test_actions_that_are_refused_move_nothing(flatten, action, match):
 
 
 PACK = (
-    "0 health 1, 0 acts, 1 health 1, 1 acts, 2 health 1, 2 acts, 0 health 2, 0 acts, 1 health 2, 1 acts, 2 health 2,"
-    " 2 acts, 0 leaves, 1 health 3, 1 acts, 2 health 3, 2 acts, 1 health 4, 1 acts, 2 health 4, 2 acts"
+    "0 health 1, 0 acts, 1 health 1, 1 acts, 2 health 1, 2 acts, 0 health 2, 0 acts, 1 health 2, 1"
+    " acts, 2 health 2, 2 acts, 0 leaves, 1 health 3, 1 acts, 2 health 3, 2 acts, 1 health 4, 1"
+    " acts, 2 health 4, 2 acts"
 )
 """Three beings act and grow, of whom the first dies in the second round."""
 
@@ -165,10 +183,15 @@ def test_the_dead_are_observed_as_they_ended_and_neither_act_nor_are_paid():
     assert env.step(action)[2]
 
 
-@pytest.mark.parametrize("make", [joint_env, partial(vector_env, num_envs=2)], ids=["one", "vector"])
+@pytest.mark.parametrize(
+    "make", [joint_env, partial(vector_env, num_envs=2)], ids=["one", "vector"]
+)
 def test_a_roster_that_is_not_known_is_refused(make):
     for program in ("0 whole 1", PACK):
-        with pytest.raises(ViewError, match=r"known when .* those of tests\S+act; .*possible_agents=.*expected_calls"):
+        with pytest.raises(
+            ViewError,
+            match=r"known when .* those of tests\S+act; .*possible_agents=.*expected_calls",
+        ):
             make(life(program), beings())
     with pytest.raises(NoDecisionError, match="without a decision"):
         joint_env(life("0 whole 1", announced=[]), beings())
@@ -223,13 +246,23 @@ def test_flattened_discrete_spaces_have_one_mask():
         action_space_mapping=lambda action: action.tolist(),
         action_mask_mapping=lambda: ([0, 1], [1, 1, 1]),
     )
-    functions = [ant, decision(agent="bee_0", action_space=spaces.Discrete(2, start=5)), decision(agent="cat_0")]
+    functions = [
+        ant,
+        decision(agent="bee_0", action_space=spaces.Discrete(2, start=5)),
+        decision(agent="cat_0"),
+    ]
     env = joint_env(calling(*functions * 2), functions, flatten=True)
     assert env.action_space == spaces.MultiDiscrete([2, 3, 2, 10], start=[0, 0, 5, 0])
     with pytest.raises(NotResetError, match="no episode yet"):
         env.action_masks()
     env.reset()
-    for refused in ([1, 2, 6, 9], np.array([1.0, 2, 6, 9]), np.array([1, 2, 4, 9]), np.array([1, 2, 6]), 6):
+    for refused in (
+        [1, 2, 6, 9],
+        np.array([1.0, 2, 6, 9]),
+        np.array([1, 2, 4, 9]),
+        np.array([1, 2, 6]),
+        6,
+    ):
         with pytest.raises(InvalidActionError):
             env.step(refused)
     assert env.simulation.log == []
@@ -251,7 +284,11 @@ def test_flattened_discrete_spaces_have_one_mask():
     ("of_ant", "of_bee", "match"),
     [
         ({"action_space": spaces.MultiDiscrete([[2, 2]])}, {}, "needs one-dimensional Box"),
-        ({**BOX, "observation_space": spaces.Box(0, 1, (2, 2), np.float32)}, BOX, "needs one-dimensional Box"),
+        (
+            {**BOX, "observation_space": spaces.Box(0, 1, (2, 2), np.float32)},
+            BOX,
+            "needs one-dimensional Box",
+        ),
         ({**BOX, "observation_space": spaces.Discrete(3)}, BOX, "needs one-dimensional Box"),
         ({}, BOX, "all continuous or all discrete"),
     ],
@@ -273,7 +310,9 @@ def test_some_spaces_cannot_be_flattened(of_ant, of_bee, match):
     "make",
     [
         lambda: joint_env(life(PACK), beings(), possible_agents=[*NAMES, "being_3"]),
-        lambda: generate_env(calling(*(pair := points(**BOX)) * 20), pair, view="joint", flatten=True)(),
+        lambda: generate_env(
+            calling(*(pair := points(**BOX)) * 20), pair, view="joint", flatten=True
+        )(),
     ],
     ids=["deaths and a roster", "flattened"],
 )

@@ -7,7 +7,16 @@ from weakref import ref
 import pytest
 from hypothesis import given, settings
 
-from simenv_marl import RULE, TRUNCATED, SimEnvError, SimulationInterface, aec_env, parallel_env, simulate, single_env
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    SimEnvError,
+    SimulationInterface,
+    aec_env,
+    parallel_env,
+    simulate,
+    single_env,
+)
 from simenv_marl.errors import (
     AgentError,
     DefinitionError,
@@ -82,16 +91,25 @@ def test_spaces_of_all_possible_agents_are_dicts(make):
 def test_entities_of_one_name_are_one_agent_even_if_it_is_empty():
     """The name is the agent: a model may replace the object behind it."""
     named = beings(agent=lambda being: "")
-    turns = play(aec_env(life("0 acts, 1 health 1, 1 acts, 2 health 2, 2 acts, 2 health 9"), named), 1)
+    turns = play(
+        aec_env(life("0 acts, 1 health 1, 1 acts, 2 health 2, 2 acts, 2 health 9"), named), 1
+    )
     assert {turn.agent for turn in turns} == {""}
-    assert [(turn.observation[1], turn.reward) for turn in turns] == [(0, 0.0), (1, 1.0), (2, 2.0), (9, 9.0)]
+    assert [(turn.observation[1], turn.reward) for turn in turns] == [
+        (0, 0.0),
+        (1, 1.0),
+        (2, 2.0),
+        (9, 9.0),
+    ]
 
 
 def test_spaces_of_those_who_join_late_are_their_own_and_seeded():
     def drawn(env, seed):
         env.reset(seed=seed)
         env.step(1)
-        return {agent: [env.action_space(agent).sample() for _ in range(20)] for agent in env.agents}
+        return {
+            agent: [env.action_space(agent).sample() for _ in range(20)] for agent in env.agents
+        }
 
     env, other = (aec_env(life("0 acts, 1 acts"), beings()) for _ in range(2))
     other.reset(seed=9)  # another history
@@ -151,9 +169,17 @@ def test_a_roster_is_declared_by_point_where_there_are_several():
         ({"possible_agents": 5}, OptionValueError, "possible_agents"),
         ({"possible_agents": {"being_0": 5}}, OptionValueError, "possible_agents"),
         ({"possible_agents": {Other.act: ["other_0"]}}, OptionValueError, "Other.act"),
-        ({"possible_agents": {f"{HERE}.Being.leave": ["being_0"]}}, OptionValueError, "Being.leave"),
+        (
+            {"possible_agents": {f"{HERE}.Being.leave": ["being_0"]}},
+            OptionValueError,
+            "Being.leave",
+        ),
         ({"possible_agents": NAMES, "undeclared": "ignore"}, OptionValueError, "undeclared"),
-        ({"possible_agents": NAMES, "points": beings() | others()}, OptionValueError, "possible_agents must be a dict"),
+        (
+            {"possible_agents": NAMES, "points": beings() | others()},
+            OptionValueError,
+            "possible_agents must be a dict",
+        ),
     ],
 )
 def test_rosters_that_cannot_be_are_refused(options, error, match):
@@ -212,11 +238,19 @@ def test_announced_agents_join_and_are_observed_before_their_first_decision():
             [1, "rule", 1, 1],
         ),
         ([0, 1, 2], {}, {"policies": {"being_1": lambda observation: 5}}, [0, 2], [1, 5, 1, 1]),
-        ([0, 3], {}, {"possible_agents": NAMES, "undeclared": "rule"}, [0, 1, 2], [1, 1, 1, "rule"]),
+        (
+            [0, 3],
+            {},
+            {"possible_agents": NAMES, "undeclared": "rule"},
+            [0, 1, 2],
+            [1, 1, 1, "rule"],
+        ),
     ],
     ids=["nobody's agent", "a policy's agent", "an undeclared agent"],
 )
-def test_those_who_are_announced_join_if_their_decisions_are_the_users(announced, changes, options, agents, log):
+def test_those_who_are_announced_join_if_their_decisions_are_the_users(
+    announced, changes, options, agents, log
+):
     env = aec_env(life(IN_ORDER, announced=announced), beings(**changes), **options)
     env.reset()
     assert env.agents == [f"being_{number}" for number in agents]
@@ -317,7 +351,12 @@ RENAMED = f"{GOING}, 2 number 7, 2 acts, 2 whole 0, 2 leaves, 0 acts"
     ("program", "changes", "options", "expected"),
     [
         # Those who have not decided, and those who are no agents.
-        ("3 leaves, 0 acts, 2 leaves, 2 leaves, 9 leaves, 1 acts", {}, {"possible_agents": NAMES}, "0 2+ 1 0+ 1+"),
+        (
+            "3 leaves, 0 acts, 2 leaves, 2 leaves, 9 leaves, 1 acts",
+            {},
+            {"possible_agents": NAMES},
+            "0 2+ 1 0+ 1+",
+        ),
         # In the last step.
         ("0 acts, 1 acts, 0 leaves, 2 acts, 2 fails", {}, {"max_steps": 2}, "0 1 0+ 1~ 2~"),
         # A bare name means the agent of the first argument, which here is no being.
@@ -329,7 +368,10 @@ RENAMED = f"{GOING}, 2 number 7, 2 acts, 2 whole 0, 2 leaves, 0 acts"
         (RENAMED, UNSEEN | {"agent": if_whole}, {}, "0 1 2 1+ 7 7+ 0 0+ 2+"),
         # A callable names who is removed.
         (
-            "0 acts, 1 acts, 2 acts, 1 health 1, 1 banished, 2 banished, 0 leaves, 2 whole 1, 2 acts",
+            (
+                "0 acts, 1 acts, 2 acts, 1 health 1, 1 banished, 2 banished, 0 leaves, 2 whole 1,"
+                " 2 acts"
+            ),
             {"removed_by": {LEAVE: None, BANISH: banished}},
             {},
             "0 1 2 1+ 0+ 2 2+",
@@ -342,9 +384,13 @@ def test_agents_are_removed_when_their_entities_leave(program, changes, options,
 
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env])
-@pytest.mark.parametrize(("agent", "roster"), [(being_of, None), (being_of, NAMES), ("being_0", None)])
+@pytest.mark.parametrize(
+    ("agent", "roster"), [(being_of, None), (being_of, NAMES), ("being_0", None)]
+)
 @pytest.mark.parametrize("again", [0, 1], ids=["revived", "a namesake"])
-def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(view, agent, roster, again):
+def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(
+    view, agent, roster, again
+):
     program = life(f"0 acts, 0 leaves, {again} number 0, {again} whole 1, {again} acts, 0 fails")
     env = view(program, beings(agent=agent), possible_agents=roster)
     env.reset(seed=11)
@@ -360,7 +406,9 @@ def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(view,
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env, single_env])
 def test_several_entities_under_one_name_are_warned_of_once(view):
-    """Nothing was said of agents, and so they are taken to be one, whose rewards and differences mix."""
+    """Nothing was said of agents, and so they are taken to be one, whose rewards and differences
+    mix.
+    """
 
     def main(simulation):
         simulation.crowd = [Being(number) for number in range(simulation.seed)]
@@ -370,7 +418,9 @@ def test_several_entities_under_one_name_are_warned_of_once(view):
     env = view(script(main), {Being.act: define()})
     follow_the_rule(env, 1)
     follow_the_rule(env, 1)  # another one in each episode is the one of that episode
-    with pytest.warns(UserWarning, match=r"several objects decide at .*Being\.act as one agent, 'act_0'.*agent="):
+    with pytest.warns(
+        UserWarning, match=r"several objects decide at .*Being\.act as one agent, 'act_0'.*agent="
+    ):
         follow_the_rule(env, 2)
     follow_the_rule(env, 2)
     follow_the_rule(view(script(main), {Being.act: define(agent="all_of_them")}), 2)
@@ -507,11 +557,15 @@ BY_NAME = beings(removed_by=())
 
 
 def test_an_agent_that_is_ended_is_rewarded_and_observed_for_the_last_time_and_leaves():
-    program = "0 acts, 1 acts, 2 acts, 1 health 2, 1 ends, 7 ends, 1 health 9, 0 acts, 1 ends, 2 acts"
+    program = (
+        "0 acts, 1 acts, 2 acts, 1 health 2, 1 ends, 7 ends, 1 health 9, 0 acts, 1 ends, 2 acts"
+    )
     turns = play(aec_env(ending(program), BY_NAME), 1)
     assert story(turns) == "0 1 2 1+ 0 2 0+ 2+"
     assert (turns[3].observation.tolist(), turns[3].reward) == ([1, 2], 2.0)
-    env = parallel_env(ending("0 acts, 1 acts, 1 health 3, 1 ends, 0 acts"), BY_NAME, possible_agents=NAMES[:2])
+    env = parallel_env(
+        ending("0 acts, 1 acts, 1 health 3, 1 ends, 0 acts"), BY_NAME, possible_agents=NAMES[:2]
+    )
     env.reset()
     _, rewards, terminations, *_ = env.step({"being_0": 1, "being_1": 1})
     assert (rewards["being_1"], terminations) == (3.0, {"being_0": False, "being_1": True})
@@ -535,7 +589,10 @@ def test_outside_an_environment_end_agent_does_nothing():
 
 
 def played(env, seed):
-    """Play a colony; check PettingZoo's books at every step. Returns who decided, the totals and the ends."""
+    """Play a colony; check PettingZoo's books at every step.
+
+    Returns who decided, the totals and the ends.
+    """
     env.reset(seed=seed)
     decided, totals, ends = [], Counter(), {}
     booked = Counter(env.rewards)
@@ -578,5 +635,7 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
             assert all(total == 0.0 for agent, total in totals.items() if agent not in plain.first)
             died = {entry[0] for entry in plain.trace if entry[1:] == ("died",)}
             for agent, ended in ends.items():
-                assert ended == ((True, False) if agent in died or not design.truncates else (False, True))
+                assert ended == (
+                    (True, False) if agent in died or not design.truncates else (False, True)
+                )
             assert set(ends) >= set(plain.first)

@@ -1,4 +1,6 @@
-"""What mappings are given: the simulation, where they ask for it; a chosen answer, where there are choices."""
+"""What mappings are given: the simulation, where they ask for it; a chosen answer, where there are
+choices.
+"""
 
 import gc
 import pickle
@@ -103,15 +105,21 @@ def last_choice(agent, env):
 
 
 @pytest.mark.parametrize(
-    ("title", "pay", "earned"), [("here", pay, [0, 2, 4, 6]), ("there", difference(pay), [0, 2, 2, 2])]
+    ("title", "pay", "earned"),
+    [("here", pay, [0, 2, 4, 6]), ("there", difference(pay), [0, 2, 2, 2])],
 )
 def test_each_kind_of_mapping_gets_the_simulation_of_its_environment(title, pay, earned) -> None:
     other = aec_env(Market("elsewhere"), points())
     other.reset()
     env = aec_env(Market(title), points(reward_mapping=pay))
     turns = play(env, last_choice, seed=5)
-    assert [turn.agent for turn in turns] == [f"{title}_0", f"{title}_1"] * 3 + [f"{title}_1", f"{title}_0"]
-    mine = [(turn.observation.tolist(), turn.reward) for turn in turns if turn.agent == f"{title}_0"]
+    assert [turn.agent for turn in turns] == [f"{title}_0", f"{title}_1"] * 3 + [
+        f"{title}_1",
+        f"{title}_0",
+    ]
+    mine = [
+        (turn.observation.tolist(), turn.reward) for turn in turns if turn.agent == f"{title}_0"
+    ]
     assert mine == list(zip([[0, 5], [1, 5], [2, 5], [2, 5]], earned, strict=True))
     assert [turn.terminated for turn in turns] == [False] * 6 + [True] * 2
     assert env.unwrapped.simulation.log == [(title, "low")] * 2 + [(title, "high")] * 4
@@ -160,7 +168,9 @@ def test_mappings_get_the_simulation_in_every_view_and_runner() -> None:
     first = {DEAL: lambda observation: 0}
     assert simulate(Market, first, points=points(), seed=1).log == [("market", "low")] * 6
     batched = {DEAL: lambda observations: np.zeros(len(observations), np.int64)}
-    days = simulate_many(Market, batched, seeds=range(3), points=points(), collect=lambda market: market.log)
+    days = simulate_many(
+        Market, batched, seeds=range(3), points=points(), collect=lambda market: market.log
+    )
     assert days == [[("market", "low")] * 6] * 3
     made = collect_episodes(Market, batched, seeds=range(3), points=points())[DEAL]
     assert made.names == ("market_0", "market_1")

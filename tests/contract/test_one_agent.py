@@ -55,7 +55,10 @@ class Player:
 
 
 class Game:
-    """Two players, turn by turn; how many moves are offered depends on the round. Each episode has six rounds."""
+    """Two players, turn by turn; how many moves are offered depends on the round.
+
+    Each episode has six rounds.
+    """
 
     offers = (1, 3, 1, 2, 1, 1)
 
@@ -116,7 +119,9 @@ NAMED = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(
 
 
 def episode(env):
-    """Play an episode of a Gymnasium environment; what each step has returned but for the info, and the offers."""
+    """Play an episode of a Gymnasium environment; what each step has returned but for the info,
+    and the offers.
+    """
     observation, info = env.reset(seed=3)
     steps, offers = [], [int(info["action_mask"].sum())]
     while True:
@@ -148,7 +153,9 @@ def test_one_named_agent_is_asked_and_all_others_are_left_to(policies, moves) ->
 
 def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
     """Names of a roster and of policies that are left to the rule are no reason for a warning."""
-    env = single_env(Casino, NAMED, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE})
+    env = single_env(
+        Casino, NAMED, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE}
+    )
     env.reset(seed=0)
     while not env.step(0)[2]:
         pass
@@ -196,12 +203,32 @@ def simulated(simulation, points, **options):
             AgentError,
             "its agents are ant_0",
         ),
-        *((single_env, Game, MOVE, {"agent": agent}, OptionValueError, "agent") for agent in ("", 3, ("player_red",))),
-        *((make, Game, MOVE, RED, UnknownOptionError, "single view") for make in (aec_env, parallel_env, joint_env)),
+        *(
+            (single_env, Game, MOVE, {"agent": agent}, OptionValueError, "agent")
+            for agent in ("", 3, ("player_red",))
+        ),
+        *(
+            (make, Game, MOVE, RED, UnknownOptionError, "single view")
+            for make in (aec_env, parallel_env, joint_env)
+        ),
         (simulated, Game, MOVE, RED, UnknownOptionError, "single_env"),
-        (single_env, Game, MOVE, RED | {"policies": {"player_red": RULE}}, OptionValueError, "policies"),
+        (
+            single_env,
+            Game,
+            MOVE,
+            RED | {"policies": {"player_red": RULE}},
+            OptionValueError,
+            "policies",
+        ),
         # Of a point all of whose agents a policy answers, none is left.
-        (single_env, Game, MOVE, RED | {"policies": {f"{PLACE}.move": RULE}}, UnknownPointError, "no decision point"),
+        (
+            single_env,
+            Game,
+            MOVE,
+            RED | {"policies": {f"{PLACE}.move": RULE}},
+            UnknownPointError,
+            "no decision point",
+        ),
     ],
 )
 def test_only_the_single_view_takes_an_agent_and_needs_one_of_many(
@@ -215,7 +242,10 @@ def test_all_that_makes_single_views_takes_the_name_of_the_agent() -> None:
     alone = episode(single_env(Game, MOVE, agent="player_blue"))
     made = generate_env(Game, MOVE, agent="player_blue")
     assert episode(made()) == alone
-    assert episode(generate_env(Game, MOVE, view="single", agent="player_red")(agent="player_blue")) == alone
+    assert (
+        episode(generate_env(Game, MOVE, view="single", agent="player_red")(agent="player_blue"))
+        == alone
+    )
     ids = register_simulation(Game, MOVE, name="one-agent", agent="player_blue")
     assert "one-agent/Move-v0" in ids
     assert episode(gymnasium.make("one-agent/Move-v0")) == alone
@@ -249,10 +279,13 @@ def test_forced_moves_ask_neither_the_user_nor_a_policy() -> None:
     simulate(Game, {f"{PLACE}.move": policy}, points=MOVE, skip_forced=True)
     assert asked == [3, 3, 2, 2]
     asked.clear()
-    (made,) = collect_episodes(Game, {f"{PLACE}.move": batched}, seeds=[0], points=MOVE, skip_forced=True).values()
+    (made,) = collect_episodes(
+        Game, {f"{PLACE}.move": batched}, seeds=[0], points=MOVE, skip_forced=True
+    ).values()
     assert sorted(asked) == [2, 2, 3, 3]
     assert len(made.actions) == 4
-    # Each player is paid what it has after each move but the first, and forced moves are paid with the next.
+    # Each player is paid what it has after each move but the first, and forced moves are paid with
+    # the next.
     assert made.rewards.sum() == 2 * sum(range(1, 7))
 
 
@@ -276,7 +309,10 @@ def test_in_rounds_forced_moves_use_no_action() -> None:
             {
                 "action_space": spaces.MultiDiscrete([2, 3], start=[0, 5]),
                 "action_space_mapping": lambda action: int(action.sum()),
-                "action_mask_mapping": lambda player, moves: ([0, 1], [0, 0, 1] if len(moves) == 1 else [1, 0, 1]),
+                "action_mask_mapping": lambda player, moves: (
+                    [0, 1],
+                    [0, 0, 1] if len(moves) == 1 else [1, 0, 1],
+                ),
             },
             [np.array([1, 5])],
             [8, 6, 8],
@@ -330,7 +366,9 @@ CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 
 
 
 def flown(make, space, action, *, clip_actions=True):
-    """What reaches the mapping of an agent called ``pilot``, of the last one where there are several."""
+    """What reaches the mapping of an agent called ``pilot``, of the last one where there are
+    several.
+    """
     taken = []
     fly = decision(agent="pilot", action_space=space, action_space_mapping=taken.append)
     env = make(calling(fly), fly, clip_actions=clip_actions)
@@ -360,7 +398,9 @@ def flown(make, space, action, *, clip_actions=True):
         ),
     ],
 )
-def test_actions_outside_a_box_are_clipped_with_the_option_alone(make, space, action, expected) -> None:
+def test_actions_outside_a_box_are_clipped_with_the_option_alone(
+    make, space, action, expected
+) -> None:
     taken = flown(make, space, action)
     assert same(taken, expected) or (type(taken) is float and taken == expected)
     with pytest.raises(InvalidActionError):
@@ -370,7 +410,16 @@ def test_actions_outside_a_box_are_clipped_with_the_option_alone(make, space, ac
 @pytest.mark.parametrize(
     ("space", "wrong"),
     [
-        *((BOX, wrong) for wrong in (np.array([np.nan, 0.0]), np.array([5.0]), np.array(["a", "b"]), None, [[1, 2]])),
+        *(
+            (BOX, wrong)
+            for wrong in (
+                np.array([np.nan, 0.0]),
+                np.array([5.0]),
+                np.array(["a", "b"]),
+                None,
+                [[1, 2]],
+            )
+        ),
         (spaces.Box(0, 5, (1,), np.int8), np.array([2.5])),
         (CAR, {"gas": [9.5, -9], "gear": (3, np.float32([7]))}),
     ],
@@ -383,7 +432,9 @@ def test_actions_that_cannot_be_clipped_are_refused(space, wrong) -> None:
 def test_the_vector_view_clips_as_the_single_view_does() -> None:
     two = partial(vector_env, num_envs=2)
     action = np.array([-7.5, 1e30], np.float32)
-    assert same(flown(two, BOX, np.stack([np.zeros(2, np.float32), action])), flown(single_env, BOX, action))
+    assert same(
+        flown(two, BOX, np.stack([np.zeros(2, np.float32), action])), flown(single_env, BOX, action)
+    )
     with pytest.raises(InvalidActionError):
         flown(two, BOX, np.array([[0, 0], [np.nan, 0]], np.float32))
 
@@ -394,7 +445,8 @@ def test_the_vector_view_clips_as_the_single_view_does() -> None:
 def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_step_or_round() -> None:
     """The first being has no choice and is out before the second one is asked."""
     program = (
-        "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2, 1 acts, 1 health 3"
+        "0 acts, 0 health 1, 0 acts, 0 health 2, 0 leaves, 1 acts, 1 health 1, 1 acts, 1 health 2,"
+        " 1 acts, 1 health 3"
     )
     points = beings(choices=lambda being: [1] if being.number == 0 else [1, 2])
     one = {"agent": "being_0", "skip_forced": True}

@@ -8,14 +8,28 @@ from hypothesis import given, settings
 from simenv_marl import RULE, aec_env
 from simenv_marl.errors import EpisodeOverError
 from tests.worlds.models import play
-from tests.worlds.worlds import Design, Reference, World, advised, answers, designs, legal, points_of, seeds
+from tests.worlds.worlds import (
+    Design,
+    Reference,
+    World,
+    advised,
+    answers,
+    designs,
+    legal,
+    points_of,
+    seeds,
+)
 
 
 def made(design: Design) -> Any:
     """An environment of a design."""
     points = points_of(design)
-    policies = {points[point]: advised for point in design.policies} | {points[point]: RULE for point in design.rules}
-    return aec_env(lambda: World(design, points), points, policies=policies or None, max_steps=design.max_steps)
+    policies = {points[point]: advised for point in design.policies} | {
+        points[point]: RULE for point in design.rules
+    }
+    return aec_env(
+        lambda: World(design, points), points, policies=policies or None, max_steps=design.max_steps
+    )
 
 
 def agrees(env: Any, reference: Reference) -> None:
@@ -25,7 +39,12 @@ def agrees(env: Any, reference: Reference) -> None:
         told = reference.turns[-1]
         assert env.agent_selection == told.agent
         observation, reward, terminated, truncated, _ = env.last()
-        assert (observation.tolist(), reward, terminated, truncated) == (told.observation, told.reward, False, False)
+        assert (observation.tolist(), reward, terminated, truncated) == (
+            told.observation,
+            told.reward,
+            False,
+            False,
+        )
         assert type(reward) is float
         return
     flags = (not reference.truncated, reference.truncated)

@@ -19,7 +19,16 @@ from simenv_marl.errors import (
     UnknownAgentError,
 )
 from tests.worlds.lives import life
-from tests.worlds.many_worlds import Announcing, Answered, Colony, answer, beings, colony, designs, seeds
+from tests.worlds.many_worlds import (
+    Announcing,
+    Answered,
+    Colony,
+    answer,
+    beings,
+    colony,
+    designs,
+    seeds,
+)
 from tests.worlds.models import calling, decision, define, notes, script
 
 
@@ -40,11 +49,17 @@ def acted(results):
 def test_observations_do_not_show_the_moves_of_the_same_round():
     env = parallel_env(life("0 acts, 1 health 5, 1 acts, 0 health 6", announced=[0, 1]), beings())
     observations, _ = env.reset()
-    assert {agent: seen.tolist() for agent, seen in observations.items()} == {"being_0": [0, 0], "being_1": [1, 0]}
+    assert {agent: seen.tolist() for agent, seen in observations.items()} == {
+        "being_0": [0, 0],
+        "being_1": [1, 0],
+    }
     observations["being_0"][:] = 7  # the user's own
     env.agents.append("me")
     observations, *_ = env.step({"being_0": 1, "being_1": 2})
-    assert {agent: seen.tolist() for agent, seen in observations.items()} == {"being_0": [0, 6], "being_1": [1, 5]}
+    assert {agent: seen.tolist() for agent, seen in observations.items()} == {
+        "being_0": [0, 6],
+        "being_1": [1, 5],
+    }
     assert env.agents == []
 
 
@@ -59,7 +74,10 @@ def test_a_round_answers_a_decision_within_a_decision():
 
 
 def test_actions_of_a_round_are_replayed_as_they_were_given():
-    box = {"action_space": spaces.Box(0, 9, (1,)), "action_space_mapping": lambda action: action.__iadd__(1).item()}
+    box = {
+        "action_space": spaces.Box(0, 9, (1,)),
+        "action_space_mapping": lambda action: action.__iadd__(1).item(),
+    }
     ant = decision(agent="ant_0", **box)
     env = parallel_env(calling(ant, ant), ant)
     env.reset(seed=0)
@@ -71,7 +89,9 @@ def play_rounds(env, share, rounds=10):
     """Play rounds with an action for the second agent in a share of them."""
     env.reset(seed=0)
     for number in range(rounds):
-        env.step({"ant_0": 1, "bee_0": 1} if number < share * rounds else {"ant_0": 1, "bee_0": RULE})
+        env.step(
+            {"ant_0": 1, "bee_0": 1} if number < share * rounds else {"ant_0": 1, "bee_0": RULE}
+        )
 
 
 @pytest.mark.filterwarnings("error")
@@ -88,7 +108,9 @@ def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
     play_rounds(env, 0.2)  # 11 of 12 were used
     nine = parallel_env(script(lambda simulation: [bee(), *(ant() for _ in range(8))]), [ant, bee])
     play_rounds(nine, 0.2, 8)  # 9 of 10
-    with pytest.warns(UserWarning, match=r"of 15 actions in this episode, 11 were used: .* aec_env loses none"):
+    with pytest.warns(
+        UserWarning, match=r"of 15 actions in this episode, 11 were used: .* aec_env loses none"
+    ):
         play_rounds(env, 0.5)
     play_rounds(env, 0.5)  # once for each environment
 
@@ -99,16 +121,28 @@ def test_the_end_of_an_episode_tells_once_how_many_actions_were_lost():
 @pytest.mark.parametrize(
     ("actions", "error", "match"),
     [
-        *((given, UnknownAgentError, "not a live agent") for given in ({"ant_0": 1, "nobody": 1}, {"ant_0": 1, 0: 1})),
+        *(
+            (given, UnknownAgentError, "not a live agent")
+            for given in ({"ant_0": 1, "nobody": 1}, {"ant_0": 1, 0: 1})
+        ),
         ({"ant_0": 10, "bee_0": 1}, InvalidActionError, "action"),
-        *(({"ant_0": 1, "bee_0": wrong}, InvalidActionError, "action") for wrong in (10, None, np.array([1]))),
-        *((given, InvalidActionError, "takes a dict of actions") for given in (None, 3, "ant_0", [1, 2])),
+        *(
+            ({"ant_0": 1, "bee_0": wrong}, InvalidActionError, "action")
+            for wrong in (10, None, np.array([1]))
+        ),
+        *(
+            (given, InvalidActionError, "takes a dict of actions")
+            for given in (None, 3, "ant_0", [1, 2])
+        ),
     ],
     ids=repr,
 )
 def test_actions_that_are_refused_move_nothing(actions, error, match):
     calls = []
-    ant, bee = (decision(agent=name, reward_mapping=lambda: calls.append(0) or 1.0) for name in ("ant_0", "bee_0"))
+    ant, bee = (
+        decision(agent=name, reward_mapping=lambda: calls.append(0) or 1.0)
+        for name in ("ant_0", "bee_0")
+    )
     env = parallel_env(calling(ant, bee, ant), [ant, bee])
     env.reset()
     del calls[:]
@@ -192,7 +226,11 @@ def test_the_dead_are_dropped_from_agents_in_the_same_step():
 
 @pytest.mark.parametrize(
     ("mapping", "good"),
-    [("reward_mapping", 0.0), ("observation_space_mapping", [1, 2]), ("action_mask_mapping", [1] * 10)],
+    [
+        ("reward_mapping", 0.0),
+        ("observation_space_mapping", [1, 2]),
+        ("action_mask_mapping", [1] * 10),
+    ],
 )
 def test_errors_in_mappings_say_whose_they_were(mapping, good):
     def bad():
@@ -241,7 +279,9 @@ class World:
         observation_space_mapping=lambda world, number: [world.level, world.calls],
         reward_mapping=lambda world, number: float(world.level),
         action_space=spaces.Discrete(4),
-        action_mask_mapping=lambda world, number: [allowed(world.level, number, action) for action in range(4)],
+        action_mask_mapping=lambda world, number: [
+            allowed(world.level, number, action) for action in range(4)
+        ],
     )
     def decide(self, number):
         return self.level % 4
@@ -305,7 +345,9 @@ def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
     for _ in range(40):
         if reference.over:
             break
-        wanted = data.draw(st.dictionaries(st.integers(0, 3), st.integers(0, 3) | st.just(RULE), max_size=4))
+        wanted = data.draw(
+            st.dictionaries(st.integers(0, 3), st.integers(0, 3) | st.just(RULE), max_size=4)
+        )
         before = reference.level
         expected = reference.step(wanted)
         actions = {AGENTS[agent]: action for agent, action in wanted.items()}
@@ -316,13 +358,21 @@ def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
             continue
         used, paid = expected
         all_rule = len(actions) == 4 and set(actions.values()) == {RULE}
-        observations, rewards, terminated, truncated, infos = env.step(RULE if all_rule else actions)
+        observations, rewards, terminated, truncated, infos = env.step(
+            RULE if all_rule else actions
+        )
         assert (env.simulation.level, env.simulation.calls) == (reference.level, reference.calls)
-        assert {agent for agent in AGENTS if infos[agent]["acted"]} == {AGENTS[agent] for agent in used}
-        assert rewards == {name: float(reference.level) if n in paid else 0.0 for n, name in enumerate(AGENTS)}
+        assert {agent for agent in AGENTS if infos[agent]["acted"]} == {
+            AGENTS[agent] for agent in used
+        }
+        assert rewards == {
+            name: float(reference.level) if n in paid else 0.0 for n, name in enumerate(AGENTS)
+        }
         for number, name in enumerate(AGENTS):
             joined = number in reference.joined
-            assert observations[name].tolist() == ([reference.level, reference.calls] if joined else [0, 0])
+            assert observations[name].tolist() == (
+                [reference.level, reference.calls] if joined else [0, 0]
+            )
             mask = [not joined or allowed(reference.level, number, action) for action in range(4)]
             assert infos[name]["action_mask"].tolist() == mask
         assert len({id(info["action_mask"]) for info in infos.values()}) == 4
@@ -330,14 +380,18 @@ def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
         assert set(truncated.values()) == {reference.truncated}
         assert env.agents == ([] if reference.over else AGENTS)
         if not reference.over:
-            assert [name for name in AGENTS if infos[name]["deciding"]] == [AGENTS[reference.program[0]]]
+            assert [name for name in AGENTS if infos[name]["deciding"]] == [
+                AGENTS[reference.program[0]]
+            ]
 
 
 # -- colonies -------------------------------------------------------------------------------------
 
 
 def played(env, seed, in_turns):
-    """Play a colony in rounds; returns the totals, the fortune at which everybody joined, and the ends."""
+    """Play a colony in rounds; returns the totals, the fortune at which everybody joined, and the
+    ends.
+    """
     _, infos = env.reset(seed=seed)
     used, totals, joined, ended = Counter(), Counter(), {}, {}
     for _ in range(2000):
@@ -385,7 +439,11 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
         for agent in plain.first:
             since = joined[agent] if simulation is Announcing else plain.first[agent]
             assert totals[agent] == plain.last[agent] - since
-        assert simulation is Announcing or not any(totals[agent] for agent in totals.keys() - plain.first.keys())
+        assert simulation is Announcing or not any(
+            totals[agent] for agent in totals.keys() - plain.first.keys()
+        )
         assert set(ended) >= set(plain.first)
         for agent, over in ended.items():
-            assert over == ((True, False) if agent in died or not design.truncates else (False, True))
+            assert over == (
+                (True, False) if agent in died or not design.truncates else (False, True)
+            )

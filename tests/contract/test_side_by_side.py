@@ -1,4 +1,6 @@
-"""Section 5.10 of the contract, and models that switch stacks of their own: SimPy, generators, greenlets, asyncio."""
+"""Section 5.10 of the contract, and models that switch stacks of their own: SimPy, generators,
+greenlets, asyncio.
+"""
 
 import asyncio
 import gc
@@ -30,11 +32,21 @@ def run_inner(env, action):
 
 
 @pytest.mark.parametrize(
-    "place", ["rule", "observation_space_mapping", "reward_mapping", "action_space_mapping", "agent", "policy"]
+    "place",
+    [
+        "rule",
+        "observation_space_mapping",
+        "reward_mapping",
+        "action_space_mapping",
+        "agent",
+        "policy",
+    ],
 )
 def test_rules_mappings_and_policies_may_run_an_environment_of_their_own(place):
     inner, logs = inner_env(), []
-    value = {"observation_space_mapping": [0, 0], "reward_mapping": 0, "agent": "outer_0"}.get(place, 7)
+    value = {"observation_space_mapping": [0, 0], "reward_mapping": 0, "agent": "outer_0"}.get(
+        place, 7
+    )
 
     def nested(*args):
         logs.append([list(run_inner(inner, action)) for action in (4, RULE)])
@@ -47,7 +59,8 @@ def test_rules_mappings_and_policies_may_run_an_environment_of_their_own(place):
     policies = {outer: nested} if place == "policy" else None
     env = aec_env(calling(outer, other, outer, INNER), [outer, other, INNER], policies=policies)
     turns = play(env, {"outer_0": RULE if place == "rule" else 7, "other_0": 7, "inner_0": 7})
-    # What the inner environment decides is no decision of the outer one, although that has the same point.
+    # What the inner environment decides is no decision of the outer one, although that has the same
+    # point.
     asked = ["outer_0", "other_0", "outer_0", "inner_0"]
     assert decisions(turns) == [agent for agent in asked if place != "policy" or agent != "outer_0"]
     assert env.unwrapped.simulation.log == [7, 7, 7, 7]
@@ -119,7 +132,8 @@ def test_simpy_models_unwind(how):
     gym = single_env(script(main), decide)
     gym.reset()
     if how == "error":
-        for n in range(2):  # SimPy keeps the error of a process until those that wait for it are told
+        # SimPy keeps the error of a process until those that wait for it are told
+        for n in range(2):
             assert len(unwound) == n
             gym.step(RULE)
         with pytest.raises(ZeroDivisionError):

@@ -33,7 +33,8 @@ from tests.worlds.models import calling, decision, notes, script
 
 def test_without_policies_it_is_the_plain_run_of_a_copy():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    assert simulate(calling(ant, bee), {bee: lambda observation: 2}, points=ant).log == ["rule", 2]  # and lists it
+    # and lists it
+    assert simulate(calling(ant, bee), {bee: lambda observation: 2}, points=ant).log == ["rule", 2]
     for arguments in ({}, {"points": ant}, {"policies": {}, "points": [ant]}):
         given_simulation = calling(ant, ant)()
         simulation = simulate(given_simulation, **arguments)
@@ -45,7 +46,9 @@ def test_without_policies_it_is_the_plain_run_of_a_copy():
 def test_a_seed_is_handed_on_or_drawn():
     ant = decision(agent="ant_0")
     assert simulate(calling(ant), seed=7).seed == 7
-    drawn = {simulate(calling(ant)).seed for _ in range(5)} | {simulate(calling(ant), seed=np.int64(7)).seed}
+    drawn = {simulate(calling(ant)).seed for _ in range(5)} | {
+        simulate(calling(ant), seed=np.int64(7)).seed
+    }
     assert len(drawn) > 2
     assert all(type(seed) is int for seed in drawn)
     with pytest.raises(OptionValueError, match="seed must be a non-negative"):
@@ -59,7 +62,12 @@ def test_errors_name_the_seed():
     for source, policy, error, match in (
         (calling(ANT), lambda observation: 10, InvalidActionError, "is not in its action space"),
         (calling(ANT), lambda observation: 1 // 0, ZeroDivisionError, "division"),
-        (script(lambda simulation: ANT() // 0), lambda observation: 4, ZeroDivisionError, "division"),
+        (
+            script(lambda simulation: ANT() // 0),
+            lambda observation: 4,
+            ZeroDivisionError,
+            "division",
+        ),
     ):
         with pytest.raises(error, match=match) as caught:
             simulate(source, {ANT: policy}, seed=13)
@@ -92,7 +100,9 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
     def policy(observation, info):
         return advised(observation, seed)
 
-    by_point = {f"{HERE}.Creature.act": policy} | ({Colony.oversee: policy} if design.overseen else {})
+    by_point = {f"{HERE}.Creature.act": policy} | (
+        {Colony.oversee: policy} if design.overseen else {}
+    )
     simulation = simulate(lambda: Colony(design), by_point, points=points, seed=seed)
     assert simulation.trace == plain.trace
     assert simulation.random.getstate() == plain.random.getstate()
@@ -111,8 +121,13 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
     ids=["both", "rule of the point", "rule of the agent"],
 )
 def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent, expected):
-    source = script(lambda simulation: simulation.log.extend(Being(number).act() for number in (0, 1)))
-    assert simulate(source, {Being.act: of_point, "being_1": of_agent}, points=beings()).log == expected
+    source = script(
+        lambda simulation: simulation.log.extend(Being(number).act() for number in (0, 1))
+    )
+    assert (
+        simulate(source, {Being.act: of_point, "being_1": of_agent}, points=beings()).log
+        == expected
+    )
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     env = aec_env(calling(ant, bee), [ant, bee], policies={ant: of_point, "ant_0": of_agent})
     assert env.possible_agents == ["bee_0"]
@@ -132,8 +147,13 @@ def test_policies_keep_no_entity_alive(action):
             simulation.log.append(watched() is None)
 
     points = beings(observation_space_mapping=lambda being: [0.0, 0.0])
-    assert simulate(script(main), {Being.act: lambda observation: action}, points=points).log == [True] * 3
-    many = simulate_many(script(main), {Being.act: lambda observations: [action] * 4}, points=points, seeds=range(4))
+    assert (
+        simulate(script(main), {Being.act: lambda observation: action}, points=points).log
+        == [True] * 3
+    )
+    many = simulate_many(
+        script(main), {Being.act: lambda observations: [action] * 4}, points=points, seeds=range(4)
+    )
     assert [simulation.log for simulation in many] == [[True] * 3] * 4
     points |= {Other.act: beings(agent="other_0", removed_by=())[Being.act]}
     env = aec_env(script(main), points, policies={Being.act: lambda observation: action})

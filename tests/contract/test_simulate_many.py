@@ -23,12 +23,17 @@ from tests.worlds.models import calling, decision, define, notes, plainly, scrip
 some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=12)
 sizes = st.integers(1, 14)
 
-PAIRS = {"observation_space": spaces.Box(-9, 9, (2,), np.float32), "observation_space_mapping": lambda *args: [1, 2]}
+PAIRS = {
+    "observation_space": spaces.Box(-9, 9, (2,), np.float32),
+    "observation_space_mapping": lambda *args: [1, 2],
+}
 
 
 def by_row(policy):
     def of_many(observations, infos):
-        return [policy(observation, info) for observation, info in zip(observations, infos, strict=True)]
+        return [
+            policy(observation, info) for observation, info in zip(observations, infos, strict=True)
+        ]
 
     return of_many
 
@@ -57,13 +62,19 @@ going = {Going.decide: define(agent="going_0")}
 @given(worlds.designs(), some_seeds, sizes)
 @settings(max_examples=60)
 def test_worlds_are_what_they_are_one_by_one(design, seeds, size):
-    """Whatever the decision points are like: nested, generators, with choices, of entities, named now and then."""
+    """Whatever the decision points are like: nested, generators, with choices, of entities, named
+    now and then.
+    """
 
     def source():
         return worlds.World(design, points)
 
     points = worlds.points_of(design)
-    one = {points[number]: worlds.advised for number in range(len(points)) if number not in design.rules}
+    one = {
+        points[number]: worlds.advised
+        for number in range(len(points))
+        if number not in design.rules
+    }
     many = {point: by_row(policy) for point, policy in one.items()}
     found = simulate_many(source, many, seeds=seeds, points=points, batch_size=size)
     for seed, simulation in zip(seeds, found, strict=True):
@@ -74,13 +85,19 @@ def test_worlds_are_what_they_are_one_by_one(design, seeds, size):
 
 def test_without_policies_they_are_plain_runs():
     ant = decision(agent="ant_0")
-    assert [s.log for s in simulate_many(calling(ant, ant), seeds=range(3))] == [["rule", "rule"]] * 3
-    assert [s.log for s in simulate_many(calling(ant), {ant: RULE}, seeds=[5], points=ant)] == [["rule"]]
+    assert [s.log for s in simulate_many(calling(ant, ant), seeds=range(3))] == [
+        ["rule", "rule"]
+    ] * 3
+    assert [s.log for s in simulate_many(calling(ant), {ant: RULE}, seeds=[5], points=ant)] == [
+        ["rule"]
+    ]
     assert simulate_many(calling(ant), {ant: ones}, seeds=[]) == []
 
 
 def test_each_seed_has_a_simulation_of_its_own_and_its_results_stand_in_their_order():
-    found = simulate_many(Going, {Going.decide: ones}, points=going, seeds=iter([4, 0, 2, 4]), batch_size=2)
+    found = simulate_many(
+        Going, {Going.decide: ones}, points=going, seeds=iter([4, 0, 2, 4]), batch_size=2
+    )
     assert [simulation.seed for simulation in found] == [4, 0, 2, 4]
     assert [simulation.log for simulation in found] == [[1] * 4, [], [1, 1], [1] * 4]
     assert len({id(simulation) for simulation in found}) == 4
@@ -91,7 +108,12 @@ def test_each_seed_has_a_simulation_of_its_own_and_its_results_stand_in_their_or
 
 
 def test_policies_see_stacks_of_all_kinds_of_spaces():
-    kinds = [spaces.Box(-9, 9, (2,), np.float32), spaces.Discrete(5), spaces.Box(0, 9, ()), spaces.MultiBinary(3)]
+    kinds = [
+        spaces.Box(-9, 9, (2,), np.float32),
+        spaces.Discrete(5),
+        spaces.Box(0, 9, ()),
+        spaces.MultiBinary(3),
+    ]
     values = ([1.0, 2.0], 3, 3.0, [1, 0, 1])
     ant = decision(
         agent="ant_0",
@@ -116,7 +138,9 @@ def test_policies_own_their_observations_and_get_infos_if_they_take_them():
 
     def policy(observations, infos):
         assert observations.tolist() == [[1, 2]] * 3
-        assert [{name: value.tolist() for name, value in info.items()} for info in infos] == [{"action_mask": mask}] * 3
+        assert [{name: value.tolist() for name, value in info.items()} for info in infos] == [
+            {"action_mask": mask}
+        ] * 3
         observations[:] = 7
         for info in infos:
             info["seen"] = True
@@ -135,10 +159,14 @@ def test_policies_that_are_the_same_are_asked_together():
         asked.append(len(observations))
         return ones(observations)
 
-    source = script(lambda simulation: simulation.log.append(ant() if simulation.seed % 2 else bee()))
+    source = script(
+        lambda simulation: simulation.log.append(ant() if simulation.seed % 2 else bee())
+    )
     simulate_many(source, {ant: policy, bee: policy}, seeds=range(10))
     assert asked == [10]
-    assert [s.log for s in simulate_many(calling(ant, cat), {ant: policy, cat: policy}, seeds=range(3))] == [[1, 1]] * 3
+    assert [
+        s.log for s in simulate_many(calling(ant, cat), {ant: policy, cat: policy}, seeds=range(3))
+    ] == [[1, 1]] * 3
     assert asked == [10, 3, 3]
 
 
@@ -197,19 +225,31 @@ BOTH = spaces.Dict(a=spaces.Discrete(9), b=spaces.Box(0, 9, (2,), np.float64))
         (spaces.Discrete(10), np.array([RULE, 4], object), ["rule", 4]),
         (spaces.Discrete(10), RULE, ["rule", "rule"]),
         (spaces.Box(0, 9, (2,), np.float32), PAIRED, PAIRED.astype(np.float32)),
-        (BOTH, {"a": np.array([5, 6]), "b": PAIRED}, [{"a": 5, "b": PAIRED[0]}, {"a": 6, "b": PAIRED[1]}]),
-        (spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9)]), [(1, 2), (3, 4)], [(1, 2), (3, 4)]),
+        (
+            BOTH,
+            {"a": np.array([5, 6]), "b": PAIRED},
+            [{"a": 5, "b": PAIRED[0]}, {"a": 6, "b": PAIRED[1]}],
+        ),
+        (
+            spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9)]),
+            [(1, 2), (3, 4)],
+            [(1, 2), (3, 4)],
+        ),
     ],
     ids=lambda value: type(value).__name__,
 )
 def test_actions_come_as_anything_that_has_rows(space, answer, expected):
     ant = decision(agent="ant_0", action_space=space)
-    found = simulate_many(calling(ant), {ant: lambda observations: answer}, seeds=range(len(expected)))
+    found = simulate_many(
+        calling(ant), {ant: lambda observations: answer}, seeds=range(len(expected))
+    )
     assert same([simulation.log for simulation in found], [[action] for action in expected])
 
 
 @pytest.mark.parametrize(
-    "answer", [[1], [1, 1, 1], [], np.int64(1), 1, None, "ab", {}, {"a": [1], "b": [1, 2]}, np.ones((3, 2))], ids=repr
+    "answer",
+    [[1], [1, 1, 1], [], np.int64(1), 1, None, "ab", {}, {"a": [1], "b": [1, 2]}, np.ones((3, 2))],
+    ids=repr,
 )
 def test_a_wrong_number_of_actions_is_refused(answer):
     ant = decision(agent="ant_0")
@@ -266,17 +306,42 @@ def observe(simulation):
         (ZeroDivisionError, {}, ["seed 13"]),
         (ZeroDivisionError, {"seeds": [20, 17, 50]}, ["seed 50"]),
         (ZeroDivisionError, {"seeds": [20, 13, 99]}, ["seed 13", "seed 99", "not yet"]),
-        *((kind, raising(kind), ["seeds 20, 13, 17", "decide"]) for kind in (StopIteration, KeyboardInterrupt)),
+        *(
+            (kind, raising(kind), ["seeds 20, 13, 17", "decide"])
+            for kind in (StopIteration, KeyboardInterrupt)
+        ),
         (ZeroDivisionError, {"points": delicate(observation_space_mapping=observe)}, ["seed 17"]),
-        (InvalidActionError, {"policies": {Delicate.decide: lambda seen: [1, 10, 1]}}, ["seed 13", "going_0"]),
-        (ZeroDivisionError, {"seeds": [20, 17, 18], "collect": lambda model: 1 // (model.seed - 17)}, ["seed 17"]),
+        (
+            InvalidActionError,
+            {"policies": {Delicate.decide: lambda seen: [1, 10, 1]}},
+            ["seed 13", "going_0"],
+        ),
+        (
+            ZeroDivisionError,
+            {"seeds": [20, 17, 18], "collect": lambda model: 1 // (model.seed - 17)},
+            ["seed 17"],
+        ),
     ],
-    ids=["model", "reset", "unwinding", "policy", "interrupt", "mapping", "illegal action", "collect"],
+    ids=[
+        "model",
+        "reset",
+        "unwinding",
+        "policy",
+        "interrupt",
+        "mapping",
+        "illegal action",
+        "collect",
+    ],
 )
 def test_an_error_anywhere_says_of_which_seed_and_unwinds_all(error, arguments, told, run):
     Delicate.ended.clear()
     plain, before = vars(Going)["decide"], stacks()
-    usual = {"policies": {Delicate.decide: ones}, "points": delicate(), "seeds": [20, 13, 17, 30], "batch_size": 3}
+    usual = {
+        "policies": {Delicate.decide: ones},
+        "points": delicate(),
+        "seeds": [20, 13, 17, 30],
+        "batch_size": 3,
+    }
     usual |= arguments
     with pytest.raises(error) as caught:
         run(Delicate, **usual)
@@ -297,7 +362,10 @@ def test_an_error_in_a_factory_says_of_which_seed():
 @pytest.mark.parametrize(
     "wrong",
     [
-        *({"seeds": seeds} for seeds in (5, None, "12", [1, "a"], [1, None], [1, -1], [True], [0.5])),
+        *(
+            {"seeds": seeds}
+            for seeds in (5, None, "12", [1, "a"], [1, None], [1, -1], [True], [0.5])
+        ),
         *({"batch_size": size} for size in (0, -1, 1.5, True)),
         *({"workers": workers} for workers in (-2, -3, 0.5, True, None, "all")),
         {"collect": 3},
@@ -307,14 +375,18 @@ def test_an_error_in_a_factory_says_of_which_seed():
 )
 def test_invalid_arguments_are_refused(wrong):
     (name,) = wrong
-    with pytest.raises(OptionValueError, match={"policies": "polic", "seeds": "seed"}.get(name, f"{name} must be")):
+    with pytest.raises(
+        OptionValueError, match={"policies": "polic", "seeds": "seed"}.get(name, f"{name} must be")
+    ):
         simulate_many(Going, **{"seeds": range(3), "points": going} | wrong)
 
 
 def test_seeds_may_be_an_array_and_workers_as_many_as_there_are():
     told = lambda simulation: (type(simulation.seed), simulation.log)  # noqa: E731
     given = {"seeds": np.arange(3), "points": going, "workers": -1}
-    assert simulate_many(Going, {Going.decide: ones}, **given, collect=told) == [(int, [1] * seed) for seed in range(3)]
+    assert simulate_many(Going, {Going.decide: ones}, **given, collect=told) == [
+        (int, [1] * seed) for seed in range(3)
+    ]
 
 
 def test_plugins_are_for_these_simulations_alone():
@@ -336,13 +408,19 @@ def test_policies_and_rules_may_simulate():
         return [sum(simulation.log) for simulation in found]
 
     def main(simulation):
-        simulation.log.append([s.log for s in simulate_many(calling(bee), {bee: ones}, seeds=range(2))])
+        simulation.log.append(
+            [s.log for s in simulate_many(calling(bee), {bee: ones}, seeds=range(2))]
+        )
         simulation.log.append(ant())
 
-    assert [s.log for s in simulate_many(script(main), {ant: look_ahead}, seeds=range(2))] == [[[[1], [1]], 2]] * 2
+    assert [s.log for s in simulate_many(script(main), {ant: look_ahead}, seeds=range(2))] == [
+        [[[1], [1]], 2]
+    ] * 2
 
 
-@pytest.mark.parametrize(("missing", "wanted"), [("tqdm.auto", {"progress": True}), ("joblib", {"workers": 2})])
+@pytest.mark.parametrize(
+    ("missing", "wanted"), [("tqdm.auto", {"progress": True}), ("joblib", {"workers": 2})]
+)
 def test_missing_packages_are_named_with_their_extra(monkeypatch, missing, wanted):
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[many\]"):
@@ -350,7 +428,9 @@ def test_missing_packages_are_named_with_their_extra(monkeypatch, missing, wante
 
 
 def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch):
-    """Few at first, which stay in the processor's caches; never more than asked for, and the same comes of it."""
+    """Few at first, which stay in the processor's caches; never more than asked for, and the same
+    comes of it.
+    """
     monkeypatch.setattr("simenv_marl.many.batch.CROWD", 4)
     clock = [0.0]  # stands still while simulations run
     monkeypatch.setattr("simenv_marl.many.batch.perf_counter", lambda: clock[0])
@@ -368,7 +448,11 @@ def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch
         assert [simulation.log for simulation in found] == [[1] * 6] * 40
         return seen
 
-    assert (max(crowd(0.0)), max(crowd(1.0, batch_size=6)), max(crowd(1.0, batch_size=3))) == (4, 6, 3)
+    assert (max(crowd(0.0)), max(crowd(1.0, batch_size=6)), max(crowd(1.0, batch_size=3))) == (
+        4,
+        6,
+        3,
+    )
     assert crowd(1.0)[:4] == [4, 8, 16, 32]
 
 
@@ -376,5 +460,7 @@ def test_functions_that_run_many_simulations_have_the_same_defaults():
     expected = {"batch_size": 1024, "concurrency": 64, "workers": 0, "progress": False}
     for function in (simulate_many, collect_episodes, evaluate, run_experiment):
         parameters = inspect.signature(function).parameters
-        assert {name: parameters[name].default for name in expected if name in parameters}.items() <= expected.items()
+        assert {
+            name: parameters[name].default for name in expected if name in parameters
+        }.items() <= expected.items()
         assert {"workers", "concurrency"} <= parameters.keys()

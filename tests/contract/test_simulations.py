@@ -1,4 +1,6 @@
-"""Section 2, and 5.1 of the contract: what a simulation is, how it is made, reset, seeded and ended."""
+"""Section 2, and 5.1 of the contract: what a simulation is, how it is made, reset, seeded and
+ended.
+"""
 
 import threading
 from typing import Any
@@ -59,7 +61,9 @@ def test_a_simulation_is_made_once_for_each_environment_and_reset_for_each_episo
             super().__init__()
             made.append(self)
 
-    env_class = generate_env(Counted if kind == "class" else lambda: Counted(), Model.decide if named else None)
+    env_class = generate_env(
+        Counted if kind == "class" else lambda: Counted(), Model.decide if named else None
+    )
     env = env_class()
     simulation = env.unwrapped.simulation
     assert made == [simulation]
@@ -114,7 +118,9 @@ class Lockable(Simulation):
 
 
 @pytest.mark.parametrize(
-    "source", [3, "Simulation", None, NoReset(), NoReset, NoRun, NoRun(), lambda: None, Lockable()], ids=plainly
+    "source",
+    [3, "Simulation", None, NoReset(), NoReset, NoRun, NoRun(), lambda: None, Lockable()],
+    ids=plainly,
 )
 def test_objects_that_are_no_simulation_are_refused(source):
     with pytest.raises(SimulationError, match="simulation") as caught:
@@ -152,7 +158,11 @@ SIZE = {"size": 3}
         (lambda self, seed: self.got.append({"seed": seed}), SIZE, {"seed": 7}),
         (lambda self, seed=None, options=None: self.got.append((seed, options)), SIZE, (7, SIZE)),
         (lambda self, seed=None, options=None: self.got.append((seed, options)), None, (7, None)),
-        (lambda self, *, seed=None, options=None: self.got.append((seed, options)), SIZE, (7, SIZE)),
+        (
+            lambda self, *, seed=None, options=None: self.got.append((seed, options)),
+            SIZE,
+            (7, SIZE),
+        ),
         (lambda self, **keywords: self.got.append(keywords), SIZE, {"seed": 7, "options": SIZE}),
         (lambda self, options=None: self.got.append({"options": options}), SIZE, {"options": SIZE}),
     ],
@@ -168,7 +178,9 @@ def seeds_of(env):
 
 
 def test_every_view_draws_seeds_until_one_is_given_and_derives_the_later_ones():
-    one, two, three = (make(recording(reset_seed), Model.decide) for make in (aec_env, single_env, aec_env))
+    one, two, three = (
+        make(recording(reset_seed), Model.decide) for make in (aec_env, single_env, aec_env)
+    )
     for env in (one, two):
         env.reset()
     assert seeds_of(one) != seeds_of(two)
@@ -217,7 +229,8 @@ def samples(space):
 
 
 @pytest.mark.parametrize(
-    ("ends", "truncated"), [(None, False), (TRUNCATED, True), (True, False), (0, False), ("truncated", False)]
+    ("ends", "truncated"),
+    [(None, False), (TRUNCATED, True), (True, False), (0, False), ("truncated", False)],
 )
 def test_the_return_of_run_ends_the_episode(ends, truncated):
     decide = decision()

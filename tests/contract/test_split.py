@@ -6,7 +6,16 @@ import random
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, aec_env, branch, joint_env, parallel_env, simulate, simulate_many, single_env
+from simenv_marl import (
+    RULE,
+    aec_env,
+    branch,
+    joint_env,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+)
 from simenv_marl.errors import DefinitionError
 from tests.worlds.models import decisions, define, follow_the_rule, play
 
@@ -24,7 +33,10 @@ class Grid:
 
     def allot(self, wanted, most=2):
         self.rules += 1
-        return {station.name: min(number, most) for station, number in zip(self.stations, wanted, strict=True)}
+        return {
+            station.name: min(number, most)
+            for station, number in zip(self.stations, wanted, strict=True)
+        }
 
 
 class Day:
@@ -48,7 +60,9 @@ def points(**changes):
         "reward_mapping": lambda station, *call: float(station.load),
         "agent": lambda station, *call: station.name,
         "split": lambda grid, wanted, most: iter(grid.stations),
-        "gather": lambda items, found, *call: {item.name: one for item, one in zip(items, found, strict=True)},
+        "gather": lambda items, found, *call: {
+            item.name: one for item, one in zip(items, found, strict=True)
+        },
         "part": lambda result, station, *call: result[station.name],
     }
     return {Grid.allot: define(**given | changes)}
@@ -63,7 +77,9 @@ def test_items_decide_in_order_and_those_that_are_answered_by_the_rule_get_their
     env = aec_env(Day, points())
     day = follow_the_rule(env, seed=5)
     assert (day.log, day.grid.rules) == (PLAIN.log, 4)  # the rule runs once for a call
-    assert decisions(play(env, {"s_0": 7, "s_1": RULE, "s_2": 7}, seed=5)) == ["s_0", "s_1", "s_2"] * 4
+    assert (
+        decisions(play(env, {"s_0": 7, "s_1": RULE, "s_2": 7}, seed=5)) == ["s_0", "s_1", "s_2"] * 4
+    )
     assert env.simulation.log == [(7, number, 7) for _, number, _ in PLAIN.log]
     assert env.simulation.grid.rules == 4
 
@@ -90,8 +106,12 @@ def test_all_views_and_policies_answer_items():
     one.reset(seed=5)
     one.step(8)
     assert one.simulation.log == [(first, 8, last) for first, _, last in PLAIN.log[:1]]
-    assert simulate(Day, {Grid.allot: lambda seen: 6}, points=points(), seed=5).log == [(6, 6, 6)] * 4
-    days = simulate_many(Day, {Grid.allot: lambda seen: (6 for _ in seen)}, points=points(), seeds=[1, 2])
+    assert (
+        simulate(Day, {Grid.allot: lambda seen: 6}, points=points(), seed=5).log == [(6, 6, 6)] * 4
+    )
+    days = simulate_many(
+        Day, {Grid.allot: lambda seen: (6 for _ in seen)}, points=points(), seeds=[1, 2]
+    )
     assert [day.log for day in days] == [[(6, 6, 6)] * 4] * 2
 
 
@@ -99,7 +119,12 @@ def test_branches_and_ends_amid_a_call_are_exact_and_leave_nothing():
     env = aec_env(Day, points())
     env.reset(seed=5)
     env.step(7)
-    assert branch(env, lambda twin, number: (twin.step(1), twin.agent_selection)[1], 2, method="replay") == ["s_2"] * 2
+    assert (
+        branch(
+            env, lambda twin, number: (twin.step(1), twin.agent_selection)[1], 2, method="replay"
+        )
+        == ["s_2"] * 2
+    )
     env.close()
     assert follow_the_rule(env, seed=5).log == PLAIN.log
 
@@ -160,13 +185,16 @@ class Clinic:
 def under_another_factor(action, clinic, days, *, _rule):
     clinic.factor = action
     try:
-        return _rule(clinic, days + 1) + clinic.stay(days)  # its own function, which would ask again
+        # its own function, which would ask again
+        return _rule(clinic, days + 1) + clinic.stay(days)
     finally:
         clinic.factor = 2
 
 
 def test_apply_runs_the_rule_under_other_parameters_and_its_own_calls_do_not_ask_again():
-    env = single_env(Clinic, {Clinic.stay: define(action_space=spaces.Discrete(9), apply=under_another_factor)})
+    env = single_env(
+        Clinic, {Clinic.stay: define(action_space=spaces.Discrete(9), apply=under_another_factor)}
+    )
     env.reset()
     for action in (3, RULE, 4):
         env.step(action)

@@ -1,4 +1,6 @@
-"""What a user is warned of at run time: shared generators, agents that never come, rounds that stand still."""
+"""What a user is warned of at run time: shared generators, agents that never come, rounds that
+stand still.
+"""
 
 import random
 import sys
@@ -25,12 +27,16 @@ def heard():
     """The warnings of a test, as texts."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        yield lambda part: [str(warning.message) for warning in caught if part in str(warning.message)]
+        yield lambda part: [
+            str(warning.message) for warning in caught if part in str(warning.message)
+        ]
 
 
 @pytest.fixture
 def heard_alone(heard, monkeypatch):
-    """As if no threads of other tests were left, beside which the driver of threads can blame no simulation."""
+    """As if no threads of other tests were left, beside which the driver of threads can blame no
+    simulation.
+    """
     monkeypatch.setattr(rng, "enumerate_threads", lambda: [threading.current_thread()])
     return heard
 
@@ -41,7 +47,9 @@ decide = decision(agent="chooser")
 
 
 def gambler(draw, *, in_reset=False):
-    """A class of simulations that draw from what the process shares, in the reset or before the first decision."""
+    """A class of simulations that draw from what the process shares, in the reset or before the
+    first decision.
+    """
 
     class Gambler:
         def reset(self):
@@ -155,7 +163,9 @@ ANTS = hill("ant_0", "ant_1")
     ],
     ids=["policies", "a roster"],
 )
-def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode(heard, options, absent) -> None:
+def test_an_agent_that_never_appears_is_warned_of_once_at_the_end_of_the_episode(
+    heard, options, absent
+) -> None:
     env = aec_env(ANTS, ant, **options)
     for _ in range(2):
         play_in_turns(env, seed=1)
@@ -176,7 +186,11 @@ def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
 
 def test_agents_that_appear_and_unfinished_episodes_cause_no_warning(heard) -> None:
     names = ["nest.1", "ant_0"]  # a dot makes no path
-    play_in_turns(aec_env(hill(*names), ant, possible_agents=names, policies={"nest.1": lambda observation: 0}))
+    play_in_turns(
+        aec_env(
+            hill(*names), ant, possible_agents=names, policies={"nest.1": lambda observation: 0}
+        )
+    )
     env = aec_env(ANTS, ant, possible_agents=["ant_0", "ant_1", "ant_9"])
     env.reset()
     env.close()

@@ -1,4 +1,6 @@
-"""What no driver may do differently: stacks, nesting, threads that models start, forks, ends of the process."""
+"""What no driver may do differently: stacks, nesting, threads that models start, forks, ends of
+the process.
+"""
 
 import asyncio
 import contextvars
@@ -81,7 +83,14 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
             assert variable.get() == user
             for action in (1, 2, RULE):
                 env.step(action)
-            assert env.unwrapped.simulation.log == [user, "the model's", 1, 2, "rule", "the model's"]
+            assert env.unwrapped.simulation.log == [
+                user,
+                "the model's",
+                1,
+                2,
+                "rule",
+                "the model's",
+            ]
         if user == "two":
             env.reset()
             assert len(set(seen)) == 1
@@ -98,7 +107,9 @@ def test_everything_of_a_simulation_runs_on_one_stack_and_in_its_context(driver)
 
 @DRIVERS
 @pytest.mark.parametrize("inner", ["greenlet", "thread"])
-def test_while_a_simulation_moves_other_threads_run_rules_and_environments_of_their_own(driver, inner):
+def test_while_a_simulation_moves_other_threads_run_rules_and_environments_of_their_own(
+    driver, inner
+):
     decide, other = decision(), decision(lambda: "its rule")
     deeper = decision(agent="inner_0", reward_mapping=lambda: decide() == "rule")
 
@@ -160,7 +171,8 @@ def test_decisions_in_threads_of_the_model_are_refused_and_the_step_says_so(driv
     assert "refuse" in culprits(caught.value.__cause__)  # which leads to the thread
     env.reset()
     env.close()
-    # Else greenlet frees that root too early, if the collector runs while the thread ends, and the process crashes.
+    # Else greenlet frees that root too early, if the collector runs while the thread ends, and the
+    # process crashes.
     (root,) = roots
     assert root() is None or not gc.get_referrers(root())
 
@@ -192,7 +204,9 @@ def test_a_refusal_is_raised_once_or_noted_on_another_error(driver):
 
 @DRIVERS
 @pytest.mark.parametrize("how", ["run", "step", "close", "reset"])
-def test_threads_that_are_older_than_the_episode_are_refused_also_while_it_is_suspended(driver, how):
+def test_threads_that_are_older_than_the_episode_are_refused_also_while_it_is_suspended(
+    driver, how
+):
     class Hiring(Script):
         def __init__(self):
             super().__init__(main)
@@ -237,7 +251,9 @@ PREAMBLE = """
     decide = decision()
 """
 # Python warns of forks where there are other threads; here there are, and that is what is tested.
-run = partial(run_code, PREAMBLE, options=["-W", "error", "-W", "ignore:This process:DeprecationWarning"])
+run = partial(
+    run_code, PREAMBLE, options=["-W", "error", "-W", "ignore:This process:DeprecationWarning"]
+)
 
 
 @needs_fork
@@ -297,7 +313,9 @@ def test_uncaught_errors_of_a_forked_model_in_a_thread_are_printed():
 
 
 @DRIVERS
-@pytest.mark.parametrize("where", ["suspended", "closed", "inside", "in a thread", "in daemons", "moving"])
+@pytest.mark.parametrize(
+    "where", ["suspended", "closed", "inside", "in a thread", "in daemons", "moving"]
+)
 def test_a_process_ends_cleanly_with_environments_in_mid_episode(driver, where):
     said = run(f"""
         where = {where!r}

@@ -1,4 +1,6 @@
-"""What event loops set for a whole thread is the model's while it runs, and its user's between the steps."""
+"""What event loops set for a whole thread is the model's while it runs, and its user's between the
+steps.
+"""
 
 import asyncio
 import gc
@@ -19,7 +21,11 @@ DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
 
 def around():
     """What event loops set for a whole thread."""
-    return asyncio._get_running_loop(), sys.get_asyncgen_hooks(), sys.get_coroutine_origin_tracking_depth()
+    return (
+        asyncio._get_running_loop(),
+        sys.get_asyncgen_hooks(),
+        sys.get_coroutine_origin_tracking_depth(),
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -44,14 +50,20 @@ def loud(caplog):
 
 def told(caplog):
     gc.collect()
-    return [record.getMessage().partition("\n")[0] for record in caplog.records if record.levelno > logging.DEBUG]
+    return [
+        record.getMessage().partition("\n")[0]
+        for record in caplog.records
+        if record.levelno > logging.DEBUG
+    ]
 
 
 # -- what is set for the thread -------------------------------------------------------------------
 
 
 def tracking(decide):
-    """A model that notes what is set around it, before and after each of its decisions within a loop."""
+    """A model that notes what is set around it, before and after each of its decisions within a
+    loop.
+    """
 
     async def work(simulation):
         simulation.log.append(around())
@@ -226,7 +238,9 @@ async def waited(clerk):
 @pytest.mark.parametrize("how", ["close", "reset", "collected"])
 def test_tasks_that_are_unwound_are_not_reported(driver, way, steps, how, loud):
     decide = decision()
-    env = single_env(script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide, driver=driver)
+    env = single_env(
+        script(lambda simulation: asyncio.run(way(clerk_of(decide)))), decide, driver=driver
+    )
     env.reset()
     for _ in range(steps):
         env.step(1)
@@ -278,7 +292,9 @@ async def stay(log, cleanup):
 
 
 async def office(simulation, decide, cleanup):
-    """Decide while tasks and asynchronous generators of the model are left, of which some decide in their cleanup."""
+    """Decide while tasks and asynchronous generators of the model are left, of which some decide
+    in their cleanup.
+    """
 
     def quietly():
         cleanup.append("decides")
@@ -298,7 +314,11 @@ async def office(simulation, decide, cleanup):
 @pytest.mark.parametrize("end", ["close", "reset"])
 def test_a_loop_of_the_models_own_cancels_its_tasks_and_closes_its_generators(driver, end):
     decide, cleanup = decision(), []
-    env = single_env(script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))), decide, driver=driver)
+    env = single_env(
+        script(lambda simulation: asyncio.run(office(simulation, decide, cleanup))),
+        decide,
+        driver=driver,
+    )
     env.reset()
     log = env.simulation.log
     getattr(env, end)()
@@ -355,13 +375,20 @@ def test_models_of_trio_run_on_one_greenlet_or_side_by_side_in_threads(driver, n
     envs = [single_env(model, decide, driver=driver) for _ in range(number)]
     for env in envs * 2:
         env.reset()
-    assert [[env.step(action)[2] for env in envs] for action in range(2)] == [[False] * number, [True] * number]
+    assert [[env.step(action)[2] for env in envs] for action in range(2)] == [
+        [False] * number,
+        [True] * number,
+    ]
     assert [env.simulation.log for env in envs] == [[0, 1]] * number
 
 
-@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited", "ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings(
+    "ignore:coroutine .* was never awaited", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
 def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations() -> None:
-    """A loop that outlives its episodes keeps their tasks, which pass their exit on when it runs again."""
+    """A loop that outlives its episodes keeps their tasks, which pass their exit on when it runs
+    again.
+    """
     decide, raised = decision(), None
     env = single_env(lambda: Lasting(partial(gathered, clerk_of(decide))), decide)
     for _ in range(10):

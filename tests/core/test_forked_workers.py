@@ -1,4 +1,6 @@
-"""Processes that a simulation forks have no user to ask: what they decide is refused, and the environment goes on."""
+"""Processes that a simulation forks have no user to ask: what they decide is refused, and the
+environment goes on.
+"""
 
 import sys
 
@@ -62,7 +64,10 @@ PREAMBLE = """
 
 def run(code, driver):
     """Run code in a process of its own, which no worker leaves as a second one."""
-    assert run_code(f"driver = {driver!r}", PREAMBLE, code, "print('end', os.getpid() == user)") == "end True\n"
+    assert (
+        run_code(f"driver = {driver!r}", PREAMBLE, code, "print('end', os.getpid() == user)")
+        == "end True\n"
+    )
 
 
 @DRIVERS

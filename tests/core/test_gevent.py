@@ -1,4 +1,6 @@
-"""Models that wait in gevent's hub, which serves all greenlets of a thread: their own, and those of their user."""
+"""Models that wait in gevent's hub, which serves all greenlets of a thread: their own, and those
+of their user.
+"""
 
 import pytest
 

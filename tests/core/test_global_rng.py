@@ -1,4 +1,6 @@
-"""``global_rng=True``: global generators of its own for each environment, and untouched ones for everybody else."""
+"""``global_rng=True``: global generators of its own for each environment, and untouched ones for
+everybody else.
+"""
 
 import random
 import threading
@@ -20,7 +22,12 @@ class Casino:
 
     def reset(self, seed=None):
         self.seed = seed
-        self.log = [random.random(), np.random.random(), random.gauss(0, 1), np.random.standard_normal()]
+        self.log = [
+            random.random(),
+            np.random.random(),
+            random.gauss(0, 1),
+            np.random.standard_normal(),
+        ]
 
     def run(self):
         for _ in range(6):
@@ -35,7 +42,11 @@ class Casino:
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 BET = f"{__name__}.Casino.bet"
-POINTS = {BET: define(agent="player_0", observation_space_mapping=lambda casino, card: [card, np.random.random()])}
+POINTS = {
+    BET: define(
+        agent="player_0", observation_space_mapping=lambda casino, card: [card, np.random.random()]
+    )
+}
 
 
 def world():
@@ -75,7 +86,10 @@ def plain(seed):
 @pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
     logs = {seed: plain(seed) for seed in (7, 8)}
-    envs = {seed: make(Casino, {BET: define(agent="player_0")}, global_rng=True, driver=driver) for seed in logs}
+    envs = {
+        seed: make(Casino, {BET: define(agent="player_0")}, global_rng=True, driver=driver)
+        for seed in logs
+    }
 
     def assert_untouched(move, *args, **kwargs):
         before = world()
@@ -131,7 +145,9 @@ class Seeding(Casino):
 def test_simulations_may_seed_the_generators_themselves():
     before = world()
     policies = {BET: lambda observation: int(observation[0])}
-    one, other = (simulate(Seeding, policies, points=POINTS, seed=seed, global_rng=True) for seed in (1, 2))
+    one, other = (
+        simulate(Seeding, policies, points=POINTS, seed=seed, global_rng=True) for seed in (1, 2)
+    )
     assert one.log == other.log
     assert world() == before
 
@@ -157,7 +173,9 @@ def test_one_environment_in_the_rule_of_another(driver):
 
     class Gambler(Casino):
         def run(self):
-            self.inner = simulate(Casino, points=POINTS, seed=self.seed, global_rng=True, driver=driver)
+            self.inner = simulate(
+                Casino, points=POINTS, seed=self.seed, global_rng=True, driver=driver
+            )
             return super().run()
 
     outer = simulate(Gambler, points=POINTS, seed=3, global_rng=True, driver=driver)
@@ -180,7 +198,9 @@ def test_two_at_work_at_once_in_two_threads_are_refused():
         return [card, 0]
 
     before = world()
-    env = aec_env(Casino, {BET: define(agent="player_0", observation_space_mapping=observe)}, global_rng=True)
+    env = aec_env(
+        Casino, {BET: define(agent="player_0", observation_space_mapping=observe)}, global_rng=True
+    )
     env.reset(seed=7)
     env.step(RULE)
     assert len(errors) == 2

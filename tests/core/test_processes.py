@@ -166,7 +166,9 @@ class Recalcitrant(Unspeakable):
         raise PicklingError("no")
 
 
-@pytest.mark.parametrize("error", [Many("some", "thing", "more"), Recalcitrant()], ids=["unpicklable", "recalcitrant"])
+@pytest.mark.parametrize(
+    "error", [Many("some", "thing", "more"), Recalcitrant()], ids=["unpicklable", "recalcitrant"]
+)
 def test_errors_that_cannot_be_pickled_cross_as_text_with_notes_and_causes(error):
     noted(caused(error, raised(open, "/nowhere")), "a note").held = (part for part in ())
     again = unpack_error(pack_error(error))
@@ -174,7 +176,9 @@ def test_errors_that_cannot_be_pickled_cross_as_text_with_notes_and_causes(error
     assert f"cannot be pickled: {type(error).__name__}: {error_text(error)}" in str(again)
     assert again.__notes__ == ["a note"]
     assert "/nowhere" in str(again.__cause__)
-    group = unpack_error(pack_error(noted(ExceptionGroup("several", [error, Many(4, 5, 6)]), "another")))
+    group = unpack_error(
+        pack_error(noted(ExceptionGroup("several", [error, Many(4, 5, 6)]), "another"))
+    )
     assert type(group) is WorkerError
     assert "cannot be pickled: ExceptionGroup: several (2 sub-exceptions)" in str(group)
     assert group.__notes__ == ["another"]
@@ -190,5 +194,9 @@ def test_notes_that_are_no_list_of_texts_are_no_obstacle(notes):
     error.__notes__ = notes
     again = unpack_error(pack_error(error))
     assert (type(again), again.args) == (ValueError, ("noted",))
-    texts = [note for note in notes if isinstance(note, str)] if isinstance(notes, (list, tuple)) else []
+    texts = (
+        [note for note in notes if isinstance(note, str)]
+        if isinstance(notes, (list, tuple))
+        else []
+    )
     assert getattr(again, "__notes__", []) == texts

@@ -1,4 +1,6 @@
-"""``reseed_generators``: the generators that a simulation holds are found and seeded in place; ``Streams`` by name."""
+"""``reseed_generators``: the generators that a simulation holds are found and seeded in place;
+``Streams`` by name.
+"""
 
 import copy
 import functools
@@ -35,7 +37,10 @@ class Crowd:
         chances = [random.Random(seed + number) for number in range(9)]
         self.chance, self.legacy = chances[0], np.random.RandomState(seed)
         self.number, self.name, self.weights = 3, "crowd", np.zeros(4)
-        self.kinds = [np.random.Generator(kind(seed)) for kind in (np.random.PCG64, np.random.MT19937, np.random.SFC64)]
+        self.kinds = [
+            np.random.Generator(kind(seed))
+            for kind in (np.random.PCG64, np.random.MT19937, np.random.SFC64)
+        ]
         self.bits = np.random.Philox(seed)
         self.by_name = {"one": Slotted(chances[1]), Slotted(chances[2]): (chances[3],)}
         self.draw, self.normal = chances[4].random, np.random.default_rng(seed + 9).normal
@@ -43,14 +48,28 @@ class Crowd:
         self.queue, self.some = deque([chances[6]]), {Slotted(chances[7])}
         self.waiting = wait(chances[8])
         next(self.waiting)
-        self.itself, self.module, self.kind, self.function = self, np.random, Crowd, reseed_generators
+        self.itself, self.module, self.kind, self.function = (
+            self,
+            np.random,
+            Crowd,
+            reseed_generators,
+        )
         self.shared = SimpleNamespace(same=self.chance)
         self.all = chances
 
     def drawn(self):
         many = [chance.random() for chance in self.all]
-        many += [self.legacy.standard_normal(), self.legacy.random(), self.bits.random_raw(), self.normal()]
-        many += [generator.random() for generator in self.kinds] + [self.draw(), self.later(1.0), next(self.waiting)]
+        many += [
+            self.legacy.standard_normal(),
+            self.legacy.random(),
+            self.bits.random_raw(),
+            self.normal(),
+        ]
+        many += [generator.random() for generator in self.kinds] + [
+            self.draw(),
+            self.later(1.0),
+            next(self.waiting),
+        ]
         return [*many, self.shared.same.random()]
 
 
@@ -92,11 +111,15 @@ def test_streams_are_not_those_that_a_model_makes_of_the_same_seed():
 
 
 def test_global_generators_are_left_alone_and_where_there_are_no_others_it_says_what_to_do():
-    model = SimpleNamespace(random=random, draw=random.random, numpy=np.random.mtrand._rand, function=world)
+    model = SimpleNamespace(
+        random=random, draw=random.random, numpy=np.random.mtrand._rand, function=world
+    )
     model.chance, model.kind = random.SystemRandom(), random.Random
     before = world()
     for nothing in (object(), model):
-        with pytest.raises(SimulationError, match=r"no random generator[\s\S]*attribute[\s\S]*global_rng=True"):
+        with pytest.raises(
+            SimulationError, match=r"no random generator[\s\S]*attribute[\s\S]*global_rng=True"
+        ):
             reseed_generators(nothing, 3)
     model.own = random.Random()
     assert reseed_generators(model, 3) == 1
@@ -105,7 +128,11 @@ def test_global_generators_are_left_alone_and_where_there_are_no_others_it_says_
 
 @pytest.mark.parametrize("seed", [-1, True, 1.5, "7"])
 def test_seeds_are_integers(seed):
-    for refused in (Streams, Streams(1).reseed, functools.partial(reseed_generators, random.Random())):
+    for refused in (
+        Streams,
+        Streams(1).reseed,
+        functools.partial(reseed_generators, random.Random()),
+    ):
         with pytest.raises(OptionValueError, match="seed must be a non-negative integer"):
             refused(seed)
 
@@ -147,7 +174,9 @@ def test_entities_that_hold_their_streams_are_reseeded_with_them():
     assert [entity.chance.random() for entity in model.entities] != draws(Streams(3), "a", "b")
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda streams: pickle.loads(pickle.dumps(streams))])
+@pytest.mark.parametrize(
+    "duplicate", [copy.deepcopy, lambda streams: pickle.loads(pickle.dumps(streams))]
+)
 def test_streams_are_copied_as_they_stand(duplicate):
     streams = Streams(3)
     streams["a"].random()

@@ -1,4 +1,6 @@
-"""What goes through a space: observations are cast to it, actions and masks are checked against it."""
+"""What goes through a space: observations are cast to it, actions and masks are checked against
+it.
+"""
 
 import copy
 
@@ -75,7 +77,11 @@ def test_invalid_observations_are_refused(space, value, match):
 def leaves(value):
     """The values in a nested value that have no parts."""
     if isinstance(value, dict | tuple | list):
-        return [leaf for part in (value.values() if isinstance(value, dict) else value) for leaf in leaves(part)]
+        return [
+            leaf
+            for part in (value.values() if isinstance(value, dict) else value)
+            for leaf in leaves(part)
+        ]
     return [value]
 
 
@@ -102,12 +108,16 @@ def test_casts_and_duplicates_share_nothing(made_of, value):
 
 def test_same_compares_number_for_number():
     """Each of these is the same as its copy alone."""
-    arrays = [np.array(numbers) for numbers in ([1.0, np.nan], [1.0, 2.0], [1.0, 4.0], [1.0, 2.0, 5.0])]
+    arrays = [
+        np.array(numbers) for numbers in ([1.0, np.nan], [1.0, 2.0], [1.0, 4.0], [1.0, 2.0, 5.0])
+    ]
     dicts = [{"a": np.array([1])}, {"a": np.array([2])}, {"a": 1, "b": 1}, {"b": 1}]
     tuples = [(1, np.array([2])), (1, 3), (1, 2, 3)]
     values = [*arrays, *dicts, *tuples]
     for one in values:
-        assert [other is one for other in values] == [same(one, copy.deepcopy(other)) for other in values]
+        assert [other is one for other in values] == [
+            same(one, copy.deepcopy(other)) for other in values
+        ]
     assert [same((1, 2), 3), same(3, 4), same("word", "word")] == [False, False, True]
 
 
@@ -115,7 +125,10 @@ def test_blanks_are_zero_clipped_into_their_space():
     assert_alike(blank(spaces.Discrete(9, start=-4)), np.int64(0))
     assert_alike(blank(spaces.Box(-3, -2, (1,), np.float64)), np.array([-2.0]))
     assert_alike(blank(spaces.MultiDiscrete([2, 2], start=[-5, -1])), np.array([-4, 0]))
-    assert_alike(blank(TREE), {"box": np.float32([0, 0]), "pair": (np.int64(5), {"bits": np.int8([0, 0, 0])})})
+    assert_alike(
+        blank(TREE),
+        {"box": np.float32([0, 0]), "pair": (np.int64(5), {"bits": np.int8([0, 0, 0])})},
+    )
 
 
 def test_the_blank_of_a_space_without_a_zero_is_always_the_same():
@@ -143,7 +156,10 @@ class Choking(spaces.Space):
         (DIAL, [np.float32(5), True]),
         (BOX, [[[0.0, 0.0]], [None, 0.0], [[1], [2, 3]]]),
         (spaces.Box(0, 9, (1,), np.int8), [5.0]),
-        (spaces.Box(np.array([0, 10]), np.array([1, 11]), dtype=np.float64), [np.array([10.0, 1.0])]),
+        (
+            spaces.Box(np.array([0, 10]), np.array([1, 11]), dtype=np.float64),
+            [np.array([10.0, 1.0])],
+        ),
         (Choking((), np.int8), [3]),
     ],
     ids=lambda given: type(given).__name__,
@@ -158,7 +174,13 @@ def test_actions_outside_the_space_are_illegal(space, actions):
 def test_each_element_of_a_box_counts_and_bounds_are_legal_in_every_precision(number, dtype):
     high = np.full(number, 0.1, dtype)
     check = action_check(spaces.Box(-high, high, dtype=dtype))
-    for legal in (high, -high, high.astype(np.float64), high.tolist(), np.zeros(number, np.float32)):
+    for legal in (
+        high,
+        -high,
+        high.astype(np.float64),
+        high.tolist(),
+        np.zeros(number, np.float32),
+    ):
         assert_alike(check(legal), np.asarray(legal, dtype))
         assert check(legal) is not legal
     for at in (0, -1):
@@ -172,7 +194,11 @@ def test_each_element_of_a_box_counts_and_bounds_are_legal_in_every_precision(nu
 @pytest.mark.parametrize("shape", [(1,), (2,)])
 def test_integers_are_clipped_without_wrapping_around(shape):
     check = action_check(spaces.Box(-5, 2**63 - 1, shape, np.int64), clips=True)
-    for given, clipped in ((np.uint64(2**64 - 1), 2**63 - 1), (np.int64(-(2**63)), -5), (np.int64(7), 7)):
+    for given, clipped in (
+        (np.uint64(2**64 - 1), 2**63 - 1),
+        (np.int64(-(2**63)), -5),
+        (np.int64(7), 7),
+    ):
         assert_alike(check(np.full(shape, given)), np.full(shape, clipped))
 
 
@@ -244,7 +270,9 @@ def test_invalid_masks_are_refused(given, match):
             mask_cast(space)(mask)
 
 
-@pytest.mark.parametrize("given", [([1, 1],), ([1, 1], [1, 1, 1], [1]), np.ones((2, 3)), None], ids=str)
+@pytest.mark.parametrize(
+    "given", [([1, 1],), ([1, 1], [1, 1, 1], [1]), np.ones((2, 3)), None], ids=str
+)
 def test_masks_of_several_numbers_have_a_part_for_each(given):
     with pytest.raises(MaskError, match="2 parts"):
         mask_cast(DIALS)(given)
@@ -253,7 +281,10 @@ def test_masks_of_several_numbers_have_a_part_for_each(given):
 def test_a_mask_allows_its_actions_and_an_open_one_allows_all():
     mask = mask_cast(DIAL)([0, 1, 0])
     assert [mask_allows(DIAL, mask, action) for action in (5, 6, 7)] == [False, True, False]
-    masks, pairs = mask_cast(DIALS)([[1, 0], [0, 0, 1]]), [(one, other) for one in (0, 1) for other in (4, 5, 6)]
+    masks, pairs = (
+        mask_cast(DIALS)([[1, 0], [0, 0, 1]]),
+        [(one, other) for one in (0, 1) for other in (4, 5, 6)],
+    )
     assert [pair for pair in pairs if mask_allows(DIALS, masks, np.array(pair))] == [(0, 6)]
     assert_alike(open_mask(DIAL), np.int8([1, 1, 1]))
     assert [pair for pair in pairs if mask_allows(DIALS, open_mask(DIALS), np.array(pair))] == pairs

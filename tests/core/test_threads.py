@@ -1,4 +1,6 @@
-"""driver="thread": simulations in threads of their own, and environments that are used from changing threads."""
+"""driver="thread": simulations in threads of their own, and environments that are used from
+changing threads.
+"""
 
 import gc
 import signal
@@ -54,7 +56,9 @@ def older_threads():
 
 
 @pytest.mark.parametrize("place", farms.PLACES)
-def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(place, older_threads):
+def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users(
+    place, older_threads
+):
     env, farm = farms.farm_env(aec_env, place, driver="thread")
     (own,) = set(simulation_threads()) - set(older_threads)
     seen = set()
@@ -102,7 +106,9 @@ def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what, pl
         inside.set()
         assert go_on.wait(10)
 
-    (env, farm), (other, undisturbed) = (farms.farm_env(view, place, driver="thread") for _ in range(2))
+    (env, farm), (other, undisturbed) = (
+        farms.farm_env(view, place, driver="thread") for _ in range(2)
+    )
     env.reset(seed=11)
     farm.let(wait, place)
     stepping = threading.Thread(target=farms.take, args=(env, RULE))
@@ -145,7 +151,9 @@ def test_too_many_threads_are_an_error(monkeypatch, older_threads):
 # -- errors and interruptions ---------------------------------------------------------------------
 
 
-needs_signals = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="the platform has no pthread_kill")
+needs_signals = pytest.mark.skipif(
+    not hasattr(signal, "pthread_kill"), reason="the platform has no pthread_kill"
+)
 
 
 def interrupt():
@@ -177,7 +185,9 @@ def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_or_is_g
     (interrupted,) = set(simulation_threads()) - set(older_threads)
     if stops:
         env.simulation.stop = go_on.set  # is called as soon as the interruption has surfaced
-    warned = nullcontext() if stops else pytest.warns(ResourceWarning, match=r"Script.*neither decided")
+    warned = (
+        nullcontext() if stops else pytest.warns(ResourceWarning, match=r"Script.*neither decided")
+    )
     with pytest.raises(KeyboardInterrupt) as caught, warned:
         env.step(1)
     assert "seed" in notes(caught.value)
@@ -192,7 +202,9 @@ def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_or_is_g
 
 
 @pytest.mark.parametrize("how", ["close", "collect"])
-def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(monkeypatch, how, older_threads):
+def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(
+    monkeypatch, how, older_threads
+):
     monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, decide = threading.Event(), decision()
 

@@ -1,4 +1,6 @@
-"""Variants: a model with all that an experiment changes, under one name; and what environments say they are made of."""
+"""Variants: a model with all that an experiment changes, under one name; and what environments say
+they are made of.
+"""
 
 import json
 import pickle
@@ -10,7 +12,13 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, aec_env, generate_env, joint_env, simulate, single_env
-from simenv_marl.errors import HandlerError, OptionValueError, SimulationError, UnknownOptionError, UnknownPointError
+from simenv_marl.errors import (
+    HandlerError,
+    OptionValueError,
+    SimulationError,
+    UnknownOptionError,
+    UnknownPointError,
+)
 from simenv_marl.experiments import Variant, provenance
 from simenv_marl.plugins import ChangedResult
 from tests.worlds.models import Script, decision, define, play
@@ -61,7 +69,9 @@ def test_a_variant_is_accepted_like_a_simulation():
     assert single_env(DEAR).reset()[0].tolist() == [1.0, 2.0]
     assert set(joint_env(LARGE).action_space.spaces) == {"sower_0", "reaper_0"}
     assert simulate(Variant("instance", Farm(1), points=POINTS)).log == [("wheat", 1)]
-    assert simulate(Variant("factory", lambda fields: Farm(fields), parameters={"fields": 1})).log == [("wheat", 1)]
+    assert simulate(
+        Variant("factory", lambda fields: Farm(fields), parameters={"fields": 1})
+    ).log == [("wheat", 1)]
     assert Farm().sow(0) == "wheat"  # and the model is what it was
 
 
@@ -82,13 +92,20 @@ def test_variants_are_frozen_and_can_be_pickled():
         LARGE.parameters["fields"] = 5
     given = {"fields": 1}
     plugins = ((dearer, HARVEST, "after"),)
-    variant = Variant("small", Farm, parameters=given, plugins=plugins, points={Farm.sow: POINTS[SOW]})
+    variant = Variant(
+        "small", Farm, parameters=given, plugins=plugins, points={Farm.sow: POINTS[SOW]}
+    )
     given["fields"] = 7
     env = aec_env(variant)
     env.reset()  # now hooks stand in the places of the functions
     again = pickle.loads(cloudpickle.dumps(variant))
     env.close()
-    assert (again.name, again.simulation, again.plugins, list(again.points)) == ("small", Farm, plugins, [SOW])
+    assert (again.name, again.simulation, again.plugins, list(again.points)) == (
+        "small",
+        Farm,
+        plugins,
+        [SOW],
+    )
     for each in (variant, again):
         assert simulate(each, points=POINTS).log == [("wheat", 10)]
     plain = pickle.loads(pickle.dumps(replace(DEAR, points=None)))  # also without cloudpickle
@@ -101,7 +118,11 @@ def test_variants_are_frozen_and_can_be_pickled():
         ({"name": ""}, OptionValueError, "name"),
         ({"parameters": {"acres": 3}}, SimulationError, "acres"),
         ({"parameters": 3}, OptionValueError, "parameters"),
-        ({"simulation": Farm(), "parameters": {"fields": 3}}, SimulationError, "class or a factory"),
+        (
+            {"simulation": Farm(), "parameters": {"fields": 3}},
+            SimulationError,
+            "class or a factory",
+        ),
         ({"simulation": DEAR}, SimulationError, "replace"),
         ({"options": {"plugins": []}}, OptionValueError, "plugins"),
         ({"options": {"speed": 3}}, UnknownOptionError, "speed"),
@@ -138,7 +159,10 @@ def test_an_environment_says_what_it_is_made_of():
 
 
 def test_versions_are_those_of_the_packages_that_the_model_comes_from():
-    move, untold = "mesa.examples.advanced.wolf_sheep.agents.Wolf.move", "typing_extensions.reveal_type"
+    move, untold = (
+        "mesa.examples.advanced.wolf_sheep.agents.Wolf.move",
+        "typing_extensions.reveal_type",
+    )
     said = provenance(Farm, {move: define(agent=str), untold: define(agent="one")})
     versions = {package: version(package) for package in ("mesa", "typing_extensions")}
     assert said["packages"] == versions | {"tests": None}

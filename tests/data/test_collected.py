@@ -1,4 +1,6 @@
-"""Whole episodes of all agents as arrays: ``collect_episodes``, beside an AEC environment that is played alike."""
+"""Whole episodes of all agents as arrays: ``collect_episodes``, beside an AEC environment that is
+played alike.
+"""
 
 from collections import defaultdict
 
@@ -15,7 +17,16 @@ from simenv_marl.experiments import Variant
 from tests.contract.test_simulate_many import by_row, ones
 from tests.worlds import worlds
 from tests.worlds.lives import life
-from tests.worlds.many_worlds import Announcing, Being, Colony, Other, beings, colony_points, designs, others
+from tests.worlds.many_worlds import (
+    Announcing,
+    Being,
+    Colony,
+    Other,
+    beings,
+    colony_points,
+    designs,
+    others,
+)
 from tests.worlds.models import Timed, calling, decision, play, script
 
 some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=6)
@@ -35,16 +46,28 @@ def played(env, policies, seed):
         if action is None:
             last[agent] = observation
             if rows[agent]:
-                rows[agent][-1] |= {"terminated": terminated, "truncated": truncated, "turn of the end": turn}
+                rows[agent][-1] |= {
+                    "terminated": terminated,
+                    "truncated": truncated,
+                    "turn of the end": turn,
+                }
             continue
-        told = {"observation": observation, "action": action, "turn": turn, "terminated": False, "truncated": False}
+        told = {
+            "observation": observation,
+            "action": action,
+            "turn": turn,
+            "terminated": False,
+            "truncated": False,
+        }
         rows[agent].append(told | {"mask": info.get("action_mask"), "time": info.get("time")})
         turn += 1
     return {agent: own for agent, own in rows.items() if own}, last
 
 
 def check(found, episodes, chosen):
-    """Compare what was collected under one key with what was ``played`` by the agents that belong to it."""
+    """Compare what was collected under one key with what was ``played`` by the agents that belong
+    to it.
+    """
     trajectory = row = 0
     following = found.next_observations
     for number, (agents, last) in enumerate(episodes):
@@ -58,7 +81,11 @@ def check(found, episodes, chosen):
             upcoming = [*(row["observation"] for row in rows[1:]), last[agent]]
             for step, expected in enumerate(rows):
                 assert found.names[found.agents[row]] == agent
-                assert (found.episodes[row], found.steps[row], found.turns[row]) == (number, step, expected["turn"])
+                assert (found.episodes[row], found.steps[row], found.turns[row]) == (
+                    number,
+                    step,
+                    expected["turn"],
+                )
                 assert np.array_equal(found.observations[row], expected["observation"])
                 assert np.array_equal(following[row], upcoming[step])
                 assert found.by_rule[row] == (expected["action"] is RULE)
@@ -89,11 +116,14 @@ def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, 
 
     points = colony_points(overseen=bool(design.overseen))
     given = {"points": points, "max_steps": most}
-    found = collect_episodes(simulation, dict.fromkeys(points, by_row(policy)), seeds=seeds, batch_size=size, **given)
+    found = collect_episodes(
+        simulation, dict.fromkeys(points, by_row(policy)), seeds=seeds, batch_size=size, **given
+    )
     env = aec_env(simulation, **given)
     episodes = [played(env, lambda agent: policy, seed) for seed in seeds]
     assert found.keys() == points.keys()
-    act, *oversee = points  # as long as the environment is there, the class has others in their place
+    # as long as the environment is there, the class has others in their place
+    act, *oversee = points
     check(found[act], episodes, lambda agent: agent != "overseer_0")
     for point in oversee:
         check(found[point], episodes, lambda agent: agent == "overseer_0")
@@ -107,18 +137,30 @@ def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
 
     points = worlds.points_of(design)
     given = {"points": points, "max_steps": design.max_steps}
-    answered = {points[number]: by_row(worlds.advised) for number in range(len(points)) if number not in design.rules}
+    answered = {
+        points[number]: by_row(worlds.advised)
+        for number in range(len(points))
+        if number not in design.rules
+    }
     found = collect_episodes(simulation, answered, seeds=seeds, batch_size=size, **given)
     env = aec_env(simulation, policies={points[number]: RULE for number in design.rules}, **given)
     episodes = [played(env, lambda agent: worlds.advised, seed) for seed in seeds]
     for number, point in enumerate(points):
         if point in answered:
-            check(found[point], episodes, lambda agent, number=number: agent.split("_")[1] == str(number))
+            check(
+                found[point],
+                episodes,
+                lambda agent, number=number: agent.split("_")[1] == str(number),
+            )
 
 
 def test_agents_are_collected_under_their_own_keys():
     points = beings(observation_space_mapping=lambda being: [being.number, 0], removed_by=())
-    policies = {Being.act: ones, "being_1": lambda observations: [2] * len(observations), "being_2": RULE}
+    policies = {
+        Being.act: ones,
+        "being_1": lambda observations: [2] * len(observations),
+        "being_2": RULE,
+    }
     source = life("0 acts, 1 acts, 2 acts, 1 acts, 0 acts")
     found = collect_episodes(source, policies, points=points, seeds=[3, 4])
     assert list(found) == [Being.act, "being_1", "being_2"]
@@ -137,7 +179,9 @@ def test_arrays_have_the_documented_shapes_and_dtypes():
         observation_space_mapping=lambda: np.ones((2, 3)),
         action_mask_mapping=lambda: [0, 1] + [0] * 8,
     )
-    found = collect_episodes(lambda: Timed(calling(ant, ant)().main), {ant: ones}, seeds=range(3))[ant]
+    found = collect_episodes(lambda: Timed(calling(ant, ant)().main), {ant: ones}, seeds=range(3))[
+        ant
+    ]
     for shape, dtype, names in (
         ((6,), np.float64, "rewards times elapsed"),
         ((6,), np.bool_, "terminations truncations by_rule"),
@@ -160,15 +204,22 @@ def test_arrays_have_the_documented_shapes_and_dtypes():
 def test_observations_actions_and_masks_of_several_parts_are_stacked():
     ant = decision(
         agent="ant_0",
-        observation_space=spaces.Dict(a=spaces.Discrete(5), b=spaces.Tuple([spaces.Box(0, 9, (2,)), spaces.Text(5)])),
+        observation_space=spaces.Dict(
+            a=spaces.Discrete(5), b=spaces.Tuple([spaces.Box(0, 9, (2,)), spaces.Text(5)])
+        ),
         observation_space_mapping=lambda: {"a": 3, "b": ([1, 2], "ant")},
         action_space=spaces.Dict(c=spaces.Box(0, 9, (2,)), d=spaces.MultiDiscrete([3, 3])),
     )
     bee = decision(
-        agent="bee_0", action_space=spaces.MultiDiscrete([2, 3]), action_mask_mapping=lambda: ([0, 1], [1, 0, 0])
+        agent="bee_0",
+        action_space=spaces.MultiDiscrete([2, 3]),
+        action_mask_mapping=lambda: ([0, 1], [1, 0, 0]),
     )
     answers = iter([[{"c": np.array([1, 2], np.float32), "d": np.array([0, 2])}, RULE], RULE])
-    policies = {ant: lambda observations: next(answers), bee: lambda observations: [[1, 0]] * len(observations)}
+    policies = {
+        ant: lambda observations: next(answers),
+        bee: lambda observations: [[1, 0]] * len(observations),
+    }
     found = collect_episodes(calling(ant, ant, bee), policies, seeds=range(2))
     of_ant, of_bee = found.values()
     assert of_ant.observations["a"].tolist() == [3] * 4
@@ -193,22 +244,33 @@ def test_policies_can_tell_decisions_apart_and_their_extras_stand_row_by_row():
         return ones(observations), {"seeds": [seed for seed, _ in identities], "arrays": own}
 
     for size in (1, 2, 3):
-        found = collect_episodes(calling(ant, bee, ant), {ant: policy, bee: ones}, seeds=[7, 5, 9], batch_size=size)
+        found = collect_episodes(
+            calling(ant, bee, ant), {ant: policy, bee: ones}, seeds=[7, 5, 9], batch_size=size
+        )
         own = found[ant]
-        assert own.extras["seeds"].tolist() == [own.seeds[episode] for episode in own.episodes] == [7, 7, 5, 5, 9, 9]
+        assert (
+            own.extras["seeds"].tolist()
+            == [own.seeds[episode] for episode in own.episodes]
+            == [7, 7, 5, 5, 9, 9]
+        )
         assert own.extras["arrays"][:, 1].tolist() == own.turns.tolist() == [0, 2] * 3
         assert own.extras["arrays"].dtype == np.float32
         assert own.observations.tolist() == [[1, 2]] * 6
 
 
 @pytest.mark.parametrize(
-    ("second", "match"), [({"values": [1.0]}, "2 decisions"), ({"values": 1.0}, "2 decisions"), (None, "values")]
+    ("second", "match"),
+    [({"values": [1.0]}, "2 decisions"), ({"values": 1.0}, "2 decisions"), (None, "values")],
 )
 def test_extras_that_do_not_fit_are_refused(second, match):
     ant = decision(agent="ant_0")
-    answers = iter([([1, 1], {"values": [0.5, 1.5]}), [1, 1] if second is None else ([1, 1], second)])
+    answers = iter(
+        [([1, 1], {"values": [0.5, 1.5]}), [1, 1] if second is None else ([1, 1], second)]
+    )
     with pytest.raises(OptionValueError, match=match):
-        collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2))
+        collect_episodes(
+            calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2)
+        )
 
 
 def test_agents_that_never_decide_have_arrays_without_rows_and_the_spaces_of_their_point():
@@ -221,7 +283,12 @@ def test_agents_that_never_decide_have_arrays_without_rows_and_the_spaces_of_the
     assert len(nothing) == 0
     assert nothing.action_space == spaces.Box(0, 1, (2,))
     assert nothing.agents.dtype == nothing.episodes.dtype == np.int64
-    assert nothing.observations.shape == nothing.next_observations.shape == nothing.actions.shape == (0, 2)
+    assert (
+        nothing.observations.shape
+        == nothing.next_observations.shape
+        == nothing.actions.shape
+        == (0, 2)
+    )
     assert nothing.seeds == (0, 1, 2, 3)
     assert len(collect_episodes(source, {ant: ones}, seeds=[])[ant]) == 0
     unborn = collect_episodes(source, {"being_3": ones}, points=beings(), seeds=[1])
@@ -232,18 +299,23 @@ def test_collect_is_called_with_each_simulation():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
 
     def found(policies, **options):
-        source = script(lambda simulation: [ant() and None for _ in range(simulation.seed)])  # the last end first
+        # the last end first
+        source = script(lambda simulation: [ant() and None for _ in range(simulation.seed)])
         return collect_episodes(source, policies, points=[ant, bee], seeds=[4, 0, 2], **options)
 
     both = {ant: ones, bee: ones}
     collected = found(both, collect=lambda simulation: simulation.seed)
-    assert collected[ant].collected == collected[bee].collected == (4, 0, 2)  # also of whom has never decided
+    # also of whom has never decided
+    assert collected[ant].collected == collected[bee].collected == (4, 0, 2)
     assert found(both)[ant].collected is None
     assert found({}) == {}
     for wrong in ({"collect": 3}, {"batch_size": 0}, {"batch_size": 1.5}, {"workers": 1.5}):
         with pytest.raises(OptionValueError, match=next(iter(wrong))):
             found(both, **wrong)
-    for policies, error, told in (([1], OptionValueError, "policies"), ({"nobody": ones}, UnknownPointError, "nobody")):
+    for policies, error, told in (
+        ([1], OptionValueError, "policies"),
+        ({"nobody": ones}, UnknownPointError, "nobody"),
+    ):
         with pytest.raises(error, match=told):
             found(policies)
 
@@ -258,9 +330,16 @@ def test_one_name_at_points_whose_spaces_differ_is_refused():
 
 def test_points_without_a_policy_of_the_call_are_no_agents():
     asked = []
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0)
-    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: lambda observation: 5})
-    found = collect_episodes(variant, {ant: ones}, seeds=range(2), collect=lambda simulation: simulation.log)
+    ant, bee = (
+        decision(agent="ant_0"),
+        decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0),
+    )
+    variant = Variant(
+        "own", calling(ant, bee), points=[ant, bee], policies={bee: lambda observation: 5}
+    )
+    found = collect_episodes(
+        variant, {ant: ones}, seeds=range(2), collect=lambda simulation: simulation.log
+    )
     assert list(found) == [ant]
     assert found[ant].turns.tolist() == [0, 0]
     assert found[ant].collected == ([1, 5], [1, 5])

@@ -1,4 +1,7 @@
-"""Demonstrations by the rule and by others: mixtures and comparisons. Of data sets: ``test_minari.py``."""
+"""Demonstrations by the rule and by others: mixtures and comparisons.
+
+Of data sets: ``test_minari.py``.
+"""
 
 import sys
 from functools import partial
@@ -8,7 +11,13 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, simulate_many
-from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset, save_dataset
+from simenv_marl.data import (
+    Mixture,
+    collect_episodes,
+    compare_with_rule,
+    record_dataset,
+    save_dataset,
+)
 from simenv_marl.errors import DefinitionError, MissingExtraError, OptionValueError
 from tests.contract.test_simulate_many import ones
 from tests.worlds.lives import life
@@ -27,12 +36,19 @@ def test_mixtures_leave_each_decision_to_one_of_their_policies():
     assert "0.5 functools.partial" in repr(Mixture([(partial(ones), 1), (RULE, 1)]))
     found = collect_episodes(calling(*[ant] * 20), {ant: mixture}, seeds=range(100))[ant]
     component = found.extras["component"]
-    assert [float((component == number).mean()) for number in range(3)] == pytest.approx([0.375, 0.125, 0.5], abs=0.04)
+    assert [float((component == number).mean()) for number in range(3)] == pytest.approx(
+        [0.375, 0.125, 0.5], abs=0.04
+    )
     assert found.actions.tolist() == (component + 1).tolist()
     assert found.by_rule.tolist() == (component == 2).tolist()
     assert found.known.all()
-    logs = [simulation.log for simulation in simulate_many(calling(*[ant] * 20), {ant: mixture}, seeds=range(2))]
-    assert logs == [[[1, 2, "rule"][own] for own in component[start : start + 20]] for start in (0, 20)]
+    logs = [
+        simulation.log
+        for simulation in simulate_many(calling(*[ant] * 20), {ant: mixture}, seeds=range(2))
+    ]
+    assert logs == [
+        [[1, 2, "rule"][own] for own in component[start : start + 20]] for start in (0, 20)
+    ]
 
 
 def test_mixtures_draw_by_seed_and_decision_alone():
@@ -41,15 +57,23 @@ def test_mixtures_draw_by_seed_and_decision_alone():
 
     def actions(seeds, **options):
         policies = {ant: mixture, bee: mixture}
-        found = collect_episodes(calling(*[ant, bee] * 10), policies, points=[ant, bee], seeds=seeds, **options)
+        found = collect_episodes(
+            calling(*[ant, bee] * 10), policies, points=[ant, bee], seeds=seeds, **options
+        )
         of_seeds = {}
         for own in found.values():
-            for seed, turn, action in zip(np.take(own.seeds, own.episodes), own.turns, own.actions, strict=True):
+            for seed, turn, action in zip(
+                np.take(own.seeds, own.episodes), own.turns, own.actions, strict=True
+            ):
                 of_seeds[int(seed), int(turn)] = int(action)
         return of_seeds
 
     together = actions([5, 6, 2**70])
-    assert together == actions([2**70, 5, 6], batch_size=1) == actions([5, 6], batch_size=2) | actions([2**70])
+    assert (
+        together
+        == actions([2**70, 5, 6], batch_size=1)
+        == actions([5, 6], batch_size=2) | actions([2**70])
+    )
     drawn = ["".join(str(together[seed, turn]) for turn in range(20)) for seed in (5, 6, 2**70)]
     assert drawn == [
         "22222212122121111111",
@@ -70,14 +94,19 @@ def test_mixtures_give_policies_what_is_theirs():
     given = {"points": beings(action_mask_mapping=lambda being: mask), "seeds": range(9)}
     own = collect_episodes(source, {Being.act: Mixture({informed: 1, twos: 1})}, **given)[Being.act]
     rows = np.flatnonzero(own.extras["component"] == 0)
-    expected = [(own.observations[r, 0], mask, (own.seeds[own.episodes[r]], own.turns[r])) for r in rows]
+    expected = [
+        (own.observations[r, 0], mask, (own.seeds[own.episodes[r]], own.turns[r])) for r in rows
+    ]
     assert sorted(seen) == sorted(expected)
     assert own.extras.keys() == {"component"}
 
 
 def test_mixtures_work_with_composite_spaces():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), what=spaces.Discrete(3))
-    observed = {"observation_space": space, "observation_space_mapping": lambda: {"how": [1, 2], "what": 1}}
+    observed = {
+        "observation_space": space,
+        "observation_space_mapping": lambda: {"how": [1, 2], "what": 1},
+    }
     ant = decision(agent="ant_0", action_space=space, **observed)
     policies = {ant: Mixture({(lambda observations: observations): 1, RULE: 1})}
     found = collect_episodes(calling(*[ant] * 9), policies, seeds=[1, 2])[ant]
@@ -91,7 +120,10 @@ def test_mixtures_work_with_composite_spaces():
     "parts",
     [
         *({}, [], [ones], {"ones": 1}, [(ones, 1, 2)], {ones: 0}),
-        *({ones: 1, twos: weight} for weight in (-1, -1e-9, float("inf"), float("nan"), "1", True, None, 1j)),
+        *(
+            {ones: 1, twos: weight}
+            for weight in (-1, -1e-9, float("inf"), float("nan"), "1", True, None, 1j)
+        ),
     ],
     ids=plainly,
 )
@@ -133,7 +165,10 @@ def test_unknown_rule_actions_are_refused_before_anything_runs(monkeypatch):
     def main(simulation):
         raise Ran
 
-    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", rule_action_mapping=lambda decided: 3)
+    ant, bee = (
+        decision(agent="ant_0"),
+        decision(agent="bee_0", rule_action_mapping=lambda decided: 3),
+    )
     unknown = DefinitionError, r"choose.*rule_action_mapping"
     cases = [(ant, Mixture({ones: 1, RULE: 0}), Ran, None)]
     for policy in (RULE, Mixture({ones: 1, RULE: 1}), Mixture({Mixture({RULE: 1}): 1})):
@@ -167,13 +202,24 @@ def test_policies_are_asked_while_the_rule_decides(size):
     assert "0.333" in repr(found)
     assert found.trajectories.actions.tolist() == [0, 1, 2] * 6
     assert found.trajectories.extras == {}
-    for name in ("observations", "actions", "rewards", "terminations", "starts", "episodes", "by_rule", "turns"):
+    for name in (
+        "observations",
+        "actions",
+        "rewards",
+        "terminations",
+        "starts",
+        "episodes",
+        "by_rule",
+        "turns",
+    ):
         assert np.array_equal(getattr(found.trajectories, name), getattr(alone, name)), name
 
 
 def test_a_policy_that_leaves_the_decision_to_the_rule_agrees_with_it():
     policy = Mixture({RULE: 1, (lambda seen: [7] * len(seen)): 1})
-    found = compare_with_rule(script(crowd), {Being.act: policy}, points=TOLD, seeds=range(4))[Being.act]
+    found = compare_with_rule(script(crowd), {Being.act: policy}, points=TOLD, seeds=range(4))[
+        Being.act
+    ]
     assert set(np.unique(found.policy_actions)) == {0, 1, 2, 7}
     assert found.agreements.tolist() == (found.policy_actions != 7).tolist()
 
@@ -184,27 +230,39 @@ def test_numbers_may_differ_by_a_tolerance():
         {"how": np.array(how, np.float32), "what": what}
         for how, what in (([1, 2], 1), ([1.5, 2], 1), ([1, 2.75], 1), ([1, 2], 2))
     ]
-    ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: answers[0])
+    ant = decision(
+        agent="ant_0", action_space=space, rule_action_mapping=lambda decided: answers[0]
+    )
     for tolerance, number in ((0.0, 1), (0.5, 2), (1, 3)):
-        found = compare_with_rule(calling(ant), {ant: lambda seen: answers}, seeds=range(4), tolerance=tolerance)
+        found = compare_with_rule(
+            calling(ant), {ant: lambda seen: answers}, seeds=range(4), tolerance=tolerance
+        )
         assert found[ant].agreements.tolist() == [True] * number + [False] * (4 - number)
 
 
 def test_actions_of_all_kinds_are_compared():
-    space = spaces.Tuple([spaces.MultiDiscrete([3, 3]), spaces.Text(5), spaces.Dict(a=spaces.MultiBinary(2))])
+    space = spaces.Tuple(
+        [spaces.MultiDiscrete([3, 3]), spaces.Text(5), spaces.Dict(a=spaces.MultiBinary(2))]
+    )
 
     def action(numbers=(1, 2), word="hello", bits=(0, 1)):
         return np.array(numbers), word, {"a": np.array(bits, np.int8)}
 
     ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: action())
-    answers = iter([action(), action(numbers=(1, 1)), action(word="hell"), action(bits=(1, 1)), RULE])
-    found = compare_with_rule(calling(*[ant] * 5), {ant: lambda seen: [next(answers)]}, seeds=[1])[ant]
+    answers = iter(
+        [action(), action(numbers=(1, 1)), action(word="hell"), action(bits=(1, 1)), RULE]
+    )
+    found = compare_with_rule(calling(*[ant] * 5), {ant: lambda seen: [next(answers)]}, seeds=[1])[
+        ant
+    ]
     assert found.agreements.tolist() == [True, False, False, False, True]
     assert found.policy_actions[1].tolist() == ["hello", "hello", "hell", "hello", "hello"]
 
 
 def test_comparisons_of_several_policies_and_without_decisions():
-    ant, bee = (decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0"))
+    ant, bee = (
+        decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0")
+    )
     cat, logs = decision(agent="cat_0"), []
     source = script(lambda simulation: logs.append([ant(), cat(), ant()]))
     given = {"points": [ant, bee, cat], "seeds": [1], "others": {cat: twos}}
@@ -218,7 +276,9 @@ def test_comparisons_of_several_policies_and_without_decisions():
 
 def test_decisions_that_correspond_to_no_action():
     points = beings(rule_action_mapping=lambda decided, being: None if being.number == 2 else 1)
-    with pytest.raises(DefinitionError, match=r"in 3 of 9 decisions .*'being_2' at turn 2 of the episode of seed 8"):
+    with pytest.raises(
+        DefinitionError, match=r"in 3 of 9 decisions .*'being_2' at turn 2 of the episode of seed 8"
+    ):
         compare_with_rule(script(crowd), {Being.act: ones}, points=points, seeds=[8])
     ant = decision(rule_action_mapping=lambda decided: None)
     with pytest.raises(DefinitionError, match=r"in 2 of 2 decisions .* of the episode of seed 8"):
@@ -227,7 +287,13 @@ def test_decisions_that_correspond_to_no_action():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"policies": ones}, {"policies": {"ant_0": RULE}}, {"tolerance": -1}, {"others": 3}, {"tolerance": "1"}],
+    [
+        {"policies": ones},
+        {"policies": {"ant_0": RULE}},
+        {"tolerance": -1},
+        {"others": 3},
+        {"tolerance": "1"},
+    ],
     ids=plainly,
 )
 def test_invalid_comparisons_are_refused(wrong):

@@ -42,18 +42,25 @@ def check(found, dataset):
     """A data set has just what was found."""
     assert dataset.total_episodes == len(found.starts)
     assert dataset.total_steps == len(found)
-    assert (dataset.observation_space, dataset.action_space) == (found.observation_space, found.action_space)
+    assert (dataset.observation_space, dataset.action_space) == (
+        found.observation_space,
+        found.action_space,
+    )
     metadata = list(dataset.storage.get_episode_metadata(range(dataset.total_episodes)))
     for place, (start, length) in enumerate(zip(found.starts, found.lengths, strict=True)):
         rows, episode = slice(start, start + length), dataset[place]
         assert same(part(episode.observations, slice(0, length)), part(found.observations, rows))
-        assert same(part(episode.observations, slice(1, length + 1)), part(found.next_observations, rows))
+        assert same(
+            part(episode.observations, slice(1, length + 1)), part(found.next_observations, rows)
+        )
         assert same(episode.actions, part(found.actions, rows))
         assert same(episode.rewards, found.rewards[rows])
         assert same(episode.terminations, found.terminations[rows])
         assert same(episode.truncations, found.truncations[rows])
         assert same(episode.infos["by_rule"], np.append(found.by_rule[rows], False))
-        assert all(same(episode.infos[name][:-1], values[rows]) for name, values in found.extras.items())
+        assert all(
+            same(episode.infos[name][:-1], values[rows]) for name, values in found.extras.items()
+        )
         assert metadata[place]["seed"] == found.seeds[found.episodes[start]]
         assert metadata[place]["agent"] == found.names[found.agents[start]]
         assert metadata[place]["episode"] == found.episodes[start]
@@ -81,7 +88,11 @@ def thirds(seen):
 
 @pytest.mark.parametrize(
     ("policy", "name"),
-    [(thirds, "thirds"), (RULE, "rule"), (Mixture({RULE: 1, ones: 1}), "<Mixture: 0.5 rule, 0.5 ones>")],
+    [
+        (thirds, "thirds"),
+        (RULE, "rule"),
+        (Mixture({RULE: 1, ones: 1}), "<Mixture: 0.5 rule, 0.5 ones>"),
+    ],
 )
 def test_data_sets_hold_what_was_collected_and_say_who_decided(policy, name):
     points = beings(rule_action_mapping=lambda decided, being: being.health)
@@ -110,7 +121,12 @@ SPACES = [
 @pytest.mark.parametrize("space", SPACES, ids=str)
 def test_all_kinds_of_spaces_are_read_again(space):
     space.seed(1)
-    ant = decision(agent="ant_0", observation_space=space, observation_space_mapping=space.sample, action_space=space)
+    ant = decision(
+        agent="ant_0",
+        observation_space=space,
+        observation_space_mapping=space.sample,
+        action_space=space,
+    )
     policies = {ant: lambda seen: [space.sample() for _ in range(2)]}
     found = collect_episodes(calling(ant, ant, ant), policies, seeds=[1, 2], points=ant)[ant]
     check(found, save_dataset(NAME, found))
@@ -134,16 +150,27 @@ def test_each_policy_has_a_data_set():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     policies = {"ant_0": ones, "bee_0": lambda seen: [2] * len(seen), ant: ones}
     names = {"ant_0": "simenv/ants-v0", "bee_0": "simenv/bees-v1"}
-    written = record_dataset(names, calling(ant, bee, bee), policies, points=[ant, bee], seeds=[1, 2])
+    written = record_dataset(
+        names, calling(ant, bee, bee), policies, points=[ant, bee], seeds=[1, 2]
+    )
     assert list(written) == ["ant_0", "bee_0"]
     assert set(minari.list_local_datasets()) == {"simenv/ants-v0", "simenv/bees-v1"}
-    assert [episode.actions.tolist() for episode in minari.load_dataset("simenv/bees-v1")] == [[2, 2]] * 2
+    assert [episode.actions.tolist() for episode in minari.load_dataset("simenv/bees-v1")] == [
+        [2, 2]
+    ] * 2
 
 
 def test_the_environment_can_be_recovered():
     greenhouse = pytest.importorskip("examples.greenhouse_coop.env")
     policies, metadata = {"waterer_0": RULE}, {"env": "greenhouse_coop/Watering-v0"}
-    record_dataset(NAME, greenhouse.GreenhouseSim, policies, points=greenhouse.WATERING, seeds=[5], metadata=metadata)
+    record_dataset(
+        NAME,
+        greenhouse.GreenhouseSim,
+        policies,
+        points=greenhouse.WATERING,
+        seeds=[5],
+        metadata=metadata,
+    )
     dataset = minari.load_dataset(NAME)
     env = dataset.recover_environment()
     observation, _ = env.reset(seed=5)
@@ -161,8 +188,12 @@ def test_nothing_is_overwritten_and_nothing_is_run_in_vain():
 
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
     with pytest.raises(TypeError):  # half a data set is none
-        record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1], metadata={"no such argument": 1})
-    record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1], max_steps=5, metadata=SAID)
+        record_dataset(
+            NAME, calling(ant), {ant: ones}, points=ant, seeds=[1], metadata={"no such argument": 1}
+        )
+    record_dataset(
+        NAME, calling(ant), {ant: ones}, points=ant, seeds=[1], max_steps=5, metadata=SAID
+    )
     for name, main, reason in [
         (NAME, never, "already"),
         ("no name", never, "not a name"),
@@ -196,7 +227,9 @@ def test_an_interrupt_leaves_no_name_taken(number, monkeypatch):
 
     monkeypatch.setattr(minari, "create_dataset_from_buffers", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        record_dataset(names, calling(ant, bee), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
+        record_dataset(
+            names, calling(ant, bee), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1]
+        )
     assert not minari.list_local_datasets()
     assert not list(Path(os.environ["MINARI_DATASETS_PATH"]).rglob("*-v0"))
 
@@ -212,7 +245,9 @@ def test_the_page_on_demonstrations_does_what_it_says(monkeypatch):
     """With the examples that need Minari, which are skipped where it is not there."""
     page = Path(__file__).parents[2] / "docs" / "demonstrations.md"
     monkeypatch.syspath_prepend(page.parent)
-    examples = DocTestParser().get_doctest(page.read_text(encoding="utf-8"), {}, page.name, str(page), 0)
+    examples = DocTestParser().get_doctest(
+        page.read_text(encoding="utf-8"), {}, page.name, str(page), 0
+    )
     skipped = [example.options.pop(SKIP, False) for example in examples.examples]
     assert sum(skipped) > 3
     with models_of_pages_forgotten():

@@ -35,7 +35,9 @@ def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **d
         for step in range(steps):
             for being in list(simulation.crowd):
                 being.act()
-            for being in [being for being in simulation.crowd if being.number in dying and not step]:
+            for being in [
+                being for being in simulation.crowd if being.number in dying and not step
+            ]:
                 being.leave()
                 simulation.crowd.remove(being)
         return TRUNCATED
@@ -47,7 +49,9 @@ def herd(number, steps, *, dying=(), policy=ones, key=Being.act, seeds=(5,), **d
 def answered(function, *answers):
     """An episode of a decision function, whose decisions are answered so."""
     remaining = iter(answers)
-    return collect_episodes(calling(*[function] * len(answers)), {function: lambda seen: next(remaining)}, seeds=[1])
+    return collect_episodes(
+        calling(*[function] * len(answers)), {function: lambda seen: next(remaining)}, seeds=[1]
+    )
 
 
 def of(axes, kind):
@@ -56,7 +60,10 @@ def of(axes, kind):
 
 def dots(axes):
     drawn = [own for own in of(axes, PathCollection) if len(own.get_offsets())]
-    return [(np.asarray(own.get_offsets()).tolist(), to_hex(own.get_facecolor()[0]) != "#ffffff") for own in drawn]
+    return [
+        (np.asarray(own.get_offsets()).tolist(), to_hex(own.get_facecolor()[0]) != "#ffffff")
+        for own in drawn
+    ]
 
 
 def texts(axes):
@@ -88,7 +95,11 @@ def test_charts_show_each_action_by_its_name_and_each_reward():
         ({1: "left"}, ["left", "2", "3", "7", "8"]),
         ({ant: {1: "dig"}, bee: letters}, ["dig", "2", "3", "h", "i"]),
     ):
-        assert [name for axes in plot_timeline(found, action_names=given).axes[::2] for name in ticks(axes)] == names
+        assert [
+            name
+            for axes in plot_timeline(found, action_names=given).axes[::2]
+            for name in ticks(axes)
+        ] == names
     with pytest.raises(OptionValueError, match="action_names"):
         plot_timeline(found, action_names="dig")
 
@@ -129,10 +140,14 @@ def test_decisions_of_the_rule_look_different(known):
 
 
 def test_actions_of_several_parts_have_a_chart_for_each_part():
-    space = spaces.Dict(how=spaces.Box(0, 1, (2,), np.float32), what=spaces.Discrete(3), say=spaces.Text(9))
+    space = spaces.Dict(
+        how=spaces.Box(0, 1, (2,), np.float32), what=spaces.Discrete(3), say=spaces.Text(9)
+    )
     ant = decision(agent="ant_0", action_space=space)
     action = {"how": np.array([0.5, 0.25], np.float32), "what": 2, "say": "hello"}
-    by_name = {axes.get_ylabel(): axes for axes in plot_timeline(answered(ant, [action], [action])).axes}
+    by_name = {
+        axes.get_ylabel(): axes for axes in plot_timeline(answered(ant, [action], [action])).axes
+    }
     assert set(by_name) == {"how", "what", "say", "reward"}
     assert dots(by_name["how"]) == [([[0, 0.5], [1, 0.5]], True), ([[0, 0.25], [1, 0.25]], True)]
     assert dots(by_name["what"]) == [([[0, 2], [1, 2]], True)]
@@ -152,7 +167,9 @@ def test_times_without_a_living_agent_are_shaded():
 
 def drawn(axes):
     """The cells that are coloured over the white ones, as (begin, end, height in the middle)."""
-    cells = [path.get_extents() for cells in of(axes, PolyCollection)[1:] for path in cells.get_paths()]
+    cells = [
+        path.get_extents() for cells in of(axes, PolyCollection)[1:] for path in cells.get_paths()
+    ]
     gap = 0.0 if len(cells) > 100 else 0.16  # which would hide what is slim
     assert all(cell.y1 - cell.y0 == pytest.approx(1 - gap) for cell in cells)
     return sorted((cell.x0, cell.x1, (cell.y0 + cell.y1) / 2) for cell in cells)
@@ -167,12 +184,24 @@ def test_many_agents_have_a_row_each_and_some_can_be_chosen():
     assert 10 < len(labels) < 60
     assert labels[0] == "being_0"
     cells = drawn(actions)
-    assert len(cells) == len(found[Being.act]) == len(of(rewards, PolyCollection)[0].get_paths()) == 400
-    # The first decides but once, at 0, and ends when all have decided; the second decides again then.
+    assert (
+        len(cells)
+        == len(found[Being.act])
+        == len(of(rewards, PolyCollection)[0].get_paths())
+        == 400
+    )
+    # The first decides but once, at 0, and ends when all have decided; the second decides again
+    # then.
     assert cells[:2] == [pytest.approx((0, 200, 0)), pytest.approx((1, 200, 1))]
-    assert [(line.get_marker(), len(line.get_xdata())) for line in actions.lines] == [("x", 100), ("|", 100)]
+    assert [(line.get_marker(), len(line.get_xdata())) for line in actions.lines] == [
+        ("x", 100),
+        ("|", 100),
+    ]
     figure = plot_timeline(found, agents=["being_7", "being_3"])
-    assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == ["being_7  (Being.act)", "being_3  (Being.act)"]
+    assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == [
+        "being_7  (Being.act)",
+        "being_3  (Being.act)",
+    ]
     with pytest.raises(UnknownAgentError, match="being_200"):
         plot_timeline(found, agents=["being_200"])
     with pytest.raises(OptionValueError, match="agents"):
@@ -180,7 +209,9 @@ def test_many_agents_have_a_row_each_and_some_can_be_chosen():
 
 
 def test_rows_are_coloured_by_the_action():
-    found = herd(8, 1, key=f"{Being.__module__}.Being.act", policy=lambda seen: [3, *[0] * 7][: len(seen)])
+    found = herd(
+        8, 1, key=f"{Being.__module__}.Being.act", policy=lambda seen: [3, *[0] * 7][: len(seen)]
+    )
     actions = plot_timeline(found, action_names=["stay", "1", "2", "go"]).axes[0]
     colours = [tuple(colour) for colour in of(actions, PolyCollection)[-1].get_facecolor()]
     assert set(colours) <= {to_rgba(COLOURS[0]), to_rgba(COLOURS[3])}
@@ -192,11 +223,17 @@ def test_rows_of_actions_with_components_are_coloured_by_one():
     space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), far=spaces.Discrete(5))
     answer = {"how": np.array([1, 2], np.float32), "far": 4}
     found = herd(8, 1, policy=lambda seen: [answer] * len(seen), action_space=space)
-    for component, name, value in ((None, "how[0]", 1), ("how[0]", "how[0]", 1), ("how[1]", "how[1]", 2)):
+    for component, name, value in (
+        (None, "how[0]", 1),
+        ("how[0]", "how[0]", 1),
+        ("how[1]", "how[1]", 2),
+    ):
         axes = plot_timeline(found, component=component).axes[0]
         assert set(of(axes, PolyCollection)[-1].get_array().tolist()) == {value}
         assert f"action {name}, one of 3" in axes.get_title(loc="left")
-    assert "action far, one of 3" in plot_timeline(found, component="far").axes[0].get_title(loc="left")
+    assert "action far, one of 3" in plot_timeline(found, component="far").axes[0].get_title(
+        loc="left"
+    )
     with pytest.raises(OptionValueError, match=r"'how\[1\]'"):
         plot_timeline(found, component="where")
 
@@ -220,7 +257,10 @@ def test_numbers_and_too_many_different_actions_share_a_scale():
         "observation_space_mapping": lambda being: [being.number, 0],
     }
     numbers = herd(10, 2, policy=lambda seen: (seen[:, :1] / 2).astype(np.float32), **given)
-    for found, values, most in ((many, list(range(30)), 29), (numbers, np.repeat(np.arange(10) / 2, 2).tolist(), 4.5)):
+    for found, values, most in (
+        (many, list(range(30)), 29),
+        (numbers, np.repeat(np.arange(10) / 2, 2).tolist(), 4.5),
+    ):
         scale = of(plot_timeline(found).axes[0], PolyCollection)[-1]
         assert scale.get_array().tolist() == values
         assert scale.get_clim() == (0, most)
@@ -264,14 +304,21 @@ def test_pictures_are_drawn_where_they_are_asked_for():
 
 
 def paid_by_seed(number, factor=1.0):
-    return herd(number, 2, seeds=[1, 2, 6], reward_mapping=lambda being: being.health * factor + being.number)
+    return herd(
+        number,
+        2,
+        seeds=[1, 2, 6],
+        reward_mapping=lambda being: being.health * factor + being.number,
+    )
 
 
 def rows_of(figure):
     """By the label of a row: where its points are."""
     (axes,) = figure.axes
     labels = dict(zip(np.round(axes.get_yticks(), 6).tolist(), ticks(axes), strict=True))
-    means = {round(float(line.get_ydata()[0]), 6): float(line.get_xdata()[0]) for line in axes.lines}
+    means = {
+        round(float(line.get_ydata()[0]), 6): float(line.get_xdata()[0]) for line in axes.lines
+    }
     points = [np.asarray(drawn.get_offsets())[:, 0].tolist() for drawn in of(axes, PathCollection)]
     assert [np.mean(values) for values in points] == pytest.approx(list(means.values()))
     return [(labels[place], values) for place, values in zip(means, points, strict=True)]
@@ -294,7 +341,10 @@ def test_a_point_is_the_mean_of_the_agents_or_of_one_or_the_sum(per, rows):
 def test_intervals_are_the_same_each_time_and_teams_are_of_all_policies():
     intervals = [plot_returns(paid_by_seed(3)).axes[0].texts[0].get_text() for _ in range(2)]
     assert intervals == ["8  [-5.145, 21.14]"] * 2  # by Student's t
-    ant, bee = (decision(agent=name, reward_mapping=lambda paid=paid: paid) for name, paid in (("a", 1.0), ("b", 10.0)))
+    ant, bee = (
+        decision(agent=name, reward_mapping=lambda paid=paid: paid)
+        for name, paid in (("a", 1.0), ("b", 10.0))
+    )
     found = collect_episodes(calling(ant, bee, ant), {ant: ones, bee: ones}, seeds=[3, 4])
     assert [values for _, values in rows_of(plot_returns(found, per="team"))] == [[12, 12]]
 
@@ -306,7 +356,10 @@ def test_several_collections_stand_side_by_side():
     assert ticks(figure.axes[0]) == ["Being.act", "once", "twice"]
     alone = plot_returns({name: found[Being.act] for name, found in several.items()})
     assert rows_of(alone) == rows_of(figure)
-    assert rows_of(plot_returns(several, per="team")) == [("once", [12, 18, 42]), ("twice", [18, 30, 78])]
+    assert rows_of(plot_returns(several, per="team")) == [
+        ("once", [12, 18, 42]),
+        ("twice", [18, 30, 78]),
+    ]
 
 
 def test_hundreds_of_agents_are_too_many_rows():

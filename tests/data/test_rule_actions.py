@@ -48,7 +48,12 @@ def test_the_next_info_has_the_rules_action_of_the_latest_decision_only(mapping,
 @pytest.mark.parametrize(
     ("mapping", "error", "match", "note"),
     [
-        (lambda tens: tens, InvalidActionError, "the rule's decision 10 to the action 10", "seed 3"),
+        (
+            lambda tens: tens,
+            InvalidActionError,
+            "the rule's decision 10 to the action 10",
+            "seed 3",
+        ),
         ({20: 4}, InvalidActionError, "no action for the rule's decision 10", "in_turn"),
         (lambda tens: 1 / 0, ZeroDivisionError, "division", "seed 3"),
     ],
@@ -73,8 +78,12 @@ def test_errors_surface_outside_the_models_own_try(mapping, error, match, note):
 
 def test_decisions_within_rules_do_not_take_each_others_place():
     inner = decision(lambda: 2, agent="inner_0", rule_action_mapping=lambda decided: decided)
-    outer = decision(lambda: 10 * inner(), agent="outer_0", rule_action_mapping=lambda decided: decided // 5)
-    wrong = decision(lambda: 10 * inner(), agent="wrong_0", rule_action_mapping=lambda decided: decided // 0)
+    outer = decision(
+        lambda: 10 * inner(), agent="outer_0", rule_action_mapping=lambda decided: decided // 5
+    )
+    wrong = decision(
+        lambda: 10 * inner(), agent="wrong_0", rule_action_mapping=lambda decided: decided // 0
+    )
     turns = play(aec_env(calling(outer, outer), [outer, inner]), RULE, seed=0)
     told = [(turn.agent, turn.info.get("rule_action")) for turn in turns]
     assert told == [("outer_0", None), ("inner_0", None), *[("outer_0", 4), ("inner_0", 2)] * 2]
@@ -84,7 +93,10 @@ def test_decisions_within_rules_do_not_take_each_others_place():
 
 
 def test_each_entity_gets_its_own_rule_action():
-    points, names = beings(rule_action_mapping=lambda decided, being: being.number), ["being_0", "being_1", "being_2"]
+    points, names = (
+        beings(rule_action_mapping=lambda decided, being: being.number),
+        ["being_0", "being_1", "being_2"],
+    )
     env = parallel_env(life("0 acts, 1 acts, 2 acts, 0 acts"), points, possible_agents=names)
     env.reset(seed=0)
     infos = env.step({"being_0": RULE, "being_1": 4, "being_2": RULE})[4]
@@ -94,7 +106,9 @@ def test_each_entity_gets_its_own_rule_action():
 def test_arrays_of_rule_actions_are_cast_and_copied():
     decided = np.array([0.25, 0.5])
     space = spaces.Box(0, 1, (2,), np.float32)
-    function = decision(lambda: decided, action_space=space, rule_action_mapping=lambda value: value)
+    function = decision(
+        lambda: decided, action_space=space, rule_action_mapping=lambda value: value
+    )
     env = begun(calling(*[function] * 4), function)
     action = env.step(RULE)[4]["rule_action"]
     assert action.dtype == np.float32
@@ -109,7 +123,9 @@ def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
     def pour():
         tank["level"] += 3
 
-    fill = decision(pour, apply=lambda action: None, rule_action_mapping=lambda nothing: tank["level"])
+    fill = decision(
+        pour, apply=lambda action: None, rule_action_mapping=lambda nothing: tank["level"]
+    )
     last = lambda: tank.update(level=5)  # noqa: E731  # what comes after the decision is not looked at
     env = begun(calling(fill, fill, fill, last), fill)
     assert [env.step(RULE)[4]["rule_action"] for _ in range(3)] == [3, 6, 9]
@@ -137,10 +153,20 @@ def test_generators_and_coroutines_have_rule_actions(driver):
         simulation.log += process()
         asyncio.run(task())
 
-    slow, late = (decision(rule, agent=rule.__name__, rule_action_mapping=lambda n: n + 1) for rule in (slowly, later))
+    slow, late = (
+        decision(rule, agent=rule.__name__, rule_action_mapping=lambda n: n + 1)
+        for rule in (slowly, later)
+    )
     env = aec_env(script(main), [slow, late], driver=driver)
     told = [(turn.agent, turn.info.get("rule_action")) for turn in play(env, RULE, seed=0)]
-    assert told == [("slowly", None), ("slowly", 4), ("later", None), ("later", 5), ("slowly", 4), ("later", 5)]
+    assert told == [
+        ("slowly", None),
+        ("slowly", 4),
+        ("later", None),
+        ("later", 5),
+        ("slowly", 4),
+        ("later", 5),
+    ]
 
 
 MOVES = {0: "stay", 1: "north", 2: "south"}
@@ -152,10 +178,18 @@ MOVES = {0: "stay", 1: "north", 2: "south"}
         ([10, 20, 30, 40], {"rule_action_mapping": lambda tens: tens // 10}, [1, 2, 3, 4]),
         ([10, 20, 30, 40], {}, [None] * 4),
         (["south", "elsewhere", "stay", "north"], {"action_space_mapping": MOVES}, [2, None, 0, 1]),
-        ([["south"], "south", {"south": 1}, "stay"], {"action_space_mapping": MOVES}, [None, 2, None, 0]),
+        (
+            [["south"], "south", {"south": 1}, "stay"],
+            {"action_space_mapping": MOVES},
+            [None, 2, None, 0],
+        ),
         (["go"] * 4, {"action_space_mapping": {0: "stay", 1: "stay", 2: "go"}}, [None] * 4),
         ([[3]] * 4, {"action_space_mapping": {0: [1], 1: [2], 2: [3]}}, [None] * 4),
-        (["b", "a", "a", "z"], {"choices": [["a", "b"], ["b", "c", "a"], ["a"], ["b", "d"]]}, [1, 2, 0, None]),
+        (
+            ["b", "a", "a", "z"],
+            {"choices": [["a", "b"], ["b", "c", "a"], ["a"], ["b", "d"]]},
+            [1, 2, 0, None],
+        ),
     ],
     ids=["mapping", "nothing", "dict", "unhashable", "ambiguous", "lists", "choices"],
 )

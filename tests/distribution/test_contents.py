@@ -1,4 +1,7 @@
-"""What the source distribution and the wheel in ``dist`` contain. ``make test-wheel`` builds them before."""
+"""What the source distribution and the wheel in ``dist`` contain.
+
+``make test-wheel`` builds them before.
+"""
 
 import subprocess
 import tarfile
@@ -16,7 +19,9 @@ ROOT = Path(__file__).parents[2]
 def tracked():
     """All files of the repository."""
     command = ["git", "ls-files", "-z", "--cached"]
-    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout
+    listed = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
+    ).stdout
     return {path for path in listed.split("\0") if path and (ROOT / path).exists()}
 
 

@@ -18,7 +18,10 @@ from simenv_marl.experiments import Variant
 from tests.processes import ROOT
 from tests.worlds.copied import Walk, WalkEnv, blow, define
 
-VIEWS = {make.__name__: partial(make, Walk, Walk.choose) for make in (aec_env, parallel_env, single_env, joint_env)}
+VIEWS = {
+    make.__name__: partial(make, Walk, Walk.choose)
+    for make in (aec_env, parallel_env, single_env, joint_env)
+}
 MAKERS = VIEWS | {
     "generated": partial(WalkEnv, max_steps=2),
     "of no name": lambda: generate_env(Walk, Walk.choose, view="aec")(max_steps=2),
@@ -109,10 +112,16 @@ def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 @COPIES
 def test_a_copy_has_all_options(copied, driver):
-    """Points that nobody has decorated, policies, plugins, variants, rosters and all other options."""
+    """Points that nobody has decorated, policies, plugins, variants, rosters and all other
+    options.
+    """
     points = {f"{Walk.__module__}.Walk.drift": define(agent="wind_0"), Walk.choose: None}
-    variant = Variant("long", Walk, parameters={"length": 7}, plugins=[(blow, Walk.drift, "instead")])
-    env = aec_env(variant, points, policies={Walk.choose: RULE}, max_steps=3, driver=driver, global_rng=True)
+    variant = Variant(
+        "long", Walk, parameters={"length": 7}, plugins=[(blow, Walk.drift, "instead")]
+    )
+    env = aec_env(
+        variant, points, policies={Walk.choose: RULE}, max_steps=3, driver=driver, global_rng=True
+    )
     twin = copied(env)
     assert twin.possible_agents == ["wind_0"]
     assert twin.provenance() == env.provenance()
@@ -141,13 +150,17 @@ class Model:
 
 def run(code, given=None):
     """What a process of its own prints that runs some code."""
-    ran = subprocess.run([sys.executable, "-c", code], input=given, capture_output=True, timeout=120, cwd=ROOT)
+    ran = subprocess.run(
+        [sys.executable, "-c", code], input=given, capture_output=True, timeout=120, cwd=ROOT
+    )
     assert ran.returncode == 0, ran.stderr.decode()
     return ran.stdout
 
 
 def test_cloudpickle_takes_a_model_of_the_main_module_to_another_process():
-    """A model in ``__main__``, decorated and not, with differences, lambdas and policies, as in a notebook."""
+    """A model in ``__main__``, decorated and not, with differences, lambdas and policies, as in a
+    notebook.
+    """
     code = """
 points = {Model.one: None, Model.two: define(agent="two_0", action_space_mapping=lambda action: action)}
 env = aec_env(Model, points, policies={"two_0": lambda observation: 5})
@@ -166,7 +179,9 @@ print([turn.reward for turn in play(env, 2, seed=1)], env.simulation.total, env.
 
 
 def test_copies_of_a_model_of_the_main_module_leave_its_class_as_it_stands():
-    """As in a script that gives its environments to processes which it has forked, or keeps them in a file."""
+    """As in a script that gives its environments to processes which it has forked, or keeps them
+    in a file.
+    """
     code = """
 two = Model.two
 for env in (

@@ -1,4 +1,6 @@
-"""Padded rosters: everybody who may ever be there is there, from the reset to the end of the episode."""
+"""Padded rosters: everybody who may ever be there is there, from the reset to the end of the
+episode.
+"""
 
 from __future__ import annotations
 
@@ -97,13 +99,20 @@ def test_rounds_have_everybody_and_are_those_of_the_living(world):
             else:
                 assert is_blank(env, agent, observations[agent])
                 assert not infos[agent]["deciding"]
-        actions = {agent: chance.choice([0, 1, 2, 3, 4, 99 if agent not in present else RULE]) for agent in everybody}
+        actions = {
+            agent: chance.choice([0, 1, 2, 3, 4, 99 if agent not in present else RULE])
+            for agent in everybody
+        }
         told = env.step(actions)
         observations, rewards, terminations, truncations, infos = told
         expected, paid, *_ = bare.step({agent: actions[agent] for agent in present})
         assert all(set(book) == set(everybody) for book in told)
-        assert {agent: value for agent, value in rewards.items() if value} == {a: v for a, v in paid.items() if v}
-        assert {tuple(sorted(info)) for info in infos.values()} == {("acted", "deciding", "present")}
+        assert {agent: value for agent, value in rewards.items() if value} == {
+            a: v for a, v in paid.items() if v
+        }
+        assert {tuple(sorted(info)) for info in infos.values()} == {
+            ("acted", "deciding", "present")
+        }
         flags = set(zip(terminations.values(), truncations.values(), strict=True))
         over = not bare.agents
         assert flags == {(over and not design.truncates, over and design.truncates)}
@@ -169,8 +178,19 @@ def test_masks_are_open_and_clocks_go_on():
     while True:
         for agent in names:
             mask = [0, 1, 0] if infos[agent]["present"] else [1, 1, 1]
-            assert infos[agent]["action_mask"].tolist() == observations[agent]["action_mask"].tolist() == mask
-            assert set(infos[agent]) == {"present", "deciding", "acted", "action_mask", "time", "elapsed"}
+            assert (
+                infos[agent]["action_mask"].tolist()
+                == observations[agent]["action_mask"].tolist()
+                == mask
+            )
+            assert set(infos[agent]) == {
+                "present",
+                "deciding",
+                "acted",
+                "action_mask",
+                "time",
+                "elapsed",
+            }
             assert infos[agent]["time"] == hours[-1]
         if not env.agents:
             break

@@ -31,7 +31,19 @@ from simenv_marl.errors import (
     ViewError,
     WrongThreadError,
 )
-from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
+from tests.worlds.counters import (
+    FORK,
+    FORKS,
+    MODES,
+    POINT,
+    VARIETY,
+    Counter,
+    Timed,
+    agree,
+    definition,
+    made,
+    same,
+)
 from tests.worlds.many_registered import IDS, Voyage
 from tests.worlds.models import decision, notes, script, stacks
 from tests.worlds.worlds import designs, seeds
@@ -50,18 +62,27 @@ def test_matches_sync_vector_env(kind, mode, processes):
     given = {"num_envs": 5, "autoreset_mode": mode, "workers": processes, "context": FORK}
     ours = vector_env(model, points, **given, **options)
     theirs = SyncVectorEnv([lambda: single_env(model, points, **options)] * 5, autoreset_mode=mode)
-    for name in ("single_observation_space", "single_action_space", "observation_space", "action_space"):
+    for name in (
+        "single_observation_space",
+        "single_action_space",
+        "observation_space",
+        "action_space",
+    ):
         assert getattr(ours, name) == getattr(theirs, name)
     assert ours.metadata == theirs.metadata
     assert ours.render_mode == theirs.render_mode
     agree(ours, theirs, 40, np.random.default_rng(1))
     assert same(ours.np_random_seed, theirs.np_random_seed)
     assert [g.random() for g in ours.np_random] == [g.random() for g in theirs.np_random]
-    samples = [[space.sample() for space in envs.get_attr("action_space")] for envs in (ours, theirs)]
+    samples = [
+        [space.sample() for space in envs.get_attr("action_space")] for envs in (ours, theirs)
+    ]
     assert same(*samples)
 
 
-@given(designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.sampled_from([*[0] * 9, 1, 3]))
+@given(
+    designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.sampled_from([*[0] * 9, 1, 3])
+)
 @settings(max_examples=150)
 def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number, processes):
     ours = made(design, number, mode, workers=processes, context=FORK)
@@ -69,7 +90,9 @@ def test_matches_sync_vector_env_over_random_worlds(design, seed, mode, number, 
         return
     theirs = made(design, number, mode, sync=True)
     agree(ours, theirs, 15, np.random.default_rng(seed))
-    assert [s.trace for s in ours.get_attr("simulation")] == [s.trace for s in theirs.get_attr("simulation")]
+    assert [s.trace for s in ours.get_attr("simulation")] == [
+        s.trace for s in theirs.get_attr("simulation")
+    ]
 
 
 def begun(envs, seed=0):
@@ -83,7 +106,9 @@ def begun(envs, seed=0):
 def test_matches_sync_vector_env_over_joint_views(flatten, mode, processes):
     given = {"num_envs": 3, "autoreset_mode": mode, "workers": processes, "context": FORK}
     ours = vector_env(Voyage, max_steps=3, flatten=flatten, **given)
-    theirs = SyncVectorEnv([lambda: joint_env(Voyage, max_steps=3, flatten=flatten)] * 3, autoreset_mode=mode)
+    theirs = SyncVectorEnv(
+        [lambda: joint_env(Voyage, max_steps=3, flatten=flatten)] * 3, autoreset_mode=mode
+    )
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     agree(ours, theirs, 20, np.random.default_rng(0))
@@ -91,7 +116,9 @@ def test_matches_sync_vector_env_over_joint_views(flatten, mode, processes):
 
 
 def test_the_view_can_be_chosen():
-    assert isinstance(vector_env(Counter, POINT, num_envs=2, view="joint").single_action_space, spaces.Dict)
+    assert isinstance(
+        vector_env(Counter, POINT, num_envs=2, view="joint").single_action_space, spaces.Dict
+    )
     with pytest.raises(ViewError, match="needs one active decision point"):
         vector_env(Voyage, num_envs=2, view="single")
 
@@ -160,7 +187,10 @@ def test_without_autoreset_an_ended_episode_must_be_reset(processes):
         ({"workers": -1}, OptionValueError, "workers"),
         ({"autoreset_mode": "never"}, OptionValueError, "autoreset_mode"),
         ({"view": "aec"}, OptionValueError, "view must be"),
-        *(({"workers": 1, "context": context}, OptionValueError, "context must be") for context in ("magic", 3)),
+        *(
+            ({"workers": 1, "context": context}, OptionValueError, "context must be")
+            for context in ("magic", 3)
+        ),
         ({"max_step": 3}, UnknownOptionError, "max_steps"),
     ],
 )
@@ -175,7 +205,11 @@ def counts(envs: Any) -> list[int]:
 
 @PROCESSES
 def test_one_illegal_action_moves_no_sub_environment(processes):
-    envs = begun(vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK))
+    envs = begun(
+        vector_env(
+            Counter, {POINT: VARIETY["masked"][1]}, num_envs=3, workers=processes, context=FORK
+        )
+    )
     for actions, number in (
         ([1, 1, 9], 2),
         ([1, 0, 1], 1),
@@ -230,7 +264,10 @@ def test_boxes_take_actions_in_other_dtypes():
     taken, box = [], VARIETY["box"][1].action_space
     mapping = {"action_space_mapping": lambda action: taken.append(action) or 3}
     envs = begun(vector_env(Counter, {POINT: definition(action_space=box, **mapping)}, num_envs=2))
-    for batch in ([[1.0, 1.0], [1, 1]], *(np.ones((2, 2), dtype) for dtype in (float, int, np.float16, np.float32))):
+    for batch in (
+        [[1.0, 1.0], [1, 1]],
+        *(np.ones((2, 2), dtype) for dtype in (float, int, np.float16, np.float32)),
+    ):
         envs.reset(seed=0)
         envs.step(batch)
     batch[:] = 0  # the caller's own
@@ -245,20 +282,27 @@ def test_boxes_take_actions_in_other_dtypes():
 @pytest.mark.parametrize("kind", ["plain", "nested"])
 def test_observations_are_copies_unless_copy_is_false(kind, copy, processes):
     model, decision = VARIETY[kind]
-    envs = vector_env(model, {POINT: decision}, num_envs=2, copy=copy, workers=processes, context=FORK)
+    envs = vector_env(
+        model, {POINT: decision}, num_envs=2, copy=copy, workers=processes, context=FORK
+    )
     told = [envs.reset(seed=0)]
     for _ in range(2):
         image = told[-1][0]["image"] if kind == "nested" else told[-1][0]
         kept = image.copy()
         told.append(envs.step([1, 1]))
-        assert np.shares_memory(image, told[-1][0]["image"] if kind == "nested" else told[-1][0]) != copy
+        assert (
+            np.shares_memory(image, told[-1][0]["image"] if kind == "nested" else told[-1][0])
+            != copy
+        )
         assert np.array_equal(image, kept) == copy
     assert not any(np.shares_memory(a, b) for a, b in zip(told[1][1:4], told[2][1:4], strict=True))
     envs.close()
     assert image.sum() > 0  # it can be read still
 
 
-@pytest.mark.parametrize("where", ["run", "observation_space_mapping", "reward_mapping", "action_space_mapping"])
+@pytest.mark.parametrize(
+    "where", ["run", "observation_space_mapping", "reward_mapping", "action_space_mapping"]
+)
 @pytest.mark.parametrize("culprit", [0, 2])
 def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, culprit):
     def fail(thing: Any) -> Any:
@@ -267,7 +311,11 @@ def test_an_error_names_its_sub_environment_and_all_work_after_a_reset(where, cu
         return [0, 0] if where.startswith("obs") else 1
 
     stacks_before = stacks()
-    envs = begun(vector_env(Counter, {POINT: definition(**{where: fail} if where != "run" else {})}, num_envs=3))
+    envs = begun(
+        vector_env(
+            Counter, {POINT: definition(**{where: fail} if where != "run" else {})}, num_envs=3
+        )
+    )
     envs.envs[culprit].simulation.failing = where == "run"
     with pytest.raises(ZeroDivisionError) as caught:
         envs.step(np.where(np.arange(3) == culprit, 3, 1))
@@ -333,7 +381,10 @@ def test_another_thread_may_use_it_with_the_thread_driver_alone(driver, error):
 @PROCESSES
 def test_call_get_attr_and_set_attr_reach_the_sub_environments(processes):
     points = {POINT: VARIETY["goal"][1]}
-    envs = begun(vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK), 3)
+    envs = begun(
+        vector_env(Timed, points, num_envs=3, render_mode="ansi", workers=processes, context=FORK),
+        3,
+    )
     envs.step([1, 2, 3])
     assert envs.render() == ("ansi 1", "ansi 2", "ansi 3")
     assert envs.call("compute_reward", np.ones(1), np.zeros(1), {}) == (-1.0,) * 3
@@ -370,7 +421,11 @@ def test_vector_environments_cannot_be_copied_or_pickled():
 @PROCESSES
 def test_close_unwinds_all_and_only_once(processes):
     stacks_before, processes_before = stacks(), set(multiprocessing.active_children())
-    for prepare in (lambda envs: None, lambda envs: envs.reset(), lambda envs: envs.reset() and envs.step([1, 1])):
+    for prepare in (
+        lambda envs: None,
+        lambda envs: envs.reset(),
+        lambda envs: envs.reset() and envs.step([1, 1]),
+    ):
         envs = vector_env(Counter, Counter.decide, num_envs=2, workers=processes, context=FORK)
         prepare(envs)
         simulations = envs.get_attr("simulation")
@@ -378,8 +433,14 @@ def test_close_unwinds_all_and_only_once(processes):
         envs.close()
         assert envs.closed
         if not processes:
-            assert all(simulation.unwound for simulation in simulations if hasattr(simulation, "count"))
-        for use in (envs.reset, lambda envs=envs: envs.step([1, 1]), lambda envs=envs: envs.call("simulation")):
+            assert all(
+                simulation.unwound for simulation in simulations if hasattr(simulation, "count")
+            )
+        for use in (
+            envs.reset,
+            lambda envs=envs: envs.step([1, 1]),
+            lambda envs=envs: envs.call("simulation"),
+        ):
             with pytest.raises(ClosedError, match="the environment is closed"):
                 use()
     assert not stacks(stacks_before)
@@ -423,8 +484,15 @@ def test_gymnasium_makes_it_of_registered_ids(identity):
     assert type(ours).__name__ == "SimulationVectorEnv"
     assert ours.spec.id == identity
     ours.spec.to_json()
-    agree(ours, gymnasium.make_vec(identity, vectorization_mode="sync", **given), 12, np.random.default_rng(0))
-    envs = gymnasium.make_vec(identity, num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
+    agree(
+        ours,
+        gymnasium.make_vec(identity, vectorization_mode="sync", **given),
+        12,
+        np.random.default_rng(0),
+    )
+    envs = gymnasium.make_vec(
+        identity, num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK
+    )
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     envs.close()
 
@@ -442,7 +510,11 @@ def test_neither_answers_nor_results_are_held_longer_than_they_are_used():
 
     reward = lambda: there.append(len(answers)) or 0.0  # noqa: E731
     decide = decision(agent="a_0", action_space_mapping=answer, reward_mapping=reward)
-    envs = begun(vector_env(script(lambda simulation: [decide() and None for _ in range(3)]), decide, num_envs=4))
+    envs = begun(
+        vector_env(
+            script(lambda simulation: [decide() and None for _ in range(3)]), decide, num_envs=4
+        )
+    )
     there.clear()
     envs.step(np.ones(4, np.int64))
     assert there == [0] * 4

@@ -1,4 +1,6 @@
-"""Simulations spread over processes tell what they tell in one, and nothing hangs or stays behind."""
+"""Simulations spread over processes tell what they tell in one, and nothing hangs or stays
+behind.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def _nothing_is_left():
 
 
 class Failing(Counter):
-    """Counts for ever, and calls what the options of its reset have for its seed, after decisions and unwinding."""
+    """Counts for ever, and calls what the options of its reset have for its seed, after decisions
+    and unwinding.
+    """
 
     def __init__(self) -> None:
         self.process = os.getpid()
@@ -69,12 +73,16 @@ KILLED = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no 
 
 def goes_on(envs: Any, seed: int = 0) -> None:
     envs.reset(seed=seed)
-    assert [simulation.seed for simulation in envs.get_attr("simulation")] == [seed + place for place in range(4)]
+    assert [simulation.seed for simulation in envs.get_attr("simulation")] == [
+        seed + place for place in range(4)
+    ]
     assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(("kind", "context"), [("masked", "spawn"), ("box", FORK), ("image", FORK), ("goal", FORK)])
+@pytest.mark.parametrize(
+    ("kind", "context"), [("masked", "spawn"), ("box", FORK), ("image", FORK), ("goal", FORK)]
+)
 def test_gymnasiums_processes_of_single_views_tell_the_same(kind, context, mode):
     model, decision = VARIETY[kind]
     makers = [partial(single_env, model, {POINT: decision}, driver=driver) for driver in DRIVERS]
@@ -99,7 +107,9 @@ def test_simulations_are_spread_evenly_and_there_are_no_more_workers_than_simula
 @pytest.mark.parametrize("context", multiprocessing.get_all_start_methods())
 def test_models_and_mappings_that_no_module_holds_are_sent_along(context):
     class Local(Counter):
-        decide = definition(reward_mapping=lambda self: float(self.seed + self.count))(lambda self: 0)
+        decide = definition(reward_mapping=lambda self: float(self.seed + self.count))(
+            lambda self: 0
+        )
 
     envs = vector_env(Local, Local.decide, num_envs=3, workers=2, context=context)
     assert envs.reset(seed=4)[0][:, 0].tolist() == [0, 0, 0]
@@ -116,7 +126,10 @@ def test_objects_that_cannot_be_pickled_are_refused():
 
 def test_an_error_says_of_which_simulation_and_the_next_reset_works():
     envs = workers(
-        Failing, definition(reward_mapping=lambda self: float("nan") if self.options == {"poor": self.seed} else 0.0)
+        Failing,
+        definition(
+            reward_mapping=lambda self: float("nan") if self.options == {"poor": self.seed} else 0.0
+        ),
     )
     envs.reset(seed=0, options={"poor": 2})
     with pytest.raises(RewardError, match="not finite") as caught:
@@ -136,9 +149,12 @@ def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(code):
     envs = workers(Failing)
     end = (lambda: os.kill(os.getpid(), 9)) if code == -9 else (lambda: os._exit(code))
     envs.reset(seed=0, options={"decided": {3: end}})
-    with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* died with exit code {code}") as caught:
+    with pytest.raises(
+        WorkerError, match=f"worker 1 .*2 to 3.* died with exit code {code}"
+    ) as caught:
         envs.step(ONES)
-    assert ("__main__" in str(caught.value)) == (code == 1)  # with which an error in a script ends it
+    # with which an error in a script ends it
+    assert ("__main__" in str(caught.value)) == (code == 1)
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
@@ -167,7 +183,9 @@ def test_workers_that_are_killed_between_steps_are_noticed(use):
 
 def test_errors_while_closing_surface_and_the_workers_end():
     envs = workers(Failing, context=multiprocessing.get_context(FORK))
-    envs.reset(seed=0, options={"unwinding": dict.fromkeys(range(4), lambda: {}["it would not go"])})
+    envs.reset(
+        seed=0, options={"unwinding": dict.fromkeys(range(4), lambda: {}["it would not go"])}
+    )
     with pytest.raises(KeyError, match="it would not go"):
         envs.close()
     assert envs.closed
@@ -179,7 +197,10 @@ def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
         path.touch()
 
     envs = workers(Failing)
-    envs.reset(seed=0, options={"unwinding": {seed: partial(finish, tmp_path / str(seed)) for seed in range(4)}})
+    envs.reset(
+        seed=0,
+        options={"unwinding": {seed: partial(finish, tmp_path / str(seed)) for seed in range(4)}},
+    )
     there = set(processes_of(envs))
     del envs
     gc.collect()
@@ -246,7 +267,9 @@ def run_script(path: Path, text: str, *options: str) -> Any:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
     # The output ends when the last worker does.
     command = [sys.executable, *options, str(path)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
 
 
 @pytest.mark.parametrize("context", ["spawn", FORK])

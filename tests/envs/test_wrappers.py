@@ -17,7 +17,9 @@ from tests.worlds.dials import DialEnv, dial_env
 
 
 class Case(NamedTuple):
-    """How a wrapper is made: its arguments, what it wants to be seen, and the packages that it needs."""
+    """How a wrapper is made: its arguments, what it wants to be seen, and the packages that it
+    needs.
+    """
 
     arguments: dict[str, Any] = {}  # noqa: RUF012 - it is never changed
     seen: str = "numbers"
@@ -34,7 +36,9 @@ def halved(value: Any) -> Any:
 
 
 WRAPPERS = {
-    "ArrayConversion": Case({"env_xp": "numpy", "target_xp": "torch"}, needs=("array_api_compat", "torch")),
+    "ArrayConversion": Case(
+        {"env_xp": "numpy", "target_xp": "torch"}, needs=("array_api_compat", "torch")
+    ),
     "ClipAction": Case(),
     "ClipReward": Case({"min_reward": 0.5, "max_reward": 1.5}),
     "DtypeObservation": Case({"dtype": np.int16}),
@@ -74,7 +78,9 @@ WRAPPERS = {
 
 
 @pytest.mark.parametrize(("name", "case"), WRAPPERS.items(), ids=WRAPPERS)
-def test_wrappers_tell_what_they_tell_around_an_environment_written_by_hand(name, case, tmp_path, monkeypatch):
+def test_wrappers_tell_what_they_tell_around_an_environment_written_by_hand(
+    name, case, tmp_path, monkeypatch
+):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     packages = {package: pytest.importorskip(package) for package in case.needs}
 
@@ -82,7 +88,8 @@ def test_wrappers_tell_what_they_tell_around_an_environment_written_by_hand(name
         env = wrappers.TimeLimit(make(case.seen, render_mode=case.render_mode), 9)
         special = packages | {"numpy": np, "a folder": str(tmp_path / type(env.unwrapped).__name__)}
         arguments = {
-            key: special.get(value, value) if isinstance(value, str) else value for key, value in case.arguments.items()
+            key: special.get(value, value) if isinstance(value, str) else value
+            for key, value in case.arguments.items()
         }
         wrapped = getattr(wrappers, name)(env, **arguments)
         assert wrapped.unwrapped is env.unwrapped
@@ -91,7 +98,9 @@ def test_wrappers_tell_what_they_tell_around_an_environment_written_by_hand(name
         actions.seed(1)
         for number in range(14):
             action = actions.sample()
-            results = wrapped.step(packages["torch"].from_numpy(action) if "torch" in packages else action)
+            results = wrapped.step(
+                packages["torch"].from_numpy(action) if "torch" in packages else action
+            )
             told.append(results)
             if case.render_mode is not None:
                 told.append(wrapped.render())

@@ -1,4 +1,6 @@
-"""The library's check, which runs those of PettingZoo and Gymnasium, on the environments of all examples."""
+"""The library's check, which runs those of PettingZoo and Gymnasium, on the environments of all
+examples.
+"""
 
 import pickle
 from functools import partial
@@ -16,8 +18,11 @@ from simenv_marl import aec_env, joint_env
 from simenv_marl.testing import check_simulation
 from tests.worlds.models import play
 
-MANAGER = {point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"}
-fund = partial(FundSim, 3, Parameters(clients=60, coverage=1.0))  # poor enough for plans, cuts and demands
+MANAGER = {
+    point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"
+}
+# poor enough for plans, cuts and demands
+fund = partial(FundSim, 3, Parameters(clients=60, coverage=1.0))
 meadow = partial(Meadow, 25, width=8, height=8, initial_sheep=20, initial_wolves=5)
 
 EXAMPLES = {

@@ -17,7 +17,9 @@ def test_no_cent_is_lost_by_random_legal_actions():
     generator = np.random.default_rng(0)
 
     def draw(agent, env):
-        return int(generator.choice(np.flatnonzero(env.infos[agent].get("action_mask", np.ones(5)))))
+        return int(
+            generator.choice(np.flatnonzero(env.infos[agent].get("action_mask", np.ones(5))))
+        )
 
     environment = aec_env(fund(12, 1.0), TEAM | PREMIUMS)  # poor enough for plans, cuts and demands
     for seed in range(10):
@@ -26,8 +28,12 @@ def test_no_cent_is_lost_by_random_legal_actions():
 
 
 @pytest.mark.parametrize(("coverage", "ends"), [(0.02, [True, False]), (1.5, [False, True])])
-def test_an_episode_is_terminated_when_pensions_cannot_be_paid_and_truncated_at_its_last_year(coverage, ends):
-    manager = {point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"}
+def test_an_episode_is_terminated_when_pensions_cannot_be_paid_and_truncated_at_its_last_year(
+    coverage, ends
+):
+    manager = {
+        point: definition for point, definition in TEAM.items() if definition.agent == "manager_0"
+    }
     environment = single_env(fund(4, coverage), manager)
     environment.reset(seed=1)
     over = [False, False]
@@ -43,7 +49,18 @@ def test_the_model_prints_its_years(capsys):
 
 
 def test_training_is_determined_by_its_seed(capsys):
-    options = ["--clients", "30", "--years", "3", "--generations", "1", "--seeds", "2", "--workers", "0"]
+    options = [
+        "--clients",
+        "30",
+        "--years",
+        "3",
+        "--generations",
+        "1",
+        "--seeds",
+        "2",
+        "--workers",
+        "0",
+    ]
     train.main(options)
     first = capsys.readouterr().out
     train.main(options)

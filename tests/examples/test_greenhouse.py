@@ -1,4 +1,6 @@
-"""The greenhouse: the model on its own, the ends of its episodes, its registration, and what a training is worth."""
+"""The greenhouse: the model on its own, the ends of its episodes, its registration, and what a
+training is worth.
+"""
 
 import re
 
@@ -50,7 +52,8 @@ def test_an_episode_terminates_when_all_plants_are_dead_and_is_truncated_after_a
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("Watering", {}), ("Ventilation", {}), ("Joint", {}), ("Joint", {"flatten": True})]
+    ("name", "options"),
+    [("Watering", {}), ("Ventilation", {}), ("Joint", {}), ("Joint", {"flatten": True})],
 )
 def test_the_greenhouse_passes_gymnasiums_check(name, options):
     environment = gymnasium.make(f"greenhouse_coop/{name}-v0", **options)
@@ -60,7 +63,8 @@ def test_the_greenhouse_passes_gymnasiums_check(name, options):
 
 def test_training_is_worth_it():
     generations, seeds = 3, range(train.HELD_OUT, train.HELD_OUT + 8)
-    pair = {"waterer_0": train.Constant(0.084), "ventilator_0": train.Constant(1.0)}  # what searching finds
+    # what searching finds
+    pair = {"waterer_0": train.Constant(0.084), "ventilator_0": train.Constant(1.0)}
     trained = train.learn(train.rate, pair, generations, np.random.default_rng(0))
     rule, constant, learnt = train.rate([{}, pair, trained], seeds)
     assert rule < 5 < 65 < constant < learnt - 3

@@ -10,7 +10,10 @@ def test_the_levy_leads_the_rule_to_what_is_best_for_all():
         return simulate(condition, policies, seed=1).market.traders
 
     def profit(condition, crates):
-        return sum(one.profit for one in traders(condition, dict.fromkeys(AGENTS, lambda observation: crates)))
+        return sum(
+            one.profit
+            for one in traders(condition, dict.fromkeys(AGENTS, lambda observation: crates))
+        )
 
     for condition, by_rule in ((Free, 8), (Levied, 5)):  # all get back what all pay
         assert max(range(11), key=lambda crates: profit(condition, crates)) == 5

@@ -1,4 +1,6 @@
-"""Mesa's example models as environments: with RULE throughout the plain run, with actions another one."""
+"""Mesa's example models as environments: with RULE throughout the plain run, with actions another
+one.
+"""
 
 import re
 from pathlib import Path
@@ -8,7 +10,8 @@ import pytest
 
 from examples import mesa_models
 
-pytestmark = pytest.mark.filterwarnings("ignore:Random number generator not specified")  # Mesa's own, before 3.5
+# Mesa's own, before 3.5
+pytestmark = pytest.mark.filterwarnings("ignore:Random number generator not specified")
 
 PAGE = Path(__file__).parents[2] / "docs" / "mesa.md"
 
@@ -27,7 +30,9 @@ def test_rules_are_the_plain_run_and_actions_are_carried_out(example):
     assert outcome.same
     assert outcome.moved
     assert outcome.agents == 1 or outcome.asked > 5 * outcome.agents
-    printed = [cell.strip() for cell in mesa_models.table([outcome]).splitlines()[-1].strip("|").split("|")]
+    printed = [
+        cell.strip() for cell in mesa_models.table([outcome]).splitlines()[-1].strip("|").split("|")
+    ]
     if mesa.__version__ in PAGE.read_text():
         assert printed == told_of(outcome.model)
     else:  # chance is drawn in another order

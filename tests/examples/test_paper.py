@@ -1,4 +1,6 @@
-"""The paper's showcase (its supplements S1 and S2, and step 4) runs as it is printed, but for its import lines."""
+"""The paper's showcase (its supplements S1 and S2, and step 4) runs as it is printed, but for its
+import lines.
+"""
 
 import re
 import subprocess
@@ -70,7 +72,8 @@ def test_the_showcase_runs_and_by_the_rule_it_is_the_plain_model(tmp_path):
     (tmp_path / "model.py").write_text(listing("# model.py"))
     (tmp_path / "env_def.py").write_text(listing("# env_def.py"))
     code = listing("from random import random\nimport gymnasium as gym") + CHECKS
-    # Gymnasium warns (UserWarning) of the listing's float64 bounds, and of humidity that leaves them.
+    # Gymnasium warns (UserWarning) of the listing's float64 bounds, and of humidity that leaves
+    # them.
     command = [sys.executable, "-W", "error", "-W", "ignore::UserWarning", "-c", code]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

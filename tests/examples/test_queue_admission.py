@@ -1,4 +1,6 @@
-"""Admission to a queue: its exact values, and those of the model; its training is in ``tests/clients``."""
+"""Admission to a queue: its exact values, and those of the model; its training is in
+``tests/clients``.
+"""
 
 import math
 
@@ -13,12 +15,16 @@ SEEN = {observation(decision).tobytes(): decision for decision in DECISIONS}
 
 
 def policy_of(table):
-    return lambda observations: np.array([table[SEEN[seen.tobytes()]] for seen in observations], int)
+    return lambda observations: np.array(
+        [table[SEEN[seen.tobytes()]] for seen in observations], int
+    )
 
 
 def earned(policies, seeds):
     return np.array(
-        simulate_many(QueueSimulation, policies, seeds=seeds, collect=lambda run: run.model.present_value())
+        simulate_many(
+            QueueSimulation, policies, seeds=seeds, collect=lambda run: run.model.present_value()
+        )
     )
 
 
@@ -29,7 +35,8 @@ def test_the_optimum_and_what_discounting_by_decision_makes_of_it():
     for gamma in (0.3, 0.5, 0.9, 0.95, 0.99, 0.995):
         for reward_rate in (0.0, INTEREST):
             assert best_table(rate=0.0, reward_rate=reward_rate, gamma=gamma) == ADMIT_ALL
-    assert round(worth(best_table(reward_rate=0.0)) / optimum, 3) == 0.776  # rewards not discounted in the interval
+    # rewards not discounted in the interval
+    assert round(worth(best_table(reward_rate=0.0)) / optimum, 3) == 0.776
 
 
 def test_a_table_is_worth_what_it_earns_in_the_model():

@@ -1,4 +1,6 @@
-"""The lives of sheep in Mesa's unmodified model; how one policy for all is trained is tested in ``tests/clients``."""
+"""The lives of sheep in Mesa's unmodified model; how one policy for all is trained is tested in
+``tests/clients``.
+"""
 
 import numpy as np
 from examples.wolf_sheep.env import MOVE, Meadow, numbers, sheep_points
@@ -15,8 +17,11 @@ def test_lives_begin_with_births_and_end_with_deaths():
         return [RULE] * len(observations)
 
     meadow = Meadow(25, width=8, height=8, initial_sheep=20, initial_wolves=5)
-    found = collect_episodes(meadow, {MOVE: by_rule}, points=sheep_points(), seeds=range(6), collect=alive)[MOVE]
-    assert found.rewards.tolist() == [1.0] * len(found)  # all turns are worth the same, the last one too
+    found = collect_episodes(
+        meadow, {MOVE: by_rule}, points=sheep_points(), seeds=range(6), collect=alive
+    )[MOVE]
+    # all turns are worth the same, the last one too
+    assert found.rewards.tolist() == [1.0] * len(found)
     ends = found.starts + found.lengths - 1
     assert (found.terminations[ends] ^ found.truncations[ends]).all()
     for episode, (survivors, counts) in enumerate(found.collected):

@@ -18,12 +18,18 @@ TWO_LEVELS = ("fractional_factorial", "plackett_burman")
 METHODS = ("full_factorial", *TWO_LEVELS, *SIZED, "central_composite", "one_at_a_time", "saltelli")
 
 ranges = st.one_of(
-    st.tuples(st.integers(-50, 50), st.integers(1, 60)).map(lambda pair: (pair[0], pair[0] + pair[1])),
-    st.tuples(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6)).map(lambda pair: (pair[0], pair[0] + pair[1])),
+    st.tuples(st.integers(-50, 50), st.integers(1, 60)).map(
+        lambda pair: (pair[0], pair[0] + pair[1])
+    ),
+    st.tuples(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6)).map(
+        lambda pair: (pair[0], pair[0] + pair[1])
+    ),
 )
 levels = st.lists(st.one_of(st.integers(), st.booleans(), st.none(), st.text(max_size=3)), min_size=1, max_size=4,
                   unique_by=lambda level: (type(level), level))  # fmt: skip
-factors = st.dictionaries(st.text(min_size=1, max_size=3), st.one_of(ranges, levels), min_size=1, max_size=4)
+factors = st.dictionaries(
+    st.text(min_size=1, max_size=3), st.one_of(ranges, levels), min_size=1, max_size=4
+)
 
 
 def allowed(value, given):
@@ -38,7 +44,12 @@ def values(table, name):
 
 
 @settings(max_examples=60)
-@given(factors=factors, method=st.sampled_from(METHODS), n=st.sampled_from([2, 4, 8, 16]), seed=st.integers(0, 99))
+@given(
+    factors=factors,
+    method=st.sampled_from(METHODS),
+    n=st.sampled_from([2, 4, 8, 16]),
+    seed=st.integers(0, 99),
+)
 def test_values_are_of_the_factors_and_designs_are_repeatable(factors, method, n, seed):
     chosen = n if method in (*SIZED, "saltelli") else None
     try:
@@ -57,11 +68,26 @@ def test_values_are_of_the_factors_and_designs_are_repeatable(factors, method, n
 
 @pytest.mark.parametrize("method", METHODS)
 def test_columns_have_the_types_of_the_factors(method):
-    factors = {"f": (0.0, 1), "i": (1, 9), "s": ["a", "b"], "b": [True, False], "o": ["a", 1], "n": [3, 1]}
+    factors = {
+        "f": (0.0, 1),
+        "i": (1, 9),
+        "s": ["a", "b"],
+        "b": [True, False],
+        "o": ["a", 1],
+        "n": [3, 1],
+    }
     table = design(factors, method, 4 if method in (*SIZED, "saltelli") else None)
-    assert [dtype.kind for dtype in table.dtypes[["f", "i", "b", "o", "n"]]] == ["f", "i", "b", "O", "i"]
+    assert [dtype.kind for dtype in table.dtypes[["f", "i", "b", "o", "n"]]] == [
+        "f",
+        "i",
+        "b",
+        "O",
+        "i",
+    ]
     assert set(map(type, values(table, "s"))) == {str}
-    assert all(allowed(value, given_) for name, given_ in factors.items() for value in values(table, name))
+    assert all(
+        allowed(value, given_) for name, given_ in factors.items() for value in values(table, name)
+    )
 
 
 def test_a_full_factorial_has_all_combinations():
@@ -72,10 +98,17 @@ def test_a_full_factorial_has_all_combinations():
     assert values(design({"x": [1, True, 1.0, [1], (1,)]}), "x") == [1, True, 1.0, [1], (1,)]
 
 
-@pytest.mark.parametrize("bounds", [(0, 2**53 + 1), (-(2**63), 2**63 - 1), (0, 10**30), (-7, 7)], ids=str)
+@pytest.mark.parametrize(
+    "bounds", [(0, 2**53 + 1), (-(2**63), 2**63 - 1), (0, 10**30), (-7, 7)], ids=str
+)
 def test_whole_ranges_stay_whole_and_reach_their_bounds(bounds):
     low, high = bounds
-    for method, number in (("full_factorial", 3), ("one_at_a_time", 3), ("latin_hypercube", 64), ("sobol", 64)):
+    for method, number in (
+        ("full_factorial", 3),
+        ("one_at_a_time", 3),
+        ("latin_hypercube", 64),
+        ("sobol", 64),
+    ):
         found = values(design({"x": bounds}, method, number), "x")
         assert {type(value) for value in found} == {int}
         assert low <= min(found) < max(found) <= high
@@ -84,7 +117,17 @@ def test_whole_ranges_stay_whole_and_reach_their_bounds(bounds):
 
 @pytest.mark.parametrize(
     ("number", "n", "clear"),
-    [(3, 4, 0), (4, 8, 1), (5, 8, 0), (5, 16, 1), (6, 16, 1), (7, 8, 0), (8, 16, 1), (15, 16, 0), (9, 128, 1)],
+    [
+        (3, 4, 0),
+        (4, 8, 1),
+        (5, 8, 0),
+        (5, 16, 1),
+        (6, 16, 1),
+        (7, 8, 0),
+        (8, 16, 1),
+        (15, 16, 0),
+        (9, 128, 1),
+    ],
 )
 def test_a_fraction_is_balanced_and_orthogonal(number, n, clear):
     table = design({f"x{place}": (-1, 1) for place in range(number)}, "fractional_factorial", n)
@@ -123,7 +166,14 @@ def test_rounding_leaves_no_range():
 
 def test_one_at_a_time_changes_one_factor():
     table = design({"a": (0, 10), "b": ["x", "y", "z"], "c": (0.0, 1.0)}, "one_at_a_time")
-    changed = [(0, "x", 0.5), (10, "x", 0.5), (5, "y", 0.5), (5, "z", 0.5), (5, "x", 0.0), (5, "x", 1.0)]
+    changed = [
+        (0, "x", 0.5),
+        (10, "x", 0.5),
+        (5, "y", 0.5),
+        (5, "z", 0.5),
+        (5, "x", 0.0),
+        (5, "x", 1.0),
+    ]
     assert list(table.itertuples(index=False, name=None)) == [(5, "x", 0.5), *changed]
 
 
@@ -150,7 +200,10 @@ THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (
         *(("must be a dict", (factors,)) for factors in ({}, [1])),
         ("has no levels", ({"a": []},)),
         *(("twice", ({"a": own},)) for own in ([1, 2, 1], [[1], [1]])),
-        *(("a tuple is a range", ({"a": own},)) for own in ((1, 2, 3), ("x", "y"), (0.0, float("inf")))),
+        *(
+            ("a tuple is a range", ({"a": own},))
+            for own in ((1, 2, 3), ("x", "y"), (0.0, float("inf")))
+        ),
         *(("that a float can hold", ({"a": own},)) for own in ((0, 10**5000), (0.5, 10**400))),
         ("is empty", ({"a": (2, 2)},)),
         *(("must be a range", ({"a": own},)) for own in ("levels", 3)),
@@ -161,10 +214,19 @@ THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (
         ("positive integer", ({"a": (0, 1)}, "sobol", 0)),
         *(("power of two", (THREE, "fractional_factorial", number)) for number in (6, 2, 16)),
         ("power of two", ({"a": (0, 1)}, "saltelli", 3)),
-        *(("two levels", (LEVELS, method)) for method in ("fractional_factorial", "plackett_burman")),
+        *(
+            ("two levels", (LEVELS, method))
+            for method in ("fractional_factorial", "plackett_burman")
+        ),
         ("has 4 runs", ({"a": (0, 1)}, "plackett_burman", 8)),
-        *(("two ranges", (factors, "central_composite")) for factors in ({"a": [1, 2], "b": (0, 1)}, {"a": (0, 1)})),
-        ("has 18 runs, not 9", ({"a": (0, 1), "b": (0, 1), "c": ["x", "y"]}, "central_composite", 9)),
+        *(
+            ("two ranges", (factors, "central_composite"))
+            for factors in ({"a": [1, 2], "b": (0, 1)}, {"a": (0, 1)})
+        ),
+        (
+            "has 18 runs, not 9",
+            ({"a": (0, 1), "b": (0, 1), "c": ["x", "y"]}, "central_composite", 9),
+        ),
         ("more than 10,000,000", ({f"x{i}": (0, 1) for i in range(30)}, "central_composite")),
         ("more than 10,000,000", ({"a": (0, 1), "b": (0, 1)}, "saltelli", 2**22)),
         ("more than 10,000,000", ({"a": (0.0, 1.0)}, "full_factorial", 10**12)),

@@ -18,7 +18,9 @@ def told(table, value, seeds=(1, 2)):
     """A table of results: of each row of a design a run with each seed, and what comes of both."""
     rows = [(row, seed) for row in table.to_dict("records") for seed in seeds]
     same = {"contender": "rule", "agent": "team", "length": 1, "status": "ok", "error": None}
-    return pd.DataFrame([{**row, **same, "seed": seed, "return": value(seed=seed, **row)} for row, seed in rows])
+    return pd.DataFrame(
+        [{**row, **same, "seed": seed, "return": value(seed=seed, **row)} for row, seed in rows]
+    )
 
 
 def linear(a=0, b=0, c="x", seed=0):
@@ -30,7 +32,11 @@ def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
         return Script(lambda simulation: simulation.log.append(linear(**row)))
 
     table = design({"a": [0, 1], "b": (0.0, 1.0), "c": ["x", "y"]})
-    given = {"metric": {"y": lambda simulation: simulation.log[0]}, "points": POINTS, "seeds": [1, 2]}
+    given = {
+        "metric": {"y": lambda simulation: simulation.log[0]},
+        "points": POINTS,
+        "seeds": [1, 2],
+    }
     found = effects(run_experiment(model, table, store=tmp_path, **given), "y")
     assert list(found.main.columns) == ["mean", "low", "high", "effect", "count"]
     for factor, difference in (("a", 1), ("b", 4)):
@@ -50,12 +56,18 @@ def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
 
 
 def test_many_numbers_are_grouped():
-    found = effects(told(design({"a": (0.0, 1.0), "b": (0.0, 1.0), "c": ["x", "y"]}, "sobol", 64), linear))
+    found = effects(
+        told(design({"a": (0.0, 1.0), "b": (0.0, 1.0), "c": ["x", "y"]}, "sobol", 64), linear)
+    )
     assert found.main.loc["a"]["count"].tolist() == [32] * 4
     assert found.main.loc["b"]["mean"].is_monotonic_increasing
-    slants = [[label.get_rotation() for label in axes.get_xticklabels()] for axes in found.plot().axes[:3]]
+    slants = [
+        [label.get_rotation() for label in axes.get_xticklabels()] for axes in found.plot().axes[:3]
+    ]
     assert slants == [[30] * 4, [30] * 4, [0] * 2]  # names that are long do not run into each other
-    found = effects(told(pd.DataFrame({"a": [0] * 36 + [*range(1, 10)]}), lambda a, seed: a + seed)).main
+    found = effects(
+        told(pd.DataFrame({"a": [0] * 36 + [*range(1, 10)]}), lambda a, seed: a + seed)
+    ).main
     assert found["count"].tolist() == [76, 4, 4, 6]  # most of whose values are equal
     assert found["mean"].is_monotonic_increasing
 
@@ -107,7 +119,10 @@ def test_invalid_arguments_are_refused():
 
 def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
     noise = {"quiet": 0, "still": 0, "loud": 4}
-    table, value = design({"a": list(noise), "b": [0, 1]}), lambda a, b, seed: 100 * b + noise[a] * (seed - 1.5)
+    table, value = (
+        design({"a": list(noise), "b": [0, 1]}),
+        lambda a, b, seed: 100 * b + noise[a] * (seed - 1.5),
+    )
     found = effects(told(table, value, range(4))).main
     for a in ("quiet", "still"):
         assert found.loc[("a", a), "mean"] == 50
@@ -119,7 +134,9 @@ def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
 
 
 def test_shares_have_the_intervals_of_shares():
-    found = effects(told(design({"a": [0, 1]}), lambda a, seed: float(seed < 3 * a), range(12))).main
+    found = effects(
+        told(design({"a": [0, 1]}), lambda a, seed: float(seed < 3 * a), range(12))
+    ).main
     for a in (0, 1):
         expected = stats.binomtest(3 * a, 12).proportion_ci(0.95, method="wilson")
         assert found.loc[("a", a), ["low", "high"]].tolist() == pytest.approx(list(expected))
@@ -128,15 +145,25 @@ def test_shares_have_the_intervals_of_shares():
 def test_levels_that_are_equal_but_of_other_types_stay_apart():
     levels = [False, 0, True, 1, 1.0]
     places = {repr(level): 10 * place for place, level in enumerate(levels)}
-    found = effects(told(design({"a": levels, "b": ["x", "y"]}), lambda a, b, seed: places[repr(a)] + seed - 1))
-    assert found.main.loc["a", "mean"].to_dict() == {"False": 0.5, "0": 10.5, "True": 20.5, "1": 30.5, "1.0": 40.5}
+    found = effects(
+        told(design({"a": levels, "b": ["x", "y"]}), lambda a, b, seed: places[repr(a)] + seed - 1)
+    )
+    assert found.main.loc["a", "mean"].to_dict() == {
+        "False": 0.5,
+        "0": 10.5,
+        "True": 20.5,
+        "1": 30.5,
+        "1.0": 40.5,
+    }
     assert [repr(level) for level in found.levels["a"]] == [repr(level) for level in levels]
     assert found.cells("a", "b").loc["1.0"].tolist() == [40.5, 40.5]
     assert "_cells" not in repr(found)
 
 
 def test_the_mean_lies_in_its_interval_where_runs_have_failed():
-    frame = told(design({"a": [0, 1], "b": [0, 1]}), lambda a, b, seed: 100 * b + seed / 10 + a, range(8))
+    frame = told(
+        design({"a": [0, 1], "b": [0, 1]}), lambda a, b, seed: 100 * b + seed / 10 + a, range(8)
+    )
     frame.loc[(frame["b"] == 1) & (frame["seed"] > 0), ["status", "return"]] = ["error", np.nan]
     for _, row in effects(frame).main.loc["a"].iterrows():
         assert row["mean"] == pytest.approx((row["low"] + row["high"]) / 2)

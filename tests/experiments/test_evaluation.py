@@ -86,7 +86,9 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
     for (name, seed), rows in found.frame.groupby(["contender", "seed"]):
         returns = dict(zip(rows["agent"], rows["return"], strict=True))
         total = returns.pop("team")
-        expected = returns_by_hand({} if name == "rule" else policies, seed, make, points, **options)
+        expected = returns_by_hand(
+            {} if name == "rule" else policies, seed, make, points, **options
+        )
         assert returns == {agent: value for agent, value in expected.items() if agent in returns}
         assert not any(value for agent, value in expected.items() if agent not in returns)
         assert total == pytest.approx(sum(returns.values()))
@@ -100,17 +102,26 @@ def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched
 def test_planners_decide_as_they_do_in_simulate(arguments):
     planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1, method="replay")
     contenders = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
-    found = evaluate(Shop, contenders, seeds=range(2), points=NEAR, metric=level, **arguments).values("metric")
+    found = evaluate(
+        Shop, contenders, seeds=range(2), points=NEAR, metric=level, **arguments
+    ).values("metric")
     for name, policies in contenders.items():
-        assert found[name].tolist() == [simulate(Shop, policies, points=NEAR, seed=seed).level for seed in range(2)]
+        assert found[name].tolist() == [
+            simulate(Shop, policies, points=NEAR, seed=seed).level for seed in range(2)
+        ]
 
 
-MIXED = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {"keeper": much_of_many}}
+MIXED = {
+    "mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})},
+    "much": {"keeper": much_of_many},
+}
 
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_mixtures_decide_as_policies_of_many(workers, capsys):
-    found = evaluate(Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers, progress=True)
+    found = evaluate(
+        Shop, MIXED, seeds=SEEDS, points=POINTS, batched=True, workers=workers, progress=True
+    )
     assert "24/24" in capsys.readouterr().err
     values, alone = found.values(), evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS).values()
     assert values["much"].equals(alone["much"])
@@ -130,22 +141,49 @@ def test_the_summary_is_paired_by_seed(confidence):
     summary, values = found.summary(), found.values()
     assert summary.index.name == "contender"
     assert list(summary.index) == ["rule", "some"]
-    assert list(summary.columns) == ["mean", "low", "high", "difference", "difference_low", "difference_high"]
-    assert summary.loc["rule", ["difference", "difference_low", "difference_high"]].tolist() == [0.0, 0.0, 0.0]
-    assert summary.loc["some", "difference"] == pytest.approx((values["some"] - values["rule"]).mean())
+    assert list(summary.columns) == [
+        "mean",
+        "low",
+        "high",
+        "difference",
+        "difference_low",
+        "difference_high",
+    ]
+    assert summary.loc["rule", ["difference", "difference_low", "difference_high"]].tolist() == [
+        0.0,
+        0.0,
+        0.0,
+    ]
+    assert summary.loc["some", "difference"] == pytest.approx(
+        (values["some"] - values["rule"]).mean()
+    )
     expected = stats.ttest_rel(values["some"], values["rule"]).confidence_interval(confidence)
-    assert summary.loc["some", ["difference_low", "difference_high"]].tolist() == pytest.approx(list(expected))
+    assert summary.loc["some", ["difference_low", "difference_high"]].tolist() == pytest.approx(
+        list(expected)
+    )
     expected = stats.ttest_1samp(values["some"], 0).confidence_interval(confidence)
     assert summary.loc["some", ["low", "high"]].tolist() == pytest.approx(list(expected))
-    assert list(evaluate(Shop, CONTENDERS, seeds=[1, 2], **given).summary().columns) == ["mean", "low", "high"]
+    assert list(evaluate(Shop, CONTENDERS, seeds=[1, 2], **given).summary().columns) == [
+        "mean",
+        "low",
+        "high",
+    ]
     assert np.isnan(evaluate(Shop, CONTENDERS, seeds=[1], **given).summary()["low"]).all()
 
 
 @pytest.mark.parametrize(
     ("values", "note", "proportion"),
     [
-        *((values, "a single", proportion) for values in ([], [1.0]) for proportion in (False, True)),
-        *(([1.0, odd], "missing", proportion) for odd in (np.nan, np.inf) for proportion in (False, True)),
+        *(
+            (values, "a single", proportion)
+            for values in ([], [1.0])
+            for proportion in (False, True)
+        ),
+        *(
+            ([1.0, odd], "missing", proportion)
+            for odd in (np.nan, np.inf)
+            for proportion in (False, True)
+        ),
         *((equal, "equal", False) for equal in ([2.0] * 5, [0.1 + 0.2, 0.3, 0.3], [0.0, 0.0])),
     ],
 )
@@ -156,7 +194,9 @@ def test_some_values_have_no_interval(values, note, proportion):
 
 
 @pytest.mark.parametrize("number", [5, 16])
-@pytest.mark.parametrize(("name", "least"), [("normal", 0.93), ("lognormal", 0.78), ("0/1, p=0.5", 0.9)])
+@pytest.mark.parametrize(
+    ("name", "least"), [("normal", 0.93), ("lognormal", 0.78), ("0/1, p=0.5", 0.9)]
+)
 def test_intervals_cover_and_equal_contenders_seldom_differ(name, least, number):
     covered, unknown, different = measure(name, number, 600)
     assert covered > least
@@ -172,9 +212,15 @@ def test_events_that_were_not_seen_have_no_interval_of_zero_width():
 
 def test_the_summary_says_why_there_is_no_interval_and_improvements_count_ties_half():
     contenders = {"a": {}, "same": {}, "some": {"keeper": some}, "much": {"keeper": much}}
-    found = evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1})
+    found = evaluate(
+        Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1}
+    )
     summary, equal = found.summary(), "differences: all are equal"
-    assert summary.loc["a", ["difference", "difference_low", "difference_high"]].tolist() == [0, 0, 0]
+    assert summary.loc["a", ["difference", "difference_low", "difference_high"]].tolist() == [
+        0,
+        0,
+        0,
+    ]
     assert summary.loc["same", ["difference_low", "difference_high"]].isna().all()
     assert summary["note"].to_dict() == {"a": "", "same": equal, "some": "", "much": equal}
     assert set(found.summary("one")["note"]) == {"all are equal"}
@@ -194,7 +240,11 @@ def test_shares_have_intervals_by_wilsons_score_also_where_some_are_missing():
     some_seeds = np.arange(12) < 3
     wilson = stats.binomtest(3, 12).proportion_ci(0.95, method="wilson")
     student = stats.ttest_1samp(2.0 * some_seeds, 0).confidence_interval(0.95)
-    for values, expected in ((some_seeds, wilson), (some_seeds.astype(int), wilson), (2 * some_seeds, student)):
+    for values, expected in (
+        (some_seeds, wilson),
+        (some_seeds.astype(int), wilson),
+        (2 * some_seeds, student),
+    ):
         low, high = Evaluation(of_teams(a=values), None, 0.95).summary().loc["a", ["low", "high"]]
         assert (low, high) == pytest.approx(tuple(expected))
     for values in ([1, 0, None], [True, False, None], [True, True], [np.nan, 1.0, 0.0]):
@@ -217,7 +267,12 @@ def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_
     for difference, number in ((1e3, 2), (1e15, 2), (1e-12, np.inf)):
         assert found.seeds_needed(difference)["b"] == number
         assert np.isnan(found.seeds_needed(difference)["same"])
-    for wrong, difference, power in (("diff", 0, 0.8), ("diff", "a", 2), ("power", 1, 1), ("power", 1, "a")):
+    for wrong, difference, power in (
+        ("diff", 0, 0.8),
+        ("diff", "a", 2),
+        ("power", 1, 1),
+        ("power", 1, "a"),
+    ):
         with pytest.raises(OptionValueError, match=f"^{wrong}"):
             found.seeds_needed(difference, power=power)
     with pytest.raises(OptionValueError, match="no baseline"):
@@ -243,7 +298,12 @@ def test_the_team_is_what_its_user_makes_of_the_returns():
         assert "keeper" in returns
         assert "stranger" not in returns
         assert returns["keeper"] in returns
-        assert dict(returns)["keeper"] == returns["keeper"] == max(returns.values()) == max(returns[0], returns[1])
+        assert (
+            dict(returns)["keeper"]
+            == returns["keeper"]
+            == max(returns.values())
+            == max(returns[0], returns[1])
+        )
         return returns.get("stranger", returns["keeper"])
 
     found = evaluate(Shop, {"much": {"keeper": much}}, seeds=[1], points=POINTS, team=team)
@@ -252,19 +312,35 @@ def test_the_team_is_what_its_user_makes_of_the_returns():
 
 
 # As joblib closes, loky's thread may find that tasks which it has cancelled are gone.
-@pytest.mark.filterwarnings("ignore:Exception in thread ExecutorManager:pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True, "batch_size": 1}], ids=str)
+@pytest.mark.filterwarnings(
+    "ignore:Exception in thread ExecutorManager:pytest.PytestUnhandledThreadExceptionWarning"
+)
+@pytest.mark.parametrize(
+    "arguments", [{}, {"workers": 2}, {"batched": True, "batch_size": 1}], ids=str
+)
 @pytest.mark.parametrize(
     ("match", "contender", "keeper", "given"),
     [
-        ("'stranger' did not decide .*: keeper, helper", "rule", much, {"team": lambda returns: returns["stranger"]}),
+        (
+            "'stranger' did not decide .*: keeper, helper",
+            "rule",
+            much,
+            {"team": lambda returns: returns["stranger"]},
+        ),
         ("stranger", "bad", lambda seen: {}["stranger"], {}),
     ],
     ids=["team", "policy"],
 )
 def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, given, arguments):
     with pytest.raises(KeyError, match=match) as caught:
-        evaluate(Shop, {"rule": {}, "bad": {"keeper": keeper}}, seeds=SEEDS, points=POINTS, **given, **arguments)
+        evaluate(
+            Shop,
+            {"rule": {}, "bad": {"keeper": keeper}},
+            seeds=SEEDS,
+            points=POINTS,
+            **given,
+            **arguments,
+        )
     assert "seed 0" in notes(caught.value)
     assert f"of the contender '{contender}'" in notes(caught.value)
 
@@ -272,8 +348,11 @@ def test_errors_surface_at_once_and_name_the_seed(match, contender, keeper, give
 def test_a_variant_brings_its_own_points_and_policies():
     variant = Variant("v", Shop, points=POINTS, parameters={"days": 2}, policies={"keeper": much})
     frame = evaluate(variant, {"rule": {}}, seeds=SEEDS, metric=level).frame
-    assert set(frame["agent"]) == {"helper", "team"}  # for the keeper a policy decides, which is no contender's
-    expected = [simulate(Shop(2), {"keeper": much}, points=POINTS, seed=seed).level for seed in SEEDS]
+    # for the keeper a policy decides, which is no contender's
+    assert set(frame["agent"]) == {"helper", "team"}
+    expected = [
+        simulate(Shop(2), {"keeper": much}, points=POINTS, seed=seed).level for seed in SEEDS
+    ]
     assert frame[frame.agent == "team"]["metric"].tolist() == expected
 
 
@@ -291,7 +370,10 @@ def test_pictures_show_each_seed_and_can_be_read():
     assert figure.axes[0].get_title(loc="left") == "1 seed"
     assert drawn({"rule": {}}, SEEDS).plot().axes[0].get_title(loc="left") == "12 seeds, each a dot"
     axes = drawn(CONTENDERS, range(201)).plot("metric").axes[0]
-    assert (axes.get_title(loc="left"), axes.get_ylabel()) == ("201 seeds, lines for 200 of them", "metric")
+    assert (axes.get_title(loc="left"), axes.get_ylabel()) == (
+        "201 seeds, lines for 200 of them",
+        "metric",
+    )
     assert sum(len(line.get_xdata()) == 2 for line in axes.lines) == 200
     assert {label.get_rotation() for label in axes.get_xticklabels()} == {0}
 
@@ -355,13 +437,26 @@ def test_metrics_are_numbers_strings_or_none():
     assert {name: team[name].tolist() for name in expected} == expected
     assert team["some"].dtype == np.float64
     assert np.isnan(found.summary("some")["mean"]).all()
-    for look in (found.summary, found.improvement, found.plot, lambda metric: found.seeds_needed(1, metric=metric)):
+    for look in (
+        found.summary,
+        found.improvement,
+        found.plot,
+        lambda metric: found.seeds_needed(1, metric=metric),
+    ):
         for metric in ("text", "huge"):
             with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
                 look(metric=metric)
     for odd in ([1], 10**5000, 2**13_999):
-        with pytest.raises(OptionValueError, match="metric 'x' must be a number of no more than 4,200 digits"):
-            evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop, odd=odd: odd})
+        with pytest.raises(
+            OptionValueError, match="metric 'x' must be a number of no more than 4,200 digits"
+        ):
+            evaluate(
+                Shop,
+                {"rule": {}},
+                seeds=[1],
+                points=POINTS,
+                metric={"x": lambda shop, odd=odd: odd},
+            )
 
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch):
@@ -382,7 +477,8 @@ def test_returns_are_not_counted_where_two_points_have_the_same_agent_which_is_t
         order, sell = map(NEAR[Shop.order], (Shop.order, Shop.sell))
 
     own = [name for name in decision_points() if name.startswith("tests.")]
-    monkeypatch.setattr("simenv_marl.core.points.decision_points", lambda: own)  # without those of studies
+    # without those of studies
+    monkeypatch.setattr("simenv_marl.core.points.decision_points", lambda: own)
     with pytest.warns(UserWarning, match="not counted, .* have the same agent"):
         found = evaluate(Doubled, {"rule": {}}, seeds=[1])
     assert found.frame["length"].tolist() == [0]

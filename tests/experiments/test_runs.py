@@ -29,13 +29,21 @@ from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script
 from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
 
-DESIGN = pd.DataFrame({"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]})
+DESIGN = pd.DataFrame(
+    {"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]}
+)
 ROOT = Path(__file__).parents[2]
 
 
 def run(store, design=DESIGN, make=Shop, **arguments):
     contenders = {"much": {"keeper": much}, "some": {"keeper": some}}
-    given = {"contenders": contenders, "seeds": range(4), "points": POINTS, "metric": {"level": level}, **arguments}
+    given = {
+        "contenders": contenders,
+        "seeds": range(4),
+        "points": POINTS,
+        "metric": {"level": level},
+        **arguments,
+    }
     return run_experiment(make, design, store=store, **given)
 
 
@@ -47,22 +55,45 @@ def lines(store):
 def test_each_run_has_rows_of_a_tidy_table_and_a_line_with_its_provenance(tmp_path):
     frame, known = run(tmp_path), lines(tmp_path)
     factors, outcome = ["days", "price", "kind"], ["status", "error"]
-    assert list(frame.columns) == [*factors, "contender", "seed", "agent", "return", "length", "level", *outcome]
+    assert list(frame.columns) == [
+        *factors,
+        "contender",
+        "seed",
+        "agent",
+        "return",
+        "length",
+        "level",
+        *outcome,
+    ]
     assert frame[factors].dtypes.equals(DESIGN.dtypes)
     runs = frame[frame.agent == "team"]
     contenders = {"rule": {}, "much": {"keeper": much}, "some": {"keeper": some}}
-    expected = [[*row, name, seed] for row in DESIGN.values.tolist() for name in contenders for seed in range(4)]
+    expected = [
+        [*row, name, seed]
+        for row in DESIGN.values.tolist()
+        for name in contenders
+        for seed in range(4)
+    ]
     assert runs[[*factors, "contender", "seed"]].values.tolist() == expected
     failed = runs[runs.status == "error"]
     assert set(zip(failed["kind"], failed["seed"], strict=True)) == {("faulty", 1), ("faulty", 3)}
     assert set(failed["error"]) == {"ZeroDivisionError: no change"}
     assert failed["return"].isna().all()
-    good = frame[(frame["kind"] == "plain") & (frame["days"] == 2)].drop(columns=[*factors, *outcome])
+    good = frame[(frame["kind"] == "plain") & (frame["days"] == 2)].drop(
+        columns=[*factors, *outcome]
+    )
     given = {"seeds": range(4), "points": POINTS, "metric": {"level": level}}
-    assert good.reset_index(drop=True).equals(evaluate(lambda: Shop(2, 2.0), contenders, **given).frame)
+    assert good.reset_index(drop=True).equals(
+        evaluate(lambda: Shop(2, 2.0), contenders, **given).frame
+    )
     assert len(known) == 3 * 3 * 4
-    assert {(line["status"], line["error"]) for line in known} == {("ok", None), ("error", *set(failed["error"]))}
-    (line,) = (e for e in known if (e["contender"], e["seed"], e["factors"]["days"]) == ("some", 2, 1))
+    assert {(line["status"], line["error"]) for line in known} == {
+        ("ok", None),
+        ("error", *set(failed["error"])),
+    }
+    (line,) = (
+        e for e in known if (e["contender"], e["seed"], e["factors"]["days"]) == ("some", 2, 1)
+    )
     provenance = line["provenance"]
     assert provenance["seed"] == 2
     assert provenance["simulation"] == "tests.worlds.shops.Shop"
@@ -80,11 +111,16 @@ def test_each_run_has_rows_of_a_tidy_table_and_a_line_with_its_provenance(tmp_pa
 )
 def test_the_table_is_the_same_however_it_is_run(arguments, tmp_path, capsys):
     if arguments.get("batched"):
-        arguments = {"contenders": {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}}, **arguments}
+        arguments = {
+            "contenders": {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}},
+            **arguments,
+        }
     alone, store = run(tmp_path / "alone"), tmp_path / "shared"
     assert run(store, progress=True, **arguments).equals(alone)
     assert "36/36" in capsys.readouterr().err
-    assert len({path.name.split("-")[2] for path in store.glob("*.jsonl")}) <= arguments.get("workers", 1)
+    assert len({path.name.split("-")[2] for path in store.glob("*.jsonl")}) <= arguments.get(
+        "workers", 1
+    )
     run(store, progress=True, seeds=range(5), **arguments)
     assert "45/45" in capsys.readouterr().err
 
@@ -93,7 +129,9 @@ def test_the_table_is_the_same_however_it_is_run(arguments, tmp_path, capsys):
     "make",
     [
         lambda days, price, kind: Shop(days, price, kind),
-        lambda days, price, kind: Variant("v", Shop, parameters={"days": days, "price": price, "kind": kind}),
+        lambda days, price, kind: Variant(
+            "v", Shop, parameters={"days": days, "price": price, "kind": kind}
+        ),
         lambda days, price, kind: lambda: Shop(days, price, kind),
         lambda **row: type("Sub", (Shop,), {"__init__": lambda self: Shop.__init__(self, **row)}),
         Variant("v", Shop),
@@ -103,7 +141,9 @@ def test_classes_factories_and_variants_make_simulations(make, tmp_path):
     assert run(tmp_path / "a", make=make).equals(run(tmp_path / "b"))
 
 
-@pytest.mark.parametrize("arguments", [{}, {"batched": True}, {"batched": True, "batch_size": 2}], ids=str)
+@pytest.mark.parametrize(
+    "arguments", [{}, {"batched": True}, {"batched": True, "batch_size": 2}], ids=str
+)
 @pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError, MemoryError])
 @pytest.mark.parametrize("method", ["run", "close"])
 def test_whatever_ends_a_run_is_an_error_of_that_run(method, error, arguments, tmp_path):
@@ -128,7 +168,14 @@ def test_an_interrupt_ends_the_experiment(batched, tmp_path):
             super().run()
 
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, {"days": [1]}, make=Interrupted, contenders=None, batched=batched, batch_size=1)
+        run(
+            tmp_path,
+            {"days": [1]},
+            make=Interrupted,
+            contenders=None,
+            batched=batched,
+            batch_size=1,
+        )
     assert [line["seed"] for line in lines(tmp_path)] == [0, 1]
 
 
@@ -136,7 +183,9 @@ def test_points_and_options_that_can_be_asked_for_once_serve_all(tmp_path):
     class Own(Shop):
         points = POINTS
 
-    plugins = [(lambda shop, _result: ChangedResult(2 * _result), "tests.worlds.shops.Shop.sell", "after")]
+    plugins = [
+        (lambda shop, _result: ChangedResult(2 * _result), "tests.worlds.shops.Shop.sell", "after")
+    ]
     points, given = [Shop.order], {"make": Own, "contenders": {"much": {"keeper": much}}}
     expected = run(tmp_path / "a", points=points, plugins=plugins, **given)
     assert run(tmp_path / "b", points=iter(points), plugins=iter(plugins), **given).equals(expected)
@@ -151,20 +200,29 @@ def test_stored_runs_are_not_run_again(tmp_path):
 
     def again(days, seeds=range(3), contenders=None, **options):
         calls.clear()
-        return run(tmp_path, {"days": days}, make=make, seeds=seeds, contenders=contenders, **options)
+        return run(
+            tmp_path, {"days": days}, make=make, seeds=seeds, contenders=contenders, **options
+        )
 
     first = again([1, 2])
     assert again([1, 2]).equals(first)
     assert len(calls) <= 1  # it is looked at
     assert again([1, 2], range(2)).equals(first[first.seed < 2].reset_index(drop=True))
     twice = again([1, 2, 1, 2])
-    assert all(half.reset_index(drop=True).equals(first) for half in (twice[: len(first)], twice[len(first) :]))
+    assert all(
+        half.reset_index(drop=True).equals(first)
+        for half in (twice[: len(first)], twice[len(first) :])
+    )
     failed = again([1, 2, 3], team=lambda returns: returns["stranger"])
     assert set(failed["agent"]) == {"team"}
     assert set(failed["status"]) == {"error"}
-    assert "'stranger' did not decide in this episode; these agents did: keeper, helper" in failed["error"][0]
+    assert (
+        "'stranger' did not decide in this episode; these agents did: keeper, helper"
+        in failed["error"][0]
+    )
     assert len(lines(tmp_path)) == 3 * 3
-    assert set(again([1, 2, 3, 1], team=lambda returns: returns.pop("keeper"))["status"]) == {"ok"}  # it is mended
+    # it is mended
+    assert set(again([1, 2, 3, 1], team=lambda returns: returns.pop("keeper"))["status"]) == {"ok"}
     assert len(lines(tmp_path)) == 3 * 3
     again([3, 1, 2], range(4), {"much": {"keeper": much}})
     assert len(lines(tmp_path)) == 3 * 4 * 2
@@ -177,7 +235,12 @@ def test_stored_runs_are_not_run_again(tmp_path):
     [
         *(b"[" * 100_000, b"\xff\xfe{}", b"{}", b"[]", b"1" * 5000),
         *({"provenance": own} for own in ({"options": "none"}, [1])),
-        *({"returns": {"keeper": 10**4000}}, {"lengths": {}}, {"metrics": {"level": [1]}}, {"seed": "one"}),
+        *(
+            {"returns": {"keeper": 10**4000}},
+            {"lengths": {}},
+            {"metrics": {"level": [1]}},
+            {"seed": "one"},
+        ),
     ],
 )
 def test_a_line_that_is_no_run_is_a_run_that_is_missing(damage, tmp_path):
@@ -189,7 +252,9 @@ def test_a_line_that_is_no_run_is_a_run_that_is_missing(damage, tmp_path):
     one, other = path.read_bytes().splitlines()
     damaged = damage if isinstance(damage, bytes) else json.dumps(json.loads(one) | damage).encode()
     path.write_bytes(damaged + b"\n" + other + b"\n")
-    with pytest.warns(UserWarning, match="line 1 of .* cannot be read, so its run counts as missing"):
+    with pytest.warns(
+        UserWarning, match="line 1 of .* cannot be read, so its run counts as missing"
+    ):
         assert again().equals(first)
 
 
@@ -288,9 +353,15 @@ def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch)
     ("told", "arguments"),
     [
         (r'options {} then, {"max_steps": 2} now', {"max_steps": 2}),
-        (r"'much' .*policies .*shops.much.* then, .*shops.some", {"contenders": {"much": {"keeper": some}}}),
+        (
+            r"'much' .*policies .*shops.much.* then, .*shops.some",
+            {"contenders": {"much": {"keeper": some}}},
+        ),
         (r"make .*Shop.* then, .*Other.* now", {"make": type("Other", (Shop,), {})}),
-        (r"plugins \[\] then", {"plugins": [(lambda shop: None, "tests.worlds.shops.Shop.sell", "before")]}),
+        (
+            r"plugins \[\] then",
+            {"plugins": [(lambda shop: None, "tests.worlds.shops.Shop.sell", "before")]},
+        ),
         (r"points .*helper.* then", {"points": {Shop.order: POINTS[Shop.order]}}),
     ],
 )
@@ -323,13 +394,17 @@ def test_stored_runs_of_equal_definitions_cause_no_warning(tmp_path):
     first = run(tmp_path, contenders={"a": {"keeper": Policy()}}, driver="thread", workers=2)
     kept = [Policy() for _ in range(3)]
     turned = dict(reversed(POINTS.items()))
-    assert run(tmp_path, contenders={"a": {"keeper": kept[-1]}}, points=turned, driver="greenlet").equals(first)
+    assert run(
+        tmp_path, contenders={"a": {"keeper": kept[-1]}}, points=turned, driver="greenlet"
+    ).equals(first)
 
 
 def test_another_version_of_a_package_is_warned_of(tmp_path):
     first = run(tmp_path)
     (path,) = tmp_path.glob("*.jsonl")
-    path.write_bytes(path.read_bytes().replace(f'"numpy":"{np.__version__}"'.encode(), b'"numpy":"1.0"'))
+    path.write_bytes(
+        path.read_bytes().replace(f'"numpy":"{np.__version__}"'.encode(), b'"numpy":"1.0"')
+    )
     with pytest.warns(UserWarning, match=f"numpy 1.0 then, {np.__version__} now"):
         assert run(tmp_path).equals(first)
 
@@ -357,7 +432,9 @@ def test_a_full_disk_is_an_error_stored_runs_stay_and_the_one_whose_line_is_torn
 def test_a_store_that_cannot_be_written_or_read_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
     for store in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(StoreError, match="cannot be made or read as the folder of an experiment"):
+        with pytest.raises(
+            StoreError, match="cannot be made or read as the folder of an experiment"
+        ):
             run(store)
     for text in (b"[" * 100_000, b"\xff\xfe[", b"{"):
         (tmp_path / "experiment.json").write_bytes(text)
@@ -377,7 +454,9 @@ def test_a_store_is_where_its_user_is(tmp_path, monkeypatch):
 
 def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
     with joblib.parallel_config(backend="threading"):
-        frame = run(tmp_path / "shared", workers=2, make=lambda **row: Shop(**row | {"kind": "slow"}))
+        frame = run(
+            tmp_path / "shared", workers=2, make=lambda **row: Shop(**row | {"kind": "slow"})
+        )
     assert frame["status"].tolist() == ["ok"] * len(frame)
     assert len(list((tmp_path / "shared").glob("*.jsonl"))) == 2
 
@@ -407,11 +486,16 @@ def test_a_name_that_no_agent_has_is_an_error_of_its_contender(arguments, tmp_pa
         run_experiment(visits, design, contenders=contenders, store=tmp_path, **given)
     assert "wrong" not in {line["contender"] for line in lines(tmp_path)}
     contenders = {"right": {"being_1": policy}, "late": {"being_4": policy}}
-    named = {"contenders": contenders, "possible_agents": ["being_4"], **given}  # it may come later, or not at all
+    # it may come later, or not at all
+    named = {"contenders": contenders, "possible_agents": ["being_4"], **given}
     evaluate(visits, **named)
-    assert set(run_experiment(visits, design, store=tmp_path / "named", **named)["status"]) == {"ok"}
+    assert set(run_experiment(visits, design, store=tmp_path / "named", **named)["status"]) == {
+        "ok"
+    }
     contenders = {"late": {"being_4": policy}}  # stored as soon as it is there
-    frame = run_experiment(visits, {"days": [5]}, contenders=contenders, store=tmp_path / "late", **given)
+    frame = run_experiment(
+        visits, {"days": [5]}, contenders=contenders, store=tmp_path / "late", **given
+    )
     assert frame[frame["agent"] == "being_4"]["length"].tolist() == [1] * 4
 
 
@@ -465,7 +549,9 @@ def test_a_run_that_kills_its_worker_is_a_row_and_the_others_go_on(batched, tmp_
     assert run(tmp_path / "a", make=Deadly, workers=2, **given).equals(frame)
 
 
-def test_a_backend_that_does_not_tell_of_the_death_of_its_workers_is_refused_before_anything_runs(tmp_path):
+def test_a_backend_that_does_not_tell_of_the_death_of_its_workers_is_refused_before_anything_runs(
+    tmp_path,
+):
     with joblib.parallel_config(backend="multiprocessing"):
         with pytest.raises(OptionValueError, match="joblib"):
             evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, workers=2)
@@ -520,8 +606,19 @@ def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_pa
     script.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
 
     def start(folder, number, most):
-        command = [sys.executable, "-W", "error::UserWarning", script, ROOT, folder, str(number), str(most)]
-        return subprocess.run(command, start_new_session=True, stderr=subprocess.PIPE, text=True, check=False)
+        command = [
+            sys.executable,
+            "-W",
+            "error::UserWarning",
+            script,
+            ROOT,
+            folder,
+            str(number),
+            str(most),
+        ]
+        return subprocess.run(
+            command, start_new_session=True, stderr=subprocess.PIPE, text=True, check=False
+        )
 
     for most in (1, 20):
         assert start(store, workers, most).returncode == -signal.SIGKILL
@@ -531,7 +628,9 @@ def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_pa
         assert done.returncode == 0, done.stderr
     tables = [pd.read_pickle(tmp_path / f"{name}.table") for name in ("store", "undisturbed")]
     assert tables[0].equals(tables[1])
-    keys = [(json.dumps(entry["factors"]), entry["contender"], entry["seed"]) for entry in lines(store)]
+    keys = [
+        (json.dumps(entry["factors"]), entry["contender"], entry["seed"]) for entry in lines(store)
+    ]
     assert len(set(keys)) == 6 * 2 * 4
     if not workers:
         assert len(keys) == len(set(keys))

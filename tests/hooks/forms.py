@@ -1,4 +1,6 @@
-"""What handlers are attached to, and what is decided by points: functions of all forms, which nobody has decorated."""
+"""What handlers are attached to, and what is decided by points: functions of all forms, which
+nobody has decorated.
+"""
 
 import asyncio
 import statistics

@@ -1,4 +1,6 @@
-"""Wrappers of a model's functions: who takes part in their calls, where they are found, set, and put back."""
+"""Wrappers of a model's functions: who takes part in their calls, where they are found, set, and
+put back.
+"""
 
 import gc
 import pickle
@@ -19,7 +21,13 @@ from simenv_marl.hooks.handlers import Installation
 from simenv_marl.hooks.hook import Hook, hook_of, made_with, unwrap
 from simenv_marl.hooks.places import find_hook, places_of, resolve
 from simenv_marl.hooks.stacks import STACKS, outside_simulation, stack_of
-from simenv_marl.plugins import ChangedResult, attach_handler, attached_handlers, expose_to_plugins, handlers
+from simenv_marl.plugins import (
+    ChangedResult,
+    attach_handler,
+    attached_handlers,
+    expose_to_plugins,
+    handlers,
+)
 from tests.foreign import market, shop
 from tests.hooks.forms import FORMS, MARKET
 from tests.worlds.models import calling, define, play
@@ -35,7 +43,7 @@ class _Hiding:
         return self.__hidden()
 
 
-# -- calls ------------------------------------------------------------------------------------------
+# -- calls -----------------------------------------------------------------------------------------
 
 
 def rule(first, second=2, *, third=3):
@@ -101,7 +109,7 @@ def test_outside_a_simulation_its_interceptors_are_masked(monkeypatch):
     assert told == [here, "entered"]
 
 
-# -- names ------------------------------------------------------------------------------------------
+# -- names -----------------------------------------------------------------------------------------
 
 
 def test_private_names_are_found_as_they_are_written():
@@ -120,7 +128,7 @@ def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
         resolve("raising_model.Model.method", UnknownTargetError)
 
 
-# -- set and put back -------------------------------------------------------------------------------
+# -- set and put back ------------------------------------------------------------------------------
 
 
 def test_a_function_is_found_by_what_its_module_calls_it(monkeypatch):
@@ -134,7 +142,9 @@ def test_a_function_is_found_by_what_its_module_calls_it(monkeypatch):
     assert log == ["called"]
 
 
-@pytest.mark.parametrize(("error", "raised"), [(TypeError, PatchError), (ZeroDivisionError, ZeroDivisionError)])
+@pytest.mark.parametrize(
+    ("error", "raised"), [(TypeError, PatchError), (ZeroDivisionError, ZeroDivisionError)]
+)
 def test_a_patch_that_fails_half_way_is_undone(error, raised, monkeypatch):
     class Refusing(types.ModuleType):
         def __setattr__(self, name, value):
@@ -160,7 +170,7 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised, monkeypatch):
     assert not kept.complete  # so that an environment that is used again sets all of it again
 
 
-# -- nothing stays behind ---------------------------------------------------------------------------
+# -- nothing stays behind --------------------------------------------------------------------------
 
 
 def test_models_of_points_and_of_targets_are_collected_with_these():
@@ -182,10 +192,15 @@ def test_models_of_points_and_of_targets_are_collected_with_these():
         references.append(weakref.ref(Model))
         name = point_of(Model.decorated)[0].name
         assert name in registered()
-        env = aec_env(calling(lambda model=Model: model().decide()), {Model.decide: define(), Model.decorated: None})
+        env = aec_env(
+            calling(lambda model=Model: model().decide()),
+            {Model.decide: define(), Model.decorated: None},
+        )
         env.reset()
         env.close()
-        with handlers((lambda model, _result: ChangedResult(_result + 1), Model.__iter__, "after_next")):
+        with handlers(
+            (lambda model, _result: ChangedResult(_result + 1), Model.__iter__, "after_next")
+        ):
             assert list(Model()) == [2, 3]
         del env, Model
     gc.collect()
@@ -200,7 +215,9 @@ def test_modules_may_come_while_names_are_looked_for(monkeypatch):
 
         @property
         def __class__(self):
-            monkeypatch.setitem(sys.modules, f"late_module_{len(sys.modules)}", types.ModuleType("late_module"))
+            monkeypatch.setitem(
+                sys.modules, f"late_module_{len(sys.modules)}", types.ModuleType("late_module")
+            )
             return types.ModuleType
 
     monkeypatch.setitem(sys.modules, "lazy_module", Lazy())

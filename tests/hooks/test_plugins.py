@@ -1,4 +1,6 @@
-"""Section 8: handlers before, after and instead of a model's functions, of the whole process and of one environment."""
+"""Section 8: handlers before, after and instead of a model's functions, of the whole process and
+of one environment.
+"""
 
 import asyncio
 import collections.abc
@@ -41,7 +43,17 @@ from simenv_marl.plugins import (
 from tests.foreign import market
 from tests.foreign.market import Broker, Trader
 from tests.hooks.forms import BID, FORMS, MARKET, PLACES, found
-from tests.worlds.models import calling, decision, decisions, define, notes, plainly, play, script, step
+from tests.worlds.models import (
+    calling,
+    decision,
+    decisions,
+    define,
+    notes,
+    plainly,
+    play,
+    script,
+    step,
+)
 from tests.worlds.undone import left_as_they_were
 
 HERE = __name__
@@ -59,7 +71,7 @@ def _nothing_stays_attached(monkeypatch):
         assert attached_handlers() == []
 
 
-# -- what handlers are attached to ------------------------------------------------------------------
+# -- what handlers are attached to -----------------------------------------------------------------
 
 
 @expose_to_plugins
@@ -100,7 +112,7 @@ def failing(*args, **kwargs):
     raise ZeroDivisionError("of the handler")
 
 
-# -- by whom ----------------------------------------------------------------------------------------
+# -- by whom ---------------------------------------------------------------------------------------
 
 
 def of_the_process(call, *entries):
@@ -144,7 +156,9 @@ def test_whatever_is_importable_can_be_extended(name, call, result, how, with_ha
 
 
 @EVERYWHERE
-def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and_their_changes_chain(with_handlers):
+def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and_their_changes_chain(
+    with_handlers,
+):
     function, seen = local(), []
 
     def see(*args, **kwargs):
@@ -239,7 +253,12 @@ def test_a_method_is_exposed_for_one_class_and_may_be_exposed_again():
 
 def test_functions_without_dotted_names_can_be_exposed_and_are_listed():
     gc.collect()  # other tests have exposed functions, too
-    first, function, length, items = local(), local(), expose_to_plugins(len), expose_to_plugins({1})
+    first, function, length, items = (
+        local(),
+        local(),
+        expose_to_plugins(len),
+        expose_to_plugins({1}),
+    )
     name = f"{HERE}.local.<locals>.function"
     assert expose_to_plugins(function) is function
     assert exposed_functions().count("an iterable set") == 1
@@ -253,7 +272,9 @@ def test_functions_without_dotted_names_can_be_exposed_and_are_listed():
     with handlers(*entries):
         assert BID in exposed_functions()
         targets = ["builtins.len", BID, name]
-        assert attached_handlers() == [(entry[0], name, entry[2]) for entry, name in zip(entries, targets, strict=True)]
+        assert attached_handlers() == [
+            (entry[0], name, entry[2]) for entry, name in zip(entries, targets, strict=True)
+        ]
         assert (first(1), function(1)) == (1, 9)  # the latest of that name
         assert (length([1, 2]), list(items)) == (3, [1])
     assert length([1, 2]) == 2
@@ -275,7 +296,10 @@ def test_an_exposed_list_is_one_in_all_respects_and_has_handlers_by_its_name_too
     )
     assert items == [10, 20]
     assert [subject is POOL for subject in subjects] == [True] * 3
-    assert with_handlers(lambda: [*POOL], (lambda thing: next(numbers), POOL, "instead_next")) == [7, 8]
+    assert with_handlers(lambda: [*POOL], (lambda thing: next(numbers), POOL, "instead_next")) == [
+        7,
+        8,
+    ]
     assert [*POOL] == [1, 2]
 
 
@@ -323,7 +347,13 @@ def two(a, b):
         ((print, POOL, "before"), HandlerError),
         *(
             ((wrong, two, "before"), HandlerError)
-            for wrong in (None, lambda: 0, lambda a, *, b: 0, lambda a, b, _result: 0, lambda **kwargs: 0)
+            for wrong in (
+                None,
+                lambda: 0,
+                lambda a, *, b: 0,
+                lambda a, b, _result: 0,
+                lambda **kwargs: 0,
+            )
         ),
         ((lambda a, b, _result: 0, two, "instead"), HandlerError),
         ((lambda good, *, discount=0: None, f"{MARKET}.price", "before"), HandlerError),
@@ -346,7 +376,8 @@ async def items_of_a_stream():
 
 
 @pytest.mark.parametrize(
-    ("thing", "why"), [(Trader, "expose one of its"), (3, "neither"), (items_of_a_stream, "async generator")]
+    ("thing", "why"),
+    [(Trader, "expose one of its"), (3, "neither"), (items_of_a_stream, "async generator")],
 )
 def test_exposing_anything_but_functions_and_iterables_is_refused(thing, why):
     with pytest.raises(PatchError, match=why):
@@ -368,12 +399,17 @@ def test_blocks_and_removals_take_away_nothing_but_their_own():
         function(1)
     function(2)
     remove_handler(function, "before", see)
-    with pytest.raises(HandlerError, match=r"print is not attached 'before' .*; handlers are attached: before"):
+    with pytest.raises(
+        HandlerError, match=r"print is not attached 'before' .*; handlers are attached: before"
+    ):
         remove_handler(function, "before", print)
     function(3)
     remove_handler(function, "before")  # all of them
     for nowhere in (function, BID):
-        with pytest.raises(HandlerError, match=r"no handler is attached 'before' .*; handlers are attached: nowhere"):
+        with pytest.raises(
+            HandlerError,
+            match=r"no handler is attached 'before' .*; handlers are attached: nowhere",
+        ):
             remove_handler(nowhere, "before")
     with pytest.raises(ZeroDivisionError), handlers((failing, function, "instead")):
         function(4)
@@ -386,9 +422,12 @@ def test_blocks_and_removals_take_away_nothing_but_their_own():
 
 @EVERYWHERE
 @pytest.mark.parametrize(
-    ("position", "target"), [("before", BID), ("after", BID), ("instead", BID), ("after_next", f"{HERE}.counting")]
+    ("position", "target"),
+    [("before", BID), ("after", BID), ("instead", BID), ("after_next", f"{HERE}.counting")],
 )
-def test_an_error_of_a_handler_says_where_it_was_attached_and_closes_the_generator(position, target, with_handlers):
+def test_an_error_of_a_handler_says_where_it_was_attached_and_closes_the_generator(
+    position, target, with_handlers
+):
     def call():
         return next(counting(3)) if position == "after_next" else Trader().bid("tea")
 
@@ -415,7 +454,9 @@ def test_an_error_of_the_function_is_its_own_and_no_handler_runs_after_it(with_h
 
 
 @EVERYWHERE
-def test_handlers_of_a_generator_function_see_its_arguments_its_items_and_what_it_returns(with_handlers):
+def test_handlers_of_a_generator_function_see_its_arguments_its_items_and_what_it_returns(
+    with_handlers,
+):
     log = []
 
     def call():
@@ -475,7 +516,9 @@ def letters(number, step=1):
     ],
     ids=["generator", "list", "nothing", "string", "bytes"],
 )
-def test_instead_of_a_generator_a_handler_may_return_items_or_its_value(instead, items, value, with_handlers):
+def test_instead_of_a_generator_a_handler_may_return_items_or_its_value(
+    instead, items, value, with_handlers
+):
     returned = []
 
     def call():
@@ -529,7 +572,9 @@ def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited(with_hand
 def test_calls_are_traced_in_the_order_in_which_they_begin():
     function = local()
     with (
-        handlers((lambda value, more=0: market.price("tea", rebate=value) and None, function, "before")),
+        handlers(
+            (lambda value, more=0: market.price("tea", rebate=value) and None, function, "before")
+        ),
         trace(function, f"{MARKET}.price", counting, Trader.wire) as calls,
     ):
         function(3, more=4)
@@ -537,13 +582,16 @@ def test_calls_are_traced_in_the_order_in_which_they_begin():
         asyncio.run(Trader().wire(8))
         with pytest.raises(TypeError):
             function([])
-    *shown, failed, price = [(call.target.rpartition(".")[2], call.arguments, call.result) for call in calls]
+    *shown, failed, price = [
+        (call.target.rpartition(".")[2], call.arguments, call.result) for call in calls
+    ]
     assert shown[:2] == [("function", "3, more=4", "7"), ("price", "'tea', rebate=3", "7")]
     assert shown[2] == ("counting", "2", "0")
     assert shown[3][::2] == ("wire", "8")
     assert (failed[:2], price[:2]) == (("function", "[]"), ("price", "'tea', rebate=[]"))
     assert failed[2].startswith("raised TypeError")
-    with handlers((nothing, BID, "before")), trace() as everything:  # which is what is exposed, or has handlers
+    # which is what is exposed, or has handlers
+    with handlers((nothing, BID, "before")), trace() as everything:
         function(1)
         Trader().bid("tea")
         Trader.rounded(2.5)
@@ -617,7 +665,14 @@ def test_plugins_apply_in_the_simulation_and_in_mappings_of_their_environment():
 
 
 @pytest.mark.parametrize(
-    "make", [aec_env, parallel_env, single_env, joint_env, lambda *args, **kwargs: generate_env(*args, **kwargs)()]
+    "make",
+    [
+        aec_env,
+        parallel_env,
+        single_env,
+        joint_env,
+        lambda *args, **kwargs: generate_env(*args, **kwargs)(),
+    ],
 )
 def test_environments_with_opposite_plugins_are_interleaved_in_every_view(make):
     words = {"one": [says("one")], "two": [says("two")], "plain": []}
@@ -625,7 +680,9 @@ def test_environments_with_opposite_plugins_are_interleaved_in_every_view(make):
     for _ in range(2):
         for word, env in envs.items():
             env.reset(seed=1)
-            assert [entry[1:] for entry in attached_handlers(env)] == [(WORD, "instead")] * (word != "plain")
+            assert [entry[1:] for entry in attached_handlers(env)] == [(WORD, "instead")] * (
+                word != "plain"
+            )
         for _ in range(2):
             for env in envs.values():
                 step(env, 1, "waterer_0")
@@ -637,7 +694,10 @@ def test_environments_with_opposite_plugins_are_interleaved_in_every_view(make):
 
 def test_handlers_of_the_process_run_before_the_environments():
     log = []
-    process, environment = telling(log, WORD, " of the process"), telling(log, WORD, " of the environment")
+    process, environment = (
+        telling(log, WORD, " of the process"),
+        telling(log, WORD, " of the environment"),
+    )
     env = single_env(House, House.water, plugins=environment)
     with handlers(*process):
         env.reset()
@@ -668,7 +728,11 @@ def test_environments_may_be_collected_at_any_moment():
     gc.disable()
     try:
         while left <= 0:  # until there are no more calls
-            env = aec_env(calling(lambda: Trader().bid("tea"), choose), choose, plugins=[(nothing, BID, "before")])
+            env = aec_env(
+                calling(lambda: Trader().bid("tea"), choose),
+                choose,
+                plugins=[(nothing, BID, "before")],
+            )
             env.reset()
             env.itself = env
             del env
@@ -702,7 +766,7 @@ def test_nothing_is_patched_but_while_there_is_an_environment():
     assert vars(House)["word"] is before
 
 
-# -- handlers and decisions -------------------------------------------------------------------------
+# -- handlers and decisions ------------------------------------------------------------------------
 
 
 @define(agent="ventilator_0", observation_space_mapping=lambda self: [self.step, 0])
@@ -721,7 +785,8 @@ def test_a_plugin_may_decide_and_extend_the_simulations_own_methods():
     env = aec_env(House, [House.water, ventilate], plugins=plugins)
     turns = play(env, {"waterer_0": 1, "ventilator_0": 7})
     assert decisions(turns) == ["ventilator_0", "waterer_0", "ventilator_0"] * 3
-    assert env.unwrapped.simulation.log == ["made", "rule", 77, *[7] * 6]  # during reset the rule decides
+    # during reset the rule decides
+    assert env.unwrapped.simulation.log == ["made", "rule", 77, *[7] * 6]
     assert turns[-1].truncated
     env.close()
 
@@ -737,7 +802,13 @@ def test_handlers_run_around_the_decision(where):
         decided.append(_result)
         return ChangedResult(_result * 10)
 
-    points = {BID: define(observation_space_mapping=lambda self, good, limit=5: seen.append((good, limit)) or [0, 0])}
+    points = {
+        BID: define(
+            observation_space_mapping=lambda self, good, limit=5: (
+                seen.append((good, limit)) or [0, 0]
+            )
+        )
+    }
     entries = {where: [(before, BID, "before"), (after, BID, "after")]}
     bids = calling(lambda: Trader().bid("tea"), lambda: Broker().bid("tea", limit=6))
     with handlers(*entries.get("before the points", ())):
@@ -779,7 +850,9 @@ def test_environments_that_open_and_close_in_any_order_do_not_disturb_each_other
             log.clear()
             assert call() == result
             base = name.replace("Broker", "Trader")  # which a broker's call goes on to
-            assert log == [name] * attached.count(name) + [base] * attached.count(base) * (base != name)
+            assert log == [name] * attached.count(name) + [base] * attached.count(base) * (
+                base != name
+            )
         for env, name, _ in random.sample(live, min(len(live), 2)):
             for action, result in ((4, 4), (RULE, calls[name][1])) if env != "handlers" else ():
                 log.clear()
@@ -794,7 +867,11 @@ def test_decision_functions_can_be_named_whether_they_are_exposed_before_or_afte
     def choose():
         return "rule"
 
-    over, under, log = expose_to_plugins(define()(choose)), define(agent="under_0")(expose_to_plugins(choose)), []
+    over, under, log = (
+        expose_to_plugins(define()(choose)),
+        define(agent="under_0")(expose_to_plugins(choose)),
+        [],
+    )
     assert inspect.unwrap(over) is inspect.unwrap(under) is choose
     assert decision_points().count(f"{choose.__module__}.{choose.__qualname__}") == 1
     for point, agent in ((over, "choose_0"), (under, "under_0")):
@@ -850,7 +927,8 @@ def test_generators_and_iterables_suspended_over_decisions_have_their_environmen
 
 
 def test_mappings_of_vector_environments_see_the_plugins_too(monkeypatch):
-    monkeypatch.setattr("simenv_marl.core.agent.DIFFERENCES", [])  # as long as no difference was made, less is entered
+    # as long as no difference was made, less is entered
+    monkeypatch.setattr("simenv_marl.core.agent.DIFFERENCES", [])
     reward = {House.water: define(agent="a_0", reward_mapping=lambda self: len(self.word()))}
     for points, observations, rewards in ((reward, [1, 2], 4), (House.water, [4, 0], 0)):
         envs = vector_env(House, points, num_envs=2, plugins=[says("mine")])

@@ -1,4 +1,6 @@
-"""Sections 3 and 4: what ``points=`` names, and what that does to models which nobody has decorated."""
+"""Sections 3 and 4: what ``points=`` names, and what that does to models which nobody has
+decorated.
+"""
 
 import gc
 import sys
@@ -15,7 +17,13 @@ from simenv_marl.core import packing
 from simenv_marl.core.packing import pack, pack_plainly, unpack
 from simenv_marl.core.points import find_point, portable
 from simenv_marl.decision import point_of
-from simenv_marl.errors import AgentError, DefinitionError, PatchError, RewardError, UnknownPointError
+from simenv_marl.errors import (
+    AgentError,
+    DefinitionError,
+    PatchError,
+    RewardError,
+    UnknownPointError,
+)
 from simenv_marl.hooks.hook import hook_of, hooks
 from simenv_marl.hooks.places import PlacedHook, resolve
 from simenv_marl.plugins import handlers
@@ -70,7 +78,9 @@ class Cabin(Home):
 
 
 def home():
-    return calling(*[lambda name=name: getattr(Cabin(), name)() for name in ("heat", "cool", "air", "light")])
+    return calling(
+        *[lambda name=name: getattr(Cabin(), name)() for name in ("heat", "cool", "air", "light")]
+    )
 
 
 HOME, CABIN = f"{__name__}.Home", f"{__name__}.Cabin"
@@ -93,13 +103,16 @@ HOME, CABIN = f"{__name__}.Home", f"{__name__}.Cabin"
 )
 def test_points_may_be_named_in_all_forms(points, agents):
     env = aec_env(home(), points)
-    order = ["heat_0", "cool_0", "cooler_0", "air_0", "fan_0", "light_0"]  # in which the simulation calls them
+    # in which the simulation calls them
+    order = ["heat_0", "cool_0", "cooler_0", "air_0", "fan_0", "light_0"]
     assert env.possible_agents == agents
     assert decisions(play(env, 1)) == sorted(agents, key=order.index)
     assert env.unwrapped.simulation.log.count(1) == len(agents)  # what is not named runs its rule
 
 
-@pytest.mark.parametrize("points", [[Home.cool], f"{HOME}.cool", {Home.cool: define()}], ids=plainly)
+@pytest.mark.parametrize(
+    "points", [[Home.cool], f"{HOME}.cool", {Home.cool: define()}], ids=plainly
+)
 def test_without_points_the_simulation_names_them(points):
     simulation = script(lambda simulation: [Home().heat(), Home().cool()])()
     simulation.points = points
@@ -129,17 +142,33 @@ def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch
     [
         (".", UnknownPointError, "dotted name"),
         (MARKET, PatchError, None),
-        ("no_such_package_at_all.function", UnknownPointError, "no module 'no_such_package_at_all'"),
+        (
+            "no_such_package_at_all.function",
+            UnknownPointError,
+            "no module 'no_such_package_at_all'",
+        ),
         (f"{__name__}.Missing.method", UnknownPointError, "has no 'Missing'"),
         (f"{HOME}.haet", UnknownPointError, r"has no 'haet'; did you mean .*Home\.heat"),
         ([], UnknownPointError, None),
         ({}, UnknownPointError, None),
         ([Home.heat, f"{HOME}.heat"], UnknownPointError, "twice"),
-        ({f"{MARKET}.price": define(agent="a_0"), shop.cost: define(agent="b_0")}, UnknownPointError, "twice"),
-        ({Home.heat: define(agent="pump_0"), Home.cool: define(agent="pump_0")}, AgentError, "pump_0"),
+        (
+            {f"{MARKET}.price": define(agent="a_0"), shop.cost: define(agent="b_0")},
+            UnknownPointError,
+            "twice",
+        ),
+        (
+            {Home.heat: define(agent="pump_0"), Home.cool: define(agent="pump_0")},
+            AgentError,
+            "pump_0",
+        ),
         (BID, DefinitionError, None),
         ({Trader.bid: lambda action: action}, DefinitionError, None),
-        ({Trader.bid: define(), f"{MARKET}.Trader.quote": define()}, PatchError, "not a function written"),
+        (
+            {Trader.bid: define(), f"{MARKET}.Trader.quote": define()},
+            PatchError,
+            "not a function written",
+        ),
         ({"random.random": define()}, PatchError, None),
         ({len: define()}, PatchError, None),
         ({Trader().bid: define()}, PatchError, None),
@@ -171,7 +200,11 @@ def test_an_inherited_point_gets_the_called_class():
     seen = []
     env = aec_env(
         calling(lambda: Broker.opening(), lambda: Junior.opening(), lambda: Dealer.opening()),
-        {f"{MARKET}.Broker.opening": define(observation_space_mapping=lambda cls: seen.append(cls) or [0, 0])},
+        {
+            f"{MARKET}.Broker.opening": define(
+                observation_space_mapping=lambda cls: seen.append(cls) or [0, 0]
+            )
+        },
     )
     assert Broker.opening.__qualname__ == "Broker.opening"
     assert log_of(env) == [9, 9, 4]
@@ -181,18 +214,24 @@ def test_an_inherited_point_gets_the_called_class():
 BASE, SUB = {BID: define(agent="trader_0")}, {f"{MARKET}.Broker.bid": define(agent="broker_0")}
 
 
-@pytest.mark.parametrize("points", [(BASE, SUB), (SUB, BASE), (BASE | SUB, SUB), (SUB, BASE | SUB)], ids=plainly)
+@pytest.mark.parametrize(
+    "points", [(BASE, SUB), (SUB, BASE), (BASE | SUB, SUB), (SUB, BASE | SUB)], ids=plainly
+)
 def test_environments_of_a_base_class_and_of_a_subclass_get_along(points):
     def bids():
         return [kind().bid("tea") for kind in (Trader, Broker, Junior, Dealer, Cautious)]
 
-    envs = [aec_env(script(lambda simulation: simulation.log.extend(bids())), named) for named in points]
+    envs = [
+        aec_env(script(lambda simulation: simulation.log.extend(bids())), named) for named in points
+    ]
     for _ in range(2):  # the second time they patch again
         for env, named in zip(envs, points, strict=True):
             assert log_of(env) == ([5, 9, 9, 5, 4] if named is SUB else [9, 9, 9, 9, 8])
             # RULE for the broker runs what it has inherited, which may be a decision of its own.
             play(env, {"broker_0": RULE, "trader_0": 7})
-            assert env.unwrapped.simulation.log == ([5, 5, 5, 5, 4] if named is SUB else [7, 7, 7, 7, 6])
+            assert env.unwrapped.simulation.log == (
+                [5, 5, 5, 5, 4] if named is SUB else [7, 7, 7, 7, 6]
+            )
         for env in envs:
             env.close()
         assert bids() == [5, 5, 5, 5, 4]
@@ -224,7 +263,10 @@ def test_patches_last_until_the_last_environment_is_gone(name, end):
 def test_modules_that_are_imported_between_reset_and_step_decide_and_are_restored(monkeypatch):
     before, late = market.price, types.ModuleType("late_shop")
     monkeypatch.setitem(sys.modules, "late_shop", late)
-    env = aec_env(calling(lambda: market.price("tea"), lambda: late.asked("tea")), {f"{MARKET}.price": define()})
+    env = aec_env(
+        calling(lambda: market.price("tea"), lambda: late.asked("tea")),
+        {f"{MARKET}.price": define()},
+    )
     env.reset()
     exec("from tests.foreign.market import price as asked", vars(late))
     assert late.asked("tea") == 10
@@ -258,7 +300,10 @@ def test_environments_of_the_same_undecorated_model_have_their_own_points_and_de
     other = decision()
     traders = calling(lambda: Trader().bid("tea"), other)
     one = aec_env(traders, {BID: define(action_space_mapping=lambda action: ("one", action))})
-    two = aec_env(traders, {Trader.bid: define(action_space_mapping=lambda action: ("two", action), agent="b_0")})
+    two = aec_env(
+        traders,
+        {Trader.bid: define(action_space_mapping=lambda action: ("two", action), agent="b_0")},
+    )
     one.reset()
     two.reset()
     assert log_of(aec_env(traders, other)) == [5, 9]
@@ -286,7 +331,9 @@ def test_local_classes_are_found_by_their_functions_and_local_functions_must_be_
         aec_env(calling(decide), {decide: define()})
 
 
-def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_each_other(monkeypatch):
+def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_each_other(
+    monkeypatch,
+):
     def dawdle(hook, *args):
         sleep(1e-3)
         make(hook, *args)
@@ -306,7 +353,10 @@ def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_
             env.close()
         return registered, points
 
-    crowd, names = types.ModuleType("crowd"), [f"crowd.Plain.choose_{number}" for number in range(20)]
+    crowd, names = (
+        types.ModuleType("crowd"),
+        [f"crowd.Plain.choose_{number}" for number in range(20)],
+    )
     crowd.Plain = type("Plain", (), {name.rpartition(".")[2]: lambda self: 0 for name in names})
     monkeypatch.setitem(sys.modules, "crowd", crowd)
     make, called, logs, meet = PlacedHook.__init__, [], [], threading.Barrier(8, timeout=30)
@@ -347,7 +397,9 @@ def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypa
     main = sys.modules["__main__"]
     monkeypatch.delattr(main, "__file__", raising=False)
     with monkeypatch.context() as notebook:
-        notebook.setattr(main, "Cell", type("Cell", (), {"__module__": "__main__", "value": 3}), raising=False)
+        notebook.setattr(
+            main, "Cell", type("Cell", (), {"__module__": "__main__", "value": 3}), raising=False
+        )
         parcel = pack_plainly(main.Cell)
     assert unpack(parcel).value == 3
 

@@ -25,8 +25,8 @@ from tests.worlds.counters import same
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import calling, decision, define, notes, script
 
-# Where work is given up, joblib empties its queue of work while a thread of its own may be about to take from it, and
-# ends that thread in any case.
+# Where work is given up, joblib empties its queue of work while a thread of its own may be about to
+# take from it, and ends that thread in any case.
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Exception in thread ExecutorManagerThread:pytest.PytestUnhandledThreadExceptionWarning"
 )
@@ -42,25 +42,47 @@ def _workers_end():
 
 
 def policy(observations):
-    return [RULE if number == 5 else number for number in (observations.sum(axis=1) % 6).astype(int).tolist()]
+    return [
+        RULE if number == 5 else number
+        for number in (observations.sum(axis=1) % 6).astype(int).tolist()
+    ]
 
 
 def traces(**arguments):
     policies = {Creature.act: policy, "overseer_0": policy}
-    return simulate_many(lambda: Colony(DESIGN), policies, points=POINTS, collect=lambda s: s.trace, **arguments)
+    return simulate_many(
+        lambda: Colony(DESIGN), policies, points=POINTS, collect=lambda s: s.trace, **arguments
+    )
 
 
-@pytest.mark.parametrize("arguments", [{"seeds": range(9)}, {"seeds": [5, 3], "batch_size": 1}, {"seeds": []}], ids=str)
+@pytest.mark.parametrize(
+    "arguments", [{"seeds": range(9)}, {"seeds": [5, 3], "batch_size": 1}, {"seeds": []}], ids=str
+)
 def test_workers_find_the_same_in_the_same_order(arguments):
     assert traces(workers=2, **arguments) == traces(**arguments)
-    assert os.getpid() not in simulate_many(calling(), workers=2, collect=lambda model: os.getpid(), **arguments)
+    assert os.getpid() not in simulate_many(
+        calling(), workers=2, collect=lambda model: os.getpid(), **arguments
+    )
 
 
 def test_collected_episodes_are_the_same():
-    policies = {Creature.act: lambda observations: (policy(observations), {"sums": observations.sum(axis=1)})}
+    policies = {
+        Creature.act: lambda observations: (
+            policy(observations),
+            {"sums": observations.sum(axis=1)},
+        )
+    }
     policies |= {"overseer_0": policies[Creature.act], "creature_99": ones}  # who is never born
-    given = {"points": POINTS, "seeds": range(9), "collect": lambda simulation: simulation.trace, "batch_size": 2}
-    alone, shared = (collect_episodes(lambda: Colony(DESIGN), policies, **given, workers=number) for number in (0, 2))
+    given = {
+        "points": POINTS,
+        "seeds": range(9),
+        "collect": lambda simulation: simulation.trace,
+        "batch_size": 2,
+    }
+    alone, shared = (
+        collect_episodes(lambda: Colony(DESIGN), policies, **given, workers=number)
+        for number in (0, 2)
+    )
     assert alone["creature_99"].collected == tuple(traces(seeds=range(9)))
     assert list(alone) == list(shared) == list(policies)
     for key, found in alone.items():
@@ -68,7 +90,9 @@ def test_collected_episodes_are_the_same():
 
 
 def test_functions_that_are_defined_anywhere_reach_the_workers():
-    """Decision functions that nobody can import ask there as here: those of local classes, differences, handlers."""
+    """Decision functions that nobody can import ask there as here: those of local classes,
+    differences, handlers.
+    """
 
     class Model:
         @expose_to_plugins
@@ -108,7 +132,8 @@ def test_functions_that_are_defined_anywhere_reach_the_workers():
     for workers in (0, 2):
         found = simulate_many(Model, policies, workers=workers, **arguments)
         assert [simulation.log for simulation in found] == [[(1, 1), (1, 1), (1, 1)]] * 3
-        assert all(type(simulation) is Model for simulation in found)  # what comes back is what it was
+        # what comes back is what it was
+        assert all(type(simulation) is Model for simulation in found)
         collected = collect_episodes(Model, policies, workers=workers, **arguments)
         assert collected[Model.decide].rewards.tolist() == [4.0, 4.0, 1.0] * 3
 
@@ -123,7 +148,10 @@ def test_undecorated_models_variants_and_closures_reach_the_workers():
         return [number % 5] * len(observations)
 
     given = {"seeds": range(4), "collect": lambda simulation: simulation.trace}
-    alone, shared = (simulate_many(variant, {Creature.act: of_many}, **given, workers=workers) for workers in (0, 2))
+    alone, shared = (
+        simulate_many(variant, {Creature.act: of_many}, **given, workers=workers)
+        for workers in (0, 2)
+    )
     assert shared == alone
     assert vars(Creature)["act"] is before
 
@@ -152,13 +180,22 @@ def test_errors_surface_as_themselves():
         (lambda observations: [1], InvalidActionError, "decisions", "seed"),
     ):
         with pytest.raises(error, match=match) as caught:
-            simulate_many(script(main), {ant: policy}, seeds=range(20), workers=2, collect=lambda simulation: None)
+            simulate_many(
+                script(main),
+                {ant: policy},
+                seeds=range(20),
+                workers=2,
+                collect=lambda simulation: None,
+            )
         assert told in notes(caught.value)
-        assert error is not ZeroDivisionError or "in main" in str(caught.value.__cause__)  # where it was raised there
+        # where it was raised there
+        assert error is not ZeroDivisionError or "in main" in str(caught.value.__cause__)
 
 
 def test_an_interrupt_cancels_the_remaining_work(monkeypatch):
-    """An interrupt while results arrive: the rest is given up, and nothing is in the way of the next call."""
+    """An interrupt while results arrive: the rest is given up, and nothing is in the way of the
+    next call.
+    """
 
     def interrupted(parcel):
         raise KeyboardInterrupt
@@ -210,17 +247,22 @@ def test_scripts_need_no_module_and_an_interrupt_ends_all_processes(tmp_path, mo
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*filter(None, sys.path), str(ROOT)]))
     path, begun = tmp_path / "script.py", tmp_path / "begun"
     path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
-    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, path], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.stdout.splitlines() == ["[0, 8, 11]"] * 3, done.stderr
     command = [sys.executable, path, begun]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    ) as process:
         for _ in range(600):
             if begun.exists():
                 break
             time.sleep(0.1)
         os.killpg(process.pid, signal.SIGINT)
         try:
-            printed, _ = process.communicate(timeout=30)  # and not after the minute for which they sleep
+            # and not after the minute for which they sleep
+            printed, _ = process.communicate(timeout=30)
         finally:
             process.kill()  # which else is waited for, for ever
     assert printed.split() == [b"interrupted"]
@@ -240,7 +282,9 @@ def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkey
         supports_return_generator = False
 
     sizes, work = [], parallel._work
-    monkeypatch.setattr(parallel, "_work", lambda *given: (sizes.append(len(given[-1])), work(*given))[1])
+    monkeypatch.setattr(
+        parallel, "_work", lambda *given: (sizes.append(len(given[-1])), work(*given))[1]
+    )
     monkeypatch.setitem(joblib.parallel.BACKENDS, "silent", Silent)
     with joblib.parallel_config(backend="silent"):
         assert traces(seeds=range(9), workers=2, batch_size=1) == traces(seeds=range(9))
@@ -250,8 +294,15 @@ def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkey
 @pytest.mark.parametrize("seeds", [range(4), range(8)])
 def test_simulations_without_decisions_are_collected_in_order(seeds):
     ant = decision(agent="ant_0")
-    given = {"seeds": seeds, "batch_size": 2, "workers": 2, "collect": lambda simulation: simulation.seed * 10}
-    found = collect_episodes(script(lambda simulation: ant() if simulation.seed == 5 else None), {ant: ones}, **given)
+    given = {
+        "seeds": seeds,
+        "batch_size": 2,
+        "workers": 2,
+        "collect": lambda simulation: simulation.seed * 10,
+    }
+    found = collect_episodes(
+        script(lambda simulation: ant() if simulation.seed == 5 else None), {ant: ones}, **given
+    )
     assert found[ant].collected == tuple(10 * seed for seed in seeds)
     assert found[ant].episodes.tolist() == ([5] if 5 in seeds else [])
 

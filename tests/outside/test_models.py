@@ -1,4 +1,6 @@
-"""Models outside Python: a town in Java, a network in ns-3, robots in Enki, and what the pages on clients show."""
+"""Models outside Python: a town in Java, a network in ns-3, robots in Enki, and what the pages on
+clients show.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,8 @@ def no_java() -> str:
 
 
 MODELS = {
-    "town": (no_java(), town, [(seed, {}) for seed in (3, 4, 5, 2)]),  # in the last, no shop stays open
+    # in the last, no shop stays open
+    "town": (no_java(), town, [(seed, {}) for seed in (3, 4, 5, 2)]),
     "network": (network.missing(), network, [(7, {}), (8, {"hosts": 3}), (2**40, BRIEF), (7, {})]),
     "robots": (robots.missing(), robots, [(8, BRIEF), (2**30, BRIEF), (4, {}), (8, BRIEF)]),
 }
@@ -66,7 +69,8 @@ def needs(name: str) -> pytest.MarkDecorator:
 
 
 pytestmark = [
-    pytest.mark.filterwarnings("ignore::UserWarning"),  # what PettingZoo says where no roster is declared
+    # what PettingZoo says where no roster is declared
+    pytest.mark.filterwarnings("ignore::UserWarning"),
     pytest.mark.greenlet("the other process is the same with every driver: test_process.py"),
 ]
 
@@ -99,7 +103,9 @@ PAGE = "clients-outside.md"
 
 def shown(language: str) -> list[str]:
     """The page's blocks in another language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / PAGE).read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    return re.findall(
+        rf"^```{language}\n(.*?)^```$", (DOCS / PAGE).read_text("utf-8"), re.MULTILINE | re.DOTALL
+    )
 
 
 @pytest.fixture
@@ -123,7 +129,9 @@ def test_the_code_of_the_page_on_java(here, capsys):
     (here / "Ferries.java").write_text(shown("java")[0])
     shutil.copy(building.CLIENT, here)
     commands = shown("sh")[1]
-    plain = subprocess.run(["sh", "-e"], input=commands, capture_output=True, text=True, timeout=120)
+    plain = subprocess.run(
+        ["sh", "-e"], input=commands, capture_output=True, text=True, timeout=120
+    )
     assert plain.stderr == ""
     command = ["java", "-cp", "out", "Ferries"]
     assert f"Java: {json.dumps(command)}" in shown("python")[1]
@@ -150,10 +158,14 @@ def test_the_code_of_the_page_on_python(here, capsys):
     environment(command)
     assert capsys.readouterr().out == printed(*command, "7")
     report = check_wire(command)
-    assert {finding.verdict for finding in report.findings if finding.tried != "reseed"} == {"ok"}, str(report)
+    assert {finding.verdict for finding in report.findings if finding.tried != "reseed"} == {
+        "ok"
+    }, str(report)
 
 
-@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed")
+@pytest.mark.skipif(
+    COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed"
+)
 def test_the_code_of_the_page_on_cpp(here, capsys):
     whole, own_loop, *_ = shown("cpp")
     (here / "ferries.cpp").write_text(whole, encoding="utf-8")

@@ -1,4 +1,6 @@
-"""A simulator in another process is a simulation like any other: every view, and all that is built on simulations."""
+"""A simulator in another process is a simulation like any other: every view, and all that is built
+on simulations.
+"""
 
 import copy
 import gc
@@ -39,7 +41,16 @@ from simenv_marl.errors import (
 from simenv_marl.experiments import design, run_experiment
 from simenv_marl.plugins import handlers
 from simenv_marl.remote import ProcessSimulation
-from tests.outside.reservoirs import BOTH, INFLOW, PRICE, by_its_rule, child, command, plays_by_its_rule, reservoirs
+from tests.outside.reservoirs import (
+    BOTH,
+    INFLOW,
+    PRICE,
+    by_its_rule,
+    child,
+    command,
+    plays_by_its_rule,
+    reservoirs,
+)
 from tests.processes import runs
 from tests.worlds import bare
 from tests.worlds.models import play
@@ -110,7 +121,9 @@ def test_single_and_joint_and_vector_views(make_env):
 
 
 def test_policies_answer_by_agent_and_by_point(make_env):
-    simulation = simulate(reservoirs(), {"broker.price": _cheap, "a": lambda observation: np.zeros(1)}, seed=1)
+    simulation = simulate(
+        reservoirs(), {"broker.price": _cheap, "a": lambda observation: np.zeros(1)}, seed=1
+    )
     assert simulation.result["price"] == 0.5
     assert simulation._child is None
     assert simulate(reservoirs(), seed=1).result == by_its_rule(1)
@@ -121,7 +134,9 @@ def test_policies_answer_by_agent_and_by_point(make_env):
 
 
 def test_points_may_be_given_other_definitions_and_apply_answers_with_what_it_returns(make_env):
-    answer = replace(PRICE, action_space_mapping=None, apply=lambda action, call: float(action) + call.total)
+    answer = replace(
+        PRICE, action_space_mapping=None, apply=lambda action, call: float(action) + call.total
+    )
     env = make_env(aec_env, reservoirs({**BOTH, "broker.price": INFLOW}), {"broker.price": answer})
     *_, last, _ = play(env, 1, seed=1)
     assert env.unwrapped.simulation.result["price"] == 1 + last.observation[0]
@@ -136,11 +151,18 @@ def _price(simulation):
 @pytest.mark.parametrize("workers", [0, 2])
 def test_simulate_many_and_evaluate_run_processes(workers):
     policies = {"broker.price": lambda observations: np.ones(len(observations), int)}
-    found = simulate_many(reservoirs({"broker.price": PRICE}), policies, seeds=range(4), workers=workers)
+    found = simulate_many(
+        reservoirs({"broker.price": PRICE}), policies, seeds=range(4), workers=workers
+    )
     assert [simulation.result["price"] for simulation in found] == [1.0] * 4
     contenders = {"rule": {}, "cheap": {"broker.price": _cheap}}
     compared = evaluate(
-        reservoirs(), contenders, seeds=range(4), baseline="rule", workers=workers, metric={"price": _price}
+        reservoirs(),
+        contenders,
+        seeds=range(4),
+        baseline="rule",
+        workers=workers,
+        metric={"price": _price},
     )
     prices = compared.frame[compared.frame.agent == "team"].set_index(["contender", "seed"]).price
     assert prices["cheap"].tolist() == [0.5] * 4
@@ -149,18 +171,25 @@ def test_simulate_many_and_evaluate_run_processes(workers):
 
 PLAIN = make_step(
     observation_space=spaces.Discrete(2),
-    observation_space_mapping=lambda call: call["entity"] is call.entity is None and call["time"] is call.time is None,
+    observation_space_mapping=lambda call: (
+        call["entity"] is call.entity is None and call["time"] is call.time is None
+    ),
     action_space=spaces.Discrete(3),
     action_space_mapping={0: "none", 1: None, 2: {"some": [1.5]}},
     reward_mapping=lambda call: float(len(call)),
 )
 
 
-@pytest.mark.parametrize("name", ["rate", "a:b/ü", "42", "a.", "json.dumps", "math.sin", "tests.worlds.bare.main"])
+@pytest.mark.parametrize(
+    "name", ["rate", "a:b/ü", "42", "a.", "json.dumps", "math.sin", "tests.worlds.bare.main"]
+)
 def test_points_may_have_any_name_also_that_of_a_function(make_env, name):
     before, seen = json.dumps, []
-    simulation = ProcessSimulation([sys.executable, bare.__file__, name], {name: PLAIN})  # sends as little as it may
-    env = make_env(aec_env, simulation, name, plugins=[(lambda call: seen.append(call.point), name, "before")])
+    # sends as little as it may
+    simulation = ProcessSimulation([sys.executable, bare.__file__, name], {name: PLAIN})
+    env = make_env(
+        aec_env, simulation, name, plugins=[(lambda call: seen.append(call.point), name, "before")]
+    )
     play(env, 2, seed=1)
     assert env.unwrapped.simulation.result == [{"some": [1.5]}] * 6
     assert seen == [name] * 6
@@ -230,7 +259,9 @@ def test_many_simulations_share_a_process(started, make_env, tmp_path):
     prices = simulate_many(simulation, {}, seeds=range(5), collect=_price)
     assert (prices, number()) == ([by_its_rule(seed)["price"] for seed in range(5)], 2)
     factory, runs = partial(_patient, simulation.command), design({"timeout": [10.0, 20.0]})
-    run_experiment(factory, runs, seeds=range(3), store=tmp_path / "store", metric={"price": _price})
+    run_experiment(
+        factory, runs, seeds=range(3), store=tmp_path / "store", metric={"price": _price}
+    )
     assert number() == 4  # one for each time limit
     env = _begun(make_env(aec_env, simulation), 1)
     assert branch(env, _played_out, 4) == [by_its_rule(3)] * 4
@@ -288,13 +319,21 @@ def test_calls_can_be_copied():
     assert len({total for total, *_ in copies}) == 4
     for total, time, copied in copies:
         for call in copied:
-            assert (call.total, call.time, call.point, call.entity) == (total, time, "broker.price", None)
+            assert (call.total, call.time, call.point, call.entity) == (
+                total,
+                time,
+                "broker.price",
+                None,
+            )
     with pytest.raises(KeyError, match=r"broker\.price has no argument 'rain'; it has total"):
         call["rain"]
 
 
 def test_what_is_no_json_is_refused_before_anything_is_sent(make_env):
-    env = make_env(aec_env, reservoirs({"broker.price": replace(PRICE, action_space_mapping=lambda action: {1, 2})}))
+    env = make_env(
+        aec_env,
+        reservoirs({"broker.price": replace(PRICE, action_space_mapping=lambda action: {1, 2})}),
+    )
     env.reset(seed=1)
     number = child(env)
     with pytest.raises(WireError, match="'a'"):
@@ -328,5 +367,11 @@ def test_options_of_a_simulation_that_are_none_are_refused():
         aec_env(reservoirs({**BOTH, "moon.phase": PRICE})).reset()
     with pytest.raises(UnknownPointError):
         aec_env(reservoirs(), "moon.phase")
-    with pytest.raises(AttributeError, match=r"reservoir\.inflow has no argument 'depth'; it has level"):
-        aec_env(reservoirs({"reservoir.inflow": replace(INFLOW, reward_mapping=lambda call: call.depth)})).reset()
+    with pytest.raises(
+        AttributeError, match=r"reservoir\.inflow has no argument 'depth'; it has level"
+    ):
+        aec_env(
+            reservoirs(
+                {"reservoir.inflow": replace(INFLOW, reward_mapping=lambda call: call.depth)}
+            )
+        ).reset()

@@ -22,7 +22,9 @@ def test_ten_of_ten_episodes_are_the_plain_run_although_others_are_given_up(make
             env.reset(seed=9)
             for _ in range(10 * seed):
                 env.step(env.action_space.sample())
-    printed = subprocess.run([*ros.COMMAND, "0"], check=True, capture_output=True, timeout=60).stdout
+    printed = subprocess.run(
+        [*ros.COMMAND, "0"], check=True, capture_output=True, timeout=60
+    ).stdout
     assert found[::2] == found[1::2]
     assert len({result["digest"] for result in found}) == 5
     assert found[0] == json.loads(printed)
@@ -34,7 +36,9 @@ def test_a_policy_decides_and_all_nodes_end_with_the_environment(make_env):
     env.reset(seed=1)
     group = child(env)
     observation, reward, *_ = env.step(np.array([1.0, 0.0], np.float32))
-    assert observation[0] == pytest.approx(1.95, abs=0.01), "both move ahead: half a metre and a metre per second"
+    assert observation[0] == pytest.approx(1.95, abs=0.01), (
+        "both move ahead: half a metre and a metre per second"
+    )
     assert reward == pytest.approx(-0.95, abs=0.01)
     env.close()
     with pytest.raises(ProcessLookupError):

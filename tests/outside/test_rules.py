@@ -1,4 +1,6 @@
-"""The frames of simulators in other processes: invalid ones, the decisions of their rules, and births."""
+"""The frames of simulators in other processes: invalid ones, the decisions of their rules, and
+births.
+"""
 
 import json
 import sys
@@ -17,7 +19,9 @@ from tests.processes import runs
 from tests.worlds.counters import alike
 from tests.worlds.models import play
 
-pytestmark = pytest.mark.greenlet("the rule's decision comes back within the simulation, whatever runs it")
+pytestmark = pytest.mark.greenlet(
+    "the rule's decision comes back within the simulation, whatever runs it"
+)
 
 
 def telling(points=TELLING) -> ProcessSimulation:
@@ -56,7 +60,9 @@ def test_the_rule_can_be_recorded_and_compared_with_policies():
 def test_actions_of_a_process_that_tells_nothing_stay_unknown():
     policies = {"broker_0": lambda observations: np.zeros(len(observations), int)}
     with pytest.raises(DefinitionError, match="the action of the rule is not known"):
-        compare_with_rule(reservoirs({"broker.price": replace(PRICE, agent="broker_0")}), policies, seeds=[1])
+        compare_with_rule(
+            reservoirs({"broker.price": replace(PRICE, agent="broker_0")}), policies, seeds=[1]
+        )
 
 
 def test_apply_may_ask_the_rule_and_leave_it_at_that():
@@ -74,8 +80,12 @@ def test_apply_may_ask_the_rule_and_leave_it_at_that():
 
 
 def test_what_the_rule_has_decided_cannot_be_replaced():
-    definition = replace(PRICE, action_space_mapping=None, apply=lambda action, call, *, _rule: 2 * _rule(call))
-    with pytest.raises(SimulationError, match=r"rule of broker\.price has decided 1\.1.* 2\.2.* cannot replace it"):
+    definition = replace(
+        PRICE, action_space_mapping=None, apply=lambda action, call, *, _rule: 2 * _rule(call)
+    )
+    with pytest.raises(
+        SimulationError, match=r"rule of broker\.price has decided 1\.1.* 2\.2.* cannot replace it"
+    ):
         simulate(telling({"broker.price": definition}), {"broker.price": lambda _: 0}, seed=1)
 
 
@@ -96,7 +106,12 @@ def call(number, name):
 
 
 def expected(*names):
-    return {"expect": [{"point": "sheep.graze", "entity": name, "args": {"hunger": 1}, "time": 0.5} for name in names]}
+    return {
+        "expect": [
+            {"point": "sheep.graze", "entity": name, "args": {"hunger": 1}, "time": 0.5}
+            for name in names
+        ]
+    }
 
 
 CALL, NEXT = call(1, "a"), call(2, "a")
@@ -123,7 +138,9 @@ def both(*frames) -> str:
 
 def speaking(*frames) -> ProcessSimulation:
     """A simulator that sends some frames or lines, whatever it receives."""
-    return ProcessSimulation([sys.executable, "-c", SPEAKS, *map(line, frames)], {"sheep.graze": GRAZE})
+    return ProcessSimulation(
+        [sys.executable, "-c", SPEAKS, *map(line, frames)], {"sheep.graze": GRAZE}
+    )
 
 
 @pytest.mark.parametrize(
@@ -157,7 +174,9 @@ def test_what_is_wrong_before_the_start_of_an_episode_is_an_error(frames, kind, 
     ids=str,
 )
 def test_a_frame_in_place_of_the_decision_of_the_rule_is_an_error_that_names_it(frame, text):
-    with pytest.raises(WireError, match=rf'has sent .*{text}.* where \{{"decided": 1, "value": \.\.\.\}} was due'):
+    with pytest.raises(
+        WireError, match=rf'has sent .*{text}.* where \{{"decided": 1, "value": \.\.\.\}} was due'
+    ):
         simulate(speaking(HELLO, CALL, frame), seed=1)
 
 
@@ -179,11 +198,17 @@ def test_a_frame_in_place_of_the_decision_of_the_rule_is_an_error_that_names_it(
         ({"end": True}, "the end True"),
         ({"end": {"truncated": "yes"}}, r"'yes'.*\"truncated\" \(true or false\)"),
         ({"remove": "a", "point": "moon"}, "the point 'moon'"),
-        ({"update": "a", "point": "sheep.graze", "args": {"time": 3}}, r"an argument 'time' for sheep\.graze"),
+        (
+            {"update": "a", "point": "sheep.graze", "args": {"time": 3}},
+            r"an argument 'time' for sheep\.graze",
+        ),
         ({"expect": {"entity": "b"}}, '"expect" with .*must be a list of objects'),
         ({"expect": [CALL]}, '"expect" with .*must be a list of objects'),
         ({"expect": [{"point": "moon"}]}, "the point 'moon'"),
-        ({"expect": [{"point": "sheep.graze", "args": {"entity": 3}}]}, r"an argument 'entity' for sheep\.graze"),
+        (
+            {"expect": [{"point": "sheep.graze", "args": {"entity": 3}}]},
+            r"an argument 'entity' for sheep\.graze",
+        ),
     ],
     ids=str,
 )
@@ -203,7 +228,18 @@ def test_frames_that_were_not_announced_are_errors(frame):
     [
         ([call(1, "a"), call(2, "b"), call(3, "c")], 1, 3),
         ([expected("a", "b", "c"), call(1, "a"), call(2, "b"), call(3, "c")], 3, 1),
-        ([expected("a", "b"), call(1, "a"), call(2, "b"), expected("c", "d"), call(3, "c"), call(4, "d")], 2, 2),
+        (
+            [
+                expected("a", "b"),
+                call(1, "a"),
+                call(2, "b"),
+                expected("c", "d"),
+                call(3, "c"),
+                call(4, "d"),
+            ],
+            2,
+            2,
+        ),
     ],
     ids=["one by one", "together", "in mid-episode"],
 )
@@ -218,7 +254,12 @@ def test_expected_calls_join_and_act_in_one_round(make_env, frames, born, rounds
 
 
 def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
-    first_day = [expected("a", "b"), call(1, "a"), call(2, "b"), {"remove": "a", "point": "sheep.graze"}]
+    first_day = [
+        expected("a", "b"),
+        call(1, "a"),
+        call(2, "b"),
+        {"remove": "a", "point": "sheep.graze"},
+    ]
     second_day = [expected("b", "c", "d"), call(3, "b"), call(4, "c"), call(5, "d"), {"end": {}}]
     env = make_env(parallel_env, speaking({**HELLO, "can": ["expect"]}, *first_day, *second_day))
     observations, _ = env.reset(seed=1)
@@ -227,7 +268,9 @@ def test_expected_calls_are_observed_and_end_with_their_removal(make_env):
     assert observations.keys() == terminations.keys()
     assert terminations == {"a": True, "b": False, "c": False, "d": False}
     calls = env.unwrapped.simulation.expected_calls("sheep.graze")
-    assert [(call.entity, call.time) for (call,) in calls] == [("c", 0.5), ("d", 0.5)], "one decides now"
+    assert [(call.entity, call.time) for (call,) in calls] == [("c", 0.5), ("d", 0.5)], (
+        "one decides now"
+    )
 
 
 def test_what_was_removed_is_expected_no_more_and_its_name_may_come_again(make_env):

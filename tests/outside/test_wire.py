@@ -1,4 +1,6 @@
-"""The wire: what is sent arrives, what is no frame is refused; and the check that authors of clients make of them."""
+"""The wire: what is sent arrives, what is no frame is refused; and the check that authors of
+clients make of them.
+"""
 
 import json
 import re
@@ -22,7 +24,9 @@ pytestmark = pytest.mark.greenlet("no environment is made")
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: st.lists(inner) | st.dictionaries(st.text().filter(lambda key: key != "float"), inner),
+    lambda inner: (
+        st.lists(inner) | st.dictionaries(st.text().filter(lambda key: key != "float"), inner)
+    ),
     max_leaves=20,
 )
 
@@ -32,14 +36,18 @@ def test_decoded_frames_equal_encoded_ones(value):
     line = encode({"value": value})
     assert line.endswith(b"\n")
     assert line.count(b"\n") == 1
-    json.loads(line, parse_constant=lambda constant: pytest.fail(constant))  # any JSON reader can read it
+    # any JSON reader can read it
+    json.loads(line, parse_constant=lambda constant: pytest.fail(constant))
     assert repr(decode(line)["value"]) == repr(value)  # nan, -0.0, and integers that are no floats
 
 
 @pytest.mark.parametrize(
     ("value", "sent"),
     [
-        ([nan, inf, -inf, np.float32(inf)], '[{"float":"nan"},{"float":"inf"},{"float":"-inf"},{"float":"inf"}]'),
+        (
+            [nan, inf, -inf, np.float32(inf)],
+            '[{"float":"nan"},{"float":"inf"},{"float":"-inf"},{"float":"inf"}]',
+        ),
         (np.float64(0.1), "0.1"),
         (np.bool_(True), "true"),
         (np.arange(4).reshape(2, 2), "[[0,1],[2,3]]"),
@@ -152,7 +160,11 @@ outside.Wire.decide = exits
 """
 SEEDS_NOTHING = "outside.random.Random.seed = lambda *_: None"
 
-HELLO, EPISODE, TWO = "starts, and says hello", "an episode by its own rule", "two episodes in a row with the same seed"
+HELLO, EPISODE, TWO = (
+    "starts, and says hello",
+    "an episode by its own rule",
+    "two episodes in a row with the same seed",
+)
 STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "other decisions at "
 
 
@@ -170,15 +182,21 @@ STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "oth
         ),
         (EXITS_AFTER_STOP.format(3), STOP, "has exited with code 3"),
         (
-            RECEIVES.format("answer = {**answer, 'act': self.number} if 'act' in answer else answer"),
+            RECEIVES.format(
+                "answer = {**answer, 'act': self.number} if 'act' in answer else answer"
+            ),
             "an answer with the number of another call",
             "it continues with .*; it must end, or send an error",
         ),
         (
-            "def remove(self, point, entity):\n    for name in 'ab': self.send({'remove': name, 'point': point})\n"
+            "def remove(self, point, entity):\n    for name in 'ab':"
+            " self.send({'remove': name, 'point': point})\n"
             "outside.Wire.remove = remove",
             EPISODE,
-            r"call \d+ is of '[ab]' at reservoir\.inflow, which was removed before; an entity .* needs a name",
+            (
+                r"call \d+ is of '[ab]' at reservoir\.inflow, which was removed before; an entity"
+                r" .* needs a name"
+            ),
         ),
         (
             DECIDES.format("return rule() if point == 'broker.price' else value"),
@@ -187,7 +205,8 @@ STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "oth
         ),
         (
             "sys.argv.append('tells')\n"
-            + DECIDES.format("return rule()")  # its rule's decisions are strings, and are known to be legal
+            # its rule's decisions are strings, and are known to be legal
+            + DECIDES.format("return rule()")
             + SENDS.format("{'decided': {'value': 'abc'[self.number % 3]}}"),
             VALUE + "reservoir.inflow",
             "the decisions '[abc]', '[abc]' lead to the same episode",
@@ -197,23 +216,47 @@ STOP, SEED, VALUE = "stop in place of the answer to call 1", "other seeds", "oth
             VALUE + "broker.price",
             "AssertionError",
         ),
-        (RECEIVES.format("if 'value' in answer: self.send({'end': 1})"), VALUE + "broker.price", "has sent the end 1"),
-        (SEEDS.format("seed % 2**16"), SEED, "1 to 4 lead to the same episodes as .*: keep all 31 bits"),
-        (SEEDS.format("seed & ~127 if seed > 2**24 else seed"), SEED, "1073741825 to .* lead to the same episode:"),
-        (SEEDS.format("7"), SEED, 'though "reseed" changes it: seed the generators with the seed of "start"'),
+        (
+            RECEIVES.format("if 'value' in answer: self.send({'end': 1})"),
+            VALUE + "broker.price",
+            "has sent the end 1",
+        ),
+        (
+            SEEDS.format("seed % 2**16"),
+            SEED,
+            "1 to 4 lead to the same episodes as .*: keep all 31 bits",
+        ),
+        (
+            SEEDS.format("seed & ~127 if seed > 2**24 else seed"),
+            SEED,
+            "1073741825 to .* lead to the same episode:",
+        ),
+        (
+            SEEDS.format("7"),
+            SEED,
+            'though "reseed" changes it: seed the generators with the seed of "start"',
+        ),
         (
             "from time import time_ns\nsys.argv.append('1')\n" + SEEDS.format("time_ns()"),
             TWO,
             r"frame \d is .*, and in a new process it was .*; seed all generators",
         ),
-        (SENDS.format({"decide": {"argz": {}}}), EPISODE, "the key 'argz' of .* does not exist; did you mean args"),
+        (
+            SENDS.format({"decide": {"argz": {}}}),
+            EPISODE,
+            "the key 'argz' of .* does not exist; did you mean args",
+        ),
         (
             SENDS.format({"end": {"end": {"score": 3}}}),
             EPISODE,
             "'score' of .* does not exist; an argument belongs into",
         ),
         (SENDS.format({"hello": {"name": "dam"}}), HELLO, "the key 'name' of .* does not exist"),
-        (SENDS.format({"hello": {"can": ["reseeds"]}}), HELLO, "'reseeds', which does not exist; did you mean reseed"),
+        (
+            SENDS.format({"hello": {"can": ["reseeds"]}}),
+            HELLO,
+            "'reseeds', which does not exist; did you mean reseed",
+        ),
     ],
     ids=range(20),
 )
@@ -226,16 +269,28 @@ def test_wire_check_says_what_is_wrong_and_what_to_do(tmp_path, change, tried, t
 
 
 def test_what_may_be_intended_is_noted(tmp_path, monkeypatch):
-    monkeypatch.setenv("NEEDED", "by the run without an environment, which is started in this one's")
+    monkeypatch.setenv(
+        "NEEDED", "by the run without an environment, which is started in this one's"
+    )
     needs = "import os\nos.environ['NEEDED']\nsys.argv.append('1')  # plays one episode"
     numbers = DECIDES.format("return value if value < 10 and value is not True else 1 // 0")
-    change = "\n".join([needs, numbers, EXITS_AFTER_STOP.format(0), SEEDS.format("7"), SEEDS_NOTHING])
+    change = "\n".join(
+        [needs, numbers, EXITS_AFTER_STOP.format(0), SEEDS.format("7"), SEEDS_NOTHING]
+    )
     report = check_wire(changed(tmp_path, change))
-    noted = {finding.tried: finding.text for finding in report.findings if finding.verdict == "note"}
+    noted = {
+        finding.tried: finding.text for finding in report.findings if finding.verdict == "note"
+    }
     stops = {tried for tried in noted if tried.startswith("stop")}
     assert report.ok, str(report)
     assert len(stops) == 3
-    assert noted.keys() - stops == {TWO, "reseed", SEED, VALUE + "reservoir.inflow", VALUE + "broker.price"}
+    assert noted.keys() - stops == {
+        TWO,
+        "reseed",
+        SEED,
+        VALUE + "reservoir.inflow",
+        VALUE + "broker.price",
+    }
     assert "exits with code 0 after an episode, and plays the same in a new process" in noted[TWO]
 
 

@@ -16,10 +16,33 @@ PATIENCE = 120.0
 """Seconds after which a process is killed, so that each wait has an end."""
 
 INTEGERS = [0, -1, 2**63 - 1, -(2**63), 2**64 - 1, 2**53 + 1]
-FLOATS = [0.0, -0.0, 0.1, 1 / 3, 1.0, 5e-324, 2.2250738585072014e-308, 1.7976931348623157e308, 1e22, 1e-7, 12345678.125]
+FLOATS = [
+    0.0,
+    -0.0,
+    0.1,
+    1 / 3,
+    1.0,
+    5e-324,
+    2.2250738585072014e-308,
+    1.7976931348623157e308,
+    1e22,
+    1e-7,
+    12345678.125,
+]
 TEXTS = ["", '\x00\x1f\x7f "quoted" \\ / \b\f\n\r\t', "ä € 𝄞 \ufffd \u2028 \U0010ffff", "x" * 5000]
-NAMED = [{"float": "nan"}, {"float": "inf"}, {"float": "-inf"}, {"float": "nan", "other": 1}, {"float": 1.0}]
-NESTED = [[], {}, [[], {}, [[1, 2.5, "x"]], None], {"": {"a": [1]}, "float": "nan ", "ü": [None, True, False]}]
+NAMED = [
+    {"float": "nan"},
+    {"float": "inf"},
+    {"float": "-inf"},
+    {"float": "nan", "other": 1},
+    {"float": 1.0},
+]
+NESTED = [
+    [],
+    {},
+    [[], {}, [[1, 2.5, "x"]], None],
+    {"": {"a": [1]}, "float": "nan ", "ü": [None, True, False]},
+]
 VALUES = [None, True, *INTEGERS, *FLOATS, *TEXTS, *NAMED, *NESTED]
 """What a model can be sent, and sends back unchanged."""
 
@@ -82,7 +105,10 @@ class Child:
         return self.receive()
 
     def rule(self, number: int) -> Any:
-        """Leave a call to the rule; return the next frame. What the rule decides is added to ``decided``."""
+        """Leave a call to the rule; return the next frame.
+
+        What the rule decides is added to ``decided``.
+        """
         self.send(act=number, rule=True)
         frame = self.receive()
         if frame is None or "decided" not in frame:
@@ -91,8 +117,13 @@ class Child:
         self.decided.append(frame["value"])
         return self.receive()
 
-    def play(self, choose: Callable[[Any], Any] | None = None, seed: Any = 7, **options: Any) -> tuple[list[Any], Any]:
-        """Play an episode, each call answered by ``choose`` or left to the rule. Return them, and the last frame."""
+    def play(
+        self, choose: Callable[[Any], Any] | None = None, seed: Any = 7, **options: Any
+    ) -> tuple[list[Any], Any]:
+        """Play an episode, each call answered by ``choose`` or left to the rule.
+
+        Return them, and the last frame.
+        """
         calls, frame = [], self.begin(seed, **options)
         while frame is not None and "decide" in frame:
             calls.append(frame)
@@ -101,7 +132,9 @@ class Child:
         return calls, frame
 
     def ended(self) -> tuple[int, str, str]:
-        """Wait until the process has ended: its status, and what it has written on stdout and stderr."""
+        """Wait until the process has ended: its status, and what it has written on stdout and
+        stderr.
+        """
         output, errors = self.process.communicate()
         return self.process.returncode, output.decode(), errors.decode()
 

@@ -1,4 +1,6 @@
-"""What candidate actions are worth: the same as by a reference that goes through the model by itself."""
+"""What candidate actions are worth: the same as by a reference that goes through the model by
+itself.
+"""
 
 import copy
 import random
@@ -8,7 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit, TransformAction, TransformReward
+from gymnasium.wrappers import (
+    OrderEnforcing,
+    PassiveEnvChecker,
+    TimeLimit,
+    TransformAction,
+    TransformReward,
+)
 from pettingzoo.utils.wrappers import (
     AssertOutOfBoundsWrapper,
     BaseParallelWrapper,
@@ -16,7 +24,16 @@ from pettingzoo.utils.wrappers import (
     TerminateIllegalWrapper,
 )
 
-from simenv_marl import RULE, TRUNCATED, aec_env, difference, joint_env, parallel_env, single_env, vector_env
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    aec_env,
+    difference,
+    joint_env,
+    parallel_env,
+    single_env,
+    vector_env,
+)
 from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
@@ -54,7 +71,9 @@ def futures_of(env, number):
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):
     seeds = futures_of(env, number)
-    return np.array([[worth(agent, action, future, **given) for future in seeds] for action in actions])
+    return np.array(
+        [[worth(agent, action, future, **given) for future in seeds] for action in actions]
+    )
 
 
 def greedy(observation):
@@ -112,7 +131,10 @@ def test_values_in_mid_episode_are_those_of_the_pending_decision(view):
         ({"discount": 0.8, "discount_by": "time"}, {"timed": True}),
         ({"discount": 0}, {"horizon": 1}),
         *[({"horizon": 2, "discount": 0.5, "method": method}, {}) for method in ("fork", "replay")],
-        *[({"horizon": h, "horizon_by": "time"}, {"timed_horizon": True}) for h in (0.1, 0.5, 2.0, 5, 1e9)],
+        *[
+            ({"horizon": h, "horizon_by": "time"}, {"timed_horizon": True})
+            for h in (0.1, 0.5, 2.0, 5, 1e9)
+        ],
     ],
 )
 @pytest.mark.parametrize("view", [*VIEWS, "joint"])
@@ -136,22 +158,31 @@ def test_the_base_is_a_policy_of_the_agent_or_policies_by_agent(view, method):
     for base, bases in given:
         told = action_values(env, futures=3, base=base, method=method)
         assert told.returns == pytest.approx(expected(env, "left", bases=bases))
-    told = action_values(env, futures=3, base=lambda observation, info: info["time"] > 2, method=method)
+    told = action_values(
+        env, futures=3, base=lambda observation, info: info["time"] > 2, method=method
+    )
     assert not np.allclose(told.returns, expected(env, "left"))
 
 
 @METHODS
 def test_joint_views_sum_up_and_have_joint_bases(method):
     env = made("joint")
-    actions, first = [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}], {"left": 2, "right": 1}
+    actions, first = (
+        [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}],
+        {"left": 2, "right": 1},
+    )
     table = expected(env, "left", (2, 1, 0), both=True)
     told = action_values(env, actions, futures=3, method=method)
     assert told.returns == pytest.approx(table)
     assert told.best is actions[2]
     told = action_values(env, [first], futures=3, base={"left": greedy}, method=method)
-    assert told.returns == pytest.approx(expected(env, "left", (2,), both=True, bases={"left": greedy}))
+    assert told.returns == pytest.approx(
+        expected(env, "left", (2,), both=True, bases={"left": greedy})
+    )
     # A round: the one on the right decides by what was seen before the other one has moved.
-    whole = action_values(env, [first], futures=3, base=lambda seen: {n: BASES[n](seen[n]) for n in BASES})
+    whole = action_values(
+        env, [first], futures=3, base=lambda seen: {n: BASES[n](seen[n]) for n in BASES}
+    )
     parts = action_values(env, [first], futures=3, base=BASES)
     assert whole.returns == pytest.approx(parts.returns)
     with pytest.raises(OptionValueError, match="without flatten"):
@@ -171,7 +202,9 @@ def test_policies_of_the_environment_stay():
 
 
 class Herd:
-    """Two beings that count up together, each in its turn; the other one joins when it first decides."""
+    """Two beings that count up together, each in its turn; the other one joins when it first
+    decides.
+    """
 
     def reset(self, seed=None):
         self.sum, self.moves = 0, 0
@@ -197,15 +230,20 @@ GRAZING = {
 
 
 @METHODS
-@pytest.mark.parametrize(("make", "others"), [(single_env, 1 + 3 + 5), (aec_env, 1 + 3 + 5), (parallel_env, 1 + 2 + 4)])
+@pytest.mark.parametrize(
+    ("make", "others"), [(single_env, 1 + 3 + 5), (aec_env, 1 + 3 + 5), (parallel_env, 1 + 2 + 4)]
+)
 def test_others_at_the_same_point_follow_the_base_by_agent(make, others, method):
     """In a round by what they saw before it; in that in which they join, by the rule."""
     options = {"agent": "one"} if make is single_env else {}
     env = begun(make(Herd, GRAZING, **options), 1)
     assert action_values(env, [0, 3], futures=1, method=method).means.tolist() == [5.0, 8.0]
-    told = action_values(env, [0, 3], futures=1, method=method, base={"other": lambda seen: int(seen[0])})
+    told = action_values(
+        env, [0, 3], futures=1, method=method, base={"other": lambda seen: int(seen[0])}
+    )
     assert told.means.tolist() == [2 + others, 5 + others]
-    with pytest.raises(UnknownAgentError, match="'right'"):  # at a point that is not the environment's
+    # at a point that is not the environment's
+    with pytest.raises(UnknownAgentError, match="'right'"):
         action_values(made("agent"), base={"right": RULE})
     declared = begun(make(Herd, GRAZING, possible_agents=["one", "other"], **options), 1)
     with pytest.raises(UnknownAgentError, match="'third'"):
@@ -223,11 +261,15 @@ class Mortal(Duel):
 @pytest.mark.parametrize("padded", [False, True])
 @pytest.mark.parametrize("view", ["aec", "parallel", "single"])
 def test_agents_that_die_on_the_way(view, padded, method):
-    env, given = made(view, Mortal), {"futures": 8, "base": lambda observation: 2, "terminal_value": lambda env: 1e6}
+    env, given = (
+        made(view, Mortal),
+        {"futures": 8, "base": lambda observation: 2, "terminal_value": lambda env: 1e6},
+    )
     if padded and view != "single":
         env = begun(pad_agents(env))
     table, endless = (
-        expected(env, "left", number=8, model=model, bases={"left": lambda seen: 2}) for model in (Mortal, Duel)
+        expected(env, "left", number=8, model=model, bases={"left": lambda seen: 2})
+        for model in (Mortal, Duel)
     )
     assert action_values(env, **given, method=method).returns == pytest.approx(table)
     assert not np.allclose(table, endless)  # the last reward counts, and none after it
@@ -260,7 +302,9 @@ def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
         return random.randrange(3) if observation[0] % 2 else int(np.random.randint(3))
 
     def returns(**given):
-        return action_values(made("single", model), [1, RULE, 2], futures=4, method=method, **given).returns.tolist()
+        return action_values(
+            made("single", model), [1, RULE, 2], futures=4, method=method, **given
+        ).returns.tolist()
 
     random.seed(1)
     state = random.getstate(), np.random.get_state()[1].tolist()
@@ -269,7 +313,8 @@ def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
     assert (random.getstate(), np.random.get_state()[1].tolist()) == state
     random.seed(2)
     np.random.seed(2)
-    assert returns(base=draws) == told or model is Unseeded  # what is drawn there follows the state of the process
+    # what is drawn there follows the state of the process
+    assert returns(base=draws) == told or model is Unseeded
     assert not np.allclose(told, returns())
 
 
@@ -277,12 +322,16 @@ def test_a_base_that_draws_has_the_same_noise_for_all_candidates(model, method):
 @pytest.mark.parametrize("view", VIEWS)
 def test_one_exact_future_and_a_warning(view, method):
     env = made(view, Unseeded)
-    with pytest.warns(UserWarning, match="Unseeded cannot draw new random numbers .* foresees") as caught:
+    with pytest.warns(
+        UserWarning, match="Unseeded cannot draw new random numbers .* foresees"
+    ) as caught:
         told = action_values(env, futures=9, method=method)
     assert caught[0].filename == __file__
     assert told.counts.tolist() == [1, 1, 1]
     assert np.isnan(told.standard_errors).all()
-    assert told.returns == pytest.approx(np.array([[worth("left", action, None)] for action in range(3)]))
+    assert told.returns == pytest.approx(
+        np.array([[worth("left", action, None)] for action in range(3)])
+    )
 
 
 def test_samples_that_wrappers_get_for_the_rule_are_not_drawn_from_the_environment():
@@ -297,10 +346,15 @@ def test_wrappers_of_single_views_take_part():
     env = made("single")
     table = expected(env, "left", horizon=3)
     limited = begun(TimeLimit(OrderEnforcing(PassiveEnvChecker(env)), 3))  # as gymnasium.make does
-    assert action_values(limited, futures=3, terminal_value=lambda env: 1e6).returns == pytest.approx(table)
-    wrapped = TransformReward(TransformAction(env, lambda action: 2 - action, spaces.Discrete(3)), lambda r: 10 * r)
+    assert action_values(
+        limited, futures=3, terminal_value=lambda env: 1e6
+    ).returns == pytest.approx(table)
+    wrapped = TransformReward(
+        TransformAction(env, lambda action: 2 - action, spaces.Discrete(3)), lambda r: 10 * r
+    )
     wrapped.reset(seed=5)
-    told = action_values(wrapped, futures=3, horizon=3)  # with RULE as base, which no wrapper is to meet
+    # with RULE as base, which no wrapper is to meet
+    told = action_values(wrapped, futures=3, horizon=3)
     assert told.returns == pytest.approx(10 * table[::-1])
     assert told.best == 0
     told = action_values(wrapped, futures=3, horizon=3, base=lambda observation: 2)
@@ -313,7 +367,10 @@ def test_wrappers_of_single_views_take_part():
 class Doubled(BaseParallelWrapper):
     def step(self, actions):
         observations, rewards, *rest = self.env.step(dict(actions))
-        doubled = ({agent: 2 * told for agent, told in all_told.items()} for all_told in (observations, rewards))
+        doubled = (
+            {agent: 2 * told for agent, told in all_told.items()}
+            for all_told in (observations, rewards)
+        )
         return *doubled, *rest
 
 
@@ -327,10 +384,16 @@ def test_wrappers_of_pettingzoo_take_part_and_see_legal_actions(method):
     assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
     told = action_values(env, [2], futures=3, base=lambda seen: greedy(seen / 2), method=method)
     assert told.returns == pytest.approx(2 * expected(env, "left", (2,), bases={"left": greedy}))
-    masked = {"action_space": spaces.Discrete(6), "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0]}
+    masked = {
+        "action_space": spaces.Discrete(6),
+        "action_mask_mapping": lambda duel: [0, 1, 0, 1, 0, 0],
+    }
     given = {name: replace(point, **masked) for name, point in points().items()}
     env, wrapped = aec_env(Duel, given), TerminateIllegalWrapper(aec_env(Duel, given), -1)
-    told, plain = (action_values(begun(each), futures=2, method=method).returns.tolist() for each in (wrapped, env))
+    told, plain = (
+        action_values(begun(each), futures=2, method=method).returns.tolist()
+        for each in (wrapped, env)
+    )
     assert told == plain
 
 
@@ -406,7 +469,9 @@ def test_masked_candidates_are_left_out(wrapper):
 
 def test_a_time_limit_ends_branches_that_hang():
     with pytest.raises(BranchError, match="longer than"):
-        action_values(made("single"), futures=1, base=lambda observation: time.sleep(60), time_limit=0.2)
+        action_values(
+            made("single"), futures=1, base=lambda observation: time.sleep(60), time_limit=0.2
+        )
 
 
 def test_progress_is_shown_on_request(capsys):
@@ -423,7 +488,9 @@ def test_branches_are_not_shown():
             self.pictures += 1
 
     env = begun(single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human"))
-    told = action_values(env, [1], futures=1, horizon=3, terminal_value=lambda env: env.unwrapped.simulation.pictures)
+    told = action_values(
+        env, [1], futures=1, horizon=3, terminal_value=lambda env: env.unwrapped.simulation.pictures
+    )
     assert told.means[0] == pytest.approx(worth("left", 1, futures_of(env, 1)[0], horizon=3) + 1)
 
 
@@ -445,7 +512,9 @@ def high(observation):
 
 
 @pytest.mark.parametrize(
-    ("view", "candidate"), [("aec", 1), ("parallel", 1), ("joint", {"left": 1, "right": 1})], ids=str
+    ("view", "candidate"),
+    [("aec", 1), ("parallel", 1), ("joint", {"left": 1, "right": 1})],
+    ids=str,
 )
 def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
     plain, planned = (

@@ -1,4 +1,6 @@
-"""No candidate is taken that is not better than the rule; what is warned of where futures tell little."""
+"""No candidate is taken that is not better than the rule; what is warned of where futures tell
+little.
+"""
 
 import random
 
@@ -13,7 +15,10 @@ from tests.worlds.models import define
 
 
 class World:
-    """Pays a gain for each action but that of its rule, and noise. An action draws as many numbers as it is large."""
+    """Pays a gain for each action but that of its rule, and noise.
+
+    An action draws as many numbers as it is large.
+    """
 
     gain, noise, shared, mean_time = 0.0, 1.0, False, 0.0
     turns = 30
@@ -58,7 +63,11 @@ def nothing_was_warned_of(monkeypatch):
 def share_of_rule(kind, model, margin, decisions):
     env, answers = made(model), []
     for _ in range(decisions):
-        answers.append(kind(actions=[1, 2, 3], futures=4, horizon=1, margin=margin, method="replay").choose(env).best)
+        answers.append(
+            kind(actions=[1, 2, 3], futures=4, horizon=1, margin=margin, method="replay")
+            .choose(env)
+            .best
+        )
         env.step(0)
     return sum(answer is RULE for answer in answers) / decisions
 
@@ -98,12 +107,19 @@ def test_fresh_futures_compare_it_with_the_rule(kind, futures, fresh, monkeypatc
 @pytest.mark.filterwarnings("ignore:SomeWorld cannot draw")
 def test_any_gain_in_one_exact_future_is_taken(kind):
     for gain, best in ((1e-6, 1), (0.0, RULE), (-1e-6, RULE)):
-        assert kind(actions=[1, 0], horizon=1, margin=1e9).choose(made(world(gain=gain, reseed=None))).best is best
+        assert (
+            kind(actions=[1, 0], horizon=1, margin=1e9)
+            .choose(made(world(gain=gain, reseed=None)))
+            .best
+            is best
+        )
 
 
 def test_returns_correlate_as_far_as_candidates_share_chance():
     def correlation(model, **given):
-        return action_values(made(model), horizon=1, **{"futures": 15, "method": "replay"} | given).correlation
+        return action_values(
+            made(model), horizon=1, **{"futures": 15, "method": "replay"} | given
+        ).correlation
 
     assert correlation(world(gain=1.0)) == pytest.approx(1.0)
     assert abs(correlation(world(shared=True), actions=[0, 3])) < 0.6
@@ -135,8 +151,18 @@ SOUND = [
 ]
 DOUBTFUL = [
     ("all futures of SomeWorld are the same.* reseed must seed each", world(**OWN), {}, {}),
-    ("all futures of SomeWorld are the same.* global_rng", world(reseed=None), {"global_rng": True}, {}),
-    ("correlate by .* a generator for itself", world(shared=True), {}, {"actions": [0, 3], "futures": 60}),
+    (
+        "all futures of SomeWorld are the same.* global_rng",
+        world(reseed=None),
+        {"global_rng": True},
+        {},
+    ),
+    (
+        "correlate by .* a generator for itself",
+        world(shared=True),
+        {},
+        {"actions": [0, 3], "futures": 60},
+    ),
     ('the times between .* use horizon_by="time"', world(**MOVING), {}, {"horizon": 5}),
 ]
 
@@ -147,7 +173,8 @@ def test_futures_that_tell_little_are_warned_of_once(match, model, options, give
     with pytest.warns(UserWarning, match=match) as caught:
         action_values(env, **{"futures": 16, "horizon": 1, "method": "replay"} | given)
     assert [found.filename for found in caught] == [__file__]
-    action_values(env, **{"futures": 16, "horizon": 2, "method": "replay"} | given)  # another would be an error
+    # another would be an error
+    action_values(env, **{"futures": 16, "horizon": 2, "method": "replay"} | given)
 
 
 @pytest.mark.parametrize(("model", "given"), SOUND)

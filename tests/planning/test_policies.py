@@ -1,4 +1,6 @@
-"""Policies that plan: how they spend their branches, all places where they serve, and what shows its worth later."""
+"""Policies that plan: how they spend their branches, all places where they serve, and what shows
+its worth later.
+"""
 
 import copy
 import pickle
@@ -39,8 +41,13 @@ def planner(**given):
 
 
 def tame(**changes):
-    """Points at which the one on the left is to come near to three, so that it matters what it does."""
-    given = {"reward_mapping": lambda duel: -abs(duel.value - 3), "rule_action_mapping": lambda decision: decision}
+    """Points at which the one on the left is to come near to three, so that it matters what it
+    does.
+    """
+    given = {
+        "reward_mapping": lambda duel: -abs(duel.value - 3),
+        "rule_action_mapping": lambda decision: decision,
+    }
     return points(**given | changes)
 
 
@@ -51,7 +58,9 @@ def known(answers):
 
 @cache
 def by_hand(seed=5, down=False):
-    """What a planner does in a single view whose user asks it: its actions, and what the model has come to."""
+    """What a planner does in a single view whose user asks it: its actions, and what the model has
+    come to.
+    """
     policies = {"right": lambda observation: 2} if down else None
     env = begun(single_env(Duel, tame(), agent="left", policies=policies), seed)
     actions, over = [], False
@@ -97,7 +106,10 @@ def test_the_budget_is_divided_among_rounds(wide):
 
 @pytest.mark.parametrize(
     ("given", "budget"),
-    [*[({"budget": budget}, budget) for budget in (9, 10, 17, 50)], ({"actions": [1, 4, 2], "futures": 6}, 24)],
+    [
+        *[({"budget": budget}, budget) for budget in (9, 10, 17, 50)],
+        ({"actions": [1, 4, 2], "futures": 6}, 24),
+    ],
 )
 def test_the_budget_is_spent_and_not_overspent(wide, given, budget):
     counts = RolloutPolicy(method="replay", **given).choose(wide).counts
@@ -138,7 +150,12 @@ def test_planners_decide_in_environments_as_by_hand(make, method):
 )
 def test_many_episodes_ask_row_by_row(down, method, batch_size):
     """Beside policies that are asked in batches, also in branches."""
-    given = {"points": tame(), "seeds": [5, 6], "batch_size": batch_size, "collect": lambda duel: duel.value}
+    given = {
+        "points": tame(),
+        "seeds": [5, 6],
+        "batch_size": batch_size,
+        "collect": lambda duel: duel.value,
+    }
     policies = {"left": planner(method=method)}
     if down:
         policies["right"] = lambda observations, infos, identities: np.full(len(observations), 2)
@@ -148,7 +165,9 @@ def test_many_episodes_ask_row_by_row(down, method, batch_size):
         own = found["left"].actions[found["left"].episodes == place].tolist()
         answers, value = by_hand(seed, down)
         assert (own, found["left"].collected[place]) == (known(answers), value)
-        assert found["left"].by_rule[found["left"].episodes == place].tolist() == [a is RULE for a in answers]
+        assert found["left"].by_rule[found["left"].episodes == place].tolist() == [
+            a is RULE for a in answers
+        ]
     assert all(len(of_agent) == 12 for of_agent in found.values())
 
 
@@ -188,7 +207,9 @@ def test_max_steps_end_the_branch_of_an_agent_only_if_no_other_takes_steps():
     evaluate(Duel, {"planner": {"left": left}}, points=points(), seeds=[5], max_steps=4)
     assert seen == [(6, (True, False)), (5, (True, False))]
     seen.clear()
-    evaluate(Duel, {"planner": {"left": left}}, points={LEFT: points()[LEFT]}, seeds=[5], max_steps=4)
+    evaluate(
+        Duel, {"planner": {"left": left}}, points={LEFT: points()[LEFT]}, seeds=[5], max_steps=4
+    )
     assert seen == [(taken, (False, True)) for taken in (4, 3, 2, 1)]
 
 
@@ -240,18 +261,24 @@ def test_a_policy_gets_the_environment_with_its_decision_pending(many):
 
 def test_entities_plan_each_for_itself():
     point = f"{Herd.__module__}.Herd.graze"
-    told = simulate(Herd, {point: RolloutPolicy(futures=1, method="replay")}, points=GRAZING, seed=1)
+    told = simulate(
+        Herd, {point: RolloutPolicy(futures=1, method="replay")}, points=GRAZING, seed=1
+    )
     assert told.sum == 6 * 9
 
 
 @METHODS
 def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
-    """In a branch of the one the other is left to its base, or to its rule; else there were a branch of each branch."""
+    """In a branch of the one the other is left to its base, or to its rule; else there were a
+    branch of each branch.
+    """
     calls, seen, plans = [], [], []
 
     def branches(observation, info, *, _environment):
         calls.append(int(observation[0]))
-        seen.append(branch(_environment, lambda twin, i: (twin.step(i)[1], calls[:]), 2, method=method))
+        seen.append(
+            branch(_environment, lambda twin, i: (twin.step(i)[1], calls[:]), 2, method=method)
+        )
         return 1
 
     simulate(Duel, {"left": branches, "right": branches}, points=points(), seed=5)
@@ -262,7 +289,9 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
     branches.base = lambda observation: 2
     del seen[:], calls[:]
     simulate(Duel, {"left": branches, "right": branches}, points=points(), seed=5)
-    assert seen[0][1][0] == pytest.approx(worth("left", 1, None, horizon=1, bases={"right": branches.base}))
+    assert seen[0][1][0] == pytest.approx(
+        worth("left", 1, None, horizon=1, bases={"right": branches.base})
+    )
 
     def plan(observation, *, _environment):
         plans.append(action_values(_environment, base=greedy, futures=2, method=method))
@@ -272,7 +301,9 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
     assert [told.counts.tolist() for told in plans] == [[2, 2, 2]] * 12
     env = begun(aec_env(Duel, points(), policies={"right": plan}))
     told = action_values(env, futures=3, method=method)
-    assert told.returns == pytest.approx(action_values(made("aec"), futures=3, method=method).returns)
+    assert told.returns == pytest.approx(
+        action_values(made("aec"), futures=3, method=method).returns
+    )
     assert len(plans) == 12
 
 
@@ -316,7 +347,11 @@ def test_two_decisions_that_are_worth_something_together(method):
     rollouts = RolloutPolicy(futures=2, method=method)
     told = choice(tree)
     assert (told.best, told.counts.sum()) == (2, 50)
-    assert choice(rollouts).best is choice(TreeSearchPolicy(futures=2, depth=1, method=method)).best is RULE
+    assert (
+        choice(rollouts).best
+        is choice(TreeSearchPolicy(futures=2, depth=1, method=method)).best
+        is RULE
+    )
     assert simulate(Lock, {"thief": tree}, points=locked(), seed=1).tried[:2] == [2, 3]
     assert not simulate(Lock, {"thief": rollouts}, points=locked(), seed=1).open
 
@@ -352,7 +387,8 @@ class Lends(Unseeded):
 
 @pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
 @pytest.mark.parametrize(
-    ("model", "most", "cost"), [(Opens, 200, 0), (Lends, 200, 0), (Unseeded, 3, 0), (Unseeded, 200, 1e9)]
+    ("model", "most", "cost"),
+    [(Opens, 200, 0), (Lends, 200, 0), (Unseeded, 3, 0), (Unseeded, 200, 1e9)],
 )
 def test_states_that_a_search_keeps_change_no_value_and_are_closed(model, most, cost, monkeypatch):
     twins = []
@@ -367,7 +403,9 @@ def test_states_that_a_search_keeps_change_no_value_and_are_closed(model, most, 
     kept = TreeSearchPolicy(depth=4, futures=8).choose(made("single", model)).returns
     assert (len(twins) > 1) == (cost == 0)
     number = len(twins)
-    replayed = TreeSearchPolicy(depth=4, futures=8, method="replay").choose(made("single", model)).returns
+    replayed = (
+        TreeSearchPolicy(depth=4, futures=8, method="replay").choose(made("single", model)).returns
+    )
     np.testing.assert_array_equal(kept, replayed)
     assert len(twins) == number
     for twin in twins:

@@ -15,7 +15,11 @@ def says(text, **message):
         "created": 1,
         "model": "fake",
         "choices": [
-            {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text, **message}}
+            {
+                "index": 0,
+                "finish_reason": "stop",
+                "message": {"role": "assistant", "content": text, **message},
+            }
         ],
         "usage": {"prompt_tokens": 10, "completion_tokens": 3, "total_tokens": 13},
     }
@@ -33,14 +37,18 @@ class _Handler(BaseHTTPRequestHandler):
         request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         request["key"] = self.headers.get("Authorization")
         self.server.requests.append(request)
-        answer = self.server.answers.pop(0) if len(self.server.answers) > 1 else self.server.answers[0]
+        answer = (
+            self.server.answers.pop(0) if len(self.server.answers) > 1 else self.server.answers[0]
+        )
         if isinstance(answer, float):
             time.sleep(answer)
             answer = says('{"action": "open"}')
         status, body, headers = answer if isinstance(answer, tuple) else (200, answer, {})
         text = body if isinstance(body, str) else json.dumps(body)
         self.send_response(status)
-        self.send_header("Content-Type", "text/html" if isinstance(body, str) else "application/json")
+        self.send_header(
+            "Content-Type", "text/html" if isinstance(body, str) else "application/json"
+        )
         for name, value in headers.items():
             self.send_header(name.replace("_", "-"), value)
         self.send_header("Content-Length", str(len(text.encode())))
@@ -53,7 +61,9 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def endpoint(answers):
-    """Serve answers, one for each request, and the last one for all others; a number of seconds is a late one."""
+    """Serve answers, one for each request, and the last one for all others; a number of seconds is
+    a late one.
+    """
     server = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
     server.daemon_threads = True
     server.answers, server.requests = [*answers], []

@@ -53,7 +53,10 @@ FILL = make_step(
 
 def filling(space, mapping=lambda action: 1.0, **more):
     """Define the first decision with actions of another space."""
-    return replace(FILL, **{"action_space": space, "action_space_mapping": mapping, "action_labels": None} | more)
+    return replace(
+        FILL,
+        **{"action_space": space, "action_space_mapping": mapping, "action_labels": None} | more,
+    )
 
 
 DRAIN = filling(spaces.Discrete(2), {0: 0.5, 1: 1.5}, agent="drainer")
@@ -72,11 +75,18 @@ def log_of(tank):
 
 def levels(policy, seeds=range(6), points=POINTS, **options):
     """Return the levels of many episodes in which a policy fills the tank."""
-    return simulate_many(Tank, {"filler": policy}, seeds=seeds, points=points, collect=log_of, **options)
+    return simulate_many(
+        Tank, {"filler": policy}, seeds=seeds, points=points, collect=log_of, **options
+    )
 
 
 def experiment(contenders, store, **options):
     """Run an experiment of one row, and return its table."""
     return run_experiment(
-        lambda days: Tank(), [{"days": 5}], contenders=contenders, points=POINTS, store=store, **options
+        lambda days: Tank(),
+        [{"days": 5}],
+        contenders=contenders,
+        points=POINTS,
+        store=store,
+        **options,
     )

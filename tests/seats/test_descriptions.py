@@ -9,7 +9,13 @@ from gymnasium import spaces
 
 from simenv_marl import RULE, aec_env, clone, joint_env, parallel_env, single_env
 from simenv_marl.data import collect_episodes, plot_timeline
-from simenv_marl.errors import DefinitionError, InvalidActionError, NotResetError, SimEnvError, ViewError
+from simenv_marl.errors import (
+    DefinitionError,
+    InvalidActionError,
+    NotResetError,
+    SimEnvError,
+    ViewError,
+)
 from simenv_marl.seats import describe, parse
 
 from .tank import FILL, POINTS, Tank, filling, played
@@ -81,10 +87,21 @@ def test_what_a_policy_gets_is_described_as_the_environment_is():
 
 SAID = {
     ("closed", "half", "open"): {
-        **dict.fromkeys(["open", " Open ", '"open"', '{"action": "open"}', "2", '{"action": 2}'], 2),
-        **dict.fromkeys(["ajar", "3", "-1", "", "{}", '{"action": null}', "[1]", "true", "1.5", "open closed"]),
+        **dict.fromkeys(
+            ["open", " Open ", '"open"', '{"action": "open"}', "2", '{"action": 2}'], 2
+        ),
+        **dict.fromkeys(
+            ["ajar", "3", "-1", "", "{}", '{"action": null}', "[1]", "true", "1.5", "open closed"]
+        ),
     },
-    ("1", "2", "3"): {"1": 0, "2": 1, '{"action": "3"}': 2, '{"action": 2.0}': 1, "0": 0, "4": None},
+    ("1", "2", "3"): {
+        "1": 0,
+        "2": 1,
+        '{"action": "3"}': 2,
+        '{"action": 2.0}': 1,
+        "0": 0,
+        "4": None,
+    },
     ("R", "R'", "U"): {"R'": 1},
     ("bxc3", "Bxc3", "a"): {"bxc3": 0, "Bxc3": 1},
     (" open", "shut", "ajar"): {" open": 0},
@@ -99,7 +116,9 @@ SAID = {
 }
 
 
-@pytest.mark.parametrize(("labels", "said"), [(labels, said) for labels in SAID for said in SAID[labels]])
+@pytest.mark.parametrize(
+    ("labels", "said"), [(labels, said) for labels in SAID for said in SAID[labels]]
+)
 def test_an_action_is_named_by_label_or_value_or_an_error_lists_the_legal_ones(labels, said):
     env = env_of(replace(FILL, action_labels=dict(enumerate(labels))))
     if SAID[labels][said] is None:
@@ -111,7 +130,9 @@ def test_an_action_is_named_by_label_or_value_or_an_error_lists_the_legal_ones(l
 
 
 def test_masked_actions_are_neither_listed_nor_taken():
-    env = env_of(replace(FILL, action_labels=["1", "2", "3"], action_mask_mapping=lambda tank: [1, 0, 1]))
+    env = env_of(
+        replace(FILL, action_labels=["1", "2", "3"], action_mask_mapping=lambda tank: [1, 0, 1])
+    )
     with pytest.raises(InvalidActionError):
         parse(env, "2")
     env = env_of(replace(FILL, action_mask_mapping=lambda tank: [1, 0, 1]))
@@ -124,18 +145,32 @@ def test_masked_actions_are_neither_listed_nor_taken():
 
 def test_choices_and_decisions_are_labels_where_none_are_given():
     decisions = replace(FILL, action_labels=None)
-    assert describe(env_of(decisions), as_json=True)["actions"] == {"type": "string", "enum": ["0.0", "1.0", "2.0"]}
-    moves = replace(decisions, action_space_mapping=None, choices=lambda tank: [3.0, 4.0, 4.0][: 3 - tank.day])
+    assert describe(env_of(decisions), as_json=True)["actions"] == {
+        "type": "string",
+        "enum": ["0.0", "1.0", "2.0"],
+    }
+    moves = replace(
+        decisions, action_space_mapping=None, choices=lambda tank: [3.0, 4.0, 4.0][: 3 - tank.day]
+    )
     env = env_of(moves)
-    assert describe(env, as_json=True)["actions"] == {"type": "string", "enum": ["3.0", "4.0 (1)", "4.0 (2)"]}
+    assert describe(env, as_json=True)["actions"] == {
+        "type": "string",
+        "enum": ["3.0", "4.0 (1)", "4.0 (2)"],
+    }
     assert (parse(env, "3.0"), parse(env, "4.0 (2)")) == (0, 2)
 
 
 def test_labels_may_be_made_for_each_call():
-    env = env_of(replace(FILL, action_labels=lambda tank: [f"{litres} of {tank.level}" for litres in range(3)]))
+    env = env_of(
+        replace(
+            FILL, action_labels=lambda tank: [f"{litres} of {tank.level}" for litres in range(3)]
+        )
+    )
     assert parse(env, "2 of 5.0") == 2
     bad = env_of(replace(FILL, action_labels=lambda tank: ["one"]))
-    with pytest.raises(DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"):
+    with pytest.raises(
+        DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"
+    ):
         describe(bad)
 
 
@@ -174,16 +209,26 @@ def test_the_schema_of_numbers_has_their_bounds_and_labels():
         return describe(env_of(filling(space, **labels)), as_json=True)["actions"]
 
     amount = spaces.Box(0, 2, (1,))
-    found = schema(spaces.Dict({"a": amount, "b": spaces.Box(-np.inf, 1, (2,)), "c": spaces.Discrete(3, start=1)}))
+    found = schema(
+        spaces.Dict(
+            {"a": amount, "b": spaces.Box(-np.inf, 1, (2,)), "c": spaces.Discrete(3, start=1)}
+        )
+    )
     assert found["required"] == ["a", "b", "c"]
     assert found["additionalProperties"] is False
     assert found["properties"]["a"] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
     assert found["properties"]["b"]["properties"]["1"] == {"type": "number", "maximum": 1.0}
     assert found["properties"]["c"] == {"type": "integer", "minimum": 1, "maximum": 3}
     pair = schema(spaces.MultiDiscrete([3, 4]))["properties"]
-    assert pair == {str(at): {"type": "integer", "minimum": 0, "maximum": 2 + at} for at in range(2)}
-    assert schema(amount, action_labels=["litres"]) == found["properties"]["a"] | {"description": "litres"}
-    assert describe(env_of(filling(amount, action_labels=["litres"]))).endswith("\n- litres: a number from 0 to 2")
+    assert pair == {
+        str(at): {"type": "integer", "minimum": 0, "maximum": 2 + at} for at in range(2)
+    }
+    assert schema(amount, action_labels=["litres"]) == found["properties"]["a"] | {
+        "description": "litres"
+    }
+    assert describe(env_of(filling(amount, action_labels=["litres"]))).endswith(
+        "\n- litres: a number from 0 to 2"
+    )
     with pytest.raises(ViewError, match="cannot be put into words"):
         schema(spaces.Box(0, 1, (2, 2)))
 
@@ -191,11 +236,16 @@ def test_the_schema_of_numbers_has_their_bounds_and_labels():
 def test_parts_of_an_observation_have_their_labels():
     definition = replace(
         FILL,
-        observation_space=spaces.Dict({"level": spaces.Box(-50, 50, (1,)), "day": spaces.Discrete(9)}),
+        observation_space=spaces.Dict(
+            {"level": spaces.Box(-50, 50, (1,)), "day": spaces.Discrete(9)}
+        ),
         observation_space_mapping=lambda tank: {"level": [tank.level], "day": tank.day},
         observation_labels={"level": "Level in m", "day": "Day"},
     )
-    assert describe(env_of(definition), as_json=True)["observation"] == {"Day": 0, "Level in m": [5.0]}
+    assert describe(env_of(definition), as_json=True)["observation"] == {
+        "Day": 0,
+        "Level in m": [5.0],
+    }
 
 
 def test_timelines_name_actions_by_their_labels():

@@ -1,4 +1,6 @@
-"""A language model decides: over an endpoint that answers right, wrong, late, with garbage, or not at all."""
+"""A language model decides: over an endpoint that answers right, wrong, late, with garbage, or not
+at all.
+"""
 
 import asyncio
 import json
@@ -10,7 +12,12 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, single_env
-from simenv_marl.errors import InvalidActionError, LanguageModelError, MissingExtraError, OptionValueError
+from simenv_marl.errors import (
+    InvalidActionError,
+    LanguageModelError,
+    MissingExtraError,
+    OptionValueError,
+)
 from simenv_marl.seats import FallbackPolicy, LanguageModelPolicy, describe
 
 from .endpoint import endpoint, fails, says
@@ -46,14 +53,22 @@ def test_a_language_model_decides_by_labels():
     assert json.dumps(schema) in system["content"]  # for endpoints that do not enforce it
     seconds = policy.usage["seconds"]
     assert seconds > 0
-    assert policy.usage == {"requests": 5, "prompt_tokens": 50, "completion_tokens": 15, "seconds": seconds}
+    assert policy.usage == {
+        "requests": 5,
+        "prompt_tokens": 50,
+        "completion_tokens": 15,
+        "seconds": seconds,
+    }
 
 
 def test_numbers_are_checked_against_their_bounds_here_as_well():
     points = {Tank.fill: filling(spaces.Box(0, 2, (1,)))}
     with endpoint([says('{"action": 7}'), says('{"action": 1.5}')]) as (address, requests):
         played(model(address), points=points)
-    assert requests[0]["response_format"]["json_schema"]["schema"]["properties"]["action"]["maximum"] == 2.0
+    assert (
+        requests[0]["response_format"]["json_schema"]["schema"]["properties"]["action"]["maximum"]
+        == 2.0
+    )
     assert "number from 0 to 2" in requests[1]["messages"][-1]["content"]
 
 
@@ -125,7 +140,18 @@ def test_requests_contain_the_latest_decisions_of_the_agent():
 def test_episodes_of_one_seed_have_a_history_each():
     with endpoint([OPEN]) as (address, requests):
         levels(model(address, history=9), seeds=[7, 7])
-    assert sorted(len(request["messages"]) for request in requests) == [2, 2, 4, 4, 6, 6, 8, 8, 10, 10]
+    assert sorted(len(request["messages"]) for request in requests) == [
+        2,
+        2,
+        4,
+        4,
+        6,
+        6,
+        8,
+        8,
+        10,
+        10,
+    ]
 
 
 def test_a_policy_that_is_sent_to_another_process_decides_there():
@@ -143,7 +169,10 @@ def test_a_client_of_the_user_and_own_words_are_taken():
 
     client = SimpleNamespace(chat=SimpleNamespace(completions=SimpleNamespace(create=create)))
     policy = LanguageModelPolicy(
-        "own", client=client, instructions="Be quick.", describe=lambda decision: f"at {decision.observation[0]:.0f} m"
+        "own",
+        client=client,
+        instructions="Be quick.",
+        describe=lambda decision: f"at {decision.observation[0]:.0f} m",
     )
     assert played(policy) == played(lambda observation: 2)
     assert asked[0]["messages"][0]["content"].endswith("Be quick.")

@@ -43,7 +43,9 @@ def in_an_environment(policy):
 
 
 def collected(policy):
-    found = collect_episodes(Tank, {"filler": policy}, seeds=range(4), points=POINTS, concurrency=3)["filler"]
+    found = collect_episodes(
+        Tank, {"filler": policy}, seeds=range(4), points=POINTS, concurrency=3
+    )["filler"]
     return [found.actions.tolist(), found.observations.tolist(), found.rewards.tolist()]
 
 
@@ -55,7 +57,9 @@ def in_a_notebook(policy):
 
 
 def compared(policy):
-    found = compare_with_rule(Tank, {"filler": policy}, seeds=range(3), points={Tank.fill: FILL})["filler"]
+    found = compare_with_rule(Tank, {"filler": policy}, seeds=range(3), points={Tank.fill: FILL})[
+        "filler"
+    ]
     return found.policy_actions.tolist()
 
 
@@ -102,7 +106,9 @@ def test_quick_policies_are_asked_in_batches_beside_slow_ones():
         return np.zeros(len(observations), int)
 
     seeds = range(6)
-    found = simulate_many(Tank, {"filler": slow, "drainer": downwards}, seeds=seeds, points=POINTS, collect=log_of)
+    found = simulate_many(
+        Tank, {"filler": slow, "drainer": downwards}, seeds=seeds, points=POINTS, collect=log_of
+    )
     plain = {"filler": quick, "drainer": lambda observation: 0}
     assert found == [simulate(Tank, plain, points=POINTS, seed=seed).log for seed in seeds]
     assert sum(sizes) == 6 * Tank.days
@@ -266,7 +272,9 @@ def test_a_policy_gets_the_pending_decision(waits, many):
     async def coroutine(observation, *, _decision):
         return plain(observation, _decision=_decision)
 
-    points = {Tank.fill: replace(FILL, action_labels=lambda tank: [f"{tank.level}", "half", "open"])}
+    points = {
+        Tank.fill: replace(FILL, action_labels=lambda tank: [f"{tank.level}", "half", "open"])
+    }
     policy = coroutine if waits else plain
     levels(policy, [7], points) if many else played(policy, 7, points)
     first, second = seen[:2]
@@ -275,7 +283,8 @@ def test_a_policy_gets_the_pending_decision(waits, many):
     assert first.doc == "Choose how much water flows in."
     assert [decision.number for decision in seen] == [1, 2, 3, 4, 5]
     assert second.time == 1.0
-    assert second.reward == pytest.approx(second.observation[0])  # the level since the first decision
+    # the level since the first decision
+    assert second.reward == pytest.approx(second.observation[0])
     assert first.action_labels == {0: "5.0", 1: "half", 2: "open"}
     assert first.observation_labels == ("level",)
     assert first.mask is None
@@ -343,13 +352,16 @@ def test_bases_that_wait_are_the_rule_and_those_that_ask_get_the_decision():
         return action_values(env, base=base, futures=3, horizon=3, method="replay").means.tolist()
 
     def planned(base):
-        planner = RolloutPolicy(base={"filler": base}, futures=2, horizon=3, margin=0.0, method="replay")
+        planner = RolloutPolicy(
+            base={"filler": base}, futures=2, horizon=3, margin=0.0, method="replay"
+        )
         return simulate(Tank, {"drainer": planner}, points=POINTS, seed=4).log
 
     agents, single, turns = set(), single_env(Tank, POINTS, agent="drainer"), aec_env(Tank, POINTS)
     assert values(turns, {"drainer": never}) == values(turns, RULE)
     assert values(single, never) == values(single, RULE)
     assert planned(never) == planned(RULE)
-    assert values(single, alternating)[0] > values(single, lambda observation: 1)[0]  # its second decision is 0
+    # its second decision is 0
+    assert values(single, alternating)[0] > values(single, lambda observation: 1)[0]
     assert len(planned(alternating)) == Tank.days
     assert agents == {"filler", "drainer"}

@@ -19,7 +19,9 @@ from .tank import FILL, POINTS, Tank, experiment, filling, levels, played
 
 
 def counted(**numbers):
-    return dict.fromkeys(("asked", "retried", "late", "failed", "illegal", "fallbacks"), 0) | numbers
+    return (
+        dict.fromkeys(("asked", "retried", "late", "failed", "illegal", "fallbacks"), 0) | numbers
+    )
 
 
 def raises(observation):
@@ -159,12 +161,18 @@ def test_fallbacks_are_counted_for_each_agent_and_seed(workers, tmp_path):
 
 
 def test_contenders_with_many_fallbacks_are_marked():
-    contenders = {"bad": {"filler": FallbackPolicy(raises)}, "good": {"filler": FallbackPolicy(one)}}
+    contenders = {
+        "bad": {"filler": FallbackPolicy(raises)},
+        "good": {"filler": FallbackPolicy(one)},
+    }
     found = evaluate(Tank, contenders, seeds=range(3), points={Tank.fill: FILL})
     summary = found.summary()
     assert summary["fallbacks"].tolist() == [1.0, 0.0]
     assert summary["note"].tolist() == ["100% of decisions by a fallback", ""]
-    assert [label.get_text() for label in found.plot().axes[0].get_xticklabels()] == ["bad\n100% fallbacks", "good"]
+    assert [label.get_text() for label in found.plot().axes[0].get_xticklabels()] == [
+        "bad\n100% fallbacks",
+        "good",
+    ]
     assert "fallbacks" in str(found)
     found = evaluate(Tank, {"plain": {"filler": one}}, seeds=range(2), points=POINTS)
     assert "fallbacks" not in found.frame
@@ -245,7 +253,9 @@ def test_the_same_seeds_run_again_without_one_call(kind, tmp_path):
     assert entry.keys() == {"seed", "agent", "number", "observation", "answer"}
     assert entry["agent"] == "filler"
     second = kind()
-    assert levels(RecordedPolicy(second, path), range(5))[:4] == recorded == levels(kind(), range(4))
+    assert (
+        levels(RecordedPolicy(second, path), range(5))[:4] == recorded == levels(kind(), range(4))
+    )
     assert second.times == 5  # those of the new seed
 
 
@@ -279,7 +289,12 @@ PARTS = {
     "box": (spaces.Box(-1, 1, (2,), np.float32), np.array([0.1, -0.7], np.float32)),
     "scalar": (spaces.Box(0, 1, (1,), np.float64), 0.1 + 0.2),
     "nested": (
-        spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Tuple([spaces.Box(0, 1, (1,)), spaces.MultiBinary(2)])}),
+        spaces.Dict(
+            {
+                "a": spaces.Discrete(3),
+                "b": spaces.Tuple([spaces.Box(0, 1, (1,)), spaces.MultiBinary(2)]),
+            }
+        ),
         {"a": 2, "b": (0.25, np.array([1, 0], np.int8))},
     ),
     "many": (spaces.MultiDiscrete([3, 4]), np.array([2, 3])),

@@ -1,4 +1,6 @@
-"""Each study runs from its command line to its figures, in a small way; those of learners are in ``tests/clients``."""
+"""Each study runs from its command line to its figures, in a small way; those of learners are in
+``tests/clients``.
+"""
 
 import json
 import re
@@ -43,7 +45,9 @@ def short(kind):
 
 def test_greenhouse_trains_plans_and_draws(tmp_path, capsys, monkeypatch):
     train.main(["--budget", "1", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)])
-    named = re.findall(r"^  (\S+/\S+)", capsys.readouterr().out.partition("What to do next:")[2], re.MULTILINE)
+    named = re.findall(
+        r"^  (\S+/\S+)", capsys.readouterr().out.partition("What to do next:")[2], re.MULTILINE
+    )
     assert len(named) == 4
     assert all((Path(__file__).parents[2] / path).is_file() for path in named)
     found = json.loads((tmp_path / "greenhouse.json").read_text())
@@ -61,7 +65,12 @@ def test_greenhouse_matrix_shows_what_it_has_found(tmp_path, capsys, monkeypatch
     monkeypatch.setattr(variants, "House", short(variants.House))
     table = matrix.main(["--quick", "--workers", "0", "--out", str(tmp_path)])
     assert set(table.status) == {"ok"}
-    assert list(dict.fromkeys(table.contender)) == ["rule", "learned at home 1", "learned all over 1", "planned"]
+    assert list(dict.fromkeys(table.contender)) == [
+        "rule",
+        "learned at home 1",
+        "learned all over 1",
+        "planned",
+    ]
     assert all(big(tmp_path / f"matrix-{name}.png") for name in ("returns", "behind", "factors"))
     shown = capsys.readouterr().out
     for name in ("compared", "moved", "shares", "learners"):
@@ -74,7 +83,9 @@ def test_greenhouse_plans_draws_budgets_and_horizons(tmp_path, monkeypatch):
     assert big(tmp_path / "plan-budget.png")
     assert big(tmp_path / "plan-horizon.png")
     rows = (tmp_path / "plan.md").read_text().splitlines()[2:]
-    assert [row.split(" | ")[0].removeprefix("| ") for row in rows[:5]] == [line.title for line in plans.LINES]
+    assert [row.split(" | ")[0].removeprefix("| ") for row in rows[:5]] == [
+        line.title for line in plans.LINES
+    ]
 
 
 def test_credit_compares_estimators_with_the_truth(capsys):
@@ -102,7 +113,9 @@ def test_wolf_sheep_plan_lets_one_sheep_plan(capsys):
     pytest.importorskip("mesa")
     from studies.wolf_sheep import plan as sheep
 
-    found = sheep.main(["--herds", "2", "--horizon", "1", "--futures", "1", "--ticks", "3", "--workers", "1"])
+    found = sheep.main(
+        ["--herds", "2", "--horizon", "1", "--futures", "1", "--ticks", "3", "--workers", "1"]
+    )
     assert found.own.shape == found.same.shape == (2,)
     assert "plans longer than by the rule" in capsys.readouterr().out
 
@@ -129,14 +142,17 @@ def test_debt_collection_learns_and_compares(capsys):
     shown = capsys.readouterr().out
     assert "Thresholds(" in shown
     assert all(name in shown for name in ("learned", "rule", *debts.CONSTANTS))
-    third = CollectionSim(parameters=agency.Parameters(arrivals=0.3, stock=20, calls=1))  # of what it has learned from
+    # of what it has learned from
+    third = CollectionSim(parameters=agency.Parameters(arrivals=0.3, stock=20, calls=1))
     unseen = range(debts.HELD_OUT, debts.HELD_OUT + 32)
     result = debts.compare({"learned": debts.LEARNED}, unseen, third).summary().loc["learned"]
     assert result["difference"] > result["difference_low"] > 0
 
 
 def test_pages_state_the_figures_of_the_finals():
-    """The table of the greenhouse's experiment is made of the runs that are under version control."""
+    """The table of the greenhouse's experiment is made of the runs that are under version
+    control.
+    """
     pytest.importorskip("pandas")
     import pandas as pd
     from studies.greenhouse_experiment import results
@@ -152,6 +168,7 @@ def test_queue_network_compares_two_learners_with_their_rules(capsys):
     alone = Queue(np.random.SeedSequence(3).generate_state(2).tolist()[0])
     alone.clock.run(until=HORIZON)
     both = simulate(network.NetworkSimulation, seed=3).model
-    assert both.first.present_value() == alone.present_value()  # what comes after it does not change it
+    # what comes after it does not change it
+    assert both.first.present_value() == alone.present_value()
     first = network.train(150)["first"].table()
     assert network.worth(first) > 1.1 * network.worth(network.ADMIT_ALL)

@@ -138,18 +138,24 @@ def in_one_generator(seed):
 
 
 @pytest.mark.parametrize(
-    ("generators", "noted"), [(in_one_generator, ["1 for 3 agents, being_0 and being_1 among them"]), (Streams, [])]
+    ("generators", "noted"),
+    [(in_one_generator, ["1 for 3 agents, being_0 and being_1 among them"]), (Streams, [])],
 )
 def test_entities_that_share_generators_are_noted(generators, noted):
     def main(simulation):
-        simulation.beings, simulation.generators = list(map(many_worlds.Being, range(3))), generators(simulation.seed)
+        simulation.beings, simulation.generators = (
+            list(map(many_worlds.Being, range(3))),
+            generators(simulation.seed),
+        )
         for being in simulation.beings:
             being.act()
             being.health += simulation.generators[str(being.number)].random()
 
     report = check_simulation(script(main), many_worlds.beings(removed_by=()), episodes=2)
     found = [finding for finding in report.findings if "share random generators" in finding.title]
-    assert [(finding.severity, finding.evidence) for finding in found] == [("note", text) for text in noted]
+    assert [(finding.severity, finding.evidence) for finding in found] == [
+        ("note", text) for text in noted
+    ]
 
 
 def moving(walk):
@@ -165,7 +171,9 @@ def seen_by(walk):
 
 
 def test_a_fingerprint_of_ones_own_leaves_out_what_it_leaves_out():
-    clean(checked(Walk, {"observation_space_mapping": seen_by}, fingerprint=lambda walk: walk.place))
+    clean(
+        checked(Walk, {"observation_space_mapping": seen_by}, fingerprint=lambda walk: walk.place)
+    )
 
     def observe(walk):
         walk.unseen = walk.random.random() < 2
@@ -176,8 +184,11 @@ def test_a_fingerprint_of_ones_own_leaves_out_what_it_leaves_out():
             return np.array([self.place])
 
     changes = {"observation_space_mapping": observe}
-    assert not checked(Secretive, changes).ok  # what a simulation tells of itself is compared: the place, in the end
-    only_error(checked(Walk, changes, fingerprint=lambda walk: [round(walk.place, 6)]), "differently when")
+    # what a simulation tells of itself is compared: the place, in the end
+    assert not checked(Secretive, changes).ok
+    only_error(
+        checked(Walk, changes, fingerprint=lambda walk: [round(walk.place, 6)]), "differently when"
+    )
 
 
 # -- what is wrong with models --------------------------------------------------------------------
@@ -186,10 +197,14 @@ FOUND = []
 
 
 def found(severity, words, *told, changes=None, **options):
-    """Makes a model a row of the table of those of which that is found; an error is all that is wrong with it."""
+    """Makes a model a row of the table of those of which that is found; an error is all that is
+    wrong with it.
+    """
 
     def add(model):
-        FOUND.append(pytest.param(model, changes, options, severity, words, told, id=model.__name__))
+        FOUND.append(
+            pytest.param(model, changes, options, severity, words, told, id=model.__name__)
+        )
         return model
 
     return add
@@ -209,27 +224,50 @@ REWARD = "reward_mapping"
 OBSERVED = "differently when it is observed"
 of_mapping("error", OBSERVED, "aec view, driver greenlet, seed 0", "simulation.place is first",
            "must not change it or draw random numbers", mapping=moving)  # fmt: skip
-of_mapping("error", OBSERVED, "state of the generator", like=REWARD, mapping=lambda walk: walk.random.random())
-of_mapping("error", "a mapping draws from", "should only read the model", mapping=lambda walk: [np.random.rand(), 0.0])
+of_mapping(
+    "error",
+    OBSERVED,
+    "state of the generator",
+    like=REWARD,
+    mapping=lambda walk: walk.random.random(),
+)
+of_mapping(
+    "error",
+    "a mapping draws from",
+    "should only read the model",
+    mapping=lambda walk: [np.random.rand(), 0.0],
+)
 of_mapping("error", "outside their space", "walker_0 has observed", "Box(-1.0, 1.0, (2,), float32)",
            mapping=Walk.observe, observation_space=spaces.Box(-1, 1, (2,), np.float32))  # fmt: skip
 of_mapping("error", "raises RewardError", "nan", "walker_0", "decision 6", like=REWARD,
            mapping=lambda walk: float("nan") if len(walk.log) == 5 else 0.5)  # fmt: skip
 of_mapping("warning", "write into the model", "simulation.seen", mapping=seen_by)
-of_mapping("warning", "agents do changes nothing", like="action_space_mapping", mapping=lambda action: 0)
+of_mapping(
+    "warning", "agents do changes nothing", like="action_space_mapping", mapping=lambda action: 0
+)
 of_mapping("warning", "always zero", like=REWARD, mapping=lambda walk: 0)
 of_mapping("note", "always the same", like=REWARD, mapping=lambda walk: 2)
 
 found("error", "same seed does not give the same run", "made without a seed", "test_testing.py")(
     variant("IgnoresItsSeed", reset=lambda walk, seed=None: Walk.reset(walk))
 )
-found("error", "The simulation never asks for a decision", "choose")(variant("Silent", run=lambda walk: None))
-found("error", "raises TypeError", "needed")(variant("CannotBeMade", __init__=lambda walk, needed: None))
-found("note", "All seeds give the same episode")(variant("Alike", reset=lambda walk, seed=None: Walk.reset(walk, 7)))
-found("note", "takes no seed")(variant("Seedless", reset=lambda walk: Walk.reset(walk, 7)))
-found("warning", "An environment warns", "wlaker", changes={"agent": lambda walk: "walker"}, policies={"wlaker": abs})(
-    variant("Misspelt")
+found("error", "The simulation never asks for a decision", "choose")(
+    variant("Silent", run=lambda walk: None)
 )
+found("error", "raises TypeError", "needed")(
+    variant("CannotBeMade", __init__=lambda walk, needed: None)
+)
+found("note", "All seeds give the same episode")(
+    variant("Alike", reset=lambda walk, seed=None: Walk.reset(walk, 7))
+)
+found("note", "takes no seed")(variant("Seedless", reset=lambda walk: Walk.reset(walk, 7)))
+found(
+    "warning",
+    "An environment warns",
+    "wlaker",
+    changes={"agent": lambda walk: "walker"},
+    policies={"wlaker": abs},
+)(variant("Misspelt"))
 
 
 @found("error", "raises OSError", "closed in mid-episode: OSError: disk full")
@@ -242,13 +280,20 @@ class FailsWhenClosed(Walk):
                 raise OSError("disk full")
 
 
-@found("error", "same seed does not give the same run", "the clock is read (perf_counter)", "in choose")
+@found(
+    "error", "same seed does not give the same run", "the clock is read (perf_counter)", "in choose"
+)
 class Timely(Walk):
     def choose(self):
         return time.perf_counter() % 1
 
 
-@found("error", "generators that the whole process shares (Python's random)", "global_rng=True", "in choose")
+@found(
+    "error",
+    "generators that the whole process shares (Python's random)",
+    "global_rng=True",
+    "in choose",
+)
 class Global(Walk):
     def choose(self):
         return random.choice([-1, 0, 1])
@@ -281,7 +326,14 @@ class Together(Walk):
             self.place = self.board["place"]
 
 
-@found("error", "raises KeyError", "in episode 3 of random legal actions, seed 2", "in run)", "the third", seeds=[0])
+@found(
+    "error",
+    "raises KeyError",
+    "in episode 3 of random legal actions, seed 2",
+    "in run)",
+    "the third",
+    seeds=[0],
+)
 class FailsLate(Walk):
     played = 0
 
@@ -292,7 +344,9 @@ class FailsLate(Walk):
         super().run()
 
 
-found("error", "raises SystemExit", "in a plain run")(variant("FailsByItself", run=lambda walk: sys.exit("bye")))
+found("error", "raises SystemExit", "in a plain run")(
+    variant("FailsByItself", run=lambda walk: sys.exit("bye"))
+)
 found("note", "stopped before their end", "60 decisions")(variant("Endless", steps=10**9))
 
 
@@ -367,7 +421,10 @@ def test_statistics_are_those_of_the_episodes():
 
 
 def test_reports_read_as_text_with_the_most_important_first():
-    changes = {"observation_space": spaces.Box(-1, 1, (2,), np.float32), "reward_mapping": lambda walk: 0}
+    changes = {
+        "observation_space": spaces.Box(-1, 1, (2,), np.float32),
+        "reward_mapping": lambda walk: 0,
+    }
     report = checked(Walk, {"observation_space_mapping": moving, **changes})
     text = str(report)
     severities = [finding.severity for finding in report.findings]
@@ -389,7 +446,11 @@ def test_reports_survive_pickling_and_json():
 
 
 def test_errors_are_raised_as_assertions():
-    report = CheckReport("Walk", (Finding("error", "It limps", "Mend it.", "at step 3"), Finding("note", "B", "C")), ())
+    report = CheckReport(
+        "Walk",
+        (Finding("error", "It limps", "Mend it.", "at step 3"), Finding("note", "B", "C")),
+        (),
+    )
     with pytest.raises(CheckFailedError, match="It limps") as caught:
         report.raise_for_errors()
     assert isinstance(caught.value, AssertionError)
@@ -418,7 +479,9 @@ def test_a_check_prints_nothing_and_restores_generators_and_functions(capsys):
 
 
 def test_options_and_points_reach_the_environments():
-    report = check_simulation(Walk, points(Walk) | points(Walk, "rest", agent="rester_0"), episodes=3)
+    report = check_simulation(
+        Walk, points(Walk) | points(Walk, "rest", agent="rester_0"), episodes=3
+    )
     assert finding(report, "rest was never called").severity == "warning"
     with pytest.raises(UnknownOptionError, match="polices"):
         checked(Walk, polices={})
@@ -437,14 +500,21 @@ def test_invalid_arguments_are_errors_of_the_caller():
         check_simulation(3, points(Walk))
     with pytest.raises(UnknownPointError, match="cannot be found"):
         check_simulation(Walk, "tests.testing.test_testing.Walk.chose")
-    for wrong in ({"seeds": []}, {"seeds": [-1]}, {"episodes": 0}, {"max_steps": 0}, {"time_limit": 0}):
+    for wrong in (
+        {"seeds": []},
+        {"seeds": [-1]},
+        {"episodes": 0},
+        {"max_steps": 0},
+        {"time_limit": 0},
+    ):
         with pytest.raises(OptionValueError, match=next(iter(wrong))):
             checked(Walk, **wrong)
 
 
 def test_the_time_limit_stops_the_check(monkeypatch):
     looks = itertools.count()
-    monkeypatch.setattr(time, "monotonic", lambda: float(next(looks)))  # a second goes by between two looks
+    # a second goes by between two looks
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(looks)))
     report = checked(Walk, time_limit=1000.0, episodes=1000)
     assert finding(report, "time limit").severity == "warning"
     assert next(looks) < 2000
@@ -462,7 +532,9 @@ def test_inspection_shows_points_calls_and_the_end():
     assert "truncated" in seen.ended
     assert sum(seen.counts.values()) > 50
     assert any("removed_by" in point["uses"] for point in seen.points)
-    assert "Possible views: aec, parallel, single with agent=, joint with possible_agents=" in str(seen)
+    assert "Possible views: aec, parallel, single with agent=, joint with possible_agents=" in str(
+        seen
+    )
 
 
 def test_inspection_shows_where_a_model_fails():
@@ -483,14 +555,19 @@ def test_inspection_shows_where_a_model_fails():
         ("", ""),
         (["a.B.run", "a.C.walk"], "run walk"),
         (["a.B.run", "a.C.run"], "a.B.run a.C.run"),
-        ([str(number) for number in range(50)] * 100, " ".join(map(str, range(30))) + " ... and 5000 calls in all"),
+        (
+            [str(number) for number in range(50)] * 100,
+            " ".join(map(str, range(30))) + " ... and 5000 calls in all",
+        ),
     ],
 )
 def test_the_order_of_calls_is_shown_in_short(calls, told):
     assert order_of(calls) == told
 
 
-Thing = dataclasses.make_dataclass("Thing", ["value", ("other", object, None)], eq=False, slots=True)
+Thing = dataclasses.make_dataclass(
+    "Thing", ["value", ("other", object, None)], eq=False, slots=True
+)
 
 
 def holding(**attributes):
@@ -541,11 +618,16 @@ def test_a_long_history_does_not_hide_the_rest():
     history = [[number] * 10 for number in range(10_000)]
     one, other = (holding(history=history, thing=random.Random(seed)) for seed in (1, 2))
     assert len(one) >= MOST_PARTS
-    assert [path for path, _, _ in differences(one, other)] == ["simulation.thing (state of the generator)"]
+    assert [path for path, _, _ in differences(one, other)] == [
+        "simulation.thing (state of the generator)"
+    ]
 
 
 def test_episodes_are_counted_by_how_they_end():
-    limited, endless = variant("Limited", run=lambda walk: Walk.run(walk) or TRUNCATED), variant("Long", steps=10**9)
+    limited, endless = (
+        variant("Limited", run=lambda walk: Walk.run(walk) or TRUNCATED),
+        variant("Long", steps=10**9),
+    )
     assert clean(checked(limited)).episodes == {"terminated": 0, "truncated": 4, "cut": 0}
     assert checked(endless).episodes == {"terminated": 0, "truncated": 0, "cut": 4}
     only_error(checked(endless, {"observation_space_mapping": moving}), OBSERVED)

@@ -142,7 +142,9 @@ same = partial(data_equivalence, exact=True)
 def alike(one: Any, other: Any) -> bool:
     """The same, but for how long it has taken; tensors are compared as arrays."""
     if isinstance(one, dict):
-        return one.keys() == other.keys() and all(alike(one[key], other[key]) for key in one if key != "t")
+        return one.keys() == other.keys() and all(
+            alike(one[key], other[key]) for key in one if key != "t"
+        )
     if isinstance(one, (list, tuple)):
         return len(one) == len(other) and all(map(alike, one, other))
     if type(one).__module__ == "torch":
@@ -157,7 +159,9 @@ def legal_actions(envs: Any, infos: dict[str, Any], rng: np.random.Generator) ->
     masks = infos.get("action_mask")
     if isinstance(masks, np.ndarray):
         start = envs.single_action_space.start
-        actions = np.array([start + rng.choice(np.flatnonzero(m)) if m.any() else start for m in masks])
+        actions = np.array(
+            [start + rng.choice(np.flatnonzero(m)) if m.any() else start for m in masks]
+        )
     return actions
 
 
@@ -181,11 +185,21 @@ def agree(ours: Any, theirs: Any, steps: int, rng: np.random.Generator) -> None:
                 assert same(*told)
 
 
-def made(design: Any, number: int, mode: AutoresetMode, *, sync: bool = False, **options: Any) -> Any:
-    """A vector environment of worlds of a design, ours or Gymnasium's; None where there is no such."""
+def made(
+    design: Any, number: int, mode: AutoresetMode, *, sync: bool = False, **options: Any
+) -> Any:
+    """A vector environment of worlds of a design, ours or Gymnasium's; None where there is no
+    such.
+    """
     points = points_of(design)
-    policies = {points[point]: advised for point in design.policies} | {points[point]: RULE for point in design.rules}
-    entities = [point for point in design.active if agent_of(design.kinds[point], point, 0) != f"point_{point}"]
+    policies = {points[point]: advised for point in design.policies} | {
+        points[point]: RULE for point in design.rules
+    }
+    entities = [
+        point
+        for point in design.active
+        if agent_of(design.kinds[point], point, 0) != f"point_{point}"
+    ]
     options |= {"policies": policies or None, "max_steps": design.max_steps}
     if entities:
         names = {p: [agent_of(design.kinds[p], p, entity) for entity in range(3)] for p in entities}

@@ -33,7 +33,9 @@ class Dial:
         self.place, self.turns = self.place + by, self.turns + 1
 
     def picture(self) -> Any:
-        return (np.arange(72).reshape(6, 4, 3) * (self.turns + 1) + int(self.place * 10)).astype(np.uint8)
+        return (np.arange(72).reshape(6, 4, 3) * (self.turns + 1) + int(self.place * 10)).astype(
+            np.uint8
+        )
 
 
 def turned_by(action: Any) -> float:
@@ -99,7 +101,13 @@ class DialEnv(gymnasium.Env[Any, Any]):
         self.dial.turn(turned_by(action))
         ended, truncated = self.dial.ended, self.dial.truncated
         info = {"time": float(self.dial.turns), "elapsed": 1.0}
-        return self.look(self.dial), self.dial.place, ended and not truncated, ended and truncated, info
+        return (
+            self.look(self.dial),
+            self.dial.place,
+            ended and not truncated,
+            ended and truncated,
+            info,
+        )
 
     def render(self) -> Any:
         return self.dial.picture()

@@ -1,4 +1,6 @@
-"""A simulation to be planned in, and what its futures must be worth, computed without the library."""
+"""A simulation to be planned in, and what its futures must be worth, computed without the
+library.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,10 @@ from tests.worlds.models import define
 
 
 class Duel:
-    """Two who move a value: the one up, the other down, as far as chance has it. Who is on the left may retire."""
+    """Two who move a value: the one up, the other down, as far as chance has it.
+
+    Who is on the left may retire.
+    """
 
     turns = 6
     ceiling = 1e9
@@ -96,10 +101,13 @@ def rule(seen: list[float]) -> int:
 class Told(Duel):
     """A duel that is told what is decided, and notes what an agent is rewarded for."""
 
-    def __init__(self, agent: str, at: int, action: int, future: int | None, bases: dict[str, Base]) -> None:
+    def __init__(
+        self, agent: str, at: int, action: int, future: int | None, bases: dict[str, Base]
+    ) -> None:
         self.agent, self.at, self.action, self.future, self.bases = agent, at, action, future, bases
         self.asked = 0
-        self.marks: list[tuple[float, float]] = []  # time and value at each decision of the agent from then on
+        # time and value at each decision of the agent from then on
+        self.marks: list[tuple[float, float]] = []
         self.over = False
 
     def _decide(self, agent: str) -> int:

@@ -1,4 +1,6 @@
-"""How many branches and clones of random worlds differ from the run that they continue; there are to be none.
+"""How many branches and clones of random worlds differ from the run that they continue.
+
+There are to be none.
 
 Run with ``python -m tests.worlds.exactness 10000``.
 """
@@ -20,7 +22,9 @@ from tests.worlds.trips import move
 
 
 def tree_of_archive(chance: random.Random) -> list[bool]:
-    """Which branches and clones in a tree become what their archive becomes: files, and global generators."""
+    """Which branches and clones in a tree become what their archive becomes: files, and global
+    generators.
+    """
 
     def step(env: Any) -> tuple[Any, bool]:
         told = env.step(3)
@@ -31,7 +35,9 @@ def tree_of_archive(chance: random.Random) -> list[bool]:
 
 
 def tree_of_yard(chance: random.Random) -> list[bool]:
-    """Which branches and clones in a tree become what their yard becomes: births, deaths, stacks in stacks."""
+    """Which branches and clones in a tree become what their yard becomes: births, deaths, stacks
+    in stacks.
+    """
     design = Design(
         machines=chance.randint(1, 4),
         jobs=chance.randint(1, 3),
@@ -47,12 +53,17 @@ def tree_of_yard(chance: random.Random) -> list[bool]:
 
 
 def of_tree(
-    chance: random.Random, env: Any, step: Callable[[Any], tuple[Any, bool]], come: Any, methods: list[str]
+    chance: random.Random,
+    env: Any,
+    step: Callable[[Any], tuple[Any, bool]],
+    come: Any,
+    methods: list[str],
 ) -> list[bool]:
-    """Which clones of an environment, which of its clones, and which branches of all these become what it becomes.
+    """Which clones of an environment, which of its clones, and which branches of all these become
+    what it becomes.
 
-    All move in a random order. A ``step`` returns what is told, and whether it was the last one. ``come`` returns what
-    has come of a simulation.
+    All move in a random order. A ``step`` returns what is told, and whether it was the last one.
+    ``come`` returns what has come of a simulation.
     """
 
     def rest(env: Any, number: int, told: list[Any]) -> Any:

@@ -1,4 +1,6 @@
-"""A simulation in which anything may happen anywhere: in the model, its mappings, policies and handlers."""
+"""A simulation in which anything may happen anywhere: in the model, its mappings, policies and
+handlers.
+"""
 
 from __future__ import annotations
 
@@ -142,10 +144,14 @@ POINTS = {
         agent=at("agent", lambda beast: f"beast_{beast.number}"),
         observation_space_mapping=at("observation", [0, 0]),
         reward_mapping=at("reward", 1.0),
-        removed_by={f"{__name__}.Farm.remove": at("removed_by", lambda farm, beast: f"beast_{beast.number}")},
+        removed_by={
+            f"{__name__}.Farm.remove": at("removed_by", lambda farm, beast: f"beast_{beast.number}")
+        },
     ),
     PICK: define(
-        agent="picker", choices=at("choices", lambda farm: list(range(farm.now + 1))), action_space=spaces.Discrete(5)
+        agent="picker",
+        choices=at("choices", lambda farm: list(range(farm.now + 1))),
+        action_space=spaces.Discrete(5),
     ),
     WORK: define(agent="worker", observation_space_mapping=at("observation", [0, 0])),
 }
@@ -176,7 +182,9 @@ def comes_by(view: Any, place: str) -> bool:
 
 
 def farm_env(view: Any, place: str | None = None, **options: Any) -> Any:
-    """An environment of a farm, which comes by that place, and its farm, for a vector the first one."""
+    """An environment of a farm, which comes by that place, and its farm, for a vector the first
+    one.
+    """
 
     def policy(observation: Any) -> int:
         farms[0].come_by("policy")
@@ -194,7 +202,9 @@ def farm_env(view: Any, place: str | None = None, **options: Any) -> Any:
     elif view in (joint_env, vector_of_joint):
         options["possible_agents"] = {MOVE: [f"beast_{number}" for number in range(3)]}
     env = view(Farm, points, **options)
-    farms += env.get_attr("simulation") if isinstance(env, VectorEnv) else [env.unwrapped.simulation]
+    farms += (
+        env.get_attr("simulation") if isinstance(env, VectorEnv) else [env.unwrapped.simulation]
+    )
     return env, farms[0]
 
 
@@ -208,7 +218,11 @@ def take(env: Any, action: Any) -> Any:
         action = np.zeros(2, np.int64)
     elif action is RULE:
         return env.step(RULE)
-    return env.step(dict.fromkeys(env.action_space, action) if isinstance(env.action_space, spaces.Dict) else action)
+    return env.step(
+        dict.fromkeys(env.action_space, action)
+        if isinstance(env.action_space, spaces.Dict)
+        else action
+    )
 
 
 dumps = partial(json.dumps, default=lambda told: [told.dtype.name, told.tolist()])
@@ -226,7 +240,9 @@ def run(env: Any, seed: int = 11) -> str:
 
 
 def cut_short(env: Any) -> None:
-    """Begin an episode, go on a little, and close the environment, or reset it if it would be of no use after that."""
+    """Begin an episode, go on a little, and close the environment, or reset it if it would be of
+    no use after that.
+    """
     env.reset(seed=11)
     take(env, RULE)
     env.reset() if isinstance(env, VectorEnv) else env.close()

@@ -42,7 +42,9 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
     "updates": lambda wire: [wire.send(UPDATE) for _ in range(10**6)],
     "slow updates": lambda wire: [(wire.send(UPDATE), time.sleep(0.01)) for _ in range(60_000)],
     "gigabyte": lambda wire: [wire.raw(bytes(1 << 20)) for _ in range(1 << 10)],
-    "error": lambda wire: wire.send({"error": {"type": "Flood", "text": "a dam broke", "trace": "dam.cpp:12"}}),
+    "error": lambda wire: wire.send(
+        {"error": {"type": "Flood", "text": "a dam broke", "trace": "dam.cpp:12"}}
+    ),
 }
 """What goes wrong in mid-episode, after three decisions."""
 
@@ -60,7 +62,9 @@ class Faulty:
         """Decide three times, then do it."""
         try:
             for _ in range(3):
-                decide("reservoir.inflow", "a", None, {"level": 1.0, "queue-length": 0}, lambda: 1.0)
+                decide(
+                    "reservoir.inflow", "a", None, {"level": 1.0, "queue-length": 0}, lambda: 1.0
+                )
         except outside.Stopped:
             if self.what == "end after stop":
                 self.wire.send({"end": {}})

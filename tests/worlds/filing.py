@@ -1,4 +1,6 @@
-"""A simulation that keeps files and draws from the global generators, which a fork must not disturb."""
+"""A simulation that keeps files and draws from the global generators, which a fork must not
+disturb.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ choose = decision()
 
 
 class Archive:
-    """Between two decisions it does something with a file, drawn at random; all that it reads is in its log."""
+    """Between two decisions it does something with a file, drawn at random; all that it reads is
+    in its log.
+    """
 
     def __init__(self, days: int = 12) -> None:
         self.days = days
@@ -38,13 +42,18 @@ class Archive:
 
     def run(self) -> None:
         with tempfile.NamedTemporaryFile("w+", dir=self.folder, delete=False) as self.named:
-            Path(self.folder, "0").write_text("".join(f"{line} " * 3 + "\n" for line in range(3000)))
+            Path(self.folder, "0").write_text(
+                "".join(f"{line} " * 3 + "\n" for line in range(3000))
+            )
             try:
-                for _ in range(self.chance.randrange(6)):  # what is found by its name is every branch's alike
+                # what is found by its name is every branch's alike
+                for _ in range(self.chance.randrange(6)):
                     self.open()
                 self.numbers.append(os.open(Path(self.folder, "0"), os.O_RDWR))
                 for day in range(self.days):
-                    self.log.append((day, choose(), random.random(), random.gauss(0, 1), np.random.random()))
+                    self.log.append(
+                        (day, choose(), random.random(), random.gauss(0, 1), np.random.random())
+                    )
                     for _ in range(self.chance.randrange(4)):
                         self.chance.choice(DEEDS)(self)
                 self.look()

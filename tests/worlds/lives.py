@@ -12,7 +12,9 @@ from tests.worlds.models import Turn
 class Life:
     """A simulation of ten beings; ``now`` is told as its time where it is timed."""
 
-    def __init__(self, program: str, announced: Iterable[int] | None, ends: Any, kind: type) -> None:
+    def __init__(
+        self, program: str, announced: Iterable[int] | None, ends: Any, kind: type
+    ) -> None:
         self.program, self.announced, self.ends, self.kind = program, announced, ends, kind
 
     def reset(self, seed: int | None = None) -> None:
@@ -54,7 +56,12 @@ class Announcing(Life):
 
 
 def life(
-    program: str, *, announced: Iterable[int] | None = None, timed: bool = False, ends: Any = None, kind: type = Being
+    program: str,
+    *,
+    announced: Iterable[int] | None = None,
+    timed: bool = False,
+    ends: Any = None,
+    kind: type = Being,
 ) -> Callable[[], Life]:
     """A factory of lives, as ``life("0 acts, 0 health 5, 0 leaves, 1 acts")``."""
     base = Life if announced is None else Announcing
@@ -67,5 +74,7 @@ def story(turns: Iterable[Turn]) -> str:
     """Who decides, is removed and is truncated, in the order of turns."""
     words = []
     for turn in turns:
-        words.append(turn.agent.removeprefix("being_") + "+" * turn.terminated + "~" * turn.truncated)
+        words.append(
+            turn.agent.removeprefix("being_") + "+" * turn.terminated + "~" * turn.truncated
+        )
     return " ".join(words)

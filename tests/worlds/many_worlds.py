@@ -1,8 +1,8 @@
 """Entities that are born, decide and die, for the tests of many agents.
 
-``Being`` is an entity of no model in particular. ``Colony`` is a whole simulation, in which what is decided makes
-creatures be born and die, decide twice, or never; ``Answered`` is the same without the library, and notes what must
-come of it.
+``Being`` is an entity of no model in particular. ``Colony`` is a whole simulation, in which what is
+decided makes creatures be born and die, decide twice, or never; ``Answered`` is the same without
+the library, and notes what must come of it.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ class Design:
     Attributes:
         initial, most: How many creatures there are first, and may be in all.
         ticks: How long it runs.
-        overseen: Whether the colony itself decides in each tick, and when: before or after the creatures.
+        overseen: Whether the colony itself decides in each tick, and when: before or after the
+            creatures.
         truncates: Whether the end is a limit of time.
     """
 
@@ -211,13 +212,18 @@ class Announcing(Colony):
     """A colony that knows who is going to decide."""
 
     def expected_calls(self, point: str) -> list[tuple[Any]]:
-        return [(creature,) for creature in self.creatures] if point.endswith("Creature.act") else [(self,)]
+        return (
+            [(creature,) for creature in self.creatures]
+            if point.endswith("Creature.act")
+            else [(self,)]
+        )
 
 
 class Answered(Colony):
     """A colony without an environment, in which everybody answers as ``answer`` says.
 
-    It keeps who has decided, in their order, and by agent the fortune at its first decision and at its end.
+    It keeps who has decided, in their order, and by agent the fortune at its first decision and at
+    its end.
     """
 
     def __init__(self, design: Design, seed: int | None = None, answers: Any = answer) -> None:
@@ -285,8 +291,13 @@ def colony_points(*, overseen: bool) -> dict[Any, Any]:
 _made: dict[Any, Any] = {}
 
 
-def colony(make: Any, design: Design, simulation: type[Colony] = Colony, *, roster: bool = False) -> Any:
-    """An environment of a colony, also one made before. ``roster``: whether all possible agents are declared."""
+def colony(
+    make: Any, design: Design, simulation: type[Colony] = Colony, *, roster: bool = False
+) -> Any:
+    """An environment of a colony, also one made before.
+
+    ``roster``: whether all possible agents are declared.
+    """
     key = make, bool(design.overseen), simulation, roster
     if key not in _made:
         names = {f"{HERE}.Creature.act": ROSTER} if roster else None

@@ -18,7 +18,9 @@ from simenv_marl import RULE, Definition, make_step
 
 
 def plainly(value: Any) -> str:
-    """What a test with that value is called: the same in every process, whatever lies where in memory."""
+    """What a test with that value is called: the same in every process, whatever lies where in
+    memory.
+    """
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
@@ -26,7 +28,9 @@ PAIR = spaces.Box(-1e6, 1e6, (2,), np.float64)
 
 
 def define(**changes: Any) -> Definition:
-    """A definition that returns the action itself, observes (1, 2) and rewards nothing, but for what is changed."""
+    """A definition that returns the action itself, observes (1, 2) and rewards nothing, but for
+    what is changed.
+    """
     given: dict[str, Any] = {
         "observation_space": PAIR,
         "observation_space_mapping": lambda *args, **kwargs: [1.0, 2.0],
@@ -111,11 +115,13 @@ class Turn(NamedTuple):
     action: Any
 
 
-def play(env: Any, actions: Any = RULE, *, seed: int | None = None, reset: bool = True) -> list[Turn]:
+def play(
+    env: Any, actions: Any = RULE, *, seed: int | None = None, reset: bool = True
+) -> list[Turn]:
     """Play an AEC environment to its end.
 
-    ``actions`` is one action for all decisions, an iterator of them, a dict from agents to either, or a callable of
-    the agent and the environment.
+    ``actions`` is one action for all decisions, an iterator of them, a dict from agents to either,
+    or a callable of the agent and the environment.
     """
     if reset:
         env.reset(seed=seed)
@@ -142,7 +148,9 @@ def step(env: Any, action: Any, agent: str) -> bool:
     if isinstance(env, ParallelEnv):
         env.step({agent: action})
         return agent not in env.agents
-    return any(env.step({agent: action} if isinstance(env.action_space, spaces.Dict) else action)[2:4])
+    return any(
+        env.step({agent: action} if isinstance(env.action_space, spaces.Dict) else action)[2:4]
+    )
 
 
 def follow_the_rule(env: Any, seed: int | None = None) -> Any:
@@ -166,7 +174,9 @@ def decisions(turns: list[Turn]) -> list[str]:
 
 
 def rewards_of(turns: list[Turn], agent: str) -> list[float]:
-    """An agent's rewards for its actions, in their order (what it had before its first one left out)."""
+    """An agent's rewards for its actions, in their order (what it had before its first one left
+    out).
+    """
     return [turn.reward for turn in turns if turn.agent == agent][1:]
 
 
@@ -185,20 +195,26 @@ def culprits(error: BaseException) -> list[str]:
 
 
 def alive(kind: type) -> int:
-    """How many objects of a type there are since the file of tests began, once the collector has run."""
+    """How many objects of a type there are since the file of tests began, once the collector has
+    run.
+    """
     gc.collect()
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
 def stacks(before: WeakSet[Any] | None = None) -> WeakSet[Any]:
-    """The greenlets since the file of tests began, but for those that are a thread's own, which have no parent.
+    """The greenlets since the file of tests began, but for those that are a thread's own, which
+    have no parent.
 
-    Those that were there ``before`` are left out. Of environments that hold others one goes at a time.
+    Those that were there ``before`` are left out. Of environments that hold others one goes at a
+    time.
     """
     for _ in range(1000):  # on a machine that is busy a moment may be long
         gc.collect()
         found = WeakSet(
-            thing for thing in gc.get_objects() if type(thing) is greenlet.greenlet and thing.parent is not None
+            thing
+            for thing in gc.get_objects()
+            if type(thing) is greenlet.greenlet and thing.parent is not None
         )
         if before is None or found <= before:
             break
@@ -210,5 +226,7 @@ _unattended = decision()
 
 
 def nobody_is_asked() -> bool:
-    """Whether no simulation is taken to run in this thread: then decision functions are their rules."""
+    """Whether no simulation is taken to run in this thread: then decision functions are their
+    rules.
+    """
     return bool(_unattended() == "rule")

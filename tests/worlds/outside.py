@@ -1,8 +1,10 @@
-"""A model of its own process, which speaks the wire: reservoirs that are filled, leak, are given up and come anew.
+"""A model of its own process, which speaks the wire: reservoirs that are filled, leak, are given
+up and come anew.
 
-``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its rule decides.
-``python outside.py SEED`` plays it by its own rule. It needs nothing but Python, and nothing of the library, as a
-simulator in another language would not have it. The tests run the same model in their own process, too.
+``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its
+rule decides. ``python outside.py SEED`` plays it by its own rule. It needs nothing but Python, and
+nothing of the library, as a simulator in another language would not have it. The tests run the same
+model in their own process, too.
 """
 
 import json
@@ -19,7 +21,10 @@ class Stopped(BaseException):
 
 
 class Reservoirs:
-    """Some reservoirs. Whoever operates one says how much is let in; a broker, now and then, sets the price."""
+    """Some reservoirs.
+
+    Whoever operates one says how much is let in; a broker, now and then, sets the price.
+    """
 
     def __init__(self, seed: int, options: dict[str, Any]) -> None:
         self.random = random.Random(seed)
@@ -27,8 +32,12 @@ class Reservoirs:
         self.levels = {"a": 4.0, "b": 6.0}
         self.price, self.time, self.born, self.log = 1.0, 0.0, 0, []
 
-    def run(self, decide: Callable[..., Any], remove: Callable[..., None], update: Callable[..., None]) -> None:
-        """The main loop: decides by ``decide``, says what is gone by ``remove``, and what has changed by ``update``."""
+    def run(
+        self, decide: Callable[..., Any], remove: Callable[..., None], update: Callable[..., None]
+    ) -> None:
+        """The main loop: decides by ``decide``, says what is gone by ``remove``, and what has
+        changed by ``update``.
+        """
         for hour in range(self.hours):
             if self.words:
                 print("hm" * self.words, file=sys.stderr)
@@ -48,13 +57,21 @@ class Reservoirs:
                 self.log.append([hour, name, self.levels[name]])
                 if not 0 < self.levels[name] < 9:
                     level = self.levels.pop(name)
-                    update("reservoir.inflow", name, {"level": level, "queue-length": hour, "price": self.price})
+                    update(
+                        "reservoir.inflow",
+                        name,
+                        {"level": level, "queue-length": hour, "price": self.price},
+                    )
                     remove("reservoir.inflow", name)
                     self.born += 1
                     self.levels[f"new{self.born}"] = self.random.uniform(2, 6)
             if hour % 3 == 2:
                 self.price = decide(
-                    "broker.price", None, self.time, {"total": sum(self.levels.values())}, lambda: self.price * 1.1
+                    "broker.price",
+                    None,
+                    self.time,
+                    {"total": sum(self.levels.values())},
+                    lambda: self.price * 1.1,
                 )
 
     def result(self) -> dict[str, Any]:
@@ -63,7 +80,11 @@ class Reservoirs:
 
     def by_its_rule(self) -> dict[str, Any]:
         """What comes of it by its own rule."""
-        self.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
+        self.run(
+            lambda point, entity, time, arguments, rule: rule(),
+            lambda *named: None,
+            lambda *named: None,
+        )
         return self.result()
 
 
@@ -95,10 +116,18 @@ class Wire:
         frame: dict[str, Any] = json.loads(line)
         return frame
 
-    def decide(self, point: str, entity: Any, time: float | None, arguments: Any, rule: Callable[[], Any]) -> Any:
+    def decide(
+        self, point: str, entity: Any, time: float | None, arguments: Any, rule: Callable[[], Any]
+    ) -> Any:
         """Have something decided."""
         self.number += 1
-        frame = {"decide": self.number, "point": point, "entity": entity, "time": time, "args": arguments}
+        frame = {
+            "decide": self.number,
+            "point": point,
+            "entity": entity,
+            "time": time,
+            "args": arguments,
+        }
         self.send({name: value for name, value in frame.items() if value is not None})
         answer = self.receive()
         if "reseed" in answer:
@@ -122,9 +151,13 @@ class Wire:
         """Say what the arguments of an entity would be by now."""
         self.send({"update": entity, "point": point, "args": arguments})
 
-    def play(self, make: Callable[[int, dict[str, Any]], Any], points: list[str], episodes: float = inf) -> None:
+    def play(
+        self, make: Callable[[int, dict[str, Any]], Any], points: list[str], episodes: float = inf
+    ) -> None:
         """Play so many episodes."""
-        self.send({"hello": 1, "points": points, "can": ["reseed", *(["decided"] if self.tells else [])]})
+        self.send(
+            {"hello": 1, "points": points, "can": ["reseed", *(["decided"] if self.tells else [])]}
+        )
         played = 0
         while played < episodes:
             start = self.receive()["start"]
@@ -142,7 +175,9 @@ POINTS = ["reservoir.inflow", "broker.price"]
 
 
 def main() -> None:
-    """Play to an environment, or by the model's own rule: the result stands on the standard output then."""
+    """Play to an environment, or by the model's own rule: the result stands on the standard output
+    then.
+    """
     numbers = [int(word) for word in sys.argv[1:] if word.isdecimal()]
     if "SIMENV_MARL_FDS" in os.environ:
         Wire().play(Reservoirs, POINTS, *numbers)

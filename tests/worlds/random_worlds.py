@@ -1,7 +1,8 @@
-"""Random models of processes in continuous time, whose machines decide while they hold what others wait for.
+"""Random models of processes in continuous time, whose machines decide while they hold what others
+wait for.
 
-A ``Yard`` is made of SimPy processes, nested generators, births and deaths. What comes of it is all in its ``trace``
-and its generator, and depends on every decision and on their order.
+A ``Yard`` is made of SimPy processes, nested generators, births and deaths. What comes of it is all
+in its ``trace`` and its generator, and depends on every decision and on their order.
 """
 
 from __future__ import annotations
@@ -21,14 +22,19 @@ from tests.worlds.models import define
 
 HERE = __name__
 MOST = 6
-ROSTER = {f"{HERE}.Machine.{name}": [f"{name}_{number}" for number in range(MOST)] for name in ("load", "pace")}
+ROSTER = {
+    f"{HERE}.Machine.{name}": [f"{name}_{number}" for number in range(MOST)]
+    for name in ("load", "pace")
+}
 
 
 @dataclass(frozen=True)
 class Design:
-    """What a yard is like: machines at first, jobs of each, machines that may load at once (``cranes``).
+    """What a yard is like: machines at first, jobs of each, machines that may load at once
+    (``cranes``).
 
-    It decides itself every ``plans`` units of time. One of ``luck`` cases brings a birth or a death.
+    It decides itself every ``plans`` units of time. One of ``luck`` cases brings a birth or a
+    death.
     """
 
     machines: int
@@ -176,7 +182,9 @@ PLAN = {f"{HERE}.Yard.plan": POINTS[f"{HERE}.Yard.plan"]}
 
 
 def advised(observation: Any) -> Any:
-    """What everybody answers who makes that observation of a machine or of the yard: an action, or the rule."""
+    """What everybody answers who makes that observation of a machine or of the yard: an action, or
+    the rule.
+    """
     number, decided, _, seed = (int(value) for value in observation)
     return random.Random(f"{seed} {number} {decided}").choice([1, 2, 3, 4, RULE])
 

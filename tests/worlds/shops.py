@@ -1,4 +1,6 @@
-"""A small shop whose keeper and helper decide, for experiments: its returns are known without the library."""
+"""A small shop whose keeper and helper decide, for experiments: its returns are known without the
+library.
+"""
 
 import time
 from dataclasses import replace
@@ -53,9 +55,12 @@ POINTS = {
     Shop.sell: make_step(**DECIDED, reward_mapping=lambda shop: 1.0, agent="helper"),
 }
 NEAR = {
-    point: replace(definition, reward_mapping=lambda shop: -abs(shop.level)) for point, definition in POINTS.items()
+    point: replace(definition, reward_mapping=lambda shop: -abs(shop.level))
+    for point, definition in POINTS.items()
 }
-"""Points at which both are to keep the level near to nothing, so that chance matters to those who plan."""
+"""Points at which both are to keep the level near to nothing, so that chance matters to those who
+plan.
+"""
 
 
 def much(observation):

@@ -1,4 +1,6 @@
-"""A trip has all that a clone must continue, and is undertaken in all views; its diary is a file of all processes."""
+"""A trip has all that a clone must continue, and is undertaken in all views; its diary is a file
+of all processes.
+"""
 
 import os
 import random
@@ -24,7 +26,13 @@ class Trip:
         self.diary = diary
 
     def reset(self, seed=None):
-        self.seed, self.random, self.day, self.place, self.steps = seed, random.Random(seed), 0, 0.0, []
+        self.seed, self.random, self.day, self.place, self.steps = (
+            seed,
+            random.Random(seed),
+            0,
+            0.0,
+            [],
+        )
         self.held = (step for step in self.steps)  # which cannot be pickled
         self.note("reset")
 
@@ -35,7 +43,9 @@ class Trip:
         try:
             while self.day < 5:
                 self.steps.append(self.walk())
-                self.steps.append(self.lead([1.5, -1.5, 3.0][: 3 if self.free else self.random.randrange(1, 4)]))
+                self.steps.append(
+                    self.lead([1.5, -1.5, 3.0][: 3 if self.free else self.random.randrange(1, 4)])
+                )
                 self.place += sum(self.steps[-2:]) + self.luck()
                 self.day += 1
         finally:
@@ -75,7 +85,10 @@ class Lucky(Trip):
         return random.random() + float(np.random.standard_normal())
 
 
-PLACE = {"observation_space": spaces.Box(-99, 99, (2,), np.float32), "action_space": spaces.Discrete(3)}
+PLACE = {
+    "observation_space": spaces.Box(-99, 99, (2,), np.float32),
+    "action_space": spaces.Discrete(3),
+}
 POINTS = {
     f"{__name__}.Trip.walk": define(
         agent="walker_0", observation_space_mapping=Trip.state, action_space_mapping=lambda action: action - 1,
@@ -112,7 +125,9 @@ def trip(view="single", simulation=Trip, *, taken=1, seed=3, **options):
 
 
 def move(env):
-    """Take the step that the generators of the spaces draw, in any view; return all that is told, and if it is over."""
+    """Take the step that the generators of the spaces draw, in any view; return all that is told,
+    and if it is over.
+    """
     view = env.unwrapped
 
     def drawn(name, space):
@@ -120,7 +135,11 @@ def move(env):
         return RULE if space.np_random.random() < 0.2 else space.sample(mask)
 
     if isinstance(env, AECEnv):
-        last, name, seen = env.last(), env.agent_selection, [env.observe(agent) for agent in env.agents]
+        last, name, seen = (
+            env.last(),
+            env.agent_selection,
+            [env.observe(agent) for agent in env.agents],
+        )
         told = repr((name, last, seen, env.rewards, env.terminations, env.truncations, env.infos))
         env.step(None if last[2] or last[3] else drawn(name, env.action_space(name)))
     elif isinstance(env, ParallelEnv):
@@ -128,7 +147,11 @@ def move(env):
     elif isinstance(env.action_space, spaces.Dict):
         told = env.step({name: drawn(name, space) for name, space in env.action_space.items()})
     else:
-        told = *env.step(drawn("walker_0", env.action_space)), view.action_masks(), view.compute_reward([2.5], 0, {})
+        told = (
+            *env.step(drawn("walker_0", env.action_space)),
+            view.action_masks(),
+            view.compute_reward([2.5], 0, {}),
+        )
     over = not env.agents if hasattr(view, "agents") else told[2] or told[3]
     return repr((told, view.state(), env.render() if view.render_mode else None)), over
 

@@ -19,7 +19,10 @@ MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")
 def registries_put_back() -> Iterator[None]:
     """Put back what Gymnasium's and PettingZoo's registries held."""
     names = ("aec_registry", "parallel_registry")  # older releases have none
-    registries = (gymnasium.registry, *(getattr(pettingzoo, name) for name in names if hasattr(pettingzoo, name)))
+    registries = (
+        gymnasium.registry,
+        *(getattr(pettingzoo, name) for name in names if hasattr(pettingzoo, name)),
+    )
     before = [dict(registry) for registry in registries]
     try:
         yield
@@ -33,7 +36,8 @@ def registries_put_back() -> Iterator[None]:
 def models_of_pages_forgotten() -> Iterator[None]:
     """Have the models of pages imported anew, and forget them afterwards.
 
-    Names of decision points would find the decorated functions of an earlier import as long as these exist.
+    Names of decision points would find the decorated functions of an earlier import as long as
+    these exist.
     """
     _forget_models_of_pages()
     try:
@@ -61,4 +65,8 @@ def left_as_they_were(*places: Any) -> Iterator[None]:
 
 def held(place: Any) -> dict[str, Any]:
     """What a class or module holds, but for what Python adds."""
-    return {name: value for name, value in vars(place).items() if not name.startswith("__") or name == "__init__"}
+    return {
+        name: value
+        for name, value in vars(place).items()
+        if not name.startswith("__") or name == "__init__"
+    }

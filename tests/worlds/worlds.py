@@ -1,8 +1,9 @@
 """Random simulations, and what must come of them, computed without the library.
 
-A world has a level, which every decision changes, and a program: the calls of its decision points in their
-order. ``Reference`` is a world that goes through its program by itself, and tells who decides when, what it observes,
-what it is paid and what the model comes to. It knows of no environment, stack or greenlet.
+A world has a level, which every decision changes, and a program: the calls of its decision points
+in their order. ``Reference`` is a world that goes through its program by itself, and tells who
+decides when, what it observes, what it is paid and what the model comes to. It knows of no
+environment, stack or greenlet.
 """
 
 from __future__ import annotations
@@ -19,7 +20,17 @@ from hypothesis import strategies as st
 from simenv_marl import RULE, TRUNCATED, difference
 from tests.worlds.models import define
 
-KINDS = ("method", "function", "keyword", "entity", "sometimes", "nested", "generator", "choices", "apply")
+KINDS = (
+    "method",
+    "function",
+    "keyword",
+    "entity",
+    "sometimes",
+    "nested",
+    "generator",
+    "choices",
+    "apply",
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +56,9 @@ class Design:
     @property
     def active(self) -> list[int]:
         """The points that the environment's user answers."""
-        return [point for point in range(len(self.kinds)) if point not in self.policies | self.rules]
+        return [
+            point for point in range(len(self.kinds)) if point not in self.policies | self.rules
+        ]
 
 
 @st.composite
@@ -71,8 +84,13 @@ def designs(draw: Any) -> Design:
 
 seeds = st.integers(0, 2**31 - 1)
 
-answers = seeds.map(lambda seed: random.Random(seed).choices([*range(10), RULE], [1] * 10 + [3], k=80))
-"""Answers in the order of the decisions; an integer becomes legal by its remainder. There are enough of them."""
+answers = seeds.map(
+    lambda seed: random.Random(seed).choices([*range(10), RULE], [1] * 10 + [3], k=80)
+)
+"""Answers in the order of the decisions; an integer becomes legal by its remainder.
+
+There are enough of them.
+"""
 
 
 def agent_of(kind: str, point: int, entity: int) -> str | None:
@@ -158,7 +176,10 @@ def iter_value(generator: Any) -> Iterable[int]:
 
 def points_of(design: Design) -> list[Callable[..., Any]]:
     """Decision functions of a design, whose rules are those of the world."""
-    return [_point(kind, number, number in design.differences) for number, kind in enumerate(design.kinds)]
+    return [
+        _point(kind, number, number in design.differences)
+        for number, kind in enumerate(design.kinds)
+    ]
 
 
 def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
@@ -167,7 +188,9 @@ def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
 
     changes: dict[str, Any] = {
         "agent": f"point_{point}",
-        "observation_space_mapping": lambda thing, **_: watched(world_of(thing).level, world_of(thing).calls),
+        "observation_space_mapping": lambda thing, **_: watched(
+            world_of(thing).level, world_of(thing).calls
+        ),
         "reward_mapping": lambda thing, **_: paid(world_of(thing).level, point),
     }
     if by_difference:
@@ -200,7 +223,10 @@ def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
     elif kind in ("keyword", "generator"):
         rule = vars(Rules)[kind]
     if kind == "choices":
-        changes |= {"choices": lambda world: offered(world_of(world).level), "action_space": spaces.Discrete(4)}
+        changes |= {
+            "choices": lambda world: offered(world_of(world).level),
+            "action_space": spaces.Discrete(4),
+        }
     if kind == "apply":
         changes["apply"] = lambda action, world: action + world.random.randrange(3)
     return define(**changes)(rule)
@@ -223,7 +249,8 @@ class Reference(World):
     """What must come of a design, a seed and the answers that were given so far.
 
     Attributes:
-        turns: The decisions that have arisen, in their order; the last one waits unless the episode is over.
+        turns: The decisions that have arisen, in their order; the last one waits unless the episode
+            is over.
         ends: What the agents are told at the end; None where the episode is not over.
         truncated: Whether it was truncated.
         trace: What the model has noted.

@@ -32,9 +32,10 @@ _SMALL = 16  # up to this many elements, comparing Python floats is faster than 
 def action_check(space: spaces.Space[Any], *, clips: bool = False) -> Check:
     """Make the function that checks actions against a space.
 
-    The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action of a ``Discrete``,
-    and a scalar for a one-element ``Box`` unchanged. All other actions are copied, for a ``Box`` in its dtype. If it
-    ``clips``, it clips the parts of actions that belong to a ``Box``.
+    The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action
+    of a ``Discrete``, and a scalar for a one-element ``Box`` unchanged. All other actions are
+    copied, for a ``Box`` in its dtype. If it ``clips``, it clips the parts of actions that belong
+    to a ``Box``.
     """
     if isinstance(space, spaces.Discrete):
         return _discrete_check(space)
@@ -58,7 +59,9 @@ def _parts_check(space: spaces.Dict | spaces.Tuple[Any], clips: bool) -> Check:
     checks: dict[Any, Check] = {key: action_check(part, clips=clips) for key, part in parts}
 
     def check(action: Any) -> Any:
-        if not isinstance(action, Mapping if named else (tuple, list)) or len(action) != len(checks):
+        if not isinstance(action, Mapping if named else (tuple, list)) or len(action) != len(
+            checks
+        ):
             return ILLEGAL
         try:
             found = {key: check_part(action[key]) for key, check_part in checks.items()}
@@ -95,12 +98,19 @@ def _box_check(space: spaces.Box, clips: bool) -> Check:
     scalar, small = len(lows) == 1, len(lows) <= _SMALL
     kinds = "iu" if dtype.kind in "iu" else "iuf"
 
-    ndarray, first_low, first_high = np.ndarray, lows[0] if scalar else 0.0, highs[0] if scalar else -1.0
+    ndarray, first_low, first_high = (
+        np.ndarray,
+        lows[0] if scalar else 0.0,
+        highs[0] if scalar else -1.0,
+    )
 
     def legal(array: NDArray[Any]) -> bool:
         if not small:
             return bool(((array >= space.low) & (array <= space.high)).all())
-        return all(low <= value <= high for low, value, high in zip(lows, array.ravel().tolist(), highs, strict=True))
+        return all(
+            low <= value <= high
+            for low, value, high in zip(lows, array.ravel().tolist(), highs, strict=True)
+        )
 
     def check(action: Any) -> Any:
         if type(action) is ndarray and action.dtype is dtype and action.shape == shape:
@@ -112,18 +122,23 @@ def _box_check(space: spaces.Box, clips: bool) -> Check:
             given = array = np.asarray(action)
         except (ValueError, TypeError):
             return ILLEGAL
-        if array.dtype.kind not in kinds or (array.shape != shape and not (scalar and array.shape == ())):
+        if array.dtype.kind not in kinds or (
+            array.shape != shape and not (scalar and array.shape == ())
+        ):
             return ILLEGAL
         if clips:
             bounds = [bound.reshape(array.shape) for bound in (space.low, space.high)]
-            if kinds == "iu":  # as integers of Python, because NumPy has no type for both int64 and uint64
+            # as integers of Python, because NumPy has no type for both int64 and uint64
+            if kinds == "iu":
                 array, *bounds = (part.astype(object) for part in (array, *bounds))
             array = np.clip(array, *bounds)
-        if kinds == "iu" and not legal(array):  # before the cast, because the cast may wrap integers around
+        # before the cast, because the cast may wrap integers around
+        if kinds == "iu" and not legal(array):
             return ILLEGAL
         with np.errstate(over="ignore"):
             cast = array.astype(dtype, copy=True)
-        if kinds != "iu" and not legal(cast):  # after the cast, so that a bound is legal in every precision
+        # after the cast, so that a bound is legal in every precision
+        if kinds != "iu" and not legal(cast):
             return ILLEGAL
         if array.shape == shape:
             return cast
@@ -136,16 +151,22 @@ def _box_check(space: spaces.Box, clips: bool) -> Check:
 
 
 def mask_cast(space: Any) -> Callable[[Any], Any]:
-    """Make the function that casts a mask of the legal actions to np.int8; that of a ``MultiDiscrete`` is a tuple.
+    """Make the function that casts a mask of the legal actions to np.int8.
 
-    It raises ``MaskError`` for another shape, for values other than 0 and 1, and if no action is legal.
+    That of a ``MultiDiscrete`` is a tuple.
+
+    It raises ``MaskError`` for another shape, for values other than 0 and 1, and if no action is
+    legal.
     """
     if isinstance(space, spaces.MultiDiscrete):
         parts = [_mask_of(int(number), space) for number in space.nvec.ravel()]
 
         def cast(value: Any) -> Any:
             if not isinstance(value, (tuple, list)) or len(value) != len(parts):
-                raise MaskError(f"the mask {short_repr(value)} must have the {len(parts)} parts of {short_repr(space)}")
+                raise MaskError(
+                    f"the mask {short_repr(value)} must have the {len(parts)} parts of"
+                    f" {short_repr(space)}"
+                )
             return tuple(part(item) for part, item in zip(parts, value, strict=True))
 
         return cast
@@ -158,7 +179,10 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
     def cast(value: Any) -> NDArray[np.int8]:
         mask = np.asarray(value)
         if mask.shape != shape:
-            raise MaskError(f"the mask {short_repr(value)} has shape {mask.shape}; {short_repr(space)} needs {shape}")
+            raise MaskError(
+                f"the mask {short_repr(value)} has shape {mask.shape}; {short_repr(space)} needs"
+                f" {shape}"
+            )
         if mask.dtype.char not in _ONE_BYTE:
             given, mask = mask, mask.astype(bool)
             if not (mask == given).all():
@@ -167,7 +191,9 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
         if marks.strip(b"\0\1"):
             raise MaskError(f"the mask {short_repr(value)} has values other than 0 and 1")
         if 1 not in marks:
-            raise MaskError(f"the mask {short_repr(value)} leaves no legal action of {short_repr(space)}")
+            raise MaskError(
+                f"the mask {short_repr(value)} leaves no legal action of {short_repr(space)}"
+            )
         return mask.astype(int8)
 
     return cast
@@ -189,13 +215,19 @@ def mask_allows(space: Any, mask: Any, action: Any) -> bool:
 
 
 def only_choice(space: spaces.Space[Any], mask: Any) -> Any:
-    """The only action that a mask of ``mask_cast`` allows (None: all are legal); None if there are several."""
+    """The only action that a mask of ``mask_cast`` allows (None: all are legal).
+
+    None if there are several.
+    """
     if isinstance(space, spaces.MultiDiscrete):
         parts = open_mask(space) if mask is None else mask
         if any(np.count_nonzero(part) != 1 for part in parts):
             return None
         chosen = np.array([np.argmax(part) for part in parts], space.dtype).reshape(space.shape)
         return (chosen + space.start).astype(space.dtype)
-    if not isinstance(space, spaces.Discrete) or (int(space.n) if mask is None else np.count_nonzero(mask)) != 1:
+    if (
+        not isinstance(space, spaces.Discrete)
+        or (int(space.n) if mask is None else np.count_nonzero(mask)) != 1
+    ):
         return None
     return int(space.start) + (0 if mask is None else int(np.argmax(mask)))

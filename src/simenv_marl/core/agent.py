@@ -31,26 +31,35 @@ class Agent:
     """One agent of an episode. If its decision point has no other agent, it is also the event of a decision there.
 
     Attributes:
-        policy: The policy that answers the agent's decisions. None: the environment's user answers them.
-        delegated: Whether its decisions do not wait for an answer from outside: a policy is asked, or it has ended.
+        policy: The policy that answers the agent's decisions. None: the environment's user answers
+            them.
+        delegated: Whether its decisions do not wait for an answer from outside: a policy is asked,
+            or it has ended.
         update: Rewards and observes the agent: see ``make_updates``.
         decided: Whether the reward mapping was called in this episode. Its first value is dropped.
         acted: Whether the latest round used an action that the user gave for the agent.
-        present: Whether the latest info comes from an observation. False if there was nothing to observe.
+        present: Whether the latest info comes from an observation. False if there was nothing to
+            observe.
         reward: The reward of the agent's previous action, as of its latest decision or its end.
-        asked: Whether the user was asked for an action in this episode. Used where forced moves are skipped.
+        asked: Whether the user was asked for an action in this episode. Used where forced moves are
+            skipped.
         carried: The sum of the rewards of forced moves. It is added to the agent's next reward.
-        applying: How many of its actions are being applied, on the simulation's side. Meanwhile its calls run the rule.
-        answered: How many of its decisions were answered: by the user, by a policy, or as forced moves.
+        applying: How many of its actions are being applied, on the simulation's side. Meanwhile its
+            calls run the rule.
+        answered: How many of its decisions were answered: by the user, by a policy, or as forced
+            moves.
         fallbacks: How many of them a fallback has answered.
         observation: The latest observation, cast to its space. None before the first one.
         handed_out: The observation that a view has returned and must not return a second time.
-        mask, choices: The legal actions of the pending decision, if the decision point restricts them.
+        mask, choices: The legal actions of the pending decision, if the decision point restricts
+            them.
         offered: The choices of the latest decision, among which the rule's decision is looked up.
-        rule_action: The action that corresponds to the rule's latest decision. None if it is not known.
+        rule_action: The action that corresponds to the rule's latest decision. None if it is not
+            known.
         informs_rule_action: Whether the next info contains ``rule_action``.
         rate: The rate at which infos discount. None: they do not.
-        read_clock: Notes the time, and returns an info: ``read_clock``, or ``read_discounted`` if there is a rate.
+        read_clock: Notes the time, and returns an info: ``read_clock``, or ``read_discounted`` if
+            there is a rate.
         now, answered_at: The times of the latest decision and of the one before.
         entity, rest, kwargs: The arguments of the latest decision: see ``keep``.
         group, notes: Used by runners of many episodes.
@@ -67,15 +76,23 @@ class Agent:
         self.name, self.point, self.clock, self.plugins = name, point, clock, plan.plugins
         self.policy = policy = plan.policy_of(name, point)
         self.rate = plan.options.discount_rate
-        self.read_clock: Callable[[Agent], dict[str, Any]] = read_clock if self.rate is None else read_discounted
-        self.delegated = policy is not None and not (plan.rewarded and isinstance(policy, DeferredPolicy))
+        self.read_clock: Callable[[Agent], dict[str, Any]] = (
+            read_clock if self.rate is None else read_discounted
+        )
+        self.delegated = policy is not None and not (
+            plan.rewarded and isinstance(policy, DeferredPolicy)
+        )
         self.deliver, self.report = point.deliver, point.report
         self.update: Callable[..., None] = point.updates[0]
-        self.decided = self.acted = self.ended = self.present = self.asked = self.informs_rule_action = False
+        self.decided = self.acted = self.ended = self.present = self.asked = (
+            self.informs_rule_action
+        ) = False
         self.reward = self.carried = 0.0
         self.answered = self.applying = self.fallbacks = 0
         nothing: Any = None
-        self.observation = self.handed_out = self.mask = self.choices = self.offered = self.rule_action = nothing
+        self.observation = self.handed_out = self.mask = self.choices = self.offered = (
+            self.rule_action
+        ) = nothing
         self.entity = self.group = self.notes = nothing
         self.info: dict[str, Any] = {}
         self.memory: dict[Any, Any] = {}
@@ -102,7 +119,8 @@ class Agent:
         else:
             if point.one_entity and args and self.rest and self.rest[0] is not args[0]:
                 point.warn_of_several(self.name)
-            self.rest, self.kwargs = args, kwargs  # a strong reference: the first argument is no entity of the model
+            # a strong reference: the first argument is no entity of the model
+            self.rest, self.kwargs = args, kwargs
         episode.latest = self
         if not episode.plain:  # in a round, after the last step, or where forced moves are skipped
             return episode.decide(self, args, kwargs)
@@ -116,10 +134,12 @@ class Agent:
         if episode.ended:
             if self.ended:
                 raise AgentError(
-                    f"the agent {self.name!r} decides at {self.point.point.name} after its end; agent= must name each"
-                    " entity differently, and removed_by= or end_agent() must end an agent only when its entity is gone"
+                    f"the agent {self.name!r} decides at {self.point.point.name} after its end;"
+                    " agent= must name each entity differently, and removed_by= or end_agent()"
+                    " must end an agent only when its entity is gone"
                 )
-            if episode.plan.one_agent in episode.ended:  # else the simulation might run for ever without its user
+            # else the simulation might run for ever without its user
+            if episode.plan.one_agent in episode.ended:
                 episode.finish(truncated=False)
                 return WAIT
         policy = self.policy
@@ -159,12 +179,18 @@ class Agent:
         return episode.answer(self, legal, False)
 
     def add_carried_reward(self, *, carry_on: bool) -> None:
-        """Add the rewards of forced moves. Carry the sum on where no reward is returned, as at a reset."""
+        """Add the rewards of forced moves.
+
+        Carry the sum on where no reward is returned, as at a reset.
+        """
         reward = self.reward + self.carried
         self.reward, self.carried = (0.0, reward) if carry_on else (reward, 0.0)
 
     def answer_forced(self, episode: Episode, action: Any) -> Any:
-        """Answer with the only legal action. The elapsed time adds up until the agent is asked, as rewards do."""
+        """Answer with the only legal action.
+
+        The elapsed time adds up until the agent is asked, as rewards do.
+        """
         if self.answered_at is not None:
             self.now = self.answered_at
         return episode.answer(self, action, False)
@@ -174,7 +200,10 @@ class Agent:
         return only_choice(self.point.definition.action_space, self.mask)
 
     def keep(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Keep the arguments of a decision; its entity, if any, by a weak reference, so that the model can free it."""
+        """Keep the arguments of a decision.
+
+        Its entity, if any, by a weak reference, so that the model can free it.
+        """
         self.entity, self.rest, self.kwargs = None, args, kwargs
         if args and self.point.agent is None:
             with suppress(TypeError):  # not every object supports weak references
@@ -182,7 +211,10 @@ class Agent:
             episode.entities[self.point, id(args[0])] = self
 
     def arguments(self) -> tuple[Any, ...] | None:
-        """The positional arguments of the latest decision; None if there was none, or if the entity is gone."""
+        """The positional arguments of the latest decision.
+
+        None if there was none, or if the entity is gone.
+        """
         if self.entity is None:
             return self.rest
         first = self.entity()
@@ -221,7 +253,10 @@ class Agent:
 
 
 def read_clock(agent: Agent) -> dict[str, Any]:
-    """Note the time. Return it, and the time elapsed since the agent's previous decision, as an info."""
+    """Note the time.
+
+    Return it, and the time elapsed since the agent's previous decision, as an info.
+    """
     clock: Any = agent.clock
     time, before = clock(), agent.answered_at
     agent.now = now = time if type(time) is float else float(time)
@@ -237,8 +272,8 @@ def read_discounted(agent: Agent) -> dict[str, Any]:
 def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]]:
     """Make the two functions that reward and observe the agents of a decision point for the arguments of a call.
 
-    The first also takes whether to reward, whether to observe, and whether this is the agent's end. The second is for
-    agents that have decided before, and skips what the point does not need.
+    The first also takes whether to reward, whether to observe, and whether this is the agent's end.
+    The second is for agents that have decided before, and skips what the point does not need.
     """
     reward_mapping, cast = point.definition.reward_mapping, point.cast
     observation_mapping = point.definition.observation_space_mapping
@@ -246,7 +281,12 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
     plain = legal is None and not point.informs_rule_action and not masked
 
     def update(
-        agent: Agent, args: Any, kwargs: Any, reward: bool = True, observe: bool = True, last: bool = False
+        agent: Agent,
+        args: Any,
+        kwargs: Any,
+        reward: bool = True,
+        observe: bool = True,
+        last: bool = False,
     ) -> None:
         here = getcurrent() if DIFFERENCES else None
         if here is not None:
@@ -266,7 +306,8 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
                 except MaskError:
                     if not last:
                         raise
-                    agent.mask, agent.choices = point.open_mask(), None  # it will not be asked again
+                    # it will not be asked again
+                    agent.mask, agent.choices = point.open_mask(), None
             agent.info = agent.inform()
             if masked:
                 agent.observation = point.observe(args, kwargs, agent.mask)
@@ -274,7 +315,8 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
                 agent.observation = cast(observation_mapping(*args, **kwargs))
         finally:
             if here is not None:
-                if before is None:  # without a function call, which could fail at the recursion limit
+                # without a function call, which could fail at the recursion limit
+                if before is None:
                     del EVALUATING[here]
                 else:
                     EVALUATING[here] = before
@@ -284,11 +326,14 @@ def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]
             update(agent, args, kwargs)
             return
         reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-        if type(reward) is not float or reward - reward != 0.0:  # spares nearly all rewards the call
+        # spares nearly all rewards the call
+        if type(reward) is not float or reward - reward != 0.0:
             reward = checked_reward(agent, reward)
         agent.reward = reward
         agent.info = {} if agent.clock is None else agent.read_clock(agent)
-        agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
+        agent.observation = cast(
+            observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args)
+        )
 
     again = update_plainly if plain else update
     return update, again

@@ -1,7 +1,7 @@
 """Coroutines of policies. They run in one thread with one event loop, for as long as the process.
 
-Simulations stay in their own threads, because greenlets cannot change threads. The loop lasts, so that clients keep
-their connections. A forked process makes a loop for itself.
+Simulations stay in their own threads, because greenlets cannot change threads. The loop lasts, so
+that clients keep their connections. A forked process makes a loop for itself.
 """
 
 from __future__ import annotations
@@ -87,7 +87,10 @@ class Answer:
 
 
 class Answers:
-    """Answers that are on their way, each with a key. Not thread-safe: one thread asks for them and takes them."""
+    """Answers that are on their way, each with a key.
+
+    Not thread-safe: one thread asks for them and takes them.
+    """
 
     def __init__(self) -> None:
         self._keys: dict[Answer, Any] = {}
@@ -105,13 +108,14 @@ class Answers:
         """Await something. What is not awaitable is an answer.
 
         Raises:
-            ReentrancyError: This is a coroutine of a policy itself: it would wait for its own thread.
+            ReentrancyError: This is a coroutine of a policy itself: it would wait for its own
+                thread.
         """
         if inspect.isawaitable(value) and current_thread().name == THREAD:
             getattr(value, "close", int)()
             raise ReentrancyError(
-                "a coroutine of a policy runs simulations whose policies are coroutines; run them in another thread:"
-                " await asyncio.to_thread(simulate, ...)"
+                "a coroutine of a policy runs simulations whose policies are coroutines; run them"
+                " in another thread: await asyncio.to_thread(simulate, ...)"
             )
         self._keys[Answer(value, self._ended.put)] = key
 
@@ -129,7 +133,8 @@ class Answers:
                 self._keys.pop(self._ended.get(timeout=SECONDS_TO_CANCEL))
             except Empty:
                 warn_user(
-                    f"{len(self._keys)} coroutines of policies have not ended {SECONDS_TO_CANCEL} s after they were"
+                    f"{len(self._keys)} coroutines of policies have not ended {SECONDS_TO_CANCEL}"
+                    " s after they were"
                     f" cancelled: {short_repr(list(self._keys.values()))}",
                     ResourceWarning,
                 )

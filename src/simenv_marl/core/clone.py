@@ -1,11 +1,13 @@
 """Live branches: copies of an environment in mid-episode that go on from where it stands, and exact continuations.
 
-A clone lives in a forked process, where the view, the episode and the simulation are as they were. In this process
-there is a view of the same kind. Its session passes resets and steps on, and its episode mirrors the one there: the
-agents, with what they observe, and what is pending. So the views know nothing of processes. Wrappers, spaces and the
-generator of seeds live here; a function that is called in the clone takes them along, and brings them back.
+A clone lives in a forked process, where the view, the episode and the simulation are as they were.
+In this process there is a view of the same kind. Its session passes resets and steps on, and its
+episode mirrors the one there: the agents, with what they observe, and what is pending. So the views
+know nothing of processes. Wrappers, spaces and the generator of seeds live here; a function that is
+called in the clone takes them along, and brings them back.
 
-Where a process cannot be forked, a clone is an environment of this process that repeats the episode.
+Where a process cannot be forked, a clone is an environment of this process that repeats the
+episode.
 """
 
 from __future__ import annotations
@@ -46,47 +48,58 @@ from .session import Session
 Result = TypeVar("Result")
 
 
-def clone(env: Any, *, seed: int | None = None, method: str | None = None, time_limit: float = 600.0) -> Any:
+def clone(
+    env: Any, *, seed: int | None = None, method: str | None = None, time_limit: float = 600.0
+) -> Any:
     """Copy an environment in mid-episode. The copy stands where ``env`` stands, and goes on from there.
 
-    Neither sees the other. What the copy does with the same actions is identical, bit for bit. It is an environment of
-    the same view with the same wrappers, and can be stepped, reset, rendered, cloned and closed like any other. A clone
-    that is never stepped is a checkpoint: clones of it rewind.
+    Neither sees the other. What the copy does with the same actions is identical, bit for bit. It
+    is an environment of the same view with the same wrappers, and can be stepped, reset, rendered,
+    cloned and closed like any other. A clone that is never stepped is a checkpoint: clones of it
+    rewind.
 
-    ``clone(env).unwrapped.call(function, *args)`` calls ``function(environment, *args)`` where the clone lives, and
-    returns a copy of the result. The function may do anything with the environment. ``unwrapped.simulation`` exists
-    only there.
+    ``clone(env).unwrapped.call(function, *args)`` calls ``function(environment, *args)`` where the
+    clone lives, and returns a copy of the result. The function may do anything with the
+    environment. ``unwrapped.simulation`` exists only there.
 
-    A clone ends when it is closed or collected, and with the user's process. Then, and at a reset, a forked clone does
-    not unwind or close the episode in which it was cloned; a replayed one has an episode for itself, and does.
+    A clone ends when it is closed or collected, and with the user's process. Then, and at a reset,
+    a forked clone does not unwind or close the episode in which it was cloned; a replayed one has
+    an episode for itself, and does.
 
     Args:
-        env: An environment of a single simulation, in any view, with or without wrappers; also another clone.
-        seed: A seed for the random numbers that lie ahead, as ``branch`` takes one for each branch. None: the clone has
-            the exact future of ``env``.
-        method: "fork": the clone lives in a forked process (Linux, and ``driver="greenlet"``). "replay": it is an
-            environment of this process, whose simulation repeats the episode from its seed and the actions. None:
-            "fork" if it is possible, else "replay", as in ``branch``.
+        env: An environment of a single simulation, in any view, with or without wrappers; also
+            another clone.
+        seed: A seed for the random numbers that lie ahead, as ``branch`` takes one for each branch.
+            None: the clone has the exact future of ``env``.
+        method: "fork": the clone lives in a forked process (Linux, and ``driver="greenlet"``).
+            "replay": it is an environment of this process, whose simulation repeats the episode
+            from its seed and the actions. None: "fork" if it is possible, else "replay", as in
+            ``branch``.
         time_limit: The time that an operation of a forked clone may take, in seconds.
 
     Raises:
         ResetNeededError: No decision is pending.
-        BranchError: It cannot be cloned by this method, or by any; there are no more processes or descriptors; or a
-            ``seed`` is given without a ``reseed`` or ``global_rng=True``. Later: its process has died, or an operation
-            took too long.
+        BranchError: It cannot be cloned by this method, or by any; there are no more processes or
+            descriptors; or a ``seed`` is given without a ``reseed`` or ``global_rng=True``. Later:
+            its process has died, or an operation took too long.
         OptionValueError: An argument has an invalid value.
         BaseException: Any exception of ``reseed``.
     """
     view = _checked_view(env, "clone", method, time_limit)
     if seed is not None:
         if not is_seed(seed):
-            raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
+            raise OptionValueError(
+                f"seed must be a non-negative integer or None, not {short_repr(seed)}"
+            )
         view._session.check_reseed()
     original, fork = view._session, _fork_of(env, view, method)
-    session: Any = Session(original.plan) if fork is None else ForkedSession(original, fork, time_limit)
+    session: Any = (
+        Session(original.plan) if fork is None else ForkedSession(original, fork, time_limit)
+    )
     try:
         if fork is None:
-            with preserve_generators():  # the model may draw from the process's generators, then and now
+            # the model may draw from the process's generators, then and now
+            with preserve_generators():
                 session.replay(original)
         else:
             session.begin(view)
@@ -113,26 +126,30 @@ def branch(
 ) -> list[Result]:
     """Call a function on exact continuations of an environment in mid-episode: on ``n`` clones, each for one call.
 
-    Each continuation starts in exactly the state of ``env``: the model and its random numbers, the environment's
-    generators, and its wrappers. Continuations that take the same actions are identical, bit for bit. ``env`` itself
-    does not move. With ``seeds``, the continuations share the present state but draw different random numbers from then
-    on.
+    Each continuation starts in exactly the state of ``env``: the model and its random numbers, the
+    environment's generators, and its wrappers. Continuations that take the same actions are
+    identical, bit for bit. ``env`` itself does not move. With ``seeds``, the continuations share
+    the present state but draw different random numbers from then on.
 
     Args:
-        env: An environment of a single simulation, in any view, with or without wrappers; also a clone.
-        function: Called with the continuation and its number, from 0 to ``n - 1``. It may do anything with it.
+        env: An environment of a single simulation, in any view, with or without wrappers; also a
+            clone.
+        function: Called with the continuation and its number, from 0 to ``n - 1``. It may do
+            anything with it.
         n: The number of continuations.
-        method: "fork": each continuation runs in a forked process, with its own open files and global generators
-            (Linux, and ``driver="greenlet"``), on all available cores. The results are pickled. "replay": the
-            continuations run one after the other in this process. Each is a new simulation with the same seed, to which
-            the same actions are given. The policies of the option ``policies`` repeat their answers, and are called
-            from the present on. None: "fork" if it is possible, else "replay". Forking is not possible if the
-            simulation has opened something that two processes cannot share: threads, sockets, child processes.
-        seeds: A seed for each continuation. The same seed gives the same future, by either method. The simulation's
-            ``reseed(seed)`` is called in each continuation, on the caller's side like ``state``. With
-            ``global_rng=True`` the simulation's own global generators are seeded. While the function runs, the
-            generators of the process are seeded, too: Python's, NumPy's and torch's. None: each continuation has the
-            exact future of ``env``.
+        method: "fork": each continuation runs in a forked process, with its own open files and
+            global generators (Linux, and ``driver="greenlet"``), on all available cores. The
+            results are pickled. "replay": the continuations run one after the other in this
+            process. Each is a new simulation with the same seed, to which the same actions are
+            given. The policies of the option ``policies`` repeat their answers, and are called from
+            the present on. None: "fork" if it is possible, else "replay". Forking is not possible
+            if the simulation has opened something that two processes cannot share: threads,
+            sockets, child processes.
+        seeds: A seed for each continuation. The same seed gives the same future, by either method.
+            The simulation's ``reseed(seed)`` is called in each continuation, on the caller's side
+            like ``state``. With ``global_rng=True`` the simulation's own global generators are
+            seeded. While the function runs, the generators of the process are seeded, too:
+            Python's, NumPy's and torch's. None: each continuation has the exact future of ``env``.
         time_limit: The time after which a forked continuation is ended, in seconds.
 
     Returns:
@@ -140,12 +157,13 @@ def branch(
 
     Raises:
         ResetNeededError: There is no episode to continue.
-        BranchError: A forked continuation died, took too long, or returned something that cannot be pickled; it cannot
-            go on with what the simulation has opened; a replay did not reach the same decision; or ``seeds`` are given
-            without a ``reseed`` or ``global_rng=True``.
-        OptionValueError: The method does not exist or is not available here, or ``seeds`` are not n non-negative
-            integers.
-        BaseException: Any exception of the function or ``reseed``, with a note that names the continuation.
+        BranchError: A forked continuation died, took too long, or returned something that cannot be
+            pickled; it cannot go on with what the simulation has opened; a replay did not reach the
+            same decision; or ``seeds`` are given without a ``reseed`` or ``global_rng=True``.
+        OptionValueError: The method does not exist or is not available here, or ``seeds`` are not n
+            non-negative integers.
+        BaseException: Any exception of the function or ``reseed``, with a note that names the
+            continuation.
     """
     view = _checked_view(env, "branch", method, time_limit)
     if isinstance(n, bool) or not isinstance(n, int) or n < 0:
@@ -154,17 +172,21 @@ def branch(
         listed = isinstance(seeds, (Sequence, np.ndarray))
         if not (listed and len(seeds) == n and all(map(is_seed, seeds))):
             raise OptionValueError(
-                f"seeds must be n = {n} non-negative integers, one for each branch, not {short_repr(seeds)}"
+                f"seeds must be n = {n} non-negative integers, one for each branch, not"
+                f" {short_repr(seeds)}"
             )
         view._session.check_reseed()
     depth = DEPTH.get() + 1
     if depth > DEEPEST:
         raise BranchError(
-            f"branches are nested {DEEPEST} deep: a policy that branches its environment also decides in the branches,"
-            " and branches them again; use action_values or RolloutPolicy, which let a base policy decide there"
+            f"branches are nested {DEEPEST} deep: a policy that branches its environment also"
+            " decides in the branches, and branches them again; use action_values or"
+            " RolloutPolicy, which let a base policy decide there"
         )
     if isinstance(view._session, ForkedSession):
-        there = partial(branch, function=function, n=n, method=method, seeds=seeds, time_limit=time_limit)
+        there = partial(
+            branch, function=function, n=n, method=method, seeds=seeds, time_limit=time_limit
+        )
         results: list[Result] = view._session.call(env, there, (), inf)
         return results
 
@@ -198,18 +220,25 @@ def pending_view(env: Any, user: str) -> Any:
 
 
 def _checked_view(env: Any, user: str, method: str | None, time_limit: float) -> Any:
-    """Return the unwrapped environment whose decision is pending; check the arguments of a ``user`` of it."""
+    """Return the unwrapped environment whose decision is pending.
+
+    Check the arguments of a ``user`` of it.
+    """
     view = pending_view(env, user)
     if method not in (None, "fork", "replay"):
         suggestion = did_you_mean(method, ["fork", "replay"])
-        raise OptionValueError(f"method must be None, 'fork' or 'replay', not {short_repr(method)}{suggestion}")
+        raise OptionValueError(
+            f"method must be None, 'fork' or 'replay', not {short_repr(method)}{suggestion}"
+        )
     if method == "fork" and not (CAN_FORK and view.driver == "greenlet"):
         raise OptionValueError(
-            'method="fork" needs Linux, and driver="greenlet": a forked process does not have the other threads; use'
-            ' "replay"'
+            'method="fork" needs Linux, and driver="greenlet": a forked process does not have the'
+            ' other threads; use "replay"'
         )
     if not isinstance(time_limit, (int, float)) or not time_limit > 0:
-        raise OptionValueError(f"time_limit must be a number of seconds, not {short_repr(time_limit)}")
+        raise OptionValueError(
+            f"time_limit must be a number of seconds, not {short_repr(time_limit)}"
+        )
     return view
 
 
@@ -246,7 +275,8 @@ def _call_in_forks(
 ) -> list[Any]:
     """Call a function in forked processes, as many at a time as there are cores."""
     results: list[Any] = [None] * n
-    running: dict[int, tuple[int, Fork, float]] = {}  # by descriptor: the number of the branch, its process and end
+    # by descriptor: the number of the branch, its process and end
+    running: dict[int, tuple[int, Fork, float]] = {}
     cores = len(os.sched_getaffinity(0))
     started, waiting = 0, select.poll()
 
@@ -259,16 +289,20 @@ def _call_in_forks(
         while started < n or running:
             while started < n and len(running) < cores:
                 fork = Fork.begin(main, separate, wait=False)
-                fork.limit(time_limit)  # for the parts of a message; the time until it comes is limited below
+                # for the parts of a message; the time until it comes is limited below
+                fork.limit(time_limit)
                 descriptor = fork.connection.fileno()
                 running[descriptor] = started, fork, time.monotonic() + time_limit
                 waiting.register(descriptor, select.POLLIN)
                 started += 1
             oldest, _, deadline = next(iter(running.values()))  # whose time limit comes first
             left = max(deadline - time.monotonic(), 0.0)
-            ready = waiting.poll(min(left, 3600.0) * 1000)  # in parts, because the time limit may be infinite
+            # in parts, because the time limit may be infinite
+            ready = waiting.poll(min(left, 3600.0) * 1000)
             if not ready and left <= 3600.0:
-                raise BranchError(f"branch {oldest} was stopped: it took longer than {time_limit} s")
+                raise BranchError(
+                    f"branch {oldest} was stopped: it took longer than {time_limit} s"
+                )
             for descriptor, _ in ready:
                 waiting.unregister(descriptor)
                 number, fork, _ = running[descriptor]

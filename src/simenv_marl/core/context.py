@@ -1,7 +1,10 @@
-"""Contexts: an environment's code on the user's side, with its own global generators; reused resources.
+"""Contexts: an environment's code on the user's side, with its own global generators.
 
-Models that draw from ``random`` and ``numpy.random`` share one state with the whole process. With ``global_rng=True``
-an environment has a state of its own, which is in place while the environment runs.
+Reused resources.
+
+Models that draw from ``random`` and ``numpy.random`` share one state with the whole process. With
+``global_rng=True`` an environment has a state of its own, which is in place while the environment
+runs.
 """
 
 from __future__ import annotations
@@ -25,10 +28,14 @@ from .rng import LEGACY, NUMPY, PYTHON, generator_of_torch
 
 
 class ExclusiveLock:
-    """A lock for an environment that any thread may use, but only one at a time. One thread may enter it repeatedly."""
+    """A lock for an environment that any thread may use, but only one at a time.
+
+    One thread may enter it repeatedly.
+    """
 
     def __init__(self) -> None:
-        self._lock: Any = RLock()  # ``_is_owned`` is private, but ``threading.Condition`` relies on it, too
+        # ``_is_owned`` is private, but ``threading.Condition`` relies on it, too
+        self._lock: Any = RLock()
         self._process = getpid()
 
     @property
@@ -47,8 +54,8 @@ class ExclusiveLock:
             raise
         if not acquired:
             raise ReentrancyError(
-                "the environment was used from inside its own simulation, or while another thread was stepping,"
-                " resetting or closing it; any thread may use it, but one at a time"
+                "the environment was used from inside its own simulation, or while another thread"
+                " was stepping, resetting or closing it; any thread may use it, but one at a time"
             )
 
     def __exit__(self, *error: object) -> None:
@@ -58,16 +65,23 @@ class ExclusiveLock:
 class environment_context(outside_simulation):  # noqa: N801 - it is used like a function
     """Run code of an environment in its own context, with its plugins and random generators.
 
-    All code that runs for an environment on the user's side needs this context. The exception are steps in which
-    ``getcurrent()`` is the driver's ``caller`` and ``EVALUATING`` is empty.
+    All code that runs for an environment on the user's side needs this context. The exception are
+    steps in which ``getcurrent()`` is the driver's ``caller`` and ``EVALUATING`` is empty.
     """
 
     __slots__ = ("_enters", "_lock", "_rng")
 
     def __init__(
-        self, evaluation: Any, rng: GlobalRandom | None, lock: ExclusiveLock | None = None, driver: Any = None
+        self,
+        evaluation: Any,
+        rng: GlobalRandom | None,
+        lock: ExclusiveLock | None = None,
+        driver: Any = None,
     ) -> None:
-        """Prepare the context. The driver is entered; without one, the simulation cannot be resumed inside."""
+        """Prepare the context.
+
+        The driver is entered; without one, the simulation cannot be resumed inside.
+        """
         super().__init__(evaluation)
         self._rng, self._lock, self._enters = rng, lock, driver
 
@@ -80,7 +94,8 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
                 self._enters.enter()
             if self._rng is not None:
                 if self._enters is not None:
-                    self._enters.caller = None  # each step must enter the generators, and so is never direct
+                    # each step must enter the generators, and so is never direct
+                    self._enters.caller = None
                 self._rng.enter()
         except BaseException:
             self._rng = None  # it was not entered
@@ -100,7 +115,8 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
 # -- states of the global generators --------------------------------------------------------------
 
 _HEADER: Final = object.__basicsize__
-_WORDS: Final = 4 * 625  # bytes: the number of words that are used up, and the 624 words of a Mersenne twister
+# bytes: the number of words that are used up, and the 624 words of a Mersenne twister
+_WORDS: Final = 4 * 625
 
 
 def _is_layout_known() -> bool:
@@ -124,7 +140,11 @@ def save_generators(*, copy: bool = False) -> tuple[Any, Any, Any]:
     Other code that draws from a bit generator that is not copied changes the saved state.
     """
     generator = NUMPY._bit_generator
-    python = (string_at(id(PYTHON) + _HEADER, _WORDS), PYTHON.gauss_next) if IS_COPIED else random.getstate()
+    python = (
+        (string_at(id(PYTHON) + _HEADER, _WORDS), PYTHON.gauss_next)
+        if IS_COPIED
+        else random.getstate()
+    )
     _NO_BITS.state = {"bit_generator": "", "state": None}
     try:
         NUMPY._bit_generator = _NO_BITS
@@ -153,7 +173,8 @@ def load_generators(state: tuple[Any, Any, Any]) -> None:
 class GlobalRandom:
     """The context in which a simulation has its own state of the global generators."""
 
-    _entered: Final[list[tuple[GlobalRandom, int, Any]]] = []  # each with its thread and the state before
+    # each with its thread and the state before
+    _entered: Final[list[tuple[GlobalRandom, int, Any]]] = []
 
     def __init__(self) -> None:
         """Copy the present state, which is used until ``begin`` seeds it."""
@@ -173,8 +194,9 @@ class GlobalRandom:
         nested = current_thread().name == SIMULATION  # its user waits in another thread meanwhile
         if self._entered and self._entered[-1][1] != thread and not nested:
             raise WrongThreadError(
-                "two environments with global_rng=True ran in two threads at once, but a process has only one state of"
-                " the global generators; run them one after the other, or in separate processes"
+                "two environments with global_rng=True ran in two threads at once, but a process"
+                " has only one state of the global generators; run them one after the other, or in"
+                " separate processes"
             )
         if not self._entered or self._entered[-1][0] is not self:
             present = save_generators()
@@ -211,15 +233,21 @@ class preserve_generators:  # noqa: N801 - it is used like a function; not a gen
 
 # -- resources that several simulations use -------------------------------------------------------
 
-_FREE: Final[ContextVar[list[tuple[Any, Any]] | None]] = ContextVar("simenv_marl.free", default=None)
-"""The free resources of the current block, with what identifies those that are alike. None outside of a block."""
+_FREE: Final[ContextVar[list[tuple[Any, Any]] | None]] = ContextVar(
+    "simenv_marl.free", default=None
+)
+"""The free resources of the current block, with what identifies those that are alike.
+
+None outside of a block.
+"""
 
 
 class reuse_resources:  # noqa: N801 - as above
     """Reuse the resources of closed simulations for new ones, until the end of the block.
 
-    Starting a process often takes longer than an episode. A resource has ``usable``, ``close_input()``, which asks it
-    to end, and ``close()``, which waits for its end. Within another such block this does nothing.
+    Starting a process often takes longer than an episode. A resource has ``usable``,
+    ``close_input()``, which asks it to end, and ``close()``, which waits for its end. Within
+    another such block this does nothing.
     """
 
     def __enter__(self) -> None:
@@ -236,7 +264,10 @@ class reuse_resources:  # noqa: N801 - as above
 
 
 def release(key: Any, resource: Any) -> bool:
-    """Leave a resource to later simulations; return False if it is not usable, or if there is no block."""
+    """Leave a resource to later simulations.
+
+    Return False if it is not usable, or if there is no block.
+    """
     free = _FREE.get()
     if free is None or not resource.usable:
         return False
@@ -247,4 +278,6 @@ def release(key: Any, resource: Any) -> bool:
 def acquire(key: Any) -> Any:
     """Return a resource that was released under an equal key; None if there is none."""
     free = _FREE.get() or []
-    return next((free.pop(number)[1] for number, (other, _) in enumerate(free) if other == key), None)
+    return next(
+        (free.pop(number)[1] for number, (other, _) in enumerate(free) if other == key), None
+    )

@@ -1,15 +1,17 @@
 """Drivers: how control switches between a simulation's stack and its user's stack.
 
-A driver keeps one stack for a simulation, over all its episodes: a greenlet, or a thread. *Jobs* run on it one after
-the other: the making of the simulation, then its ``reset`` and its ``run`` for each episode. On the user's side
-``begin`` prepares a job. ``resume`` starts it, and later passes replies to the simulation. ``throw`` raises
-``SimulationExit`` in it. Both return the simulation's next *event*, a tuple ``(event, args, kwargs)``. For a decision
-these are an object of the plan or the episode, and the arguments of the call. For the end of a job they are ``ENDED``,
-a list with the result or the error, and whether it is an error. The receiver must empty that list, because the waiting
-stack still refers to it. The episode calls the event's ``handle``, which returns the reply.
+A driver keeps one stack for a simulation, over all its episodes: a greenlet, or a thread. *Jobs*
+run on it one after the other: the making of the simulation, then its ``reset`` and its ``run`` for
+each episode. On the user's side ``begin`` prepares a job. ``resume`` starts it, and later passes
+replies to the simulation. ``throw`` raises ``SimulationExit`` in it. Both return the simulation's
+next *event*, a tuple ``(event, args, kwargs)``. For a decision these are an object of the plan or
+the episode, and the arguments of the call. For the end of a job they are ``ENDED``, a list with the
+result or the error, and whether it is an error. The receiver must empty that list, because the
+waiting stack still refers to it. The episode calls the event's ``handle``, which returns the reply.
 
-On the simulation's side a driver enters its stack into the hooks of the model's functions, each with the interceptor
-that sends an event and carries out the reply. It also notes which threads, processes and sockets the simulation opens.
+On the simulation's side a driver enters its stack into the hooks of the model's functions, each
+with the interceptor that sends an event and carries out the reply. It also notes which threads,
+processes and sockets the simulation opens.
 """
 
 from __future__ import annotations
@@ -45,14 +47,22 @@ SECONDS_TO_UNWIND: Final = 5.0
 """The seconds that a simulation in a thread may take, while it is unwound, to its next decision or its end."""
 
 UNWINDING_TRIES: Final = 1000
-"""How often ``SimulationExit`` is raised in a simulation. A SimPy model loses one of its processes at each try."""
+"""How often ``SimulationExit`` is raised in a simulation.
+
+A SimPy model loses one of its processes at each try.
+"""
 
 
 class SimulationExit(BaseException):
-    """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it."""
+    """Raised in a suspended simulation to unwind it.
+
+    It is not an error, and models should not catch it.
+    """
 
     # It is no ``SystemExit``: C code that prints what a callback raises would end the process.
-    def __init__(self, text: str = "SimulationExit: the environment was closed, reset or dropped") -> None:
+    def __init__(
+        self, text: str = "SimulationExit: the environment was closed, reset or dropped"
+    ) -> None:
         """Say what it is in its text, because some engines keep only the text of what they catch."""
         super().__init__(text)
 
@@ -64,7 +74,8 @@ class LoopExit(SimulationExit, KeyboardInterrupt):
 def is_exit(error: BaseException | None) -> bool:
     """Whether an error is a ``SimulationExit``, has one as its cause or in its text, or was raised by its ``except``.
 
-    A group is one if all its errors are. What only arises while the exit passes (a ``finally``) is not.
+    A group is one if all its errors are. What only arises while the exit passes (a ``finally``) is
+    not.
     """
     seen = set()  # causes may be cyclic
     while error is not None and id(error) not in seen:
@@ -79,15 +90,21 @@ def is_exit(error: BaseException | None) -> bool:
 
 def _is_replacement(error: BaseException) -> bool:
     """Whether an error was raised, or the process ended, by the ``except`` that has caught the error's context."""
-    frames, caught = [*walk_tb(error.__traceback__)], getattr(error.__context__, "__traceback__", None)
+    frames, caught = (
+        [*walk_tb(error.__traceback__)],
+        getattr(error.__context__, "__traceback__", None),
+    )
     if not frames or caught is None or caught.tb_frame is not frames[-1][0]:
         return False
     frame, line = frames[-1]
     kind = ast.stmt if isinstance(error, SystemExit) else ast.Raise
-    with suppress(SyntaxError, ValueError):  # bytecode does not tell an ``except`` from a ``finally``
+    # bytecode does not tell an ``except`` from a ``finally``
+    with suppress(SyntaxError, ValueError):
         tree = ast.parse("".join(getlines(frame.f_code.co_filename, frame.f_globals)))
         handlers = [node for node in ast.walk(tree) if isinstance(node, ast.ExceptHandler)]
-        nodes = [node for handler in handlers for node in ast.walk(handler) if isinstance(node, kind)]
+        nodes = [
+            node for handler in handlers for node in ast.walk(handler) if isinstance(node, kind)
+        ]
         return any(node.lineno <= line <= (node.end_lineno or line) for node in nodes)
     return False
 
@@ -120,9 +137,13 @@ _REFUSED: Final[Any] = _Refused()
 
 
 class _Thread(local):
-    """What identifies a thread. Unlike the thread's number, it is never reused for another thread."""
+    """What identifies a thread.
 
-    identity: Any = Thread  # of no thread: seen by what the garbage collector runs while that of a thread is made
+    Unlike the thread's number, it is never reused for another thread.
+    """
+
+    # of no thread: seen by what the garbage collector runs while that of a thread is made
+    identity: Any = Thread
 
     def __init__(self) -> None:
         self.identity = set[None]()  # an object of this thread that can be referenced weakly
@@ -134,16 +155,20 @@ THREAD: Final = _Thread()
 class Driver:
     """The base class of drivers.
 
-    A driver adds ``enter()``, which prepares to resume the simulation from here, or raises a ``WrongThreadError``;
-    ``resume(reply)``; ``throw()``, which returns None if no event comes in time; and ``end()``, which ends the stack.
+    A driver adds ``enter()``, which prepares to resume the simulation from here, or raises a
+    ``WrongThreadError``; ``resume(reply)``; ``throw()``, which returns None if no event comes in
+    time; and ``end()``, which ends the stack.
 
     Attributes:
-        events: The events that the simulation sends, by hook. Empty while it is made, reset or closed.
-        caller: The greenlet from which ``resume`` may be called directly. None: ``enter`` must be called before.
+        events: The events that the simulation sends, by hook. Empty while it is made, reset or
+            closed.
+        caller: The greenlet from which ``resume`` may be called directly. None: ``enter`` must be
+            called before.
         given_up: The reason why a job was given up. None if no job was.
         ended: Whether the stack has ended, or was given up.
         forked: Whether this process was forked by the simulation.
-        opened: The sockets, processes and threads that the simulation has opened; None before the first one.
+        opened: The sockets, processes and threads that the simulation has opened; None before the
+            first one.
     """
 
     __slots__ = (
@@ -176,7 +201,9 @@ class Driver:
 
     # -- on the user's side -----------------------------------------------------------------------
 
-    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] | None = None, context: Any = None) -> None:
+    def begin(
+        self, job: Callable[[], Any], events: Mapping[Hook, Any] | None = None, context: Any = None
+    ) -> None:
         """Prepare a job, with the events to send by hook, and a context or else a copy of the user's context variables.
 
         After ``enter``, the next ``resume`` starts it on the stack.
@@ -205,7 +232,10 @@ class Driver:
         return any(isinstance(other, greenlet) and other.parent is stack for other in kept)
 
     def run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
-        """Run a job to its end, during which decision functions run their rule; return its result."""
+        """Run a job to its end, during which decision functions run their rule.
+
+        Return its result.
+        """
         try:
             self.enter()
             self.begin(job, context=context)
@@ -218,7 +248,10 @@ class Driver:
         return box.pop()
 
     def unwind(self) -> list[BaseException]:
-        """Raise ``SimulationExit`` in the current job until it ends, or give it up. Return errors that it raised."""
+        """Raise ``SimulationExit`` in the current job until it ends, or give it up.
+
+        Return errors that it raised.
+        """
         self.enter()
         if self.idle or self.ended:  # the job has ended, or was interrupted before it began
             self._job = None
@@ -235,9 +268,9 @@ class Driver:
                 return [value] if failed and not is_exit(value) else []
         else:
             self.given_up = (
-                f"refuses to end: it went on after SimulationExit was raised in it {UNWINDING_TRIES} times; it is left"
-                " suspended. Let the model re-raise exceptions that it does not know; callbacks from C need a"
-                " CallbackGuard"
+                "refuses to end: it went on after SimulationExit was raised in it"
+                f" {UNWINDING_TRIES} times; it is left suspended. Let the model re-raise"
+                " exceptions that it does not know; callbacks from C need a CallbackGuard"
             )
         self.ended = True
         return []
@@ -252,7 +285,8 @@ class Driver:
 
     def _work(self) -> Event:
         """On the stack: run a job; return the event of its end."""
-        # No frame here may refer to the stack: it would then refer to itself, and could not be collected.
+        # No frame here may refer to the stack: it would then refer to itself, and could not be
+        # collected.
         self.idle = self._exiting = False
         job, self._job = self._job, None
         try:
@@ -275,8 +309,9 @@ class Driver:
             annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
         if type(error) in (SimulationExit, LoopExit) and not self._exiting:
             stray = SimulationError(
-                "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of"
-                " that episode has kept; end all of these with their episode (cancel them in stop or in a finally)"
+                "the simulation raised a SimulationExit of an earlier episode, which a task, a"
+                " greenlet or a thread of that episode has kept; end all of these with their"
+                " episode (cancel them in stop or in a finally)"
             )
             stray.__cause__ = error
             return stray
@@ -311,7 +346,10 @@ class Driver:
                 hook.leave(here)
 
     def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
-        """Return the interceptor for calls of a hook, from the stack or ``away`` from it; None if the rule decides."""
+        """Return the interceptor for calls of a hook, from the stack or ``away`` from it.
+
+        None if the rule decides.
+        """
         event = self.events.get(hook)
         if event is None:
             return None
@@ -332,10 +370,13 @@ class Driver:
         return decide
 
     def refuse(self, hook: Hook, where: str, args: Any, kwargs: Any) -> Any:
-        """Refuse a decision with an error; the user gets another one at the simulation's next event."""
+        """Refuse a decision with an error.
+
+        The user gets another one at the simulation's next event.
+        """
         error = WrongThreadError(
-            f"{hook.name} was called in {where}, where the environment cannot ask for a decision. Call it where"
-            " run() runs, and pass the decision on"
+            f"{hook.name} was called in {where}, where the environment cannot ask for a decision."
+            " Call it where run() runs, and pass the decision on"
         )
         if self._refused is None and not self.forked:
             self._refused = error
@@ -367,7 +408,12 @@ def _report_later(rule: Any, report: Interceptor, hook: Hook, /, *args: Any, **k
 
 # -- what simulations open ------------------------------------------------------------------------
 
-_OPENING: Final = ((Thread, "start"), (socket, "__init__"), (Popen, "__init__"), (BaseProcess, "start"))
+_OPENING: Final = (
+    (Thread, "start"),
+    (socket, "__init__"),
+    (Popen, "__init__"),
+    (BaseProcess, "start"),
+)
 
 _PATCHES: Final[list[tuple[type, str, Any, Any]]] = []
 """The patched methods: what was there before, and the patch. Empty while no simulation lives."""
@@ -385,7 +431,8 @@ def _watch_resources() -> None:
             _PATCHES.append((owner, name, before, patch))
         while _PATCHES and not STACKS:
             patched, name, before, patch = _PATCHES.pop()
-            if vars(patched)[name] is patch:  # else other code has replaced the patch, and may still call it
+            # else other code has replaced the patch, and may still call it
+            if vars(patched)[name] is patch:
                 setattr(patched, name, before)
 
 
@@ -397,7 +444,8 @@ def _noting(method: Any) -> Any:
             self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
         method(self, *args, **kwargs)
         if driver is not None:
-            if driver.opened is None:  # made when it is needed, because an empty one takes a kilobyte
+            # made when it is needed, because an empty one takes a kilobyte
+            if driver.opened is None:
                 driver.opened = WeakSet()
             driver.opened.add(self)
 
@@ -406,7 +454,8 @@ def _noting(method: Any) -> Any:
 
 def _run_registered(driver: Driver, run: Callable[[], None]) -> None:
     """Run a thread that a simulation has started, as a stack of that simulation's driver."""
-    # Not in a variable: tracebacks keep variables, and a root that outlives its thread makes greenlets crash.
+    # Not in a variable: tracebacks keep variables, and a root that outlives its thread makes
+    # greenlets crash.
     STACKS[getcurrent()] = driver
     try:
         run()

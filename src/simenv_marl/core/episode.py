@@ -12,19 +12,21 @@ A decision::
     ----------                     ----------------------------
     calls a decision function
       suspended          ------>   ``handle``: find the agent; if the rule decides, back to the simulation
-                                   ``update``: reward of the previous action (the first of an episode is dropped),
+                                   ``update``: reward of the previous action (the first of an
+                                   episode is dropped),
                                      legal actions, info, observation
-                                   if a policy answers (``Agent.ask_policy``), back to the simulation with its action
-                                   else PENDING, until the user answers
+                                   if a policy answers (``Agent.ask_policy``), back to the
+                                   simulation with its action else PENDING, until the user answers
                                    ``answer``: map the checked action to the reply
       returns            <------   ``advance``
     returns from ``run``
       ended              ------>   ``finish``: last reward and last observation of each agent; OVER
 
-In AEC and single views an episode is played in turns: each agent is updated when its decision arises. In parallel and
-joint views it is played in rounds: all live agents are updated when a step returns (``Round``). Where policies answer
-all agents (``simulate``, ``simulate_many``), agents are observed when a policy is asked, and not rewarded. While an
-episode is RESETTING or MOVING on the user's side, decision functions run their rule.
+In AEC and single views an episode is played in turns: each agent is updated when its decision
+arises. In parallel and joint views it is played in rounds: all live agents are updated when a step
+returns (``Round``). Where policies answer all agents (``simulate``, ``simulate_many``), agents are
+observed when a policy is asked, and not rewarded. While an episode is RESETTING or MOVING on the
+user's side, decision functions run their rule.
 """
 
 from __future__ import annotations
@@ -68,7 +70,10 @@ if TYPE_CHECKING:
     from .point import Point
 
 LONGEST_TAPE: Final = 200_000
-"""How many answers are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""
+"""How many answers are kept for a replay.
+
+The limit keeps a simulation that never ends from filling the memory.
+"""
 
 
 class EpisodeState:
@@ -79,10 +84,13 @@ class EpisodeState:
         others: The agents for which policies answer, by name.
         ended: The agents of the environment whose episodes ended before the simulation's, by name.
         just_ended: The ended agents whose end no view has reported yet.
-        pending: The agent whose decision waits for an answer. None while the episode moves, and when it is over.
-        consulted: The agent whose policy is being asked. In a replay, the one at whose decision the replay ends.
+        pending: The agent whose decision waits for an answer. None while the episode moves, and
+            when it is over.
+        consulted: The agent whose policy is being asked. In a replay, the one at whose decision the
+            replay ends.
         over: Whether the episode is over, and nothing moves any more.
-        terminated, truncated: How the episode ended. Both are False before its end, and if an error ended it.
+        terminated, truncated: How the episode ended. Both are False before its end, and if an error
+            ended it.
         unreported_end: Whether there were ends during the reset, which the first step reports.
         turns: How many actions the environment's user has given.
         round: The round that is played; None if the episode is played in turns.
@@ -97,7 +105,9 @@ class EpisodeState:
         "round", "seed", "skips", "terminated", "truncated", "turns", "unreported_end", "where",
     )  # fmt: skip
 
-    def __init__(self, plan: Plan, seed: int, clock: Callable[[], float] | None, *, in_rounds: bool) -> None:
+    def __init__(
+        self, plan: Plan, seed: int, clock: Callable[[], float] | None, *, in_rounds: bool
+    ) -> None:
         self.plan, self.seed, self.clock = plan, seed, clock
         self.round = Round() if in_rounds else None
         self.skips, self.where = plan.options.skip_forced, Where.USER
@@ -129,7 +139,13 @@ class EpisodeState:
         """Whether there is an agent with that name, or could be one later."""
         declared = self.plan.options.possible_agents
         open_to_all = declared is None and any(point.agent is None for point in self.plan.points)
-        known = (self.agents, self.others, self.plan.roster, self.plan.policies, declared_agents(declared))
+        known = (
+            self.agents,
+            self.others,
+            self.plan.roster,
+            self.plan.policies,
+            declared_agents(declared),
+        )
         return any(name in names for names in known) or (open_to_all and isinstance(name, str))
 
     def refusal(self) -> Exception:
@@ -151,12 +167,17 @@ class Episode(EpisodeState):
         latest: The agent that decided last, for the notes of errors.
         running: Whether the simulation's ``run`` has not ended yet.
         failed_in_model: Whether the error that ended the episode came from the simulation.
-        most_steps: The number of turns after which the episode is truncated; infinity without ``max_steps``.
-        plain: Whether a decision of the user's agents is just updated, and waits. If not, see ``decide``.
-        tape: The answers of the user and of policies, in order. If it is full, later ones are not kept.
+        most_steps: The number of turns after which the episode is truncated; infinity without
+            ``max_steps``.
+        plain: Whether a decision of the user's agents is just updated, and waits. If not, see
+            ``decide``.
+        tape: The answers of the user and of policies, in order. If it is full, later ones are not
+            kept.
         session: Returns its session, for the environment that planners get.
-        script: During a replay, the answers on the other episode's tape that are still to be given. Else None.
-        items: The items of a call that was split, until the rule has decided or another call is split.
+        script: During a replay, the answers on the other episode's tape that are still to be given.
+            Else None.
+        items: The items of a call that was split, until the rule has decided or another call is
+            split.
     """
 
     __slots__ = (
@@ -168,15 +189,19 @@ class Episode(EpisodeState):
         self, plan: Plan, simulation: Any, driver: Driver, seed: int, rng: GlobalRandom | None, lock: Any,
         *, in_rounds: bool = False,
     ) -> None:  # fmt: skip
-        """Prepare the run of a simulation that has been reset. The driver's next ``resume`` begins it."""
+        """Prepare the run of a simulation that has been reset.
+
+        The driver's next ``resume`` begins it.
+        """
         clock = getattr(simulation, "time", None)
         if clock is None and plan.options.discount_rate is not None:
             raise OptionValueError(
-                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no method time(); add"
-                " one that returns its clock, or leave out discount_rate"
+                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no"
+                " method time(); add one that returns its clock, or leave out discount_rate"
             )
         if clock is not None and (plan.plugins is not None or rng is not None):
-            clock = _in_context(plan.plugins, rng, clock)  # views call it, too, outside of the context
+            # views call it, too, outside of the context
+            clock = _in_context(plan.plugins, rng, clock)
         super().__init__(plan, seed, clock, in_rounds=in_rounds)
         self.simulation, self.driver, self._rng, self._lock = simulation, driver, rng, lock
         self.agents = {name: Agent(name, point, plan, clock) for name, point in plan.roster.items()}
@@ -198,12 +223,17 @@ class Episode(EpisodeState):
     def events_by_hook(self) -> dict[Hook, Any]:
         """The events that the simulation sends: an agent where it is the only one of a point, else the plan's event."""
         agents = self.agents
-        return {hook: agents.get(getattr(event, "agent", None), event) for hook, event in self.plan.events.items()}  # type: ignore[arg-type]
+        return {
+            hook: agents.get(getattr(event, "agent", None), event)
+            for hook, event in self.plan.events.items()
+        }  # type: ignore[arg-type]
 
     # -- steps ------------------------------------------------------------------------------------
 
     def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
-        """Run the simulation to its first decision; when it has sent its first event, call a function.
+        """Run the simulation to its first decision.
+
+        When it has sent its first event, call a function.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
@@ -224,15 +254,17 @@ class Episode(EpisodeState):
                 raise
         self.unreported_end = self.over or (self.in_rounds and bool(self.just_ended))
         if self.pending is None and not self.plan.unattended:
-            forced = self.skips and any(agent.decided for agent in (*self.agents.values(), *self.just_ended))
+            forced = self.skips and any(
+                agent.decided for agent in (*self.agents.values(), *self.just_ended)
+            )
             if not forced:
                 raise self._without_decision()
 
     def step(self, action: Any, entered: bool = False) -> None:
         """Answer the pending decision by an action or ``RULE``, and run to the user's next decision, or to the end.
 
-        In rounds, the action is a dict of actions by agent: see ``Round.play``. ``entered``: The environment's context
-        is already entered.
+        In rounds, the action is a dict of actions by agent: see ``Round.play``. ``entered``: The
+        environment's context is already entered.
 
         Raises:
             InvalidActionError: The action is not legal. Nothing has moved.
@@ -251,7 +283,8 @@ class Episode(EpisodeState):
             return
         try:
             if action is not RULE:
-                check = agent.point.check  # a local variable: calling the attribute directly is slower
+                # a local variable: calling the attribute directly is slower
+                check = agent.point.check
                 legal = check(action)
                 if legal is ILLEGAL or agent.mask is not None:
                     legal = agent.point.checked(action, agent.name, agent.mask)
@@ -267,7 +300,8 @@ class Episode(EpisodeState):
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
         """Turn the checked action of an agent, or ``RULE``, into the reply for the driver's ``resume``.
 
-        If a mapping raises, the decision stays pending. ``turn``: The user answers the pending decision.
+        If a mapping raises, the decision stays pending. ``turn``: The user answers the pending
+        decision.
         """
         try:
             self.pending = None  # so that an action from inside a mapping is refused
@@ -283,7 +317,8 @@ class Episode(EpisodeState):
             else:
                 if type(action) is not int and turn:
                     recorded = duplicate(action)  # before a mapping can change it
-                convert = agent.point.convert  # a local variable: calling the attribute directly is slower
+                # a local variable: calling the attribute directly is slower
+                convert = agent.point.convert
                 reply = convert(action)
             if agent.point.applies and reply is not RULE:
                 reply = agent, reply
@@ -302,7 +337,10 @@ class Episode(EpisodeState):
         return reply
 
     def decide(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Handle a decision of a user's agent where more than an update is due; return ``WAIT`` or the reply."""
+        """Handle a decision of a user's agent where more than an update is due.
+
+        Return ``WAIT`` or the reply.
+        """
         if self.round is not None:
             return self.round.decide(self, agent, args, kwargs)
         if self.turns >= self.most_steps:  # the user has taken the last step
@@ -324,19 +362,22 @@ class Episode(EpisodeState):
         If the model, a mapping or a policy raises, the caller must call ``fail``.
         """
         while True:
-            resume = self.driver.resume  # a local variable: calling the attribute directly is slower
+            # a local variable: calling the attribute directly is slower
+            resume = self.driver.resume
             event, args, kwargs = resume(reply)
             reply = event.handle(self, args, kwargs)
             if reply is WAIT:
                 return
-            event = args = kwargs = None  # so that they keep nothing alive that the model frees meanwhile
+            # so that they keep nothing alive that the model frees meanwhile
+            event = args = kwargs = None
 
     def update_all(self, *, truncated: bool = False) -> None:
         """Reward and observe the live agents when a reset or a round returns. ``truncated``: The episode ends here.
 
         In turns, only agents that have not decided yet are observed, and none is rewarded.
         """
-        following, self.pending = self.pending, None  # so that an action from inside a mapping is refused
+        # so that an action from inside a mapping is refused
+        following, self.pending = self.pending, None
         in_rounds, expected = self.in_rounds, getattr(self.simulation, "expected_calls", None)
         for agent, call in () if expected is None else self.announced(expected).items():
             if agent is not following and (in_rounds or not agent.decided):
@@ -366,9 +407,14 @@ class Episode(EpisodeState):
     # -- agents -----------------------------------------------------------------------------------
 
     def agent_for(self, point: Point, name: Any) -> Agent:
-        """Find the agent with a name that decides at a point, or let it join; raise ``AgentError`` if it cannot."""
+        """Find the agent with a name that decides at a point, or let it join.
+
+        Raise ``AgentError`` if it cannot.
+        """
         if not isinstance(name, str):
-            raise AgentError(f"agent= of {point.point.name} must return a string or None, not {short_repr(name)}")
+            raise AgentError(
+                f"agent= of {point.point.name} must return a string or None, not {short_repr(name)}"
+            )
         agent = self.others.get(name) or self.agents.get(name) or self.ended.get(name)
         if agent is None:
             agent = Agent(name, point, self.plan, self.clock)
@@ -381,9 +427,13 @@ class Episode(EpisodeState):
         return agent
 
     def named_before(self, point: Point, entity: Any) -> str | None:
-        """The name of the agent as which an entity last decided at a point; None if it was no agent."""
+        """The name of the agent as which an entity last decided at a point.
+
+        None if it was no agent.
+        """
         agent = self.entities.get((point, id(entity)))
-        args = None if agent is None else agent.arguments()  # to exclude a freed entity that had the same id
+        # to exclude a freed entity that had the same id
+        args = None if agent is None else agent.arguments()
         return agent.name if agent is not None and args and args[0] is entity else None
 
     def announced(self, expected_calls: Any) -> dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]]:
@@ -410,7 +460,10 @@ class Episode(EpisodeState):
     # -- branches that wait for one agent ---------------------------------------------------------
 
     def single_out(self, agent: Agent) -> None:
-        """In a branch, wait for one agent's decision alone. For all others answer their policies, else the rule."""
+        """In a branch, wait for one agent's decision alone.
+
+        For all others answer their policies, else the rule.
+        """
         others = {name: other for name, other in self.agents.items() if other is not agent}
         if others:
             self.most_steps = inf  # ``max_steps`` counts the steps of other agents
@@ -450,7 +503,11 @@ class Episode(EpisodeState):
         unmatched = self.plan.unmatched_names
         if not unmatched:
             return
-        present = [name for name, agent in self.agents.items() if agent.decided or agent.observation is not None]
+        present = [
+            name
+            for name, agent in self.agents.items()
+            if agent.decided or agent.observation is not None
+        ]
         present += [*self.others, *self.ended]
         absent = unmatched.difference(present)
         if absent:
@@ -465,21 +522,31 @@ class Episode(EpisodeState):
         expected = ", ".join(point.point.name for point in self.plan.active)
         overriding = listed([name for point in self.plan.active for name in overrides(point.point)])
         hints: list[str] = []
-        threads = {name for point in self.plan.active for name in point.point.threads} - {current_thread().name}
+        threads = {name for point in self.plan.active for name in point.point.threads} - {
+            current_thread().name
+        }
         if overriding:
-            hints.append(f"these override it and are called instead: {overriding}; name them as decision points")
+            hints.append(
+                f"these override it and are called instead: {overriding}; name them as decision"
+                " points"
+            )
         if threads:
             hints.append(
-                f"the rule has decided in threads that are not the simulation's: {listed(sorted(threads))}; call it"
-                " where run() runs, and pass the decision on"
+                "the rule has decided in threads that are not the simulation's:"
+                f" {listed(sorted(threads))}; call it where run() runs, and pass the decision on"
             )
         if self.others:
             expected = f"{self.plan.one_agent!r} at {expected}" if self.plan.one_agent else expected
             hints = [f"these have decided: {listed(self.others)}"]
-        hint = "; ".join(hints) or "does the simulation call its decision functions as attributes of class or module?"
-        return NoDecisionError(f"{type(self.simulation).__name__}.run() ended without a decision of {expected}; {hint}")
+        hint = (
+            "; ".join(hints)
+            or "does the simulation call its decision functions as attributes of class or module?"
+        )
+        return NoDecisionError(
+            f"{type(self.simulation).__name__}.run() ended without a decision of {expected}; {hint}"
+        )
 
-    # -- errors, and the end by a close -------------------------------------------------------------
+    # -- errors, and the end by a close ------------------------------------------------------------
 
     def annotate(self, error: BaseException) -> None:
         """Add a note to an error: at which decision of which agent it arose."""
@@ -493,21 +560,26 @@ class Episode(EpisodeState):
 
     def fail(self, error: BaseException) -> None:
         """End the episode because of an error, and add a note to the error that says where it arose."""
-        self.pending, self.over = None, True  # first, because the next call may come to the end of the stack
+        # first, because the next call may come to the end of the stack
+        self.pending, self.over = None, True
         self.annotate(error)
         try:
             problems = self._unwind()
-        except Warning as warning:  # warnings may be errors; this one must not replace the original error
+        # warnings may be errors; this one must not replace the original error
+        except Warning as warning:
             problems = [warning]
         for problem in problems:
-            annotate(error, f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well")
+            annotate(
+                error, f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well"
+            )
         clear_frames(error)
 
     def close(self) -> None:
         """Unwind the simulation if it is suspended, without answering its decisions.
 
         Raises:
-            ReentrancyError, WrongThreadError: The simulation is moving, or suspended in another thread.
+            ReentrancyError, WrongThreadError: The simulation is moving, or suspended in another
+                thread.
         """
         if self.running and (self.driver.lost or self.driver.given_up is not None):
             self.running, self.over = False, True
@@ -521,7 +593,10 @@ class Episode(EpisodeState):
         self.pending, self.over = None, True
 
     def _unwind(self) -> list[BaseException]:
-        """Unwind the simulation if it is suspended; then the episode is over. Return the errors that it raised."""
+        """Unwind the simulation if it is suspended; then the episode is over.
+
+        Return the errors that it raised.
+        """
         problems: list[BaseException] = []
         if self.driver.given_up is not None:  # it was inherited by a fork
             self.running = False
@@ -549,19 +624,21 @@ def refusal(state: str) -> Exception:
     return {
         "new": NotResetError("there is no episode yet; call reset() first"),
         "copied": NotResetError(
-            "this is a copy of an environment, and has no episode yet; call reset() first, or use clone() to go on from"
-            " where the original stands"
+            "this is a copy of an environment, and has no episode yet; call reset() first, or use"
+            " clone() to go on from where the original stands"
         ),
         "moving": ReentrancyError(
-            "the environment was used from inside its own reset, simulation or mappings, or while another thread was"
-            " using it"
+            "the environment was used from inside its own reset, simulation or mappings, or while"
+            " another thread was using it"
         ),
         "over": EpisodeOverError("the episode is over; call reset() to begin the next one"),
         "closed": ClosedError("the environment is closed; call reset() to use it again"),
     }[state]
 
 
-def _in_context(plugins: Any, rng: GlobalRandom | None, function: Callable[[], Any]) -> Callable[[], Any]:
+def _in_context(
+    plugins: Any, rng: GlobalRandom | None, function: Callable[[], Any]
+) -> Callable[[], Any]:
     def call() -> Any:
         with environment_context(plugins, rng):
             return function()

@@ -42,8 +42,9 @@ _LONGEST: Final = 1e9
 class _Life:
     """A pipe whose write end only this process holds. Its end ends the processes that were forked for this one.
 
-    A signal of the kernel ends them, because a process that is busy would not notice the end of a pipe. The kernel's
-    other signal, at the end of a parent, is of no use: it comes at the end of the thread that has forked.
+    A signal of the kernel ends them, because a process that is busy would not notice the end of a
+    pipe. The kernel's other signal, at the end of a parent, is of no use: it comes at the end of
+    the thread that has forked.
     """
 
     def __init__(self) -> None:
@@ -56,7 +57,9 @@ class _Life:
 
 
 class _Process:
-    """What this process has of its own: its life, while it has forked others; and as a fork, what it has from above.
+    """What this process has of its own: its life, while it has forked others.
+
+    And as a fork, what it has from above.
 
     Attributes:
         life: A weak reference to the life that all forks of this process hold.
@@ -103,7 +106,8 @@ if CAN_FORK:
 
 def _end_with(descriptor: int) -> None:
     """Let the kernel kill this process when the write end of a pipe is closed."""
-    own = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY | os.O_NONBLOCK)  # the owner belongs to the opening
+    # the owner belongs to the opening
+    own = os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY | os.O_NONBLOCK)
     os.dup2(own, descriptor, inheritable=False)
     os.close(own)
     fcntl.fcntl(descriptor, fcntl.F_SETOWN, os.getpid())
@@ -132,18 +136,28 @@ class Fork:
         life: What keeps it from ending.
     """
 
-    def __init__(self, process: int, connection: socket.socket, life: Any, *, is_child: bool) -> None:
+    def __init__(
+        self, process: int, connection: socket.socket, life: Any, *, is_child: bool
+    ) -> None:
         """Take over a process that ends with a life: a child of this process, or a child's."""
-        self.process, self.connection, self.life, self._is_child = process, connection, life, is_child
+        self.process, self.connection, self.life, self._is_child = (
+            process,
+            connection,
+            life,
+            is_child,
+        )
         connection.settimeout(None)  # whatever is the default: the socket itself has the limit
         self._owner = os.getpid()
         self._alive = True
 
     @classmethod
-    def begin(cls, main: Callable[[socket.socket], None], separate: Callable[[], None], *, wait: bool) -> Fork:
+    def begin(
+        cls, main: Callable[[socket.socket], None], separate: Callable[[], None], *, wait: bool
+    ) -> Fork:
         """Fork a process that separates itself from this one, and runs ``main`` with its end of the connection.
 
-        ``wait``: This process may go on to change what they share, so it waits until they are separated.
+        ``wait``: This process may go on to change what they share, so it waits until they are
+        separated.
 
         Raises:
             BranchError: There are no more descriptors or processes. Nothing is left behind.
@@ -171,7 +185,8 @@ class Fork:
 
     def limit(self, seconds: float) -> None:
         """Limit the time for which a message is awaited."""
-        whole, part = divmod(max(seconds, 1e-6), 1) if seconds < _LONGEST else (0, 0)  # zeros: there is no limit
+        # zeros: there is no limit
+        whole, part = divmod(max(seconds, 1e-6), 1) if seconds < _LONGEST else (0, 0)
         limit = _TIME.pack(int(whole), int(part * 1e6))
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
 
@@ -191,7 +206,10 @@ class Fork:
             raise TimeoutError from error
 
     def end(self) -> str:
-        """End the process, and wait for its end; return how it has ended. In a copy of this one, only let go of it."""
+        """End the process, and wait for its end; return how it has ended.
+
+        In a copy of this one, only let go of it.
+        """
         how, alive, self._alive = "its process has ended", self._alive, False
         if not alive:
             return how
@@ -229,11 +247,17 @@ def pair() -> tuple[socket.socket, socket.socket]:
 
 
 def start(
-    here: socket.socket, there: socket.socket, lives: tuple[int, ...], separate: Callable[[], None], *, wait: bool
+    here: socket.socket,
+    there: socket.socket,
+    lives: tuple[int, ...],
+    separate: Callable[[], None],
+    *,
+    wait: bool,
 ) -> int:
     """Fork a process that ends with the given lives; return its number, and 0 in that process.
 
-    The sockets are the two ends of its connection. ``wait``: Return after the process was separated.
+    The sockets are the two ends of its connection. ``wait``: Return after the process was
+    separated.
 
     Raises:
         BranchError: There are no more processes.
@@ -241,17 +265,23 @@ def start(
     flush()  # else both processes would write what is buffered
     try:
         # Python 3.12 warns because the child never releases locks that other threads hold.
-        with warnings.catch_warnings(action="ignore") if sys.version_info >= (3, 12) else nullcontext():
+        with (
+            warnings.catch_warnings(action="ignore")
+            if sys.version_info >= (3, 12)
+            else nullcontext()
+        ):
             process = os.fork()
     except OSError as error:
         raise exhausted(error) from error
     if process == 0:
         try:
-            gc.freeze()  # the collector would write to what is shared with the parent, and so copy it
+            # the collector would write to what is shared with the parent, and so copy it
+            gc.freeze()
             _this.lives, _this.connection = lives, there
             for life in lives:
                 _end_with(life)
-            _signal.signal(_signal.SIGINT, _signal.SIG_IGN)  # an interrupt is for the user's process
+            # an interrupt is for the user's process
+            _signal.signal(_signal.SIGINT, _signal.SIG_IGN)
             _signal.set_wakeup_fd(-1)
             separate()
             if wait:

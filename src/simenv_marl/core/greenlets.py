@@ -25,10 +25,12 @@ class GreenletDriver(Driver):
     def __init__(self, plugins: Any = None) -> None:
         """Prepare a greenlet."""
         super().__init__(plugins)
-        self._running_loop: Callable[[], Any] | None = None  # until it is known that asyncio is imported
+        # until it is known that asyncio is imported
+        self._running_loop: Callable[[], Any] | None = None
         self._body: Any = greenlet(self._serve)
         self._leave: Any = None
-        self.resume: Any = self._body.switch  # or the ``switch`` of a greenlet of the model that waits for an answer
+        # or the ``switch`` of a greenlet of the model that waits for an answer
+        self.resume: Any = self._body.switch
 
     # -- on the user's side -----------------------------------------------------------------------
 
@@ -36,12 +38,15 @@ class GreenletDriver(Driver):
         """Prepare to resume the simulation from the current greenlet."""
         if self._body is None or self._home() is not THREAD.identity:
             raise WrongThreadError(
-                "the simulation is suspended in another thread, the one that called reset(); step, reset and close the"
+                "the simulation is suspended in another thread, the one that called reset(); step,"
+                " reset and close the"
                 ' environment there, or make it with driver="thread", which allows any thread'
             )
         here = getcurrent()
-        self._leave, self._body.parent = here.switch, here  # control returns here when the stack ends
-        # Each step needs ``enter`` where there are plugins, and inside another environment's simulation, to hide that.
+        # control returns here when the stack ends
+        self._leave, self._body.parent = here.switch, here
+        # Each step needs ``enter`` where there are plugins, and inside another environment's
+        # simulation, to hide that.
         self.caller = None if self.plugins is not None or here in STACKS else here
 
     def throw(self) -> Event:
@@ -67,7 +72,8 @@ class GreenletDriver(Driver):
             self._register()
             while not self.ended:
                 self._loop = _NO_LOOP  # each job begins without a loop
-                self._body.gr_context, self._context = self._context, None  # ``Context.run`` takes a kilobyte of stack
+                # ``Context.run`` takes a kilobyte of stack
+                self._body.gr_context, self._context = self._context, None
                 self._enter_loop()
                 try:
                     event = self._work()
@@ -98,7 +104,9 @@ class GreenletDriver(Driver):
             leave, running = driver._leave, driver._running_loop
             if running is None and _ASYNCIO in modules:
                 running = driver._running_loop = modules[_ASYNCIO]._get_running_loop
-            looped = running is not None and (running() is not None or driver._users_loop[0] is not None)
+            looped = running is not None and (
+                running() is not None or driver._users_loop[0] is not None
+            )
             if looped:
                 driver._loop = _swap_loop(driver._users_loop)
             try:
@@ -126,10 +134,16 @@ class GreenletDriver(Driver):
 
 
 _given_up: Final[list[greenlet]] = []
-"""The stacks of simulations that did not unwind. Freeing a greenlet would resume it, at an arbitrary moment."""
+"""The stacks of simulations that did not unwind.
+
+Freeing a greenlet would resume it, at an arbitrary moment.
+"""
 
 _ASYNCIO: Final = "asyncio.events"
-"""The module that knows a thread's running event loop, whatever its stack. If it is not imported, no loop runs."""
+"""The module that knows a thread's running event loop, whatever its stack.
+
+If it is not imported, no loop runs.
+"""
 
 _NO_LOOP: Final[Any] = (None, (None, None), 0)
 """The state of a thread without a loop: the loop, the hooks of asynchronous generators, and the depth of tracking."""
@@ -151,7 +165,8 @@ def _swap_loop(state: Any) -> Any:
 def make_exit() -> SimulationExit:
     """Return the exit to raise here. The loop here will not report it, because no code awaits its tasks any more.
 
-    A ``LoopExit`` ends a loop at once. But where asyncio closes its loop already, it must go on to the other tasks.
+    A ``LoopExit`` ends a loop at once. But where asyncio closes its loop already, it must go on to
+    the other tasks.
     """
     hub: Any = getcurrent()
     while hub is not None and hub not in STACKS and not hasattr(hub, "NOT_ERROR"):
@@ -164,7 +179,9 @@ def make_exit() -> SimulationExit:
         return SimulationExit()
     before = loop.get_exception_handler()
     if not isinstance(before, partial):  # else it was silenced in an earlier episode
-        loop.set_exception_handler(partial(_report_task, before or type(loop).default_exception_handler))
+        loop.set_exception_handler(
+            partial(_report_task, before or type(loop).default_exception_handler)
+        )
     frame: Any = sys._getframe()
     while frame is not None and frame.f_code is not modules["asyncio"].Runner.close.__code__:
         frame = frame.f_back

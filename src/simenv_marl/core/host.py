@@ -26,7 +26,17 @@ DEEPEST: Final = 4
 DEPTH: Final[ContextVar[int]] = ContextVar("simenv_marl.core.host", default=0)
 """The depth of this branch."""
 
-FIELDS: Final = ("observation", "reward", "info", "mask", "acted", "decided", "ended", "present", "answered")
+FIELDS: Final = (
+    "observation",
+    "reward",
+    "info",
+    "mask",
+    "acted",
+    "decided",
+    "ended",
+    "present",
+    "answered",
+)
 """What views read of an agent."""
 
 _fields: Final = attrgetter(*FIELDS)
@@ -36,7 +46,10 @@ MOVES: Final = {"step": False, "begin": True, "start": True, "call": True}
 
 
 class Host:
-    """The environment in the process of a clone. Its methods, and those of its session, answer requests."""
+    """The environment in the process of a clone.
+
+    Its methods, and those of its session, answer requests.
+    """
 
     def __init__(self, env: Any, view: Any) -> None:
         self._env, self._view = env, view
@@ -53,7 +66,10 @@ class Host:
                 send(connection, self._answer(name, *args))
 
     def _answer(self, name: str, *args: Any) -> bytes:
-        """Do what a request asks for; return the reply: a value, or an error, and the state of the episode."""
+        """Do what a request asks for.
+
+        Return the reply: a value, or an error, and the state of the episode.
+        """
         value = error = state = None
         try:
             value = getattr(self if hasattr(self, name) else self._session, name)(*args)
@@ -70,7 +86,10 @@ class Host:
         return pack_reply(value, error, state)
 
     def _fork(self, connection: socket.socket, method: str | None) -> socket.socket:
-        """Fork this process. Send the connection of the new one; return the connection to serve from now on."""
+        """Fork this process.
+
+        Send the connection of the new one; return the connection to serve from now on.
+        """
         here = there = None
         process: int | None = None
         try:
@@ -104,7 +123,8 @@ class Host:
     def start(self, seed: int, options: Any, in_rounds: bool) -> None:
         """Begin another episode."""
         self._session.start(seed, options, in_rounds=in_rounds)
-        self._view._set_up()  # branches of the clone have it, and it may hold agents of the episode before
+        # branches of the clone have it, and it may hold agents of the episode before
+        self._view._set_up()
 
     def reseed(self, seed: int) -> None:
         """Draw what lies ahead anew."""
@@ -112,7 +132,10 @@ class Host:
         self._session.reseed(seed)
 
     def call(self, function: bytes, parcel: bytes | None, noted: Any) -> Any:
-        """Call a function with the environment, in the state that it has in the other process; return both."""
+        """Call a function with the environment, in the state that it has in the other process.
+
+        Return both.
+        """
         env, session = self._env, self._session
         if parcel is not None:
             env = unpack_env(parcel, [self._view], session)
@@ -141,7 +164,8 @@ class State(NamedTuple):
 
     Attributes:
         agents: The name, the number of the point and the ``FIELDS`` of each agent that is sent.
-        just_ended: The names of the agents whose end is not reported yet. The other attributes are those of ``Run``.
+        just_ended: The names of the agents whose end is not reported yet. The other attributes are
+            those of ``Run``.
     """
 
     in_rounds: bool
@@ -159,7 +183,10 @@ class State(NamedTuple):
 
 
 def state_of(episode: Episode, *, whole: bool) -> State:
-    """Return the state of an episode; without the agents that have not changed, unless it is the ``whole``."""
+    """Return the state of an episode.
+
+    Without the agents that have not changed, unless it is the ``whole``.
+    """
     agents, points, pending = [*episode.just_ended], episode.plan.points, episode.pending
     if whole:
         agents = [*episode.ended.values(), *episode.agents.values()]
@@ -222,7 +249,8 @@ def separator_of(view: Any, method: str | None) -> Callable[[], None] | None:
         obstacles.pop(loop._csock.fileno(), None)
     if obstacles and method == "fork":
         raise BranchError(
-            f"a forked process cannot continue with {', '.join(obstacles.values())} that the simulation has opened; use"
+            f"a forked process cannot continue with {', '.join(obstacles.values())} that the"
+            " simulation has opened; use"
             ' method="replay"'
         )
     return None if obstacles else separator(loops)
@@ -248,7 +276,9 @@ def layers_of(env: Any) -> list[Any]:
     layers, view = [env], env.unwrapped
     while layers[-1] is not view:
         parts = vars(layers[-1]).values()
-        layers.append(next(part for part in parts if part is view or getattr(part, "unwrapped", None) is view))
+        layers.append(
+            next(part for part in parts if part is view or getattr(part, "unwrapped", None) is view)
+        )
     return layers
 
 

@@ -74,17 +74,30 @@ class ForkedSession(Session):
         time: The simulation's time as of the latest reply; None if it has none.
     """
 
-    __slots__ = ("_fork", "_gone", "_limit", "_made_from", "_renewed", "_stepped", "_warned", "time")
+    __slots__ = (
+        "_fork",
+        "_gone",
+        "_limit",
+        "_made_from",
+        "_renewed",
+        "_stepped",
+        "_warned",
+        "time",
+    )
 
     def __init__(self, original: Session, fork: Fork, time_limit: float) -> None:
         """Take over a process in which the episode of a session goes on."""
         self.plan, self.bound_plan = original.plan, None
         self.where = Where.CLONE
         self.state, self.options, self.seed = "over", original.options, original.seed
-        self.np_random_seed, self._np_random = original.np_random_seed, copy.deepcopy(original._np_random)
+        self.np_random_seed, self._np_random = (
+            original.np_random_seed,
+            copy.deepcopy(original._np_random),
+        )
         self.exclusive = self.lock = ExclusiveLock()
         self._fork, self._limit = fork, time_limit
-        self._made_from = original if isinstance(original, ForkedSession) else None  # whose process forked this one's
+        # whose process forked this one's
+        self._made_from = original if isinstance(original, ForkedSession) else None
         self._gone: str | None = None  # why the process is gone
         self._renewed = self._warned = False
         self._stepped: bool = self._made_from is not None and self._made_from._stepped
@@ -104,13 +117,16 @@ class ForkedSession(Session):
         """Refuse it: it is in another process."""
         raise BranchError(
             "the simulation of a clone is in the clone's process; reach it with"
-            " env.unwrapped.call(lambda env: env.unwrapped.simulation...), which returns a copy of the result"
+            " env.unwrapped.call(lambda env: env.unwrapped.simulation...), which returns a copy of"
+            " the result"
         )
 
-    # -- requests -----------------------------------------------------------------------------------
+    # -- requests ----------------------------------------------------------------------------------
 
     def request(self, name: str, *args: Any, limit: float | None = None) -> Any:
-        """Call a method of the clone's ``Host`` or session; mirror the episode afterwards; return the result.
+        """Call a method of the clone's ``Host`` or session.
+
+        Mirror the episode afterwards; return the result.
 
         Raises:
             BranchError: The process has ended, or takes too long and is ended.
@@ -129,18 +145,27 @@ class ForkedSession(Session):
                     self.request("reap", value)
                     raise exhausted(OSError(EMFILE, os.strerror(EMFILE)))
                 return value
-            return Fork(value, socket.socket(fileno=descriptors[0]), self._fork.life, is_child=False)
+            return Fork(
+                value, socket.socket(fileno=descriptors[0]), self._fork.life, is_child=False
+            )
 
     def refusal(self) -> Exception:
         """Make the error that says why no action can be taken now."""
         if self.state == "closed":
-            return ClosedError("the clone is closed, and its process has ended; clone the environment again")
+            return ClosedError(
+                "the clone is closed, and its process has ended; clone the environment again"
+            )
         if self._gone is not None or not self._fork.usable:
-            return BranchError(f"the clone is gone: {self._gone or 'it belongs to another process'}")
+            return BranchError(
+                f"the clone is gone: {self._gone or 'it belongs to another process'}"
+            )
         return super().refusal()
 
     def _exchange(self, name: str, message: bytes, limit: float | None) -> tuple[bytes, list[int]]:
-        """Send a message; return the reply, empty if the process is gone, and the descriptors before it."""
+        """Send a message.
+
+        Return the reply, empty if the process is gone, and the descriptors before it.
+        """
         fork, descriptors, reply = self._fork, list[int](), b""
         try:
             if limit is not None:
@@ -152,7 +177,10 @@ class ForkedSession(Session):
             if limit is not None:
                 fork.limit(self._limit)
         except TimeoutError:
-            self._end(f"it was ended, because it took longer than {self._limit if limit is None else limit} s; ")
+            self._end(
+                "it was ended, because it took longer than"
+                f" {self._limit if limit is None else limit} s; "
+            )
         except ConnectionError:
             pass
         except BaseException:  # an interrupt: the reply would be taken for the next one
@@ -202,7 +230,13 @@ class ForkedSession(Session):
     def step_out(self) -> None:
         """Do nothing: the clone's process has done it."""
 
-    def call(self, env: Any, function: Callable[..., Any], args: tuple[Any, ...], limit: float | None = None) -> Any:
+    def call(
+        self,
+        env: Any,
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
+        limit: float | None = None,
+    ) -> Any:
         """Call a function in the clone's process, with the environment there in the state that it has here."""
         view, episode, parcel = env.unwrapped, self.episode, None
         noted = None if episode is None else (episode.unreported_end, episode.last_time)
@@ -211,8 +245,8 @@ class ForkedSession(Session):
         except Exception as error:
             if self._stepped or env is not view._outermost():
                 raise BranchError(
-                    f"the wrappers of the clone cannot be sent to its process ({describe_error(error)}); call functions"
-                    " before its first step"
+                    "the wrappers of the clone cannot be sent to its process"
+                    f" ({describe_error(error)}); call functions before its first step"
                 ) from error
         self._renewed = True  # the function may reset the environment
         result, parcel = self.request("call", pack((function, args)), parcel, noted, limit=limit)
@@ -224,10 +258,15 @@ class ForkedSession(Session):
         view._set_up()  # there may be another episode
         return result
 
-    # -- episodes -----------------------------------------------------------------------------------
+    # -- episodes ----------------------------------------------------------------------------------
 
     def start(
-        self, seed: int | None, options: dict[str, Any] | None, *, in_rounds: bool = False, script: Any = None
+        self,
+        seed: int | None,
+        options: dict[str, Any] | None,
+        *,
+        in_rounds: bool = False,
+        script: Any = None,
     ) -> Any:
         """Reset the simulation in the clone's process."""
         self.options, self.seed = options, self.seed_for(seed)

@@ -1,6 +1,7 @@
 """Packing for other processes: simulations, decision functions, policies, results and errors.
 
-Objects that can be imported are pickled by reference, all others by value, such as those of a script or a notebook.
+Objects that can be imported are pickled by reference, all others by value, such as those of a
+script or a notebook.
 """
 
 from __future__ import annotations
@@ -86,11 +87,17 @@ class Pickler(cloudpickle.Pickler):
 
 
 class RemoteTraceback(Exception):
-    """The cause of an error from another process. Its message is the traceback there, with all causes."""
+    """The cause of an error from another process.
+
+    Its message is the traceback there, with all causes.
+    """
 
 
 def pack_error(error: BaseException) -> bytes:
-    """Pickle an error with its traceback. An error that cannot be pickled becomes a ``WorkerError``."""
+    """Pickle an error with its traceback.
+
+    An error that cannot be pickled becomes a ``WorkerError``.
+    """
     try:
         text = "".join(traceback.format_exception(error))
     except Exception:  # formatting runs code of the error's class, which may fail
@@ -99,17 +106,23 @@ def pack_error(error: BaseException) -> bytes:
         parcel = pack(error)
         unpack(parcel)  # the class may define pickling that works only in one direction
     except Exception:
-        other = WorkerError(f"another process raised an error that cannot be pickled: {describe_error(error)}")
+        other = WorkerError(
+            f"another process raised an error that cannot be pickled: {describe_error(error)}"
+        )
         other.__notes__ = error_notes(error)
         parcel = pack(other)
     return pickle.dumps((parcel, text), 5)
 
 
 def unpack_error(parcel: bytes) -> BaseException:
-    """Rebuild an error that ``pack_error`` has packed. Its cause becomes the traceback in the other process."""
+    """Rebuild an error that ``pack_error`` has packed.
+
+    Its cause becomes the traceback in the other process.
+    """
     inner, text = pickle.loads(parcel)
     error: BaseException = unpack(inner)
-    BaseException.__setattr__(error, "__cause__", RemoteTraceback(f"\n\n{text}"))  # the error's class may be frozen
+    # the error's class may be frozen
+    BaseException.__setattr__(error, "__cause__", RemoteTraceback(f"\n\n{text}"))
     return error
 
 
@@ -118,18 +131,32 @@ _IN_PYTHON: Final = 1 << 9
 
 
 def _reduce_error(error: BaseException) -> tuple[Any, ...] | None:
-    """How to rebuild an error without a call of its ``__init__``; None if its class itself defines pickling."""
-    kinds = [kind for kind in type(error).__mro__ if kind not in (BaseExceptionGroup, BaseException, object)]
-    if any(kind.__flags__ & _IN_PYTHON and {"__reduce__", "__reduce_ex__"} & vars(kind).keys() for kind in kinds):
+    """How to rebuild an error without a call of its ``__init__``.
+
+    None if its class itself defines pickling.
+    """
+    kinds = [
+        kind
+        for kind in type(error).__mro__
+        if kind not in (BaseExceptionGroup, BaseException, object)
+    ]
+    if any(
+        kind.__flags__ & _IN_PYTHON and {"__reduce__", "__reduce_ex__"} & vars(kind).keys()
+        for kind in kinds
+    ):
         return None
     members = {
         name: getattr(error, name)
         for kind in kinds
         for name, member in vars(kind).items()
-        if isinstance(member, (MemberDescriptorType, GetSetDescriptorType)) and not name.startswith("__")
-        if name != "obj" and hasattr(error, name)  # the ``obj`` of an AttributeError may refer to the whole model
+        if isinstance(member, (MemberDescriptorType, GetSetDescriptorType))
+        and not name.startswith("__")
+        # the ``obj`` of an AttributeError may refer to the whole model
+        if name != "obj" and hasattr(error, name)
     }
-    args = (error.message, error.exceptions) if isinstance(error, BaseExceptionGroup) else error.args
+    args = (
+        (error.message, error.exceptions) if isinstance(error, BaseExceptionGroup) else error.args
+    )
     return _rebuild_error, (
         type(error),
         args,
@@ -138,7 +165,9 @@ def _reduce_error(error: BaseException) -> tuple[Any, ...] | None:
     )
 
 
-def _rebuild_error(kind: Any, args: tuple[Any, ...], members: dict[str, Any], attributes: dict[str, Any]) -> Any:
+def _rebuild_error(
+    kind: Any, args: tuple[Any, ...], members: dict[str, Any], attributes: dict[str, Any]
+) -> Any:
     builtin: Any = next(base for base in kind.__mro__ if not base.__flags__ & _IN_PYTHON)
     error = builtin.__new__(kind, *args)
     for name, value in members.items():
@@ -162,19 +191,32 @@ def _restore_class(made: type, sent: tuple[Any, Any, Any]) -> None:
     """Give a class its attributes, unless it has them: it was never away, or an environment has patched some here."""
     origin, restore, (attributes, slots) = sent
     if origin != _origin():
-        patched = {name for name, value in vars(made).items() if getattr(hook_of(value), "owner", None) is made}
-        restore(made, ({name: value for name, value in attributes.items() if name not in patched}, slots))
+        patched = {
+            name
+            for name, value in vars(made).items()
+            if getattr(hook_of(value), "owner", None) is made
+        }
+        restore(
+            made,
+            ({name: value for name, value in attributes.items() if name not in patched}, slots),
+        )
 
 
 # -- functions ------------------------------------------------------------------------------------
 
 _tokens: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
-"""Functions and hooks that were sent or received, by token. What comes back is identical to what was sent."""
+"""Functions and hooks that were sent or received, by token.
+
+What comes back is identical to what was sent.
+"""
 
 
 def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
-    """How another process finds or makes a function that its name does not lead to; None for all others."""
+    """How another process finds or makes a function that its name does not lead to.
+
+    None for all others.
+    """
     place = function.__module__, function.__qualname__
     for way in _WAYS:
         if _find(*place, way) is function:
@@ -192,7 +234,10 @@ _WAYS: Final = {
 
 
 def _find(module: str | None, path: str, way: str) -> Any:
-    """Import the object with a dotted name, and return what a way leads to from there; None if there is none."""
+    """Import the object with a dotted name, and return what a way leads to from there.
+
+    None if there is none.
+    """
     if module is None or module == "__main__":
         return None
     try:

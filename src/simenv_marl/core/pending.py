@@ -32,8 +32,8 @@ class Decision:
         action_space: The space of its actions.
         mask: The action mask; None if all actions are legal.
         choices: The answers that the actions stand for, where they arrive with the call; else None.
-        action_labels: For a ``Discrete`` a dict from action to text, for a ``Dict`` a dict from key to text, for a
-            space with one dimension a sequence of texts, for others None.
+        action_labels: For a ``Discrete`` a dict from action to text, for a ``Dict`` a dict from key
+            to text, for a space with one dimension a sequence of texts, for others None.
         observation_labels: The same for the parts of the observation.
         reward: The reward of the agent's previous action; 0.0 at its first decision.
         doc: The docstring of the model's function; None if it has none.

@@ -1,7 +1,7 @@
 """The plan of an environment: a complete description that is checked before anything runs.
 
-A plan names the decision points of an environment, the names of their agents, the policies and the options. It holds no
-state of any episode, so that one plan serves any number of environments.
+A plan names the decision points of an environment, the names of their agents, the policies and the
+options. It holds no state of any episode, so that one plan serves any number of environments.
 """
 
 from __future__ import annotations
@@ -49,7 +49,10 @@ from .policies import AskingPolicy, DeferredPolicy
 from .split import Split
 from .threads import ThreadDriver
 
-DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {"greenlet": GreenletDriver, "thread": ThreadDriver}
+DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {
+    "greenlet": GreenletDriver,
+    "thread": ThreadDriver,
+}
 
 
 def source_name(source: Any) -> str:
@@ -79,23 +82,30 @@ class Plan:
     """The plan of an environment.
 
     Attributes:
-        source, variant: What the environment makes its simulation from, and the variant that says so, if there is one.
-        options, render_modes, render_fps: The options, and what the simulation says of its rendering.
+        source, variant: What the environment makes its simulation from, and the variant that says
+            so, if there is one.
+        options, render_modes, render_fps: The options, and what the simulation says of its
+            rendering.
         points: The decision points that do not run their rule.
         active: The decision points that the environment's user answers.
         events: For each hook, the event that the simulation sends when its function is called.
         policies: By agent name, the policies of agents that are not agents of the environment.
         is_bound_to_simulation: Whether a mapping asks for the simulation.
         has_planner: Whether a policy asks for the environment, and so may branch it.
-        unmatched_names: The agents that ``policies`` and ``possible_agents`` name. Agents that do not appear in an
-            episode are removed from this set, with one warning.
-        one_agent: The name of the only agent that the environment's user answers for. None if there may be several.
-        roster: By agent name, the decision points of the agents that are known beforehand, in the order of the points.
+        unmatched_names: The agents that ``policies`` and ``possible_agents`` name. Agents that do
+            not appear in an episode are removed from this set, with one warning.
+        one_agent: The name of the only agent that the environment's user answers for. None if there
+            may be several.
+        roster: By agent name, the decision points of the agents that are known beforehand, in the
+            order of the points.
         complete: Whether ``roster`` contains all possible agents.
-        unattended: Whether the environment has no user, so that the rule decides wherever no policy answers.
-        rewarded: Whether agents with deferred policies are agents of the environment, with rewards and ends.
+        unattended: Whether the environment has no user, so that the rule decides wherever no policy
+            answers.
+        rewarded: Whether agents with deferred policies are agents of the environment, with rewards
+            and ends.
         plugins: The handlers for this environment's simulation only. None if there are none.
-        patches: The hooks, and the handlers with their hooks, that must be set while an environment is in use.
+        patches: The hooks, and the handlers with their hooks, that must be set while an environment
+            is in use.
     """
 
     def __init__(
@@ -110,7 +120,8 @@ class Plan:
     ) -> None:
         """Make a plan from the arguments of ``generate_env``, and check them.
 
-        ``others`` is the policy of all agents without one. With it, ``points=None`` means all decision points.
+        ``others`` is the policy of all agents without one. With it, ``points=None`` means all
+        decision points.
 
         Raises:
             SimEnvError: The arguments do not work. The subclass of the error says why.
@@ -121,10 +132,14 @@ class Plan:
         self.source, self.options = source, Options().amended(options)
         self.unattended, self.rewarded, self._others = unattended, rewarded, others
         if unattended and self.options.agent is not None:
-            raise UnknownOptionError("agent is an option of single views only, as single_env makes them")
+            raise UnknownOptionError(
+                "agent is an option of single views only, as single_env makes them"
+            )
         inspected: Any = source
         self._prototypes: list[Prototype] = []
-        if not isinstance(source, type) or (points is None and getattr(source, "points", None) is None):
+        if not isinstance(source, type) or (
+            points is None and getattr(source, "points", None) is None
+        ):
             self._prototypes.append(Prototype(source, self.options.driver))
             inspected = self._prototypes[0].simulation
         kind = inspected if isinstance(inspected, type) else type(inspected)
@@ -135,7 +150,9 @@ class Plan:
         self._own = own_points(inspected)
         if points is None:
             points = getattr(inspected, "points", None)
-        names_agents = any(isinstance(key, str) and "." not in key for key in self.options.policies or {})
+        names_agents = any(
+            isinstance(key, str) and "." not in key for key in self.options.policies or {}
+        )
         if points is None and unattended and others is None and not names_agents:
             points = ()  # those that ``policies`` names are enough
         self._named = find_points(points, self._own, empty=unattended)
@@ -146,8 +163,8 @@ class Plan:
         mode, modes = self.options.render_mode, self.render_modes
         if mode is not None and self.options.picture_mode not in modes:
             warn_user(
-                f"render_mode {mode!r} is not one of the simulation's ({', '.join(modes) or 'it has none'}), and is"
-                f" ignored{did_you_mean(mode, modes)}"
+                f"render_mode {mode!r} is not one of the simulation's"
+                f" ({', '.join(modes) or 'it has none'}), and is ignored{did_you_mean(mode, modes)}"
             )
             self.options = replace(self.options, render_mode=None)
         options = self.options
@@ -158,9 +175,12 @@ class Plan:
         self.plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
         self.unmatched_names = {*self.policies, *declared_agents(options.possible_agents)}
         policies = (*self._by_point.values(), *self.policies.values())
-        self.has_planner = any(isinstance(policy, AskingPolicy) and policy.plans for policy in policies)
+        self.has_planner = any(
+            isinstance(policy, AskingPolicy) and policy.plans for policy in policies
+        )
         self.is_bound_to_simulation = any(
-            given_simulation(definition, None) is not definition for definition in self._definitions.values()
+            given_simulation(definition, None) is not definition
+            for definition in self._definitions.values()
         )
         self._prepare_points()
         hooks = dict.fromkeys((*self._definitions, *self.events))
@@ -182,24 +202,36 @@ class Plan:
             agent, policy = agents[point], self._by_point.get(point, self._others)
             if options.agent is not None and agent != only:
                 policy = policy or RULE
-            policies = [policy, *self.policies.values()] if agent is None else [self.policies.get(agent, policy)]
+            policies = (
+                [policy, *self.policies.values()]
+                if agent is None
+                else [self.policies.get(agent, policy)]
+            )
             if policy is RULE and policies == [RULE]:
                 self.unmatched_names.discard(agent)
                 continue
             prepared = Point(point, definition, agent, policy, self.rewarded, options.clip_actions)
             prepared.updates = make_updates(prepared)
             self.points.append(prepared)
-            if any(isinstance(p, DeferredPolicy) for p in policies) if self.rewarded else policies[0] is None:
+            if (
+                any(isinstance(p, DeferredPolicy) for p in policies)
+                if self.rewarded
+                else policies[0] is None
+            ):
                 self.active.append(prepared)
         self._find_events()
         declared = None if self.rewarded else options.possible_agents
         self.roster, self.complete = resolve_roster(self.active, declared, agents.values())
         if not self.unattended:
-            self.roster = {name: point for name, point in self.roster.items() if name not in self.policies}
+            self.roster = {
+                name: point for name, point in self.roster.items() if name not in self.policies
+            }
         if options.agent is not None and (self.active or None not in known):
             self._choose_one(options.agent, known)
         if not self.active and not self.unattended:
-            raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
+            raise UnknownPointError(
+                "no decision point is left to the environment: policies answer all of them"
+            )
         self.one_agent = self.active[0].agent or options.agent if len(self.active) == 1 else None
         return self
 
@@ -207,34 +239,41 @@ class Plan:
         """Let policies or the rule answer for all agents except one."""
         if agent in self.policies or (agent in known and agent not in self.roster):
             raise OptionValueError(
-                f"agent={short_repr(agent)} is answered by policies, and no decision is left to the environment"
+                f"agent={short_repr(agent)} is answered by policies, and no decision is left to"
+                " the environment"
             )
         if self.complete and agent not in self.roster:
             names = [name for name in dict.fromkeys((*known, *self.roster)) if name is not None]
             raise AgentError(
-                f"agent={short_repr(agent)} names no agent of the environment; its agents are {', '.join(names)}"
-                f"{did_you_mean(agent, names)}"
+                f"agent={short_repr(agent)} names no agent of the environment; its agents are"
+                f" {', '.join(names)}{did_you_mean(agent, names)}"
             )
         points = [self.roster[agent]] if self.complete else self.active
         if len(points) > 1:
             raise AgentError(
-                f"the agent {short_repr(agent)} may decide at {', '.join(point.point.name for point in points)}; name"
-                " its decision point in points=, or declare the agents of each with possible_agents="
+                f"the agent {short_repr(agent)} may decide at"
+                f" {', '.join(point.point.name for point in points)}; name its decision point in"
+                " points=, or declare the agents of each with possible_agents="
             )
         self.active, self.roster, self.complete = points, {agent: points[0]}, True
 
     def _find_events(self) -> None:
         """Find the events that the simulation sends: decisions, and calls that end agents."""
         self.events: dict[Hook, Any] = {
-            point.point: point if point.definition.split is None else Split(point) for point in self.points
+            point.point: point if point.definition.split is None else Split(point)
+            for point in self.points
         }
         for point in self.points:
-            for name, agent in (*point.point.removed_by.items(), *point.definition.removed_by.items()):
+            for name, agent in (
+                *point.point.removed_by.items(),
+                *point.definition.removed_by.items(),
+            ):
                 remover = locate(name, self._own)
                 removal = self.events.setdefault(remover, Removal())
                 if not isinstance(removal, Removal):
                     raise DefinitionError(
-                        f"{name} is a decision point, so removed_by= cannot name it as a function that ends an agent"
+                        f"{name} is a decision point, so removed_by= cannot name it as a function"
+                        " that ends an agent"
                     )
                 removal.of.append((point, agent, owner_class(point.point)))
         if self.points and self._ends_agents:
@@ -253,7 +292,8 @@ class Plan:
         if self.options.undeclared == "rule":
             return RULE
         raise AgentError(
-            f"the agent {agent!r}, which decides at {point.point.name}, is not declared in possible_agents; declare"
+            f"the agent {agent!r}, which decides at {point.point.name}, is not declared in"
+            " possible_agents; declare"
             ' it, or let its rule decide with undeclared="rule"'
         )
 
@@ -294,12 +334,19 @@ class Plan:
 
     def with_simulation(self, simulation: Any) -> Plan:
         """The same plan, in which mappings get the simulation that they ask for."""
-        definitions = {key: given_simulation(value, simulation) for key, value in self._definitions.items()}
+        definitions = {
+            key: given_simulation(value, simulation) for key, value in self._definitions.items()
+        }
         return self._changed(_definitions=definitions)._prepare_points()
 
     def for_one(self, agent: str) -> Plan:
-        """The plan of a branch that waits for one agent only. The rule decides for agents without a policy."""
-        return self._changed(unattended=True, rewarded=False, one_agent=agent, unmatched_names=set())
+        """The plan of a branch that waits for one agent only.
+
+        The rule decides for agents without a policy.
+        """
+        return self._changed(
+            unattended=True, rewarded=False, one_agent=agent, unmatched_names=set()
+        )
 
     def with_policies(self, policies: Mapping[str, Any]) -> Plan:
         """The plan of a branch in which policies, given by agent, answer for agents that have none."""
@@ -312,12 +359,15 @@ class Plan:
     def declared(self, roster: Mapping[str, Point]) -> Plan:
         """The same plan with a roster of agents that was found out."""
         names = {
-            point.point.name: [agent for agent, other in roster.items() if other.point is point.point]
+            point.point.name: [
+                agent for agent, other in roster.items() if other.point is point.point
+            ]
             for point in self.active
             if point.agent is None
         }
         made = self.amended({"possible_agents": names})
-        made.unmatched_names = self.unmatched_names  # the user has not named the agents that were found out
+        # the user has not named the agents that were found out
+        made.unmatched_names = self.unmatched_names
         return made
 
     def amended(self, options: Mapping[str, Any]) -> Plan:
@@ -329,11 +379,20 @@ class Plan:
 
     def __reduce__(self) -> Any:
         points = {
-            portable(point.function, point.name): None if definition is point.definition else definition
+            portable(point.function, point.name): None
+            if definition is point.definition
+            else definition
             for point, definition in self._named.items()
         }
-        options = {**vars(self.options), "plugins": [] if self.plugins is None else self.plugins.portable}
+        options = {
+            **vars(self.options),
+            "plugins": [] if self.plugins is None else self.plugins.portable,
+        }
         for name in ("policies", "possible_agents"):
             if isinstance(options[name], Mapping):
                 options[name] = {portable(key): value for key, value in options[name].items()}
-        return partial(Plan, unattended=self.unattended), (self.source, points, options), {"variant": self.variant}
+        return (
+            partial(Plan, unattended=self.unattended),
+            (self.source, points, options),
+            {"variant": self.variant},
+        )

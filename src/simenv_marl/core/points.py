@@ -1,7 +1,7 @@
 """The decision points, agents and policies that ``points=``, ``possible_agents=`` and ``policies=`` name.
 
-If an environment names an undecorated function, the hook of that function exists only as long as the environment needs
-it. For all other callers the function does not change.
+If an environment names an undecorated function, the hook of that function exists only as long as
+the environment needs it. For all other callers the function does not change.
 """
 
 from __future__ import annotations
@@ -13,7 +13,15 @@ from sys import modules
 from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered
+from ..decision import (
+    BY_NAME,
+    DecisionPoint,
+    Definition,
+    decision_points,
+    point_for,
+    point_of,
+    registered,
+)
 from ..errors import (
     AgentError,
     DefinitionError,
@@ -32,7 +40,13 @@ from .policies import two_arguments
 if TYPE_CHECKING:
     from .point import Point
 
-Points = str | Callable[..., Any] | Iterable[str | Callable[..., Any]] | Mapping[Any, Definition | None] | None
+Points = (
+    str
+    | Callable[..., Any]
+    | Iterable[str | Callable[..., Any]]
+    | Mapping[Any, Definition | None]
+    | None
+)
 """The ways to name decision points: see ``generate_env``."""
 
 Definitions = Mapping[DecisionPoint, Definition]
@@ -68,7 +82,10 @@ def own_points(simulation: Any) -> dict[DecisionPoint, Definition]:
 
 
 def owner_class(point: DecisionPoint) -> type | None:
-    """Return the class of which a point is a method; None if it is not a method, or if its name leads to nothing."""
+    """Return the class of which a point is a method.
+
+    None if it is not a method, or if its name leads to nothing.
+    """
     try:
         owner, _ = resolve(point.name, UnknownPointError)
     except (UnknownPointError, PatchError):
@@ -80,13 +97,19 @@ def overrides(point: DecisionPoint) -> list[str]:
     """Return the dotted names of the functions by which derived classes override a point."""
     owner, attribute = owner_class(point), point.name.rpartition(".")[2]
     derived = [] if owner is None else [kind for kind in all_classes(owner) if kind is not owner]
-    return [f"{kind.__module__}.{kind.__qualname__}.{attribute}" for kind in derived if attribute in vars(kind)]
+    return [
+        f"{kind.__module__}.{kind.__qualname__}.{attribute}"
+        for kind in derived
+        if attribute in vars(kind)
+    ]
 
 
 # -- points with their definitions ----------------------------------------------------------------
 
 
-def find_points(points: Any, own: Definitions, *, empty: bool = False) -> dict[DecisionPoint, Definition]:
+def find_points(
+    points: Any, own: Definitions, *, empty: bool = False
+) -> dict[DecisionPoint, Definition]:
     """Find the decision points that ``points=`` names, and the definition to use for each, in the order of the names.
 
     None names all decorated points. ``own`` are the points that the simulation itself defines.
@@ -95,16 +118,20 @@ def find_points(points: Any, own: Definitions, *, empty: bool = False) -> dict[D
         points = decision_points()
         packages = sorted({name.partition(".")[0] for name in points})
         if not points:
-            raise UnknownPointError("there is no decision point: decorate a function with make_step or name points=")
+            raise UnknownPointError(
+                "there is no decision point: decorate a function with make_step or name points="
+            )
         if len(packages) > 1:
             raise UnknownPointError(
-                f"decision points of more than one package are registered ({', '.join(packages)}); say which are"
-                " meant with points=, or with an attribute points of the simulation"
+                f"decision points of more than one package are registered ({', '.join(packages)});"
+                " say which are meant with points=, or with an attribute points of the simulation"
             )
     if isinstance(points, str) or not hasattr(points, "__iter__"):
         points = [points]
     found: dict[DecisionPoint, Definition] = {}
-    for key, given in points.items() if isinstance(points, Mapping) else [(key, None) for key in points]:
+    for key, given in (
+        points.items() if isinstance(points, Mapping) else [(key, None) for key in points]
+    ):
         point, definition = find_point(key, given, own=own)
         if point in found:
             raise UnknownPointError(f"the decision point {point.name} was named twice")
@@ -114,11 +141,14 @@ def find_points(points: Any, own: Definitions, *, empty: bool = False) -> dict[D
     return found
 
 
-def find_point(key: Any, definition: Any = None, *, own: Definitions = _NONE) -> tuple[DecisionPoint, Definition]:
+def find_point(
+    key: Any, definition: Any = None, *, own: Definitions = _NONE
+) -> tuple[DecisionPoint, Definition]:
     """Find one decision point by a dotted name or function, and the definition to use for it, as ``find_points``."""
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(
-            f"the definition of {name_of(key)} must come from make_step, not {short_repr(definition)}"
+            f"the definition of {name_of(key)} must come from make_step, not"
+            f" {short_repr(definition)}"
         )
     point = locate(key, own)
     decorated = None if isinstance(key, str) else point_of(getattr(key, "__func__", key))
@@ -127,8 +157,8 @@ def find_point(key: Any, definition: Any = None, *, own: Definitions = _NONE) ->
     definition = definition or own.get(point) or point.definition or _inherited(point)
     if definition is None:
         raise DefinitionError(
-            f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="
-            f"{{{point.name!r}: make_step(...)}}"
+            f"{point.name} has no definition here: decorate it with make_step, or give its"
+            f" definition in points={{{point.name!r}: make_step(...)}}"
         )
     return point, definition
 
@@ -143,7 +173,9 @@ def _inherited(point: DecisionPoint) -> Definition | None:
 
 def _named(key: Any, points: Iterable[DecisionPoint]) -> DecisionPoint | None:
     """Return the one of some points that a key names."""
-    return next((point for point in points if key == point.name or unwrap(key) is point.function), None)
+    return next(
+        (point for point in points if key == point.name or unwrap(key) is point.function), None
+    )
 
 
 # -- agents and policies ---------------------------------------------------------------------------
@@ -173,15 +205,17 @@ def declared_agents(declared: Any) -> list[str]:
     return declared or []
 
 
-def resolve_roster(active: list[Point], declared: Any, known: Collection[str | None]) -> tuple[dict[str, Point], bool]:
+def resolve_roster(
+    active: list[Point], declared: Any, known: Collection[str | None]
+) -> tuple[dict[str, Point], bool]:
     """Find out which agents are known beforehand, and whether there can be no others."""
     naming = [point.point for point in active if point.agent is None]
     if declared is not None and not isinstance(declared, Mapping):
         others = [name for name in declared if name not in known]
         if len(naming) > 1 or (others and not naming):
             raise OptionValueError(
-                "possible_agents must be a dict from decision points to names, unless exactly one point names its"
-                f" agents by a callable; here {len(naming)} do"
+                "possible_agents must be a dict from decision points to names, unless exactly one"
+                f" point names its agents by a callable; here {len(naming)} do"
             )
         declared = {point.name: others for point in naming}
     names: dict[DecisionPoint, list[Any]] = {}
@@ -189,15 +223,17 @@ def resolve_roster(active: list[Point], declared: Any, known: Collection[str | N
         named = _named(key, naming)
         if named is None:
             raise OptionValueError(
-                f"possible_agents names {short_repr(key)}, which is not an active decision point with a callable as"
-                f" agent=; these are: {[point.name for point in naming]}"
+                f"possible_agents names {short_repr(key)}, which is not an active decision point"
+                f" with a callable as agent=; these are: {[point.name for point in naming]}"
             )
         names[named] = value
     roster: dict[str, Point] = {}
     for point in active:
         for name in names.get(point.point, []) if point.agent is None else [point.agent]:
             if not isinstance(name, str) or name in roster:
-                raise AgentError(f"possible_agents must be different strings, not {short_repr(name)}")
+                raise AgentError(
+                    f"possible_agents must be different strings, not {short_repr(name)}"
+                )
             roster[name] = point
     return roster, not naming or declared is not None
 
@@ -224,10 +260,12 @@ def resolve_policies(
                 if isinstance(error, UnknownPointError) and None in agents and not _is_path(key):
                     by_agent[key] = policy  # a callable may name this agent later
                     continue
-                names = sorted([agent for agent in agents if agent] + [point.name for point in named])
+                names = sorted(
+                    [agent for agent in agents if agent] + [point.name for point in named]
+                )
                 raise UnknownPointError(
-                    f"policies names {short_repr(key)}, which is neither an agent nor a decision point ({error});"
-                    f" known are {', '.join(names)}"
+                    f"policies names {short_repr(key)}, which is neither an agent nor a decision"
+                    f" point ({error}); known are {', '.join(names)}"
                 ) from error
             definitions.setdefault(point, definition)
         by_point[point] = policy
@@ -246,7 +284,10 @@ def _is_path(key: Any) -> bool:
 
 
 def portable(key: Any, name: str | None = None) -> Any:
-    """Return a key for other processes: for a function its dotted name, if that surely leads to it; else as it is."""
+    """Return a key for other processes: for a function its dotted name, if that surely leads to it.
+
+    Else as it is.
+    """
     function = unwrap(key)
     if not isinstance(function, FunctionType):
         return key
@@ -262,7 +303,10 @@ def portable(key: Any, name: str | None = None) -> Any:
 
 @dataclass(frozen=True)
 class Member:
-    """A function of a class in the main module; unpickled, it is the function, to which no name leads elsewhere."""
+    """A function of a class in the main module.
+
+    Unpickled, it is the function, to which no name leads elsewhere.
+    """
 
     owner: type
     name: str

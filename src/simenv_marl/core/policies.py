@@ -1,9 +1,11 @@
 """Policies that are asked one decision at a time, because they ask for more than an observation and an info, or wait.
 
-A *planner* has a keyword-only parameter ``_environment``, and gets the environment in which it decides. A policy with
-``_decision`` gets the pending ``Decision``. A policy that is a coroutine function is awaited.
+A *planner* has a keyword-only parameter ``_environment``, and gets the environment in which it
+decides. A policy with ``_decision`` gets the pending ``Decision``. A policy that is a coroutine
+function is awaited.
 
-In copies of an environment, some policies are not asked themselves: see ``Where`` and ``policy_for``.
+In copies of an environment, some policies are not asked themselves: see ``Where`` and
+``policy_for``.
 """
 
 from __future__ import annotations
@@ -22,7 +24,10 @@ from .pending import decision_of
 
 
 class Where(IntEnum):
-    """Where an episode is played. Each place asks fewer policies themselves than those before it."""
+    """Where an episode is played.
+
+    Each place asks fewer policies themselves than those before it.
+    """
 
     USER = 0
     """In the user's environment: all policies."""
@@ -45,7 +50,9 @@ ASKED: Final = ("_environment", "_decision")
 def takes_info(policy: Callable[..., Any]) -> bool:
     """Return whether a policy takes the observation and the info, and not the observation alone."""
     parameters = positional(policy)
-    return len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info")
+    return len(parameters) > 1 and (
+        parameters[1].default is parameters[1].empty or parameters[1].name == "info"
+    )
 
 
 def is_planner(policy: Any) -> bool:
@@ -91,7 +98,10 @@ def policy_for(policy: Any, agent: str, where: Where) -> Any:
 
 
 COUNTS: Final[dict[str, dict[str, float]]] = {}
-"""What policies have counted in this process, by a token that their copies share. Workers send it back."""
+"""What policies have counted in this process, by a token that their copies share.
+
+Workers send it back.
+"""
 
 
 def count(token: str, **numbers: float) -> None:
@@ -157,7 +167,10 @@ class PolicyWrapper:
         self.policy, self.waits, self.ask = policy, waits(policy), Caller(policy)
         self.records: bool = getattr(policy, "records", False) is True
         names = [name for name in ASKED if name in (*self.ask.names, *asks)]
-        seen = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("observation", "info")]
+        seen = [
+            inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+            for name in ("observation", "info")
+        ]
         asked = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY) for name in names]
         self.__signature__ = inspect.Signature(seen + asked)
 
@@ -177,20 +190,24 @@ class EpisodePolicy:
     def __call__(self, observation: Any, info: Any) -> Any:
         """Refuse a call without an episode."""
         raise OptionValueError(
-            f"the policy {short_repr(self.policy)} is asked for one decision of an environment at a time, and here"
-            " there is no environment; pass the policy in policies="
+            f"the policy {short_repr(self.policy)} is asked for one decision of an environment at"
+            " a time, and here there is no environment; pass the policy in policies="
         )
 
 
 class DeferredPolicy(EpisodePolicy):
-    """One that answers many decisions in one call. An episode waits for it as it waits for the user."""
+    """One that answers many decisions in one call.
+
+    An episode waits for it as it waits for the user.
+    """
 
 
 class AskingPolicy(EpisodePolicy):
     """One that is asked alone.
 
     Attributes:
-        plans, asks, waits: Whether it gets the environment, gets the decision, and has to be awaited.
+        plans, asks, waits: Whether it gets the environment, gets the decision, and has to be
+            awaited.
     """
 
     def __init__(self, policy: Callable[..., Any]) -> None:
@@ -199,8 +216,9 @@ class AskingPolicy(EpisodePolicy):
         self.waits = waits(policy)
         if self.plans and self.waits:
             raise OptionValueError(
-                f"the policy {short_repr(policy)} waits, and asks for _environment, which only the simulation's own"
-                " thread can use; let it ask for _decision, or let it answer at once"
+                f"the policy {short_repr(policy)} waits, and asks for _environment, which only the"
+                " simulation's own thread can use; let it ask for _decision, or let it answer at"
+                " once"
             )
 
     def answer(self, episode: Any, agent: Any, observation: Any, info: Any) -> Any:
@@ -208,7 +226,10 @@ class AskingPolicy(EpisodePolicy):
         return wait_for(self.begin(episode, agent, observation, info))
 
     def begin(self, episode: Any, agent: Any, observation: Any, info: Any) -> Any:
-        """Ask the policy, or what answers for it where the episode is played. Return the answer, or an awaitable."""
+        """Ask the policy, or what answers for it where the episode is played.
+
+        Return the answer, or an awaitable.
+        """
         policy = policy_for(self.policy, agent.name, episode.where)
         if policy is RULE:
             return RULE
@@ -222,7 +243,8 @@ class AskingPolicy(EpisodePolicy):
         asked: dict[str, Any] = {}
         if self.plans:
             session = episode.session()
-            views = import_module("..envs.single", __package__)  # by name, because views import the core
+            # by name, because views import the core
+            views = import_module("..envs.single", __package__)
             asked["_environment"] = views.PlannerEnv(session.plan, session)
         if self.asks:
             asked["_decision"] = decision_of(episode, agent)

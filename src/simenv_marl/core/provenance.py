@@ -20,7 +20,11 @@ _distribution_version = cache(importlib.metadata.version)
 
 
 def provenance(
-    simulation: Any, points: Points = None, *, seed: int | None = None, **options: Unpack[ViewOptions]
+    simulation: Any,
+    points: Points = None,
+    *,
+    seed: int | None = None,
+    **options: Unpack[ViewOptions],
 ) -> dict[str, Any]:
     """Return the provenance of an environment with these arguments, as ``env.unwrapped.provenance()`` does.
 
@@ -34,9 +38,11 @@ def provenance(
         A dict of dicts, lists, strings, numbers, bools and None, ready for ``json.dump``:
 
         - ``simulation``: the dotted name of its class or factory;
-        - ``packages``: the versions (or None) of the packages of the simulation and its decision points, by name;
+        - ``packages``: the versions (or None) of the packages of the simulation and its decision
+          points, by name;
         - ``variant``, ``parameters``: the variant's name and parameters, if there is one;
-        - ``points``: the agent of each active decision point, by dotted name (None: named at each call);
+        - ``points``: the agent of each active decision point, by dotted name (None: named at each
+          call);
         - ``plugins``: the ``handler``, ``target`` and ``position`` of each;
         - ``policies``: the name of each policy, by agent or point;
         - ``options``: all other options that differ from their defaults;
@@ -57,7 +63,8 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     options = {
         option.name: as_json(getattr(plan.options, option.name))
         for option in fields(Options)
-        if option.name not in ("plugins", "policies") and getattr(plan.options, option.name) != option.default
+        if option.name not in ("plugins", "policies")
+        and getattr(plan.options, option.name) != option.default
     }
     points = {point.point.name: point.agent for point in plan.active}
     packages = sorted({dotted.partition(".")[0] for dotted in (name, *points)})
@@ -87,14 +94,25 @@ def as_json(value: Any) -> Any:
         plain = value.tolist()
         return repr(plain) if isinstance(plain, np.generic) else as_json(plain)
     if isinstance(value, Mapping):
-        return {key if isinstance(key, str) else str(as_json(key)): as_json(part) for key, part in value.items()}
+        return {
+            key if isinstance(key, str) else str(as_json(key)): as_json(part)
+            for key, part in value.items()
+        }
     if isinstance(value, (list, tuple)):
         return [as_json(part) for part in value]
     if isinstance(value, (set, frozenset)):
         return sorted(map(repr, value))
     if isinstance(value, partial):
-        return {"partial": as_json(value.func), "args": as_json(value.args), "keywords": as_json(value.keywords)}
-    return f"{value.__module__}.{value.__qualname__}" if hasattr(value, "__qualname__") else repr(value)
+        return {
+            "partial": as_json(value.func),
+            "args": as_json(value.args),
+            "keywords": as_json(value.keywords),
+        }
+    return (
+        f"{value.__module__}.{value.__qualname__}"
+        if hasattr(value, "__qualname__")
+        else repr(value)
+    )
 
 
 def _version(package: str) -> str | None:

@@ -24,8 +24,10 @@ class Round:
 
     Attributes:
         actions: The actions that no decision has used yet, by agent.
-        given, unused: The numbers of actions in the episode, other than ``RULE``, and of those that were never used.
-        stalled: The number of rounds without an action for the pending agent since the simulation last moved.
+        given, unused: The numbers of actions in the episode, other than ``RULE``, and of those that
+            were never used.
+        stalled: The number of rounds without an action for the pending agent since the simulation
+            last moved.
     """
 
     __slots__ = ("actions", "given", "stalled", "unused")
@@ -47,7 +49,10 @@ class Round:
         episode.pending = None
         try:
             if len(episode.tape) < episode.tape_size:
-                answers = {name: part if type(part) is int else duplicate(part) for name, part in given.items()}
+                answers = {
+                    name: part if type(part) is int else duplicate(part)
+                    for name, part in given.items()
+                }
                 episode.tape.append(answers)
             episode.turns += bool(actions)
             for agent in (*episode.agents.values(), *episode.just_ended):
@@ -69,23 +74,30 @@ class Round:
             raise
         if self.stalled == MANY_ROUNDS:
             warn_user(
-                f"the simulation stands still: {short_repr(pending.name)} must decide, but {MANY_ROUNDS} rounds in a"
-                ' row had no action for it; the info of the agent that must decide has "deciding": True'
+                f"the simulation stands still: {short_repr(pending.name)} must decide, but"
+                f" {MANY_ROUNDS} rounds in a"
+                ' row had no action for it; the info of the agent that must decide has "deciding":'
+                " True"
             )
 
     def check(self, episode: EpisodeState, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Check the actions of a round before the simulation moves; return them in the form that mappings take."""
+        """Check the actions of a round before the simulation moves.
+
+        Return them in the form that mappings take.
+        """
         pending, agents, checked = episode.pending, episode.agents, {}
         if type(actions) is not dict and not isinstance(actions, Mapping):
-            raise InvalidActionError(f"a round takes a dict of actions by agent, not {short_repr(actions)}")
+            raise InvalidActionError(
+                f"a round takes a dict of actions by agent, not {short_repr(actions)}"
+            )
         for name, action in actions.items():
             agent = agents.get(name)
             if agent is None:
                 if episode.unreported_end and name in episode.ended:
                     continue
                 raise UnknownAgentError(
-                    f"there is an action for {short_repr(name)}, which is not a live agent; live agents:"
-                    f" {listed(agents)}"
+                    f"there is an action for {short_repr(name)}, which is not a live agent; live"
+                    f" agents: {listed(agents)}"
                 )
             if action is not RULE:
                 check = agent.point.check
@@ -98,7 +110,9 @@ class Round:
             checked[name] = action
         return checked
 
-    def decide(self, episode: Episode, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def decide(
+        self, episode: Episode, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> Any:
         """Handle a decision: the agent was observed when the latest step returned."""
         if agent.point.legal is not None:
             agent.mask, agent.choices = agent.point.legal(args, kwargs)
@@ -112,7 +126,9 @@ class Round:
         if action is None:
             action = self.actions.pop(agent.name, WAIT)
             mask = agent.mask
-            if action is WAIT or (mask is not None and action is not RULE and not agent.point.allows(mask, action)):
+            if action is WAIT or (
+                mask is not None and action is not RULE and not agent.point.allows(mask, action)
+            ):
                 episode.pending = agent
                 return WAIT
             agent.acted = True

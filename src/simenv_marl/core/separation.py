@@ -1,7 +1,8 @@
 """What separates a forked process from its parent, so that it continues as the parent would.
 
-``fork`` copies the memory, but parent and child share the offsets and contents of open files, the events of epoll
-objects, and the sockets of event loops. And Python reseeds its global generator in the child.
+``fork`` copies the memory, but parent and child share the offsets and contents of open files, the
+events of epoll objects, and the sockets of event loops. And Python reseeds its global generator in
+the child.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ if CAN_FORK:
 _DESCRIPTORS: Final = "/proc/self/fd"
 
 _FLAGS: Final = os.O_WRONLY | os.O_RDWR | os.O_APPEND
-"""The flags with which a file is opened again. The others say how it was made, or matter for other kinds of files."""
+"""The flags with which a file is opened again.
+
+The others say how it was made, or matter for other kinds of files.
+"""
 
 Files = dict[tuple[int, int], list[tuple[int, int, list[int]]]]
 """Open regular files by what identifies them. For each time that one was opened: the flags, the offset, and the
@@ -46,7 +50,8 @@ def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
     def separate() -> None:
         random.setstate(python)  # Python reseeds it after a fork
         for inode, openings in files.items():
-            # A file may have been closed since: by the garbage collector, or in a thread that does not exist here.
+            # A file may have been closed since: by the garbage collector, or in a thread that does
+            # not exist here.
             if all(_inode(number) == inode for _, _, numbers in openings for number in numbers):
                 _reopen(openings)
         for loop in loops:
@@ -61,7 +66,10 @@ def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
 
 
 def open_resources(opened: Iterable[Any] | None) -> dict[Any, str]:
-    """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
+    """Describe each thing that is still alive or open, in a few words.
+
+    Sockets by their descriptor.
+    """
     found: dict[Any, str] = {}
     for thing in opened or ():
         if isinstance(thing, socket.socket):
@@ -99,9 +107,14 @@ def _separate_loop(loop: Any) -> None:
 
 def _separate_poll(number: int) -> None:
     """Put an epoll object of this process, which waits for the same events, behind a descriptor."""
-    with suppress(OSError), select.epoll() as own, open(f"/proc/self/fdinfo/{number}", encoding="ascii") as entries:
+    with (
+        suppress(OSError),
+        select.epoll() as own,
+        open(f"/proc/self/fdinfo/{number}", encoding="ascii") as entries,
+    ):
         watched = [entry.split() for entry in entries if entry.startswith("tfd:")]
-        # Only those of Python have the descriptors as data. C libraries find out themselves that they were forked.
+        # Only those of Python have the descriptors as data. C libraries find out themselves that
+        # they were forked.
         if all(int(entry[1]) == int(entry[5], 16) for entry in watched):
             for entry in watched:
                 own.register(int(entry[1]), int(entry[3], 16))
@@ -123,7 +136,10 @@ def _open_files() -> tuple[Files, list[int]]:
                     polls.append(number)
             continue
         with suppress(OSError):  # a descriptor that only stands for a path
-            flags, offset = fcntl.fcntl(number, fcntl.F_GETFL) & _FLAGS, os.lseek(number, 0, os.SEEK_CUR)
+            flags, offset = (
+                fcntl.fcntl(number, fcntl.F_GETFL) & _FLAGS,
+                os.lseek(number, 0, os.SEEK_CUR),
+            )
             openings = files.setdefault(inode, [])
             for *opening, numbers in openings:
                 if opening == [flags, offset] and _share_offset(numbers[0], number):

@@ -1,7 +1,7 @@
 """The simulation of one environment over all its episodes: made once, reset for each episode, closed at the end.
 
-The session has no reference to its environment. So an environment that is dropped in mid-episode is freed at once,
-together with its session.
+The session has no reference to its environment. So an environment that is dropped in mid-episode is
+freed at once, together with its session.
 """
 
 from __future__ import annotations
@@ -35,13 +35,16 @@ class Session:
 
     Attributes:
         bound_plan: The plan in which mappings have the simulation that they ask for.
-        state: The reason why there is no episode, as ``refusal`` takes it; "moving" in a reset and a close.
-        seed, options: The seed of the latest episode, and the options that the latest ``reset`` got.
+        state: The reason why there is no episode, as ``refusal`` takes it; "moving" in a reset and
+            a close.
+        seed, options: The seed of the latest episode, and the options that the latest ``reset``
+            got.
         episode: The current or latest episode. None before the first one, and after it was closed.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
         where: Whether it belongs to the user, a clone or a branch.
         exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
-        lock: The same lock, if steps need it, too. None if only the thread that began an episode can step it.
+        lock: The same lock, if steps need it, too. None if only the thread that began an episode
+            can step it.
     """
 
     __slots__ = (
@@ -58,7 +61,8 @@ class Session:
         self.episode: Episode | None = None
         self.np_random_seed: int | None = None
         self._np_random: np.random.Generator | None = None
-        self._close: Callable[[bool], None] | None = None  # closes the simulation, if it was reset since the last time
+        # closes the simulation, if it was reset since the last time
+        self._close: Callable[[bool], None] | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.exclusive = ExclusiveLock()
         self.lock = self.exclusive if plan.options.driver == "thread" else None
@@ -83,7 +87,10 @@ class Session:
         self._reset, self.bound_plan = resetter(self.simulation), None
 
     def _run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
-        """Run a job on the simulation's stack. A stack that has ended or belongs to another thread is replaced."""
+        """Run a job on the simulation's stack.
+
+        A stack that has ended or belongs to another thread is replaced.
+        """
         driver = self._driver
         if driver.ended or not (driver.idle and driver.reachable):
             driver.end()  # first, so that an interrupt cannot leave an unknown stack behind
@@ -94,7 +101,10 @@ class Session:
             return self._driver.run(job, context)
 
     def _close_simulation(self, *, last: bool) -> None:
-        """Call the simulation's ``close`` on its stack, once for each successful reset. ``last``: no reset follows."""
+        """Call the simulation's ``close`` on its stack, once for each successful reset.
+
+        ``last``: no reset follows.
+        """
         close, self._close = self._close, None
         if close is not None:
             self._run(partial(close, last))
@@ -114,7 +124,10 @@ class Session:
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The generator that was seeded with the last given seed. Seeds of other episodes are drawn from it."""
+        """The generator that was seeded with the last given seed.
+
+        Seeds of other episodes are drawn from it.
+        """
         if self._np_random is None:
             self._np_random, self.np_random_seed = seeding.np_random(self.np_random_seed)
         return self._np_random
@@ -124,12 +137,17 @@ class Session:
         self._np_random, self.np_random_seed = generator, -1
 
     def start(
-        self, seed: int | None, options: dict[str, Any] | None, *, in_rounds: bool = False, script: Any = None
+        self,
+        seed: int | None,
+        options: dict[str, Any] | None,
+        *,
+        in_rounds: bool = False,
+        script: Any = None,
     ) -> Episode:
         """End the current episode, reset the simulation, and run it to its first decision.
 
-        Without a seed, one is drawn. An episode ``in_rounds`` updates all agents when a step returns. ``script`` is the
-        tape of another episode to replay; ordinary episodes have none.
+        Without a seed, one is drawn. An episode ``in_rounds`` updates all agents when a step
+        returns. ``script`` is the tape of another episode to replay; ordinary episodes have none.
         """
         self.end()
         self.state = "moving"
@@ -140,14 +158,18 @@ class Session:
             self.options = options
             self.seed = seed = self.seed_for(seed)
             if self._driver.given_up is not None or self._driver.outlived:
-                self._make_simulation()  # code that still uses the old one must not meet another episode
+                # code that still uses the old one must not meet another episode
+                self._make_simulation()
                 self._driver.given_up = None
             return self._begin(seed, in_rounds, script)
         finally:
             self.state = "new" if self.episode is None else "over"
 
     def seed_for(self, seed: int | None) -> int:
-        """Return the seed of an episode, and seed the generator with it; draw one from the generator for None."""
+        """Return the seed of an episode, and seed the generator with it.
+
+        Draw one from the generator for None.
+        """
         if seed is None:
             return int(self.np_random.integers(2**31))
         self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
@@ -156,7 +178,11 @@ class Session:
     def _begin(self, seed: int, in_rounds: bool, script: Any) -> Episode:
         """Reset the simulation, and run it to its first decision."""
         context = copy_context()
-        check = None if self._rng is not None else draws_check(self.simulation, in_thread=self.lock is not None)
+        check = (
+            None
+            if self._rng is not None
+            else draws_check(self.simulation, in_thread=self.lock is not None)
+        )
         try:
             if self._rng is not None:
                 with self.context():
@@ -169,7 +195,9 @@ class Session:
         if self.bound_plan is None and self.plan.is_bound_to_simulation:
             self.bound_plan = self.plan.with_simulation(self.simulation)
         plan = self.bound_plan or self.plan
-        episode = Episode(plan, self.simulation, self._driver, seed, self._rng, self.lock, in_rounds=in_rounds)
+        episode = Episode(
+            plan, self.simulation, self._driver, seed, self._rng, self.lock, in_rounds=in_rounds
+        )
         episode.session, episode.where = ref(self), self.where
         episode.script = None if script is None else deque(script)
         self._driver.begin(self.simulation.run, episode.events_by_hook(), context)
@@ -189,10 +217,18 @@ class Session:
         assert episode is not None
         if len(episode.tape) == episode.tape_size:
             raise BranchError(
-                f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of the environment that"
+                f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of"
+                " the environment that"
                 ' a policy is given, so its actions were not kept; use method="fork"'
             )
-        return episode.seed, self.options, episode.in_rounds, episode.tape, _decision(episode), episode.last_time
+        return (
+            episode.seed,
+            self.options,
+            episode.in_rounds,
+            episode.tape,
+            _decision(episode),
+            episode.last_time,
+        )
 
     def replay(self, other: Session) -> None:
         """Bring the simulation to the current decision of another session with the same plan, or raise an error."""
@@ -209,8 +245,10 @@ class Session:
         again.last_time = last_time
         if not same(_decision(again), decision):
             raise BranchError(
-                f"{type(self.simulation).__name__} does not repeat its decisions with the same seed and the same"
-                ' actions: some of its random numbers do not follow from the seed. Use method="fork", or'
+                f"{type(self.simulation).__name__} does not repeat its decisions with the same"
+                " seed and the same"
+                " actions: some of its random numbers do not follow from the seed. Use"
+                ' method="fork", or'
                 " global_rng=True if it draws from random or numpy.random"
             )
         self.restore(copy.deepcopy(other.snapshot()) | {"state": self.state})
@@ -232,7 +270,10 @@ class Session:
             self.episode.where = max(self.episode.where, where)
 
     def ask(self, name: str, *args: Any) -> Any:
-        """Call a method of the simulation on the user's side; raise ``NotImplementedError`` if it has none."""
+        """Call a method of the simulation on the user's side.
+
+        Raise ``NotImplementedError`` if it has none.
+        """
         method = getattr(self.simulation, name, None)
         if not callable(method):
             raise NotImplementedError(f"{type(self.simulation).__name__} has no method {name}()")
@@ -254,7 +295,10 @@ class Session:
         return refusal(self.state) if self.episode is None else self.episode.refusal()
 
     def end(self) -> None:
-        """End the current episode, if there is one. Raise a ``ReentrancyError`` if that is not possible here."""
+        """End the current episode, if there is one.
+
+        Raise a ``ReentrancyError`` if that is not possible here.
+        """
         if self.state == "moving":
             raise refusal(self.state)
         if self.episode is not None:
@@ -283,22 +327,32 @@ class Session:
                     self._put_away()
 
     def abandon(self) -> None:
-        """Unwind the simulation and remove the patches, from a finalizer. Warn of errors instead of raising them."""
+        """Unwind the simulation and remove the patches, from a finalizer.
+
+        Warn of errors instead of raising them.
+        """
         try:
             is_running = self.episode is not None and self.episode.running
             if not is_running or self._driver.reachable:
                 self.close()  # otherwise the simulation's own thread unwinds it at its next switch
         except ReentrancyError:
-            pass  # the process is exiting, and the other thread in which the simulation moves ends with it
+            # the process is exiting, and the other thread in which the simulation moves ends with
+            # it
+            pass
         except Exception as error:
-            warn_user(f"a simulation that was abandoned raised {short_repr(error)}", ResourceWarning)
+            warn_user(
+                f"a simulation that was abandoned raised {short_repr(error)}", ResourceWarning
+            )
         finally:
             self._put_away()
 
     # -- branches ---------------------------------------------------------------------------------
 
     def step_out(self) -> None:
-        """Leave the reset or step in a branch that was forked from inside a policy; restore the user's generators."""
+        """Leave the reset or step in a branch that was forked from inside a policy.
+
+        Restore the user's generators.
+        """
         self.state = "over"  # a reset that has come to its first decision is still moving
         if self._rng is not None:
             self._rng.step_out()
@@ -307,9 +361,9 @@ class Session:
         """Raise a ``BranchError`` unless the simulation's future random numbers can be drawn anew."""
         if self._rng is None and not callable(getattr(self.simulation, "reseed", None)):
             raise BranchError(
-                f"seeds= needs a way to reseed {type(self.simulation).__name__}: give it a method reseed(seed), which"
-                " may call simenv_marl.reseed_generators(self, seed), or make the environment with global_rng=True if"
-                " it draws from random or numpy.random"
+                f"seeds= needs a way to reseed {type(self.simulation).__name__}: give it a method"
+                " reseed(seed), which may call simenv_marl.reseed_generators(self, seed), or make"
+                " the environment with global_rng=True if it draws from random or numpy.random"
             )
 
     def reseed(self, seed: int) -> None:
@@ -342,16 +396,25 @@ def _decision(episode: Episode) -> Any:
 
 
 def checked_seed(seed: Any) -> int | None:
-    """Convert the seed of a ``reset`` to a Python integer, unless it is None. Refuse what is no seed."""
+    """Convert the seed of a ``reset`` to a Python integer, unless it is None.
+
+    Refuse what is no seed.
+    """
     if seed is None:
         return None
     if not is_seed(seed):
-        raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
+        raise OptionValueError(
+            f"seed must be a non-negative integer or None, not {short_repr(seed)}"
+        )
     return int(seed)
 
 
-def close_all(sessions: Iterable[tuple[str, Session]], error: BaseException | None = None) -> BaseException | None:
-    """Close all sessions, given with their names. Return the first error, with notes of all others; None without any.
+def close_all(
+    sessions: Iterable[tuple[str, Session]], error: BaseException | None = None
+) -> BaseException | None:
+    """Close all sessions, given with their names. Return the first error, with notes of all others.
+
+    None without any.
 
     ``error`` is an error before.
     """
@@ -364,5 +427,7 @@ def close_all(sessions: Iterable[tuple[str, Session]], error: BaseException | No
                     error = problem
                     annotate(error, f"simenv_marl: in {name}")
                 else:
-                    annotate(error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well")
+                    annotate(
+                        error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well"
+                    )
     return error

@@ -1,7 +1,7 @@
 """Observations: casts to their space, copies, comparisons, and blank observations.
 
-Each space is analysed once, when an environment is made. The functions that run at each decision are closures over the
-result.
+Each space is analysed once, when an environment is made. The functions that run at each decision
+are closures over the result.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def observation_cast(space: spaces.Space[Any]) -> Cast:
 
     def cast(value: Any) -> Any:
         if not space.contains(value):
-            raise ObservationError(f"the observation {short_repr(value)} is not in {short_repr(space)}")
+            raise ObservationError(
+                f"the observation {short_repr(value)} is not in {short_repr(space)}"
+            )
         return copy.deepcopy(value)
 
     return cast
@@ -66,20 +68,25 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
         ) from error
     if array.shape != space.shape:
         raise ObservationError(
-            f"the observation has shape {array.shape}, its space {short_repr(space)} has shape {space.shape}; it was"
-            f" {short_repr(value)}"
+            f"the observation has shape {array.shape}, its space {short_repr(space)} has shape"
+            f" {space.shape}; it was {short_repr(value)}"
         )
     if array.dtype.kind not in "biuf":
-        raise ObservationError(f"the observation {short_repr(value)} has dtype {array.dtype}, which is not numeric")
+        raise ObservationError(
+            f"the observation {short_repr(value)} has dtype {array.dtype}, which is not numeric"
+        )
     assert space.dtype is not None
     if space.dtype.kind in "iu" and array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ObservationError(
-            f"the observation {short_repr(value)} is not finite, and {space.dtype} holds only finite numbers"
+            f"the observation {short_repr(value)} is not finite, and {space.dtype} holds only"
+            " finite numbers"
         )
     if space.dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, space.dtype):
         limits = np.iinfo(space.dtype)
         if array.min() < limits.min or array.max() > limits.max:
-            raise ObservationError(f"the observation {short_repr(value)} has numbers that {space.dtype} cannot hold")
+            raise ObservationError(
+                f"the observation {short_repr(value)} has numbers that {space.dtype} cannot hold"
+            )
     return array.astype(space.dtype, copy=True)
 
 
@@ -96,7 +103,9 @@ def _discrete_cast(space: spaces.Discrete) -> Cast:
                     return number
             except (TypeError, ValueError, OverflowError):
                 pass
-        raise ObservationError(f"the observation {short_repr(value)} must be an integer for {short_repr(space)}")
+        raise ObservationError(
+            f"the observation {short_repr(value)} must be an integer for {short_repr(space)}"
+        )
 
     return cast
 
@@ -124,7 +133,8 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
     def cast(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (tuple, list)) or len(value) != len(casts):
             raise ObservationError(
-                f"the observation {short_repr(value)} must have the {len(casts)} parts of {short_repr(space)}"
+                f"the observation {short_repr(value)} must have the {len(casts)} parts of"
+                f" {short_repr(space)}"
             )
         return tuple(part(item) for part, item in zip(casts, value, strict=True))
 
@@ -150,9 +160,17 @@ def duplicate(observation: Any) -> Any:
 def same(one: Any, other: Any) -> bool:
     """Whether two observations are equal, number for number."""
     if isinstance(one, Mapping):
-        return isinstance(other, Mapping) and one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+        return (
+            isinstance(other, Mapping)
+            and one.keys() == other.keys()
+            and all(same(one[k], other[k]) for k in one)
+        )
     if isinstance(one, (tuple, list)):
-        return isinstance(other, (tuple, list)) and len(one) == len(other) and all(map(same, one, other))
+        return (
+            isinstance(other, (tuple, list))
+            and len(one) == len(other)
+            and all(map(same, one, other))
+        )
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
     return bool(one == other)
@@ -164,7 +182,9 @@ def blank(space: spaces.Space[Any]) -> Any:
     For spaces without a zero (text, graphs, ...) it is a fixed sample.
     """
     if isinstance(space, spaces.Box):
-        return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high).astype(space.dtype)
+        return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high).astype(
+            space.dtype
+        )
     if isinstance(space, spaces.Discrete):
         return space.dtype.type(np.clip(0, space.start, space.start + space.n - 1))
     if isinstance(space, spaces.MultiDiscrete):
@@ -183,8 +203,9 @@ def blank(space: spaces.Space[Any]) -> Any:
 def _calibrate() -> int:
     """Count the references to an array that only the running ``cast`` holds.
 
-    The number differs between versions of Python, so it is measured with a function of the same form. Without the
-    global interpreter lock another thread may take a reference at any time, and so every array is copied.
+    The number differs between versions of Python, so it is measured with a function of the same
+    form. Without the global interpreter lock another thread may take a reference at any time, and
+    so every array is copied.
     """
     if not getattr(sys, "_is_gil_enabled", lambda: True)():
         return -1

@@ -24,7 +24,10 @@ class Split:
         self.point, self.report = point, point.report
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Split a call. From now on the items arise, one after the other, as decisions of the simulation do."""
+        """Split a call.
+
+        From now on the items arise, one after the other, as decisions of the simulation do.
+        """
         items = list(self.point.definition.split(*args, **kwargs))  # type: ignore[misc]
         if not items:
             return RULE
@@ -48,8 +51,13 @@ class Split:
             return end.value
         raise AssertionError("a function does not wait")
 
-    def _gather(self, items: list[Any], replies: list[Any], args: Any, kwargs: Any) -> Generator[Any, Any, Any]:
-        """Return the value of the call. The rule runs once, when it is first needed; waits as its function does."""
+    def _gather(
+        self, items: list[Any], replies: list[Any], args: Any, kwargs: Any
+    ) -> Generator[Any, Any, Any]:
+        """Return the value of the call.
+
+        The rule runs once, when it is first needed; waits as its function does.
+        """
         definition, hook, deliver = self.point.definition, self.point.point, self.point.deliver
         decisions: list[Any] = []
         results: list[Any] = []
@@ -58,17 +66,23 @@ class Split:
                 results.append((yield from _value(hook.rule(*args, **kwargs), hook.kind)))
                 if results[0] is RULE:
                     raise SimulationError(
-                        f"the rule of {hook.name}, in another process, decides for all items of a call or for none;"
-                        " answer all of them by RULE, or none"
+                        f"the rule of {hook.name}, in another process, decides for all items of a"
+                        " call or for none; answer all of them by RULE, or none"
                     )
             if reply is not RULE:
                 value = reply if deliver is None else deliver(reply, item, *args, **kwargs)
-                decisions.append(value if deliver is None else (yield from _value(value, hook.kind)))
+                decisions.append(
+                    value if deliver is None else (yield from _value(value, hook.kind))
+                )
             elif definition.part is None:
                 decisions.append(results[0][place])
             else:
                 decisions.append(definition.part(results[0], item, *args, **kwargs))
-        return decisions if definition.gather is None else definition.gather(items, decisions, *args, **kwargs)
+        return (
+            decisions
+            if definition.gather is None
+            else definition.gather(items, decisions, *args, **kwargs)
+        )
 
 
 @coroutine
@@ -88,7 +102,9 @@ def _value(value: Any, kind: str) -> Generator[Any, Any, Any]:
 class _Items:
     """In place of an episode's driver during a call: it sends the items as events, and then the replies to the call."""
 
-    def __init__(self, episode: Episode, point: Point, items: list[Any], args: Any, kwargs: Any) -> None:
+    def __init__(
+        self, episode: Episode, point: Point, items: list[Any], args: Any, kwargs: Any
+    ) -> None:
         self._episode, self._driver, self._point = episode, episode.driver, point
         self._items, self._args, self._kwargs = items, args, kwargs
         self._replies: list[Any] = []

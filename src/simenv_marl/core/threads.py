@@ -16,7 +16,10 @@ from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event, SimulationExit
 from .greenlets import make_exit
 
 _LONGEST_WAIT: Final = 1.0
-"""The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
+"""The longest single wait of the user's thread, in seconds.
+
+A Ctrl-C just before a wait does not end that wait.
+"""
 
 _EXIT: Final = Sentinel("EXIT")
 _JOB: Final = Sentinel("JOB")
@@ -26,8 +29,9 @@ _END: Final = Sentinel("END")
 class ThreadDriver(Driver):
     """A driver that runs a simulation in a thread of its own. The first ``begin`` starts it, and ``end`` joins it.
 
-    Only one of the two threads runs at a time. They hand over replies and events in two queues. An interrupt may leave
-    something in a queue, or lose an event. So replies between two jobs are ignored, and each job has a queue of events.
+    Only one of the two threads runs at a time. They hand over replies and events in two queues. An
+    interrupt may leave something in a queue, or lose an event. So replies between two jobs are
+    ignored, and each job has a queue of events.
     """
 
     __slots__ = ("_arrived", "_replies", "_thread")
@@ -43,7 +47,9 @@ class ThreadDriver(Driver):
 
     # -- in the user's thread ---------------------------------------------------------------------
 
-    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] | None = None, context: Any = None) -> None:
+    def begin(
+        self, job: Callable[[], Any], events: Mapping[Hook, Any] | None = None, context: Any = None
+    ) -> None:
         """Prepare a job, and start the thread if there is none."""
         with suppress(Empty):
             while True:
@@ -62,7 +68,8 @@ class ThreadDriver(Driver):
         """Check that this process was not forked, because the simulation's thread stayed behind."""
         if self.lost:
             raise WrongThreadError(
-                "this process was forked in mid-episode, but the simulation is suspended in a thread of the parent"
+                "this process was forked in mid-episode, but the simulation is suspended in a"
+                " thread of the parent"
                 ' process; call reset(), or use driver="greenlet"'
             )
 
@@ -74,7 +81,10 @@ class ThreadDriver(Driver):
                 return self._arrived.get(True, _LONGEST_WAIT)
 
     def throw(self) -> Event | None:
-        """Raise ``SimulationExit`` in the simulation, at its next decision if it still runs; return its next event."""
+        """Raise ``SimulationExit`` in the simulation, at its next decision if it still runs.
+
+        Return its next event.
+        """
         self._replies.put(_EXIT)
         try:
             return self._arrived.get(True, SECONDS_TO_UNWIND)
@@ -89,9 +99,11 @@ class ThreadDriver(Driver):
         if self.ended and not self.idle:
             return
         if self.idle and self._thread is not None and not self.lost:
-            self.ended = True  # first, because after an interrupt no job must begin that would come after ``_END``
+            # first, because after an interrupt no job must begin that would come after ``_END``
+            self.ended = True
             self._replies.put(_END)
-            with suppress(RuntimeError):  # this is that thread, or an interrupt came before it started
+            # this is that thread, or an interrupt came before it started
+            with suppress(RuntimeError):
                 self._thread.join(SECONDS_TO_UNWIND)
         self._forget_stack()
         self._thread = None
@@ -112,13 +124,14 @@ class ThreadDriver(Driver):
         context, self._context = self._context, None
         try:
             event = context.run(self._work)
-        except BaseException as error:  # raised from another thread; without an event the user would wait for ever
+        # raised from another thread; without an event the user would wait for ever
+        except BaseException as error:
             event = ENDED, [error], True
         context = None
         _, box, failed = event
         if isinstance(box[0], SimulationExit):
-            # Nothing reads this traceback. Its frames must be freed while this thread runs, because the model's own
-            # greenlets can unwind in no other thread.
+            # Nothing reads this traceback. Its frames must be freed while this thread runs, because
+            # the model's own greenlets can unwind in no other thread.
             box[0].__traceback__ = box[0].__context__ = None
         if self.forked:
             self.ended = True

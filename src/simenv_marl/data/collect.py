@@ -41,26 +41,30 @@ def collect_episodes(
 ) -> dict[Any, Trajectories]:
     """Play one episode per seed with policies that answer in batches, and return the trajectories for learning.
 
-    Agents that have a policy are rewarded and end as in an AEC environment that is played with the same policies. All
-    other agents follow their rule. An episode without decisions yields no trajectory and is not an error.
+    Agents that have a policy are rewarded and end as in an AEC environment that is played with the
+    same policies. All other agents follow their rule. An episode without decisions yields no
+    trajectory and is not an error.
 
     Args:
         simulation: As ``simulate_many`` takes it.
-        policies: The policies, as ``simulate_many`` takes them. ``RULE`` is a policy like any other. A policy may
-            return a tuple of the actions and a dict of arrays of shape ``(batch, ...)`` (log-probabilities, values).
-            The arrays become ``extras``; the dict must always have the same keys.
+        policies: The policies, as ``simulate_many`` takes them. ``RULE`` is a policy like any
+            other. A policy may return a tuple of the actions and a dict of arrays of shape
+            ``(batch, ...)`` (log-probabilities, values). The arrays become ``extras``; the dict
+            must always have the same keys.
         seeds: As ``simulate_many`` takes them.
         points: As ``simulate_many`` takes them.
-        collect: A callable of a simulation that has just ended. What it returns is in ``collected``.
+        collect: A callable of a simulation that has just ended. What it returns is in
+            ``collected``.
         batch_size: As ``simulate_many`` takes it.
         concurrency: As ``simulate_many`` takes it.
         workers: As ``simulate_many`` takes them.
         progress: As ``simulate_many`` takes it.
-        **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that has a policy counts as
-            declared, whatever ``possible_agents`` says.
+        **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that
+            has a policy counts as declared, whatever ``possible_agents`` says.
 
     Returns:
-        A dict from each key of ``policies`` to the trajectories of the agents that its policy answered for.
+        A dict from each key of ``policies`` to the trajectories of the agents that its policy
+        answered for.
 
     Raises:
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
@@ -69,7 +73,13 @@ def collect_episodes(
     policies, episodes = checked_policies(policies), list(enumerate(checked_seeds(seeds)))
     check_options(batch_size, workers, collect, concurrency)
     plan = learners_plan(simulation, policies, points, options)
-    arguments = (simulation, policies, points, options), None if workers else plan, collect, batch_size, concurrency
+    arguments = (
+        (simulation, policies, points, options),
+        None if workers else plan,
+        collect,
+        batch_size,
+        concurrency,
+    )
     with progress_bar(len(episodes), progress) as bar:
         parts = spread(_play, arguments, episodes, workers, batch_size, bar)
     all_seeds = tuple(seed for _, seed in episodes)
@@ -98,20 +108,27 @@ def learners_plan(
 ) -> Plan:
     """Return the plan of the episodes, in which a ``PolicyKey`` has the place of each policy.
 
-    With ``all_points``, entities without a policy are agents as well, whose decisions follow the rule. ``alone``: each
-    policy answers one decision at a time.
+    With ``all_points``, entities without a policy are agents as well, whose decisions follow the
+    rule. ``alone``: each policy answers one decision at a time.
     """
-    callables = {key: policy.policy if isinstance(policy, LeftToRule) else policy for key, policy in policies.items()}
-    callables = {key: _follow_rule if policy is RULE else policy for key, policy in callables.items()}
+    callables = {
+        key: policy.policy if isinstance(policy, LeftToRule) else policy
+        for key, policy in policies.items()
+    }
+    callables = {
+        key: _follow_rule if policy is RULE else policy for key, policy in callables.items()
+    }
     options = {**options, "policies": policy_keys(callables, rewarded=True, alone=alone)}
-    others = PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone)) if all_points else None
+    others = (
+        PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone)) if all_points else None
+    )
     plan = Plan(simulation, points, options, unattended=True, rewarded=True, others=others)
     for place, policy in enumerate(policies.values()):
         for point in plan.points if isinstance(policy, LeftToRule) else ():
             if point.report is None and is_answered_by(plan, point, place):
                 raise DefinitionError(
-                    f"the actions of the rule of {point.point.name} are not known; give its make_step a"
-                    " rule_action_mapping, which maps the rule's decision to an action"
+                    f"the actions of the rule of {point.point.name} are not known; give its"
+                    " make_step a rule_action_mapping, which maps the rule's decision to an action"
                 )
     return plan
 
@@ -129,7 +146,10 @@ def _play(
     episodes: list[tuple[int, int]],
     bar: Any,
 ) -> tuple[list[Records], list[Any]]:
-    """Play episodes, which are pairs of number and seed. Return the records by place of their policy, and values."""
+    """Play episodes, which are pairs of number and seed.
+
+    Return the records by place of their policy, and values.
+    """
     plan = plan or learners_plan(*arguments)
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)
@@ -150,9 +170,9 @@ def _play(
 class Mixture:
     """A policy for ``collect_episodes`` that draws, for each decision, which of several policies answers it.
 
-    The draw depends only on the seed of the episode and the number of the decision in it. It does not depend on other
-    simulations or on the number of processes. ``extras["component"]`` has the index of the policy that decided; the
-    extras of the policies themselves are dropped.
+    The draw depends only on the seed of the episode and the number of the decision in it. It does
+    not depend on other simulations or on the number of processes. ``extras["component"]`` has the
+    index of the policy that decided; the extras of the policies themselves are dropped.
 
     Example:
         ``Mixture({RULE: 0.8, trained: 0.2})``
@@ -162,8 +182,8 @@ class Mixture:
         """Mix policies.
 
         Args:
-            parts: A dict from policy to weight, or an iterable of such pairs. A policy is anything that
-                ``collect_episodes`` takes. Weights are not negative and need not sum to one.
+            parts: A dict from policy to weight, or an iterable of such pairs. A policy is anything
+                that ``collect_episodes`` takes. Weights are not negative and need not sum to one.
 
         Raises:
             OptionValueError: There are no policies, or a weight is invalid.
@@ -171,16 +191,19 @@ class Mixture:
         pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
         if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
             raise OptionValueError(
-                f"a mixture needs a dict from policies to weights, or pairs of these, not {short_repr(parts)}"
+                "a mixture needs a dict from policies to weights, or pairs of these, not"
+                f" {short_repr(parts)}"
             )
         for policy, weight in pairs:
             if policy is not RULE and not callable(policy):
                 raise OptionValueError(
-                    f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
+                    "a mixture consists of policies, callables or RULE, not of"
+                    f" {short_repr(policy)}"
                 )
             if is_asked_alone(policy):
                 raise OptionValueError(
-                    f"{short_repr(policy)} answers one decision at a time, and a mixture asks in batches"
+                    f"{short_repr(policy)} answers one decision at a time, and a mixture asks in"
+                    " batches"
                 )
             number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
             if not number or not isfinite(weight) or weight < 0:
@@ -194,13 +217,20 @@ class Mixture:
         self.policies: tuple[Any, ...] = tuple(policy for policy, _ in pairs)
         self.weights: NDArray[np.float64] = weights / weights.sum()
         self._bounds = np.cumsum(self.weights)[:-1]
-        self._batch_policies = [None if policy is RULE else BatchPolicy(policy) for policy in self.policies]
+        self._batch_policies = [
+            None if policy is RULE else BatchPolicy(policy) for policy in self.policies
+        ]
 
     def __repr__(self) -> str:
         parts = zip(self.policies, self.weights.tolist(), strict=True)
-        return f"<Mixture: {', '.join(f'{weight:.3g} {policy_name(policy)}' for policy, weight in parts)}>"
+        return (
+            "<Mixture:"
+            f" {', '.join(f'{weight:.3g} {policy_name(policy)}' for policy, weight in parts)}>"
+        )
 
-    def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
+    def __call__(
+        self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]
+    ) -> Any:
         """Answer a batch of decisions, as policies of ``collect_episodes`` do."""
         component = np.searchsorted(self._bounds, _random_numbers(identities), side="right")
         actions: list[Any] = [RULE] * len(identities)
@@ -209,8 +239,14 @@ class Mixture:
             if batch_policy is None or not len(own):
                 continue
             places = own.tolist()
-            arguments = taken(observations, own), [infos[row] for row in places], [identities[row] for row in places]
-            for row, action in zip(places, _ask(self.policies[number], batch_policy, *arguments), strict=True):
+            arguments = (
+                taken(observations, own),
+                [infos[row] for row in places],
+                [identities[row] for row in places],
+            )
+            for row, action in zip(
+                places, _ask(self.policies[number], batch_policy, *arguments), strict=True
+            ):
                 actions[row] = action
         return actions, {"component": component}
 
@@ -239,8 +275,9 @@ class Comparison:
 
     Attributes:
         trajectories: The trajectories of the rule.
-        policy_actions: The actions that the policy would have taken on the same observations, in the form of
-            ``trajectories.actions``. Where the policy would have left the decision to the rule, the rule's action.
+        policy_actions: The actions that the policy would have taken on the same observations, in
+            the form of ``trajectories.actions``. Where the policy would have left the decision to
+            the rule, the rule's action.
         agreements: ``(N,)`` bool: whether both agree, for each decision.
     """
 
@@ -269,17 +306,19 @@ def compare_with_rule(
 ) -> dict[Any, Comparison]:
     """Let the model's own rule decide, and record what policies would have decided instead.
 
-    At each decision the policy gets what it would get if it decided; then the rule decides. So the episodes are those
-    of the plain model, unless ``others`` names policies that decide.
+    At each decision the policy gets what it would get if it decided; then the rule decides. So the
+    episodes are those of the plain model, unless ``others`` names policies that decide.
 
     Args:
         simulation: As ``simulate_many`` takes it.
-        policies: The policies to compare, as ``collect_episodes`` takes them. Their actions may be illegal.
+        policies: The policies to compare, as ``collect_episodes`` takes them. Their actions may be
+            illegal.
         seeds: As ``simulate_many`` takes them.
         points: As ``simulate_many`` takes them.
-        others: Policies that decide instead of the rule, as ``collect_episodes`` takes policies. They are not compared.
-        tolerance: The largest difference between numbers in two actions that agree. It applies to ``Box`` spaces of
-            floats.
+        others: Policies that decide instead of the rule, as ``collect_episodes`` takes policies.
+            They are not compared.
+        tolerance: The largest difference between numbers in two actions that agree. It applies to
+            ``Box`` spaces of floats.
         **options: As ``collect_episodes`` takes them.
 
     Returns:
@@ -290,28 +329,38 @@ def compare_with_rule(
         OptionValueError: An argument has an invalid value.
         BaseException: All other errors are those of ``collect_episodes``.
     """
-    if not isinstance(policies, Mapping) or not all(callable(policy) for policy in policies.values()):
+    if not isinstance(policies, Mapping) or not all(
+        callable(policy) for policy in policies.values()
+    ):
         raise OptionValueError(
-            f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
+            "policies must be a dict from agents or points to callables, not"
+            f" {short_repr(policies)}"
         )
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
-        raise OptionValueError(f"tolerance must be a number that is not negative, not {short_repr(tolerance)}")
+        raise OptionValueError(
+            f"tolerance must be a number that is not negative, not {short_repr(tolerance)}"
+        )
     if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
         raise OptionValueError(
-            "others must be a dict of policies for agents or points that policies does not name, not"
-            f" {short_repr(others)}"
+            "others must be a dict of policies for agents or points that policies does not name,"
+            f" not {short_repr(others)}"
         )
-    shadows: dict[int, Any] = {}  # policies that record an action; one for each, so that keys share batches
+    # policies that record an action; one for each, so that keys share batches
+    shadows: dict[int, Any] = {}
     for policy in policies.values():
         shadows[id(policy)] = partial(_record, policy, BatchPolicy(policy))
         if is_asked_alone(policy):
             shadows[id(policy)] = _Shadow(policy)
     deciding = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
-    collected = collect_episodes(simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options)
+    collected = collect_episodes(
+        simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options
+    )
     return {key: _compare(collected[key], float(tolerance)) for key in policies}
 
 
-def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> Any:
+def _record(
+    policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any
+) -> Any:
     """Record the actions of a policy as an extra, and leave the decisions to the rule."""
     actions = _ask(policy, batch_policy, observations, infos, identities)
     return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
@@ -332,12 +381,17 @@ class _Shadow(PolicyWrapper):
 def _compare(found: Trajectories, tolerance: float) -> Comparison:
     """Compare the rule's actions with those that a shadow has recorded."""
     recorded = found.extras.get(SHADOW, ())
-    found = replace(found, extras={name: values for name, values in found.extras.items() if name != SHADOW})
+    found = replace(
+        found, extras={name: values for name, values in found.extras.items() if name != SHADOW}
+    )
     if not len(found):
         return Comparison(found, found.actions, np.zeros(0, np.bool_))
     check_known(found)
     assert found.action_space is not None
-    actions = [taken(found.actions, row) if action is RULE else action for row, action in enumerate(recorded)]
+    actions = [
+        taken(found.actions, row) if action is RULE else action
+        for row, action in enumerate(recorded)
+    ]
     policy_actions = stacker(found.action_space)(actions)
     pairs = zip(leaves(found.actions), leaves(policy_actions), strict=True)
     agreements = [_agreements(one, other, tolerance) for (_, one), (_, other) in pairs]
@@ -355,7 +409,9 @@ def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> Any
 # -- policies and their answers -------------------------------------------------------------------
 
 
-def _ask(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> list[Any]:
+def _ask(
+    policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any
+) -> list[Any]:
     """Ask a policy for one action for each decision, and drop the extras."""
     answers = batch_policy.answers(observations, infos, identities)
     return read_answers(answers, policy, len(identities))[0]
@@ -363,13 +419,21 @@ def _ask(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, 
 
 def policy_name(policy: Any) -> str:
     """Return the name of a policy."""
-    return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or short_repr(policy))
+    return (
+        "rule"
+        if policy is RULE
+        else str(getattr(policy, "__qualname__", None) or short_repr(policy))
+    )
 
 
 def follows_rule(policy: Any) -> bool:
     """Return whether a policy certainly leaves decisions to the rule."""
     if isinstance(policy, Mixture):
-        return any(follows_rule(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
+        return any(
+            follows_rule(part)
+            for part, weight in zip(policy.policies, policy.weights, strict=True)
+            if weight
+        )
     return policy is RULE
 
 
@@ -379,7 +443,8 @@ def check_known(found: Trajectories) -> None:
     if len(unknown):
         agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
         raise DefinitionError(
-            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known, first for {agent!r} at"
-            f" turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point needs a"
-            " rule_action_mapping that returns an action for every decision of the rule"
+            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known,"
+            f" first for {agent!r} at turn {found.turns[unknown[0]]} of the episode of seed"
+            f" {seed}; its decision point needs a rule_action_mapping that returns an action for"
+            " every decision of the rule"
         )

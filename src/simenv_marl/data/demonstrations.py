@@ -1,7 +1,7 @@
 """Demonstrations: data sets of the decisions of the model's rule, or of policies, for imitation and offline learning.
 
-They are made of the ``Trajectories`` that ``collect_episodes`` returns. Minari is imported only when a data set is
-written.
+They are made of the ``Trajectories`` that ``collect_episodes`` returns. Minari is imported only
+when a data set is written.
 """
 
 import shutil
@@ -37,39 +37,46 @@ def record_dataset(
 ) -> Any:
     """Play one episode per seed, and write the decisions as a Minari data set for offline learning.
 
-    A data set has the decisions of one policy. Each episode in it is the trajectory of one agent: the agent of the
-    single view, or one of many agents that share the policy. ``save_dataset`` describes the contents.
+    A data set has the decisions of one policy. Each episode in it is the trajectory of one agent:
+    the agent of the single view, or one of many agents that share the policy. ``save_dataset``
+    describes the contents.
 
     Args:
-        dataset_id: The name of the data set, such as ``"greenhouse/rule-v0"``. With several policies: a dict from their
-            keys to such names. Policies without a name decide, but are not recorded.
+        dataset_id: The name of the data set, such as ``"greenhouse/rule-v0"``. With several
+            policies: a dict from their keys to such names. Policies without a name decide, but are
+            not recorded.
         simulation: As ``simulate_many`` takes it.
-        policies: The policies: ``RULE``, a callable, or a ``Mixture``, as ``collect_episodes`` takes them. The rule's
-            decisions are known as actions if the point has a ``rule_action_mapping`` or needs none.
+        policies: The policies: ``RULE``, a callable, or a ``Mixture``, as ``collect_episodes``
+            takes them. The rule's decisions are known as actions if the point has a
+            ``rule_action_mapping`` or needs none.
         seeds: As ``simulate_many`` takes them.
         points: As ``simulate_many`` takes them.
-        metadata: Metadata for Minari: see ``save_dataset``. ``algorithm_name`` defaults to the name of the policy. The
-            result of ``provenance`` is always added.
+        metadata: Metadata for Minari: see ``save_dataset``. ``algorithm_name`` defaults to the name
+            of the policy. The result of ``provenance`` is always added.
         batch_size: As ``simulate_many`` takes it.
         workers: As ``simulate_many`` takes them.
         progress: As ``simulate_many`` takes it.
         **options: The options of ``aec_env``.
 
     Returns:
-        The ``minari.MinariDataset``. If ``dataset_id`` is a dict: a dict of data sets. After an error or an interrupt,
-        none of them is left on disk.
+        The ``minari.MinariDataset``. If ``dataset_id`` is a dict: a dict of data sets. After an
+        error or an interrupt, none of them is left on disk.
 
     Raises:
-        BaseException: Any error of ``collect_episodes`` or ``save_dataset``. What can be checked before is checked
-            before anything runs.
+        BaseException: Any error of ``collect_episodes`` or ``save_dataset``. What can be checked
+            before is checked before anything runs.
     """
     if not isinstance(policies, Mapping) or not policies:
-        raise OptionValueError(f"policies must be a dict from agents or points to policies, not {short_repr(policies)}")
+        raise OptionValueError(
+            f"policies must be a dict from agents or points to policies, not {short_repr(policies)}"
+        )
     names = _dataset_ids(dataset_id, policies)
     paths = {key: _free_path(name) for key, name in names.items()}
     left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
     sizes: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress}
-    collected = collect_episodes(simulation, {**policies, **left}, seeds=seeds, points=points, **sizes, **options)
+    collected = collect_episodes(
+        simulation, {**policies, **left}, seeds=seeds, points=points, **sizes, **options
+    )
     origin = provenance(simulation, points, **options)
     written: dict[Any, Any] = {}
     try:
@@ -91,8 +98,8 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Mapping[Any, s
     names = dataset_id.values() if isinstance(dataset_id, Mapping) else ()
     if not names or not all(isinstance(name, str) for name in names):
         raise OptionValueError(
-            f"dataset_id must be a name, or for {len(policies)} policies a dict from their keys to names, not"
-            f" {short_repr(dataset_id)}"
+            f"dataset_id must be a name, or for {len(policies)} policies a dict from their keys to"
+            f" names, not {short_repr(dataset_id)}"
         )
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
@@ -101,7 +108,9 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Mapping[Any, s
             f"{did_you_mean(unknown[0], map(str, policies))}"
         )
     if len(set(names)) < len(names):
-        raise OptionValueError(f"each policy needs a data set of its own: {short_repr(dict(dataset_id))}")
+        raise OptionValueError(
+            f"each policy needs a data set of its own: {short_repr(dict(dataset_id))}"
+        )
     named: Mapping[Any, str] = dataset_id
     return named
 
@@ -109,43 +118,48 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Mapping[Any, s
 def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -> Any:
     """Write the decisions of one policy as a Minari data set.
 
-    Each trajectory becomes an episode, with its seed. An episode has one more observation than actions; the last one is
-    the agent's final observation. Terminations and truncations follow Gymnasium. The infos have one row per
-    observation: ``by_rule``, ``action_mask`` and ``time`` where they exist, and all numeric extras. The row of the
-    final observation, where nothing was decided, has zeros, and all actions are legal. The episode's metadata has the
-    ``agent``, the ``episode`` (the index of its seed), and the ``turn`` of its first decision.
+    Each trajectory becomes an episode, with its seed. An episode has one more observation than
+    actions; the last one is the agent's final observation. Terminations and truncations follow
+    Gymnasium. The infos have one row per observation: ``by_rule``, ``action_mask`` and ``time``
+    where they exist, and all numeric extras. The row of the final observation, where nothing was
+    decided, has zeros, and all actions are legal. The episode's metadata has the ``agent``, the
+    ``episode`` (the index of its seed), and the ``turn`` of its first decision.
 
     Args:
         dataset_id: The name of the data set, by Minari's rules: ``"(namespace/)name-v0"``.
         trajectories: The trajectories that ``collect_episodes`` returned under one key.
-        **metadata: As ``minari.create_dataset_from_buffers`` takes it: ``author``, ``description``, ``env`` or
-            ``eval_env`` (from which readers recover the environment), ``algorithm_name``, ``data_format``, ... Images
-            are stored as they are, unless ``jpeg_encoding=True``.
+        **metadata: As ``minari.create_dataset_from_buffers`` takes it: ``author``, ``description``,
+            ``env`` or ``eval_env`` (from which readers recover the environment),
+            ``algorithm_name``, ``data_format``, ... Images are stored as they are, unless
+            ``jpeg_encoding=True``.
 
     Returns:
         The ``minari.MinariDataset``. It is stored in Minari's folder, ``MINARI_DATASETS_PATH``.
 
     Raises:
-        OptionValueError: The data set exists already, there are no decisions to write, or the name is invalid.
+        OptionValueError: The data set exists already, there are no decisions to write, or the name
+            is invalid.
         DefinitionError: The actions that correspond to the rule's decisions are unknown.
         MissingExtraError: Minari is missing.
     """
     if not isinstance(trajectories, Trajectories):
         raise OptionValueError(
-            f"the data set {short_repr(dataset_id)} needs Trajectories, as collect_episodes returns them under each"
-            f" key, not {short_repr(trajectories)}"
+            f"the data set {short_repr(dataset_id)} needs Trajectories, as collect_episodes"
+            f" returns them under each key, not {short_repr(trajectories)}"
         )
     path = _free_path(dataset_id)
     if not len(trajectories):
         raise OptionValueError(
-            f"there is nothing to write to {short_repr(dataset_id)}: no agent has decided in any episode"
+            f"there is nothing to write to {short_repr(dataset_id)}: no agent has decided in any"
+            " episode"
         )
     check_known(trajectories)
     import minari
 
     try:
         with warnings.catch_warnings():
-            # Warnings about missing metadata: users know best whether readers of the data set need it.
+            # Warnings about missing metadata: users know best whether readers of the data set need
+            # it.
             warnings.filterwarnings("ignore", r"`\w+` is set to None|env_spec is None")
             dataset = minari.create_dataset_from_buffers(
                 dataset_id,
@@ -155,7 +169,11 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
                 **{"jpeg_encoding": False, **metadata},
             )
         starts, names = trajectories.starts, trajectories.names
-        columns = (trajectories.agents[starts], trajectories.episodes[starts], trajectories.turns[starts])
+        columns = (
+            trajectories.agents[starts],
+            trajectories.episodes[starts],
+            trajectories.turns[starts],
+        )
         dataset.storage.update_episode_metadata(
             {"agent": names[agent], "episode": episode, "turn": turn}
             for agent, episode, turn in zip(*(column.tolist() for column in columns), strict=True)
@@ -172,7 +190,9 @@ def _free_path(name: str) -> Path:
         from minari.dataset.minari_dataset import parse_dataset_id
         from minari.storage.datasets_root_dir import get_dataset_path
     except ImportError as error:
-        raise MissingExtraError(f"data sets need Minari: install simenv-marl[minari] ({error})") from None
+        raise MissingExtraError(
+            f"data sets need Minari: install simenv-marl[minari] ({error})"
+        ) from None
     try:
         parse_dataset_id(name)
     except (TypeError, ValueError):
@@ -182,8 +202,8 @@ def _free_path(name: str) -> Path:
     path = Path(get_dataset_path(name))
     if path.exists():
         raise OptionValueError(
-            f"the data set {short_repr(name)} exists already, in {path}; take another name or version, or delete it"
-            " with minari.delete_dataset"
+            f"the data set {short_repr(name)} exists already, in {path}; take another name or"
+            " version, or delete it with minari.delete_dataset"
         )
     return path
 
@@ -194,7 +214,9 @@ def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
     # The rows of the ends follow those of the decisions.
     infos: dict[str, Any] = {"by_rule": _extend(found.by_rule, number, False)}
     if isinstance(found.action_masks, tuple):
-        infos["action_mask"] = {str(place): _extend(mask, number, 1) for place, mask in enumerate(found.action_masks)}
+        infos["action_mask"] = {
+            str(place): _extend(mask, number, 1) for place, mask in enumerate(found.action_masks)
+        }
     elif found.action_masks is not None:
         infos["action_mask"] = _extend(found.action_masks, number, 1)
     if found.times is not None and found.elapsed is not None:
@@ -202,7 +224,10 @@ def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
     for name, values in found.extras.items():
         if values.dtype.kind in "biufc":
             infos.setdefault(name, _extend(values, number, 0))
-    columns = {"observations": joined([found.observations, found.last_observations]), "infos": infos}
+    columns = {
+        "observations": joined([found.observations, found.last_observations]),
+        "infos": infos,
+    }
     for place, (start, last) in enumerate(zip(found.starts, lasts, strict=True)):
         rows = np.arange(start, last + 1)
         seed = found.seeds[found.episodes[start]]

@@ -1,7 +1,7 @@
 """Plots of the trajectories from ``collect_episodes``: the style of all plots, intervals, and the returns of episodes.
 
-Matplotlib is imported only when something is drawn. Figures are made without pyplot: no window opens, and a figure is
-freed when its user drops it.
+Matplotlib is imported only when something is drawn. Figures are made without pyplot: no window
+opens, and a figure is freed when its user drops it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ COLOURS: Final = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#332288", "#B5A900",
     "#882255", "#44AA99", "#999933", "#661100",
 )  # fmt: skip
-"""The colours of actions. The first ones are those of Okabe and Ito, which colour-blind people can tell apart."""
+"""The colours of actions.
+
+The first ones are those of Okabe and Ito, which colour-blind people can tell apart.
+"""
 
 INK, PALE, ABSENT = "#333333", "#C9C9C9", "#E9E9E9"
 
@@ -46,7 +49,10 @@ STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def style(what: str) -> Iterator[Any]:
-    """Set the style of these plots; yield a function that makes a new figure from its width and height in inches."""
+    """Set the style of these plots.
+
+    Yield a function that makes a new figure from its width and height in inches.
+    """
     rc_context = import_extra("matplotlib", what).rc_context
     make = import_extra("matplotlib.figure", what).Figure
 
@@ -69,9 +75,12 @@ def by_key(trajectories: Any) -> Mapping[Any, Trajectories]:
     """Return the trajectories to draw by the key of their policy."""
     if isinstance(trajectories, Trajectories):
         return {None: trajectories}
-    if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):
+    if not isinstance(trajectories, Mapping) or not all(
+        isinstance(v, Trajectories) for v in trajectories.values()
+    ):
         raise OptionValueError(
-            f"only the dict of Trajectories that collect_episodes returned can be drawn, not {short_repr(trajectories)}"
+            "only the dict of Trajectories that collect_episodes returned can be drawn, not"
+            f" {short_repr(trajectories)}"
         )
     if not trajectories:
         raise OptionValueError("there is nothing to draw: no policy has answered any decision")
@@ -85,18 +94,35 @@ def title_of(key: Any) -> str:
 
 def write_beside(axes: Axes, text: str, height: float, at: Any) -> None:
     """Write text to the right of axes."""
-    axes.annotate(text, (1.0, height), (6, 0), at, "offset points", va="center", fontsize=8.5, annotation_clip=False)
+    axes.annotate(
+        text,
+        (1.0, height),
+        (6, 0),
+        at,
+        "offset points",
+        va="center",
+        fontsize=8.5,
+        annotation_clip=False,
+    )
 
 
 # -- intervals ------------------------------------------------------------------------------------
 
 
 def is_proportion(values: NDArray[Any]) -> bool:
-    """Return whether values are bools, or 0 and 1 alone, of which both occur. None and nan do not count."""
-    return values.dtype == np.bool_ or {v for v in values.ravel() if v is not None and v == v} == {0, 1}
+    """Return whether values are bools, or 0 and 1 alone, of which both occur.
+
+    None and nan do not count.
+    """
+    return values.dtype == np.bool_ or {v for v in values.ravel() if v is not None and v == v} == {
+        0,
+        1,
+    }
 
 
-def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool = False) -> tuple[float, float, str]:
+def interval(
+    values: NDArray[np.float64], confidence: float, *, proportion: bool = False
+) -> tuple[float, float, str]:
     """Return a confidence interval of the mean: by Student's t or, of a proportion, by Wilson's score.
 
     Bounds of which nothing is known are nan. Then the third value says why; otherwise it is empty.
@@ -107,7 +133,9 @@ def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool
     if not np.isfinite(values).all():
         return nan, nan, "a value is missing or not finite"
     if proportion:
-        bounds = stats.binomtest(round(values.sum()), number).proportion_ci(confidence, method="wilson")
+        bounds = stats.binomtest(round(values.sum()), number).proportion_ci(
+            confidence, method="wilson"
+        )
         return float(bounds.low), float(bounds.high), ""
     if np.ptp(values) <= 1e-12 * np.abs(values).max():  # they differ by rounding errors at most
         return nan, nan, "all are equal"
@@ -126,24 +154,26 @@ def plot_returns(
 ) -> Figure | SubFigure:
     """Draw the returns of many episodes, of one collection or of several side by side.
 
-    The return of an agent is the undiscounted sum of its rewards in an episode. Each point is an episode. The bar goes
-    from the lower to the upper quartile, and its notch is the median. The dot is the mean, and the line through it is
-    its 95 % confidence interval, by the rule of ``Evaluation.summary``. The numbers of both stand beside the bar.
+    The return of an agent is the undiscounted sum of its rewards in an episode. Each point is an
+    episode. The bar goes from the lower to the upper quartile, and its notch is the median. The dot
+    is the mean, and the line through it is its 95 % confidence interval, by the rule of
+    ``Evaluation.summary``. The numbers of both stand beside the bar.
 
     Args:
-        collected: The result of ``collect_episodes``, its value for one key, or a dict from labels to such values:
-            ``{"rule": ..., "trained": ...}``.
-        per: What one point shows. ``"policy"``: for each policy, the mean return of the agents it answered for in the
-            episode. ``"agent"``: for each agent, its return. ``"team"``: the sum of the returns of all agents of all
-            policies of a collection.
+        collected: The result of ``collect_episodes``, its value for one key, or a dict from labels
+            to such values: ``{"rule": ..., "trained": ...}``.
+        per: What one point shows. ``"policy"``: for each policy, the mean return of the agents it
+            answered for in the episode. ``"agent"``: for each agent, its return. ``"team"``: the
+            sum of the returns of all agents of all policies of a collection.
         ax: The axes to draw in. None: a new figure.
 
     Returns:
-        The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
+        The figure. A notebook shows a new figure that is the last value of a cell; ``savefig``
+        saves it.
 
     Raises:
-        OptionValueError: There is nothing to draw, an argument has an invalid value, or there would be more than 60
-            rows, as with hundreds of agents.
+        OptionValueError: There is nothing to draw, an argument has an invalid value, or there would
+            be more than 60 rows, as with hundreds of agents.
         MissingExtraError: Matplotlib or SciPy is missing.
     """
     if per not in ("policy", "agent", "team"):
@@ -153,9 +183,13 @@ def plot_returns(
     if not number:
         raise OptionValueError("there is nothing to draw: no agent has decided in any episode")
     if number > LISTED:
-        raise OptionValueError(f"per={per!r} would draw {number} rows, more than {LISTED}; per='policy' draws fewer")
+        raise OptionValueError(
+            f"per={per!r} would draw {number} rows, more than {LISTED}; per='policy' draws fewer"
+        )
     labels = list(dict.fromkeys(label for rows in groups.values() for label in rows))
-    proportion = is_proportion(np.concatenate([returns for rows in groups.values() for returns in rows.values()]))
+    proportion = is_proportion(
+        np.concatenate([returns for rows in groups.values() for returns in rows.values()])
+    )
     with style("plot_returns") as new_figure:
         if ax is None:
             ax = new_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
@@ -188,7 +222,9 @@ def plot_returns(
 def _returns(collected: Any, per: str) -> dict[str, dict[str, NDArray[Any]]]:
     """Return the returns of episodes, by policy or agent, and by the label of their collection."""
     collections = {"": collected}
-    if isinstance(collected, Mapping) and any(isinstance(value, Mapping) for value in collected.values()):
+    if isinstance(collected, Mapping) and any(
+        isinstance(value, Mapping) for value in collected.values()
+    ):
         collections = {str(label): value for label, value in collected.items()}
     groups: dict[str, dict[str, NDArray[Any]]] = {}
     for label, trajectories in collections.items():
@@ -197,9 +233,13 @@ def _returns(collected: Any, per: str) -> dict[str, dict[str, NDArray[Any]]]:
             episodes, agents = found.episodes[found.starts], found.agents[found.starts]
             if per == "agent":
                 for agent, name in enumerate(found.names):
-                    own.setdefault(name, []).append((episodes[agents == agent], found.returns[agents == agent]))
+                    own.setdefault(name, []).append(
+                        (episodes[agents == agent], found.returns[agents == agent])
+                    )
             else:
-                own.setdefault(title_of(key) if per == "policy" else "", []).append((episodes, found.returns))
+                own.setdefault(title_of(key) if per == "policy" else "", []).append(
+                    (episodes, found.returns)
+                )
         for title, pairs in own.items():
             episodes, returns = (np.concatenate(column) for column in zip(*pairs, strict=True))
             if len(returns):
@@ -209,11 +249,14 @@ def _returns(collected: Any, per: str) -> dict[str, dict[str, NDArray[Any]]]:
     return groups
 
 
-def _draw_returns(axes: Axes, height: float, returns: NDArray[np.float64], colour: str, *, proportion: bool) -> None:
+def _draw_returns(
+    axes: Axes, height: float, returns: NDArray[np.float64], colour: str, *, proportion: bool
+) -> None:
     """Draw the episodes of a row, their quartiles and median, and their mean with its interval."""
     number, mean = len(returns), float(returns.mean())
     low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
-    heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)  # spread evenly, in irregular order
+    # spread evenly, in irregular order
+    heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)
     size = float(np.clip(900 / number, 2, 12))
     axes.scatter(returns, heights, size, color=colour, alpha=0.45, linewidths=0, zorder=2)
     axes.barh(height, high - low, left=low, height=0.62, color=colour, alpha=0.16, zorder=1)
@@ -222,5 +265,7 @@ def _draw_returns(axes: Axes, height: float, returns: NDArray[np.float64], colou
     text, bars = f"{mean:.4g}", None
     if below == below:  # otherwise nothing is known of the interval
         text, bars = f"{mean:.4g}  [{below:.4g}, {above:.4g}]", [[mean - below], [above - mean]]
-    axes.errorbar([mean], [height], xerr=bars, fmt="o", color=INK, markersize=4, elinewidth=1.6, zorder=5)
+    axes.errorbar(
+        [mean], [height], xerr=bars, fmt="o", color=INK, markersize=4, elinewidth=1.6, zorder=5
+    )
     write_beside(axes, text, height, axes.get_yaxis_transform())

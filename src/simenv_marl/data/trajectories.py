@@ -1,7 +1,8 @@
 """Trajectories of many episodes: observations, actions, rewards and what else a learner needs.
 
-While the episodes run, a ``Recorder`` keeps a log for each group of decisions, in the order of the answers. Learners
-get the same rows sorted by policy, episode, agent and step, independent of that order.
+While the episodes run, a ``Recorder`` keeps a log for each group of decisions, in the order of the
+answers. Learners get the same rows sorted by policy, episode, agent and step, independent of that
+order.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -31,44 +32,52 @@ from ..simulation import RULE
 class Trajectories:
     """The trajectories of all agents that one policy answered for, in one or many episodes. Immutable.
 
-    There are N rows, one for each decision, and M trajectories, one for each agent in each episode in which it decided.
-    The rows of a trajectory are consecutive, in the order of its decisions. Trajectories are sorted by episode and,
-    within an episode, by their first decision. For ``Dict`` and ``Tuple`` spaces, an attribute is a dict or a tuple of
-    arrays instead of one array. For spaces without a shape (text, graphs, ...), it is an array of objects.
+    There are N rows, one for each decision, and M trajectories, one for each agent in each episode
+    in which it decided. The rows of a trajectory are consecutive, in the order of its decisions.
+    Trajectories are sorted by episode and, within an episode, by their first decision. For ``Dict``
+    and ``Tuple`` spaces, an attribute is a dict or a tuple of arrays instead of one array. For
+    spaces without a shape (text, graphs, ...), it is an array of objects.
 
     Attributes:
-        observations: ``(N, *shape)``, in the dtype of the observation space: the observations at the decisions.
-        actions: ``(N, *shape)``, in the dtype of the action space: the actions. Where the rule decided, this is the
-            action that corresponds to the rule's decision, by ``rule_action_mapping`` or, without one, by ``choices``
-            or a dict ``action_space_mapping``; zero where this action is unknown.
+        observations: ``(N, *shape)``, in the dtype of the observation space: the observations at
+            the decisions.
+        actions: ``(N, *shape)``, in the dtype of the action space: the actions. Where the rule
+            decided, this is the action that corresponds to the rule's decision, by
+            ``rule_action_mapping`` or, without one, by ``choices`` or a dict
+            ``action_space_mapping``; zero where this action is unknown.
         rewards: ``(N,)`` float64: the rewards of the actions, as an AEC environment has them.
-        terminations: ``(N,)`` bool: whether this was the agent's last decision and the agent then terminated.
-        truncations: ``(N,)`` bool: whether this was the agent's last decision and the agent then was truncated.
-        last_observations: ``(M, *shape)``: the final observation of each trajectory, for bootstrapping the value of
-            truncated ones.
-        last_turns: ``(M,)`` int64: the number of decisions in the episode when the trajectory ended, counted as in
-            ``turns``.
+        terminations: ``(N,)`` bool: whether this was the agent's last decision and the agent then
+            terminated.
+        truncations: ``(N,)`` bool: whether this was the agent's last decision and the agent then
+            was truncated.
+        last_observations: ``(M, *shape)``: the final observation of each trajectory, for
+            bootstrapping the value of truncated ones.
+        last_turns: ``(M,)`` int64: the number of decisions in the episode when the trajectory
+            ended, counted as in ``turns``.
         starts: ``(M,)`` int64: the first row of each trajectory.
-        episodes: ``(N,)`` int64: the number of the episode, which is the index of its seed in ``seeds``.
+        episodes: ``(N,)`` int64: the number of the episode, which is the index of its seed in
+            ``seeds``.
         seeds: The seeds of all episodes. The seed of row i is ``seeds[episodes[i]]``.
         agents: ``(N,)`` int64: the deciding agent, as an index into ``names``.
         names: The names of the agents, in order of appearance.
         steps: ``(N,)`` int64: the number of the decision in its trajectory, from 0.
-        turns: ``(N,)`` int64: the number of the decision among those of all agents of all policies in the episode, from
-            0.
+        turns: ``(N,)`` int64: the number of the decision among those of all agents of all policies
+            in the episode, from 0.
         by_rule: ``(N,)`` bool: whether the policy left the decision to the model's rule.
         known: ``(N,)`` bool: whether ``actions`` has the action that was taken.
-        action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such arrays: the legal actions. None where all
-            actions are legal.
+        action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such arrays: the legal
+            actions. None where all actions are legal.
         times: ``(N,)`` float64: the simulation's time at the decision. None where it has no clock.
-        elapsed: ``(N,)`` float64: the time from the decision until its reward was known, at the agent's next decision
-            or its end. None where there is no clock.
-        extras: A dict from name to array, ``(N, ...)``: what the policy returned besides the actions.
-        observation_space, action_space: The spaces of the decision point. None where no agent decided and the decision
-            point is not known.
-        action_labels: The ``action_labels`` of the decision point; None where it has none, or they vary with the call.
-        collected: What ``collect`` returned for each episode's simulation, in the order of the seeds. None where there
-            was no ``collect``.
+        elapsed: ``(N,)`` float64: the time from the decision until its reward was known, at the
+            agent's next decision or its end. None where there is no clock.
+        extras: A dict from name to array, ``(N, ...)``: what the policy returned besides the
+            actions.
+        observation_space, action_space: The spaces of the decision point. None where no agent
+            decided and the decision point is not known.
+        action_labels: The ``action_labels`` of the decision point; None where it has none, or they
+            vary with the call.
+        collected: What ``collect`` returned for each episode's simulation, in the order of the
+            seeds. None where there was no ``collect``.
     """
 
     _: KW_ONLY
@@ -103,8 +112,8 @@ class Trajectories:
 
     def __repr__(self) -> str:
         return (
-            f"<Trajectories: {len(self)} decisions in {len(self.starts)} trajectories of {len(self.names)} agents,"
-            f" {len(self.seeds)} episodes>"
+            f"<Trajectories: {len(self)} decisions in {len(self.starts)} trajectories of"
+            f" {len(self.names)} agents, {len(self.seeds)} episodes>"
         )
 
     @cached_property
@@ -122,7 +131,8 @@ class Trajectories:
         """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
         ends = self.starts + self.lengths - 1
         following = np.arange(1, len(self) + 1)
-        following[ends] = len(self) + np.arange(len(ends))  # the last observations lie behind all others
+        # the last observations lie behind all others
+        following[ends] = len(self) + np.arange(len(ends))
         return taken(joined([self.observations, self.last_observations]), following)
 
 
@@ -142,15 +152,21 @@ def leaves(stack: Any, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
 class Records:
     """The records of one policy in some episodes, in the order of its ``Trajectories``."""
 
-    decisions: Mapping[str, Any]  # by attribute of ``Trajectories``: arrays with a row for each decision
+    # by attribute of ``Trajectories``: arrays with a row for each decision
+    decisions: Mapping[str, Any]
     trajectories: Mapping[str, Any]  # the same with a row for each trajectory
     observation_space: spaces.Space[Any] | None
     action_space: spaces.Space[Any] | None
     action_labels: Any
 
 
-def combine(parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[Any, ...] | None = None) -> Trajectories:
-    """Combine the records of one policy in consecutive parts of the episodes; seeds and values are those of all."""
+def combine(
+    parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[Any, ...] | None = None
+) -> Trajectories:
+    """Combine the records of one policy in consecutive parts of the episodes.
+
+    Seeds and values are those of all.
+    """
     filled = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
     _check_extras([part.decisions["extras"] for part in filled])
     trajectories = joined([part.trajectories for part in filled])
@@ -194,7 +210,8 @@ class _TrajectoryLog:
 class _DecisionLog:
     """The decisions of one group, in the order of the answers.
 
-    The point is one of those at which the group decides; None if it is not known, and there are no decisions.
+    The point is one of those at which the group decides; None if it is not known, and there are no
+    decisions.
     """
 
     def __init__(self, point: Point | None) -> None:
@@ -203,9 +220,17 @@ class _DecisionLog:
         self.stack_actions: Stacker = np.array
         if point is not None:
             self.name, definition = point.point.name, point.definition
-            self.observation_space, self.action_space = definition.observation_space, definition.action_space
-            self.action_labels = None if callable(definition.action_labels) else definition.action_labels
-            self.stack_observations, self.stack_actions = stacker(self.observation_space), stacker(self.action_space)
+            self.observation_space, self.action_space = (
+                definition.observation_space,
+                definition.action_space,
+            )
+            self.action_labels = (
+                None if callable(definition.action_labels) else definition.action_labels
+            )
+            self.stack_observations, self.stack_actions = (
+                stacker(self.observation_space),
+                stacker(self.action_space),
+            )
             self.unknown_action = blank(self.action_space)
         # One entry for each batch.
         self.observations: list[Any] = []
@@ -226,7 +251,8 @@ class _DecisionLog:
         """Return the values of all decisions, by attribute of ``Trajectories``."""
         _check_extras(self.extras)
         number, by_rule = len(self.rewards), np.array(self.by_rule, np.bool_)
-        # The actions of the rule lie behind those of the policy; ``rows`` finds the action of each decision.
+        # The actions of the rule lie behind those of the policy; ``rows`` finds the action of each
+        # decision.
         actions = joined([*self.actions, self.stack_actions(list(self.rule_actions.values()))])
         rows, replaced = np.arange(number), list(self.rule_actions)
         rows[replaced] = number + np.arange(len(replaced))
@@ -257,7 +283,10 @@ class _DecisionLog:
         terminations[last_rows] = [log.terminated for log in logs]
         truncations[last_rows] = [log.truncated for log in logs]
         rows = np.array([row for log in logs for row in log.rows], np.int64)
-        decisions = taken(self.columns, rows) | {"terminations": terminations, "truncations": truncations}
+        decisions = taken(self.columns, rows) | {
+            "terminations": terminations,
+            "truncations": truncations,
+        }
         trajectories = {
             "lengths": lengths,
             "episodes": np.array([log.episode for log in logs], np.int64),
@@ -265,7 +294,9 @@ class _DecisionLog:
             "last_turns": np.array([log.last_turn for log in logs], np.int64),
             "last_observations": self.stack_observations([log.last_observation for log in logs]),
         }
-        return Records(decisions, trajectories, self.observation_space, self.action_space, self.action_labels)
+        return Records(
+            decisions, trajectories, self.observation_space, self.action_space, self.action_labels
+        )
 
 
 class Recorder:
@@ -275,7 +306,14 @@ class Recorder:
         self._first_episode = first_episode
         self._logs: dict[Group, _DecisionLog] = {}
 
-    def record(self, group: Group, places: list[int], waiting: list[Any], observations: Any, answers: Answers) -> None:
+    def record(
+        self,
+        group: Group,
+        places: list[int],
+        waiting: list[Any],
+        observations: Any,
+        answers: Answers,
+    ) -> None:
         """Record decisions and their answers: see ``Watcher``."""
         actions, extras = answers
         log = self._logs.get(group)
@@ -286,7 +324,9 @@ class Recorder:
         for place, episode, agent in zip(places, waiting, agents, strict=True):
             trajectory = agent.notes
             if trajectory is None:
-                trajectory = agent.notes = _TrajectoryLog(log, self._first_episode + place, agent.name)
+                trajectory = agent.notes = _TrajectoryLog(
+                    log, self._first_episode + place, agent.name
+                )
                 log.trajectories.setdefault(agent.policy.place, []).append(trajectory)
             trajectory.rows.append(row)
             turns.append(episode.turns)
@@ -297,16 +337,22 @@ class Recorder:
         if group.point.legal is not None:
             log.masks.append(stack_masks([agent.mask for agent in agents]))
         if waiting[0].clock is not None:
-            log.times.extend([agent.now for agent in agents])  # the policy may have been given the info
+            # the policy may have been given the info
+            log.times.extend([agent.now for agent in agents])
         log.by_rule += [action is RULE for action in actions]
-        log.actions.append(log.stack_actions([log.unknown_action if action is RULE else action for action in actions]))
-        # Copied because policies may reuse their arrays; in two steps because np.array cannot copy every tensor.
+        log.actions.append(
+            log.stack_actions(
+                [log.unknown_action if action is RULE else action for action in actions]
+            )
+        )
+        # Copied because policies may reuse their arrays; in two steps because np.array cannot copy
+        # every tensor.
         arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(
-                    f"{group.asked!r} returned {short_repr(name)} of shape {array.shape} for {len(actions)} decisions;"
-                    " the length of its first axis must be their number"
+                    f"{group.asked!r} returned {short_repr(name)} of shape {array.shape} for"
+                    f" {len(actions)} decisions; the length of its first axis must be their number"
                 )
         log.extras.append(arrays)
 
@@ -319,7 +365,9 @@ class Recorder:
         ended = [(agent, True, False) for agent in episode.just_ended]
         episode.just_ended = []
         if episode.over:
-            ended += [(agent, episode.terminated, episode.truncated) for agent in episode.agents.values()]
+            ended += [
+                (agent, episode.terminated, episode.truncated) for agent in episode.agents.values()
+            ]
         for agent, terminated, truncated in ended:
             _reward(agent)
             trajectory: _TrajectoryLog | None = agent.notes
@@ -334,11 +382,14 @@ class Recorder:
             logs = [log for log in self._logs.values() if place in log.trajectories]
             if len(logs) > 1:
                 raise AgentError(
-                    f"{short_repr(key)} has decided at {' and at '.join(log.name for log in logs)}, whose spaces"
-                    " differ; give its policy under the names of the points"
+                    f"{short_repr(key)} has decided at"
+                    f" {' and at '.join(log.name for log in logs)}, whose spaces differ; give its"
+                    " policy under the names of the points"
                 )
             if not logs:
-                point = next((point for point in plan.points if is_answered_by(plan, point, place)), None)
+                point = next(
+                    (point for point in plan.points if is_answered_by(plan, point, place)), None
+                )
                 logs = [_DecisionLog(point)]
             records.append(logs[0].records(place))
         return records
@@ -367,6 +418,6 @@ def _check_extras(batches: Sequence[Mapping[str, Any]]) -> None:
     for batch in batches:
         if batch.keys() != batches[0].keys():
             raise OptionValueError(
-                f"a policy returned {sorted(batches[0])} beside its actions, but later {sorted(batch)}; it must return"
-                " the same names in every call"
+                f"a policy returned {sorted(batches[0])} beside its actions, but later"
+                f" {sorted(batch)}; it must return the same names in every call"
             )

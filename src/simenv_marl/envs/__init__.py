@@ -44,14 +44,20 @@ def view_class(plan: Plan, view: str | None) -> Any:
 
 @explain_arguments
 def generate_env(
-    simulation: Any, points: Points = None, *, view: str | None = None, **options: Unpack[ViewOptions]
+    simulation: Any,
+    points: Points = None,
+    *,
+    view: str | None = None,
+    **options: Unpack[ViewOptions],
 ) -> Any:
     """Make an environment class for a simulation (paper, section 3.3).
 
-    The constructor of the class takes options as keyword arguments, which override those given here.
+    The constructor of the class takes options as keyword arguments, which override those given
+    here.
 
     {arguments}
-        view: "aec", "parallel", "single" or "joint". None: single if one point with one agent is active, or if
+        view: "aec", "parallel", "single" or "joint". None: single if one point with one agent is
+        active, or if
             ``agent=`` names one agent; else AEC.
         {options}
     """
@@ -73,7 +79,9 @@ def generate_env(
 
 
 @explain_arguments
-def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationAECEnv:
+def aec_env(
+    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+) -> SimulationAECEnv:
     """Make a PettingZoo AEC environment whose agents decide at the decision points.
 
     {arguments}
@@ -83,7 +91,9 @@ def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOption
 
 
 @explain_arguments
-def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationParallelEnv:
+def parallel_env(
+    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+) -> SimulationParallelEnv:
     """Make a PettingZoo parallel environment whose agents decide at the decision points.
 
     {arguments}
@@ -93,11 +103,13 @@ def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewO
 
 
 @explain_arguments
-def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationEnv:
+def single_env(
+    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+) -> SimulationEnv:
     """Make a Gymnasium environment for the one active agent. If there are several, ``agent=`` names it.
 
-    If its decision point has a goal, the environment is goal-based: its observations are dicts of ``observation``,
-    ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
+    If its decision point has a goal, the environment is goal-based: its observations are dicts of
+    ``observation``, ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
 
     {arguments}
         {options}
@@ -106,10 +118,13 @@ def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOpt
 
 
 @explain_arguments
-def joint_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationJointEnv:
+def joint_env(
+    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+) -> SimulationJointEnv:
     """Make a Gymnasium environment with one agent that takes all decisions.
 
-    All agents must be known beforehand. With ``flatten=True``, their spaces must be ones that can be concatenated.
+    All agents must be known beforehand. With ``flatten=True``, their spaces must be ones that can
+    be concatenated.
 
     {arguments}
         {options}
@@ -132,17 +147,20 @@ def vector_env(
 ) -> SimulationVectorEnv:
     """Make a Gymnasium vector environment: many copies of a simulation, stepped together.
 
-    Each step returns what ``gymnasium.vector.SyncVectorEnv`` would return for as many single (or joint) views.
+    Each step returns what ``gymnasium.vector.SyncVectorEnv`` would return for as many single (or
+    joint) views.
 
     {arguments}
         num_envs: The number of simulations.
         workers: The number of worker processes. 0: all simulations are suspended in this process.
         view: "single" or "joint". None: single if one point with one agent is active, else joint.
-        copy: Whether ``reset`` and ``step`` return new arrays of observations. Otherwise they return the same arrays
+        copy: Whether ``reset`` and ``step`` return new arrays of observations. Otherwise they
+        return the same arrays
             every time, and the next call overwrites them.
         autoreset_mode: When a simulation is reset after its episode has ended, as in Gymnasium:
             ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
-        context: The start method of workers: "spawn" (the default), "forkserver", "fork", or a context of
+        context: The start method of workers: "spawn" (the default), "forkserver", "fork", or a
+        context of
             ``multiprocessing``.
         {options}
     """

@@ -16,26 +16,28 @@ from .base import AgentsView
 class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     """A simulation as a PettingZoo AEC environment. Made by ``aec_env`` and ``generate_env``.
 
-    ``possible_agents`` exists only if all agents are known beforehand. The time for a step does not depend on the
-    number of agents: PettingZoo's helpers for rewards and dead steps, which loop over all agents, are not used.
+    ``possible_agents`` exists only if all agents are known beforehand. The time for a step does not
+    depend on the number of agents: PettingZoo's helpers for rewards and dead steps, which loop over
+    all agents, are not used.
 
     Attributes:
         agents: The agents that have not yet taken the final ``None`` step of their episode.
-        agent_selection: The agent whose decision is pending; after agents have ended, the one that takes its ``None``
-            step next.
+        agent_selection: The agent whose decision is pending; after agents have ended, the one that
+            takes its ``None`` step next.
         rewards: The rewards of the latest step, as Python floats.
         terminations, truncations: The flags of each agent, as Python bools.
-        infos: The info of each agent's latest decision. ``infos[agent]["action_mask"]``, np.int8, exists if the
-            decision point restricts its actions; ``"time"`` and ``"elapsed"`` exist if the simulation has a clock. The
-            keys exist from the reset on. Until an agent was observed, its mask has all actions legal.
+        infos: The info of each agent's latest decision. ``infos[agent]["action_mask"]``, np.int8,
+            exists if the decision point restricts its actions; ``"time"`` and ``"elapsed"`` exist
+            if the simulation has a clock. The keys exist from the reset on. Until an agent was
+            observed, its mask has all actions legal.
     """
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Reset the simulation and run it to its first decision.
 
         Args:
-            seed: The seed for the environment's generator, the agents' spaces, and the simulation's ``reset``. None:
-                the simulation gets a seed from the environment's generator.
+            seed: The seed for the environment's generator, the agents' spaces, and the simulation's
+                ``reset``. None: the simulation gets a seed from the environment's generator.
             options: Options for the simulation's ``reset``, if it takes them.
 
         Raises:
@@ -48,7 +50,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         """Answer the decision of ``agent_selection`` and run to the next one.
 
         Args:
-            action: An action in the agent's action space, or ``RULE``. None for an agent whose episode has ended.
+            action: An action in the agent's action space, or ``RULE``. None for an agent whose
+                episode has ended.
 
         Raises:
             InvalidActionError: The action is not legal. The environment does not change.
@@ -84,7 +87,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             observe: Whether to return the observation, or None instead.
 
         Returns:
-            Its observation, the sum of its rewards since its last step, terminated, truncated, info.
+            Its observation, the sum of its rewards since its last step, terminated, truncated,
+            info.
 
         Raises:
             ResetNeededError: There is no episode, or all agents have taken their final step.
@@ -96,10 +100,18 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             raise self._session.refusal()
         elif observe:
             observation = episode.pending.observation
-            observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
+            observation = (
+                observation.copy() if type(observation) is ndarray else duplicate(observation)
+            )
         name = self.agent_selection
         reward = self._cumulative_rewards[name]
-        return observation, reward, self.terminations[name], self.truncations[name], self.infos[name]
+        return (
+            observation,
+            reward,
+            self.terminations[name],
+            self.truncations[name],
+            self.infos[name],
+        )
 
     def observe(self, agent: str) -> Any:
         """Return the latest observation of an agent of this episode, as a new copy.
@@ -118,8 +130,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     def _clear(self) -> None:
         self.agents = []
         self._places: dict[str, int] = {}  # of the agents, in the list of agents
-        self._leaving: list[str] = []  # agents that have ended, and whose None step is to come, the next one last
-        self._rewarded: list[str] = []  # agents besides the selected one that the latest step has rewarded
+        # agents that have ended, and whose None step is to come, the next one last
+        self._leaving: list[str] = []
+        # agents besides the selected one that the latest step has rewarded
+        self._rewarded: list[str] = []
         self.rewards: dict[str, float] = {}
         self._cumulative_rewards: dict[str, float] = {}
         self.terminations: dict[str, bool] = {}
@@ -180,14 +194,21 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     def _dead_step(self, episode: Episode, action: Any) -> None:
         if action is not None and action is not RULE:
             raise InvalidActionError(
-                f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not"
-                f" {short_repr(action)}"
+                f"the episode of {self.agent_selection!r} has ended: its only legal action is"
+                f" None, not {short_repr(action)}"
             )
         self._clear_rewards()
         name = self._leaving.pop()
-        for book in (self.rewards, self._cumulative_rewards, self.terminations, self.truncations, self.infos):
+        for book in (
+            self.rewards,
+            self._cumulative_rewards,
+            self.terminations,
+            self.truncations,
+            self.infos,
+        ):
             del book[name]
-        # The last agent takes its place in the list, so that this takes the same time for any number of agents.
+        # The last agent takes its place in the list, so that this takes the same time for any
+        # number of agents.
         place, mover = self._places.pop(name), self.agents.pop()
         if mover != name:
             self.agents[place], self._places[mover] = mover, place

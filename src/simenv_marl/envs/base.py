@@ -24,11 +24,28 @@ from ..core.point import Point
 from ..core.provenance import describe
 from ..core.session import Session, checked_seed
 from ..core.spaces import observation_cast
-from ..errors import UnknownAgentError, UnknownOptionError, ViewError, did_you_mean, short_repr, warn_user
+from ..errors import (
+    UnknownAgentError,
+    UnknownOptionError,
+    ViewError,
+    did_you_mean,
+    short_repr,
+    warn_user,
+)
 from ..plugins import Entry
 
 _OWN = frozenset(
-    ("_definition", "_finalizer", "_outermost", "_own", "_plan", "_roster", "_session", "joint", "metadata")
+    (
+        "_definition",
+        "_finalizer",
+        "_outermost",
+        "_own",
+        "_plan",
+        "_roster",
+        "_session",
+        "joint",
+        "metadata",
+    )
 )
 """The attributes that no copy takes over."""
 
@@ -47,9 +64,11 @@ class View:
     _in_rounds: ClassVar[bool] = False  # whether all agents are updated when a step returns
     _solo: ClassVar[bool] = False  # whether its branches wait for one agent only
     _finalizer: Any = None
-    _outermost: Callable[[], Any] = staticmethod(lambda: None)  # the wrapper with which it was cloned
+    # the wrapper with which it was cloned
+    _outermost: Callable[[], Any] = staticmethod(lambda: None)
     _set_up: Callable[[], None]  # completes what is made
-    _begin: Callable[[Episode], Any]  # makes the records of a new episode, and returns the results of its reset
+    # makes the records of a new episode, and returns the results of its reset
+    _begin: Callable[[Episode], Any]
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the view of a plan, of a session that its owner closes, or else of a new session."""
@@ -62,8 +81,10 @@ class View:
         self.render_mode = plan.options.render_mode
         self._picture_mode, self._shows = plan.options.picture_mode, plan.options.shows
         self._frames: list[Any] = []
-        self._roster: Mapping[str, Point] = self._session.plan.roster  # of agents that are known beforehand
-        self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}  # of observations and of actions, by agent
+        # of agents that are known beforehand
+        self._roster: Mapping[str, Point] = self._session.plan.roster
+        # of observations and of actions, by agent
+        self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}
         self._clear()
         self._set_up()
 
@@ -79,7 +100,11 @@ class View:
     def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
         modes = list(dict.fromkeys(filter(None, [*plan.render_modes, plan.options.render_mode])))
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": modes, "render_fps": plan.render_fps}
+        return {
+            "name": f"{plan.name.lower()}_v0",
+            "render_modes": modes,
+            "render_fps": plan.render_fps,
+        }
 
     @property
     def simulation(self) -> Any:
@@ -124,10 +149,14 @@ class View:
         space = self._plan.options.state_space
         if not isinstance(space, str):
             return space
-        parts = spaces.Tuple([point.definition.observation_space for point in self._roster.values()])
+        parts = spaces.Tuple(
+            [point.definition.observation_space for point in self._roster.values()]
+        )
         together = spaces.flatten_space(parts)
         if not isinstance(together, spaces.Box):
-            raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
+            raise ViewError(
+                f'state_space="observations" needs spaces that can be flattened, not {parts}'
+            )
         return together
 
     def state(self) -> Any:
@@ -135,7 +164,8 @@ class View:
 
         Returns:
             A new array, in the dtype of ``state_space`` if the environment was made with one. With
-            ``state_space="observations"``: the flattened observations of all possible agents, concatenated.
+            ``state_space="observations"``: the flattened observations of all possible agents,
+            concatenated.
 
         Raises:
             NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
@@ -149,13 +179,20 @@ class View:
             value: Any = np.concatenate(parts)
         else:
             value = self._session.ask("state")
-        return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
+        return (
+            np.array(value)
+            if self.state_space is None
+            else observation_cast(self.state_space)(value)
+        )
 
     # -- episodes ---------------------------------------------------------------------------------
 
     @property
     def episode(self) -> Episode:
-        """The running episode, or the one that has just ended; raise ``ResetNeededError`` if there is none."""
+        """The running episode, or the one that has just ended.
+
+        Raise ``ResetNeededError`` if there is none.
+        """
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()
@@ -169,8 +206,9 @@ class View:
     def render(self) -> Any:
         """Render the simulation in ``render_mode``. Without a render mode, warn and return None.
 
-        In the mode "human", every ``reset`` and ``step`` renders by itself. With ``_list`` at the end of a mode, these
-        are collected; return the list of those since the last ``render`` or ``reset``.
+        In the mode "human", every ``reset`` and ``step`` renders by itself. With ``_list`` at the
+        end of a mode, these are collected; return the list of those since the last ``render`` or
+        ``reset``.
         """
         if self.render_mode is None:
             warn_user(
@@ -202,7 +240,10 @@ class View:
             self._end(self._session.close)
 
     def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
-        """Begin another episode, which ends if the environment is abandoned. Return the results of the reset."""
+        """Begin another episode, which ends if the environment is abandoned.
+
+        Return the results of the reset.
+        """
         session = self._session
         with session.exclusive:
             seed = checked_seed(seed)
@@ -219,7 +260,10 @@ class View:
             return results
 
     def _step_alone(self, step: Callable[..., Any], action: Any) -> Any:
-        """Take a step with the lock, which also covers reading the results; refuse it if there is no episode."""
+        """Take a step with the lock, which also covers reading the results.
+
+        Refuse it if there is no episode.
+        """
         if self._session.episode is None:
             raise self._session.refusal()
         with self._session.lock or nullcontext():
@@ -234,7 +278,8 @@ class View:
             if episode is None or episode.over:
                 self._clear()
             if self._finalizer is not None and self._session.idle:
-                # It would keep the session alive, and with it an environment that its own parts refer to.
+                # It would keep the session alive, and with it an environment that its own parts
+                # refer to.
                 self._finalizer.detach()
 
     def _clear(self) -> None:
@@ -242,7 +287,9 @@ class View:
 
     def _make_spaces(self, agent: str, definition: Any) -> tuple[spaces.Space[Any], ...]:
         """Make the spaces of an agent, which no other environment shares, on demand: many may never need them."""
-        made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
+        made = self._spaces[agent] = copy.deepcopy(
+            (definition.observation_space, definition.action_space)
+        )
         given = self._session.np_random_seed if self._plan.complete else -1
         self._seed_spaces(agent, self._session.seed if given == -1 else given)
         return made
@@ -268,7 +315,8 @@ class View:
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset.
 
-        Functions without names, such as lambdas, are pickled by value, also by the standard library's ``pickle``.
+        Functions without names, such as lambdas, are pickled by value, also by the standard
+        library's ``pickle``.
         """
         view: Any = type(self)
         try:
@@ -307,10 +355,13 @@ class View:
         return made
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Return ``function(environment, *args)``; for a clone from its process, with the wrappers that were cloned.
+        """Return ``function(environment, *args)``.
+
+        For a clone from its process, with the wrappers that were cloned.
 
         Raises:
-            BaseException: Any exception of the function; a ``BranchError`` if the clone's process has ended.
+            BaseException: Any exception of the function; a ``BranchError`` if the clone's process
+                has ended.
         """
         return self._session.call(self._outermost() or self, function, args)
 
@@ -327,12 +378,15 @@ def _unpickled(parcel: bytes) -> View:
 
 
 class _Undeclared:
-    """In place of ``possible_agents`` where not all are known. A ``__getattr__`` would make each attribute slower."""
+    """In place of ``possible_agents`` where not all are known.
+
+    A ``__getattr__`` would make each attribute slower.
+    """
 
     def __get__(self, view: Any, kind: Any) -> Any:
         raise AttributeError(
-            "there is no possible_agents, because not all agents are known beforehand; declare them with the option"
-            " possible_agents=, or name them by strings"
+            "there is no possible_agents, because not all agents are known beforehand; declare"
+            " them with the option possible_agents=, or name them by strings"
         )
 
 
@@ -352,12 +406,16 @@ class AgentsView(View):
             self.possible_agents = self._plan.possible_agents
         elif isinstance(self._plan.options.state_space, str):
             raise ViewError(
-                'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='
+                'state_space="observations" needs to know all agents beforehand: declare them in'
+                " possible_agents="
             )
 
     @classmethod
     def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
-        """Return the metadata of a plan's environments. The order of agents is an order of rounds only in rounds."""
+        """Return the metadata of a plan's environments.
+
+        The order of agents is an order of rounds only in rounds.
+        """
         return super()._metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -366,18 +424,23 @@ class AgentsView(View):
         Raises:
             UnknownAgentError: There is no such agent.
         """
-        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[0]
+        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[
+            0
+        ]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """The action space of an agent, as ``observation_space`` returns the observation space."""
-        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[1]
+        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[
+            1
+        ]
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
         """The observation spaces of all possible agents, by name, for learners that read all at once.
 
         Raises:
-            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+            AttributeError: Not all agents are known beforehand, and so there is no
+                ``possible_agents`` either.
         """
         return {agent: self.observation_space(agent) for agent in self.possible_agents}
 
@@ -404,19 +467,26 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     _agent: str
     _definition: Any  # has the spaces, of which this environment has copies
-    _np_random, _np_random_seed = View.np_random, View.np_random_seed  # where Gymnasium's checks look
+    # where Gymnasium's checks look
+    _np_random, _np_random_seed = View.np_random, View.np_random_seed
 
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The observation space. No other environment shares it."""
-        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[0]
+        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[
+            0
+        ]
 
     @cached_property
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The action space. No other environment shares it."""
-        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[1]
+        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[
+            1
+        ]
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Reset the simulation and run it to its first decision.
 
         The arguments and errors are those of ``SimulationAECEnv.reset``.
@@ -431,17 +501,20 @@ class OneAgentView(View, gym.Env[Any, Any]):
         """The mask of the legal actions, in the form that ``MaskablePPO`` of sb3-contrib expects.
 
         Returns:
-            A bool array. For a ``Discrete`` it has shape ``(n,)``. For a ``MultiDiscrete`` it is the concatenation of
-            the masks of the parts. If the decision point does not restrict its actions, all entries are True.
+            A bool array. For a ``Discrete`` it has shape ``(n,)``. For a ``MultiDiscrete`` it is
+            the concatenation of the masks of the parts. If the decision point does not restrict its
+            actions, all entries are True.
 
         Raises:
-            ViewError: The action space is neither ``Discrete`` nor ``MultiDiscrete``, and so has no masks.
+            ViewError: The action space is neither ``Discrete`` nor ``MultiDiscrete``, and so has no
+                masks.
             ResetNeededError: There is no episode.
         """
         if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
             raise ViewError(
-                f"action masks need a Discrete or MultiDiscrete action space, not {self.action_space}; a joint"
-                " environment of discrete actions has a MultiDiscrete with flatten=True"
+                "action masks need a Discrete or MultiDiscrete action space, not"
+                f" {self.action_space}; a joint environment of discrete actions has a"
+                " MultiDiscrete with flatten=True"
             )
         parts: list[Any] = []
         for agent in self._agents():

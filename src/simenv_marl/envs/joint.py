@@ -23,7 +23,9 @@ class Joint:
     def __init__(self, roster: Mapping[str, Point], *, flatten: bool) -> None:
         """Combine the spaces, or raise ``ViewError`` if they cannot be flattened."""
         self.roster, self._flatten = roster, flatten
-        observations = {name: deepcopy(point.definition.observation_space) for name, point in roster.items()}
+        observations = {
+            name: deepcopy(point.definition.observation_space) for name, point in roster.items()
+        }
         actions = {name: deepcopy(point.definition.action_space) for name, point in roster.items()}
         self.observation_space: spaces.Space[Any] = spaces.Dict(observations)
         self.action_space: spaces.Space[Any] = spaces.Dict(actions)
@@ -45,15 +47,15 @@ class Joint:
         elif self._flatten:
             if not isinstance(action, np.ndarray) or action.shape != self.action_space.shape:
                 raise InvalidActionError(
-                    f"the joint action {short_repr(action)} is not in {short_repr(self.action_space)}; with"
-                    " flatten=True, it is a NumPy array"
+                    f"the joint action {short_repr(action)} is not in"
+                    f" {short_repr(self.action_space)}; with flatten=True, it is a NumPy array"
                 )
             actions = {name: action[place] for name, place in self._places.items()}
         elif not isinstance(action, Mapping) or set(action) != set(self.roster):
             given = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
-                f"a joint action is a dict with an action for each of {', '.join(self.roster)}; given:"
-                f" {short_repr(given)}"
+                f"a joint action is a dict with an action for each of {', '.join(self.roster)};"
+                f" given: {short_repr(given)}"
             )
         return {name: actions[name] for name in self.roster if name in episode.agents}
 
@@ -61,15 +63,22 @@ class Joint:
         """Check the joint action of a vector environment, as far as possible before the simulation moves."""
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
-            raise InvalidActionError("RULE is not an action in vector environments; use joint_env, or policies=")
+            raise InvalidActionError(
+                "RULE is not an action in vector environments; use joint_env, or policies="
+            )
         episode.round.check(episode, actions)  # type: ignore[union-attr]
 
     def observe(self, episode: Episode) -> Any:
-        """Return the observations of all agents; an agent that has ended keeps its last observation."""
+        """Return the observations of all agents.
+
+        An agent that has ended keeps its last observation.
+        """
         observations = {}
         for name, agent in self.agents(episode).items():
             observation = agent.observation
-            observations[name] = agent.point.blank() if observation is None else duplicate(observation)
+            observations[name] = (
+                agent.point.blank() if observation is None else duplicate(observation)
+            )
         if self._flatten:
             return np.concatenate(list(observations.values())).astype(self.observation_space.dtype)
         return observations
@@ -92,7 +101,9 @@ class Joint:
             "deciding": episode.pending.name if episode.pending is not None else "",
             "acted": {name: agent.acted for name, agent in agents.items()},
         }
-        masks = {name: duplicate(agent.mask) for name, agent in agents.items() if agent.mask is not None}
+        masks = {
+            name: duplicate(agent.mask) for name, agent in agents.items() if agent.mask is not None
+        }
         if masks:
             info["action_mask"] = masks
         if episode.clock is not None:
@@ -108,14 +119,16 @@ class Joint:
 class SimulationJointEnv(OneAgentView):
     """A simulation as a Gymnasium environment with one agent that takes all decisions. Made by ``joint_env``.
 
-    A step is a round of the parallel view with an action for each agent. The reward is the sum of their rewards. The
-    agents are those that are known when the environment is made: those whose names are strings, those in
-    ``possible_agents``, and those that the simulation's ``expected_calls`` announces after a reset.
+    A step is a round of the parallel view with an action for each agent. The reward is the sum of
+    their rewards. The agents are those that are known when the environment is made: those whose
+    names are strings, those in ``possible_agents``, and those that the simulation's
+    ``expected_calls`` announces after a reset.
 
     Attributes:
-        observation_space, action_space: ``Dict`` spaces by agent. With ``flatten=True``: one-dimensional ``Box``
-            spaces, the concatenation of those of the agents (the paper's two-dimensional action space). ``Discrete``
-            and one-dimensional ``MultiDiscrete`` action spaces become one ``MultiDiscrete``.
+        observation_space, action_space: ``Dict`` spaces by agent. With ``flatten=True``:
+            one-dimensional ``Box`` spaces, the concatenation of those of the agents (the paper's
+            two-dimensional action space). ``Discrete`` and one-dimensional ``MultiDiscrete`` action
+            spaces become one ``MultiDiscrete``.
     """
 
     _option = "flatten"
@@ -126,11 +139,14 @@ class SimulationJointEnv(OneAgentView):
         session = self._session
         if not self._plan.complete:
             if not hasattr(session.simulation, "expected_calls"):
-                points = ", ".join(point.point.name for point in self._plan.active if point.agent is None)
+                points = ", ".join(
+                    point.point.name for point in self._plan.active if point.agent is None
+                )
                 raise ViewError(
-                    "all agents must be known when the environment is made, and a callable names those of"
-                    f" {points}; declare them with possible_agents=, let the simulation announce them"
-                    " (expected_calls), or name the one agent of a single view with agent="
+                    "all agents must be known when the environment is made, and a callable names"
+                    f" those of {points}; declare them with possible_agents=, let the simulation"
+                    " announce them (expected_calls), or name the one agent of a single view with"
+                    " agent="
                 )
             agents = session.start(0, None, in_rounds=True).agents
             roster = {name: agent.point for name, agent in agents.items()}
@@ -144,17 +160,20 @@ class SimulationJointEnv(OneAgentView):
         """Play a round with an action for each agent.
 
         Args:
-            action: An action in the action space, with an action for each agent (those of ended agents are not used).
-                ``RULE``, or ``RULE`` instead of an agent's action, lets the rule decide.
+            action: An action in the action space, with an action for each agent (those of ended
+                agents are not used). ``RULE``, or ``RULE`` instead of an agent's action, lets the
+                rule decide.
 
         Returns:
-            Observation, sum of the rewards (a Python float), terminated, truncated, info. An agent that has ended keeps
-            its last observation. ``info["deciding"]`` is the name of the agent whose decision is pending.
-            ``info["acted"]`` tells for each agent whether its action was used. If the simulation has a clock,
-            ``info["time"]`` is its time, and ``info["elapsed"]`` the time since the previous step.
+            Observation, sum of the rewards (a Python float), terminated, truncated, info. An agent
+            that has ended keeps its last observation. ``info["deciding"]`` is the name of the agent
+            whose decision is pending. ``info["acted"]`` tells for each agent whether its action was
+            used. If the simulation has a clock, ``info["time"]`` is its time, and
+            ``info["elapsed"]`` the time since the previous step.
 
         Raises:
-            InvalidActionError: The action is not legal, or lacks an agent. The environment does not change.
+            InvalidActionError: The action is not legal, or lacks an agent. The environment does not
+                change.
             BaseException: Any other error of ``SimulationAECEnv.step``.
         """
         session = self._session
@@ -166,7 +185,13 @@ class SimulationJointEnv(OneAgentView):
         if self._shows:
             self._show()
         info = joint.inform(episode)
-        return joint.observe(episode), joint.reward(episode), episode.terminated, episode.truncated, info
+        return (
+            joint.observe(episode),
+            joint.reward(episode),
+            episode.terminated,
+            episode.truncated,
+            info,
+        )
 
     def _begin(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
         return self.joint.observe(episode), self.joint.inform(episode)
@@ -176,13 +201,15 @@ def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> spaces.Sp
     """Return the space of concatenated vectors. ``discrete``: they may all be discrete, too."""
     kinds = (spaces.Discrete, spaces.MultiDiscrete)
     if discrete and all(isinstance(space, kinds) and np.ndim(space.start) < 2 for space in parts):
-        numbers = [np.atleast_1d(space.nvec if isinstance(space, kinds[1]) else space.n) for space in parts]
+        numbers = [
+            np.atleast_1d(space.nvec if isinstance(space, kinds[1]) else space.n) for space in parts
+        ]
         starts = [np.atleast_1d(space.start) for space in parts]
         return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))
     for space in parts:
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ViewError(
-                "flatten=True needs one-dimensional Box spaces, and actions that are all continuous or all discrete,"
-                f" not {space}"
+                "flatten=True needs one-dimensional Box spaces, and actions that are all"
+                f" continuous or all discrete, not {space}"
             )
     return spaces.flatten_space(spaces.Tuple(parts))

@@ -16,9 +16,10 @@ from .parallel import Results
 def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
     """Pad the agents of an environment to its ``possible_agents``, from the reset to the end of the episode.
 
-    ``infos[agent]["present"]`` tells whether an agent lives. Agents that are not born yet, or that the model has
-    removed, do not decide. Their observations are zero with all actions legal, their rewards 0.0, and actions for them
-    are ignored. All agents end together, with the episode. This is also known as black death.
+    ``infos[agent]["present"]`` tells whether an agent lives. Agents that are not born yet, or that
+    the model has removed, do not decide. Their observations are zero with all actions legal, their
+    rewards 0.0, and actions for them are ignored. All agents end together, with the episode. This
+    is also known as black death.
 
     Args:
         env: An AEC or parallel environment of a simulation, with ``possible_agents``.
@@ -28,7 +29,9 @@ def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
     """
     view = getattr(env, "unwrapped", env)
     if not isinstance(view, AgentsView):
-        raise ViewError(f"pad_agents needs the environment of aec_env or parallel_env, not {short_repr(env)}")
+        raise ViewError(
+            f"pad_agents needs the environment of aec_env or parallel_env, not {short_repr(env)}"
+        )
     if not hasattr(view, "possible_agents"):
         raise ViewError("pad_agents needs to know all agents: declare them in possible_agents=")
     return PaddedAECEnv(env) if isinstance(env, AECEnv) else PaddedParallelEnv(env)
@@ -45,9 +48,14 @@ def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any]) -> 
         else:
             agent.clear_observation()
             agent.observation = None  # so that ``observe`` and ``state`` have blanks
-            info = agent.info | ({"deciding": False, "acted": agent.acted} if view._in_rounds else {})
+            info = agent.info | (
+                {"deciding": False, "acted": agent.acted} if view._in_rounds else {}
+            )
         padded[name] = {**info, "present": present}
-    terminations, truncations = dict.fromkeys(roster, episode.terminated), dict.fromkeys(roster, episode.truncated)
+    terminations, truncations = (
+        dict.fromkeys(roster, episode.terminated),
+        dict.fromkeys(roster, episode.truncated),
+    )
     return {name: rewards.get(name, 0.0) for name in roster}, terminations, truncations, padded
 
 
@@ -70,23 +78,32 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
         """Play a round; return the results of all possible agents."""
         if isinstance(actions, Mapping) and self.agents:
             agents = self.unwrapped.episode.agents
-            absent = {name for name in self.possible_agents if name not in agents or not agents[name].present}
+            absent = {
+                name
+                for name in self.possible_agents
+                if name not in agents or not agents[name].present
+            }
             actions = {name: action for name, action in actions.items() if name not in absent}
         results: Results = super().step(actions)
-        return self._padded(results) if results[0] else results  # they are empty after the end of the episode
+        # they are empty after the end of the episode
+        return self._padded(results) if results[0] else results
 
     def _padded(self, results: Results) -> Results:
         """Add the agents that are not present to the results of a round, and let all agents end together."""
         view, (observations, rewards, _, _, infos) = self.unwrapped, results
         *padded, infos = _pad(view, rewards, infos)
-        seen = {name: observations[name] if i["present"] else view._point(name).blank() for name, i in infos.items()}
+        seen = {
+            name: observations[name] if i["present"] else view._point(name).blank()
+            for name, i in infos.items()
+        }
         return seen, *padded, infos
 
 
 class PaddedAECEnv(BaseWrapper[str, Any, Any]):
     """An AEC environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``.
 
-    Absent agents are not selected before the end of the episode. A step takes time for each possible agent.
+    Absent agents are not selected before the end of the episode. A step takes time for each
+    possible agent.
     """
 
     @property
@@ -117,7 +134,9 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
         rewards, infos = dict(env.rewards), env.infos
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
-        self.rewards, self.terminations, self.truncations, self.infos = _pad(self.unwrapped, rewards, infos)
+        self.rewards, self.terminations, self.truncations, self.infos = _pad(
+            self.unwrapped, rewards, infos
+        )
         for name, reward in self.rewards.items():
             self._cumulative_rewards[name] += reward
         self.agent_selection = self.agents[0] if episode.over else env.agent_selection

@@ -11,17 +11,19 @@ from ..errors import warn_user
 from ..simulation import Sentinel
 from .base import AgentsView
 
-Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
+Results = tuple[
+    dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+]
 """The results of a step: observations, rewards, terminations, truncations and infos, by agent."""
 
 
 class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     """A simulation as a PettingZoo parallel environment. Made by ``parallel_env`` and ``generate_env``.
 
-    A step answers each decision as it arises with the action of its agent. Each action is used once. The step returns
-    at the first decision whose action is missing or already used. So, giving all actions at once makes simultaneous
-    moves, and giving one action at a time makes turns. When the step returns, all live agents are observed and
-    rewarded.
+    A step answers each decision as it arises with the action of its agent. Each action is used
+    once. The step returns at the first decision whose action is missing or already used. So, giving
+    all actions at once makes simultaneous moves, and giving one action at a time makes turns. When
+    the step returns, all live agents are observed and rewarded.
 
     Attributes:
         agents: The live agents.
@@ -48,17 +50,19 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         """Play a round.
 
         Args:
-            actions: A dict from live agent to an action in its action space, or ``RULE``. ``RULE`` instead of the dict
-                means ``RULE`` for every agent. After the end of the episode, an empty dict is accepted and has no
-                effect.
+            actions: A dict from live agent to an action in its action space, or ``RULE``. ``RULE``
+                instead of the dict means ``RULE`` for every agent. After the end of the episode, an
+                empty dict is accepted and has no effect.
 
         Returns:
-            Observations, rewards (Python floats), terminations, truncations (Python bools) and infos, by agent.
-            ``infos[agent]["deciding"]`` tells whether the agent's decision is pending, ``["acted"]`` whether its action
-            was used. Agents that have ended are in the dicts one last time.
+            Observations, rewards (Python floats), terminations, truncations (Python bools) and
+            infos, by agent. ``infos[agent]["deciding"]`` tells whether the agent's decision is
+            pending, ``["acted"]`` whether its action was used. Agents that have ended are in the
+            dicts one last time.
 
         Raises:
-            UnknownAgentError: An action is for an agent that does not live. The environment does not change.
+            UnknownAgentError: An action is for an agent that does not live. The environment does
+                not change.
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
         session = self._session
@@ -80,8 +84,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         if episode.over and not self._warned and 10 * played.unused > played.given:
             self._warned = True
             warn_user(
-                f"of {played.given} actions in this episode, {played.given - played.unused} were used: the agents do"
-                " not decide in each round, and the other actions are lost. aec_env loses none; joint_env gives one"
+                f"of {played.given} actions in this episode, {played.given - played.unused} were"
+                " used: the agents do not decide in each round, and the other actions are lost."
+                " aec_env loses none; joint_env gives one"
                 ' controller all of them; infos[agent]["acted"] tells which were used'
             )
         results = self._begin(episode)
@@ -94,12 +99,16 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         agents, ended, pending = episode.agents, episode.just_ended, episode.pending
         if ended:
             agents = {agent.name: agent for agent in ended} | agents
-        terminations, truncations = dict.fromkeys(agents, episode.terminated), dict.fromkeys(agents, episode.truncated)
+        terminations, truncations = (
+            dict.fromkeys(agents, episode.terminated),
+            dict.fromkeys(agents, episode.truncated),
+        )
         results: Results = {}, {}, terminations, truncations, {}
         observations, rewards, _, _, infos = results
         for name, agent in agents.items():
             observation = agent.observation
-            if observation is agent.handed_out:  # it could not be observed anew, or was never observed
+            # it could not be observed anew, or was never observed
+            if observation is agent.handed_out:
                 observation = agent.point.blank() if observation is None else duplicate(observation)
             else:
                 agent.handed_out = observation  # the caller may change it

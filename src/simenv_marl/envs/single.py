@@ -1,4 +1,7 @@
-"""The single view: a Gymnasium environment of one agent. A planner gets it for the agent for which it decides."""
+"""The single view: a Gymnasium environment of one agent.
+
+A planner gets it for the agent for which it decides.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,10 @@ _REFUSAL = "a policy cannot move the environment that it is given: it must retur
 
 
 class SimulationEnv(OneAgentView):
-    """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``."""
+    """A simulation as a Gymnasium environment of one agent.
+
+    Made by ``single_env`` and ``generate_env``.
+    """
 
     _option = "agent"
     _own: Any = None  # its agent during an episode
@@ -38,9 +44,9 @@ class SimulationEnv(OneAgentView):
         if plan.one_agent is None:
             points = ", ".join(point.point.name for point in plan.active)
             raise ViewError(
-                "the single view needs one active decision point whose agent= is not a callable, or the name of one"
-                f" agent; active are {points}. Name the agent with agent=, name one point in points=, answer the"
-                " others with policies=, or use aec_env"
+                "the single view needs one active decision point whose agent= is not a callable,"
+                f" or the name of one agent; active are {points}. Name the agent with agent=, name"
+                " one point in points=, answer the others with policies=, or use aec_env"
             )
         definition = plan.active[0].definition
         if definition.goal_space is None:
@@ -54,10 +60,19 @@ class SimulationEnv(OneAgentView):
 
         def observe(*args: Any, _simulation: Any, **kwargs: Any) -> dict[str, Any]:
             given = {"_simulation": _simulation}
-            return {key: part(*args, **kwargs, **given if asking[key] else {}) for key, part in parts.items()}
+            return {
+                key: part(*args, **kwargs, **given if asking[key] else {})
+                for key, part in parts.items()
+            }
 
         goal: Any = definition.goal_space
-        space = spaces.Dict({"observation": definition.observation_space, "achieved_goal": goal, "desired_goal": goal})
+        space = spaces.Dict(
+            {
+                "observation": definition.observation_space,
+                "achieved_goal": goal,
+                "desired_goal": goal,
+            }
+        )
         changed = replace(definition, observation_space=space, observation_space_mapping=observe)
         return super()._adapt(plan).redefined(plan.active[0].point, changed)
 
@@ -86,18 +101,23 @@ class SimulationEnv(OneAgentView):
     def compute_reward(self) -> Callable[[Any, Any, Any], float | NDArray[np.float64]]:
         """A function that returns the rewards for other goals, if the decision point has a goal.
 
-        Its arguments are the achieved goals, of shape ``goal_space.shape``, or ``(n, *goal_space.shape)`` for n steps;
-        the desired goals, of the same shape; and the info of the step, or a sequence of n infos. It returns the reward,
-        or an array of n rewards.
+        Its arguments are the achieved goals, of shape ``goal_space.shape``, or
+        ``(n, *goal_space.shape)`` for n steps; the desired goals, of the same shape; and the info
+        of the step, or a sequence of n infos. It returns the reward, or an array of n rewards.
 
         Raises:
             AttributeError: The decision point has no goal.
         """
         compute = self._definition.compute_reward
         if compute is None:
-            raise AttributeError(f"{type(self).__name__} has no compute_reward: its decision point has no goal_space=")
+            raise AttributeError(
+                f"{type(self).__name__} has no compute_reward: its decision point has no"
+                " goal_space="
+            )
 
-        def compute_reward(achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:
+        def compute_reward(
+            achieved_goal: Any, desired_goal: Any, info: Any
+        ) -> float | NDArray[np.float64]:
             reward = np.asarray(compute(achieved_goal, desired_goal, info), np.float64)
             return float(reward) if reward.ndim == 0 else reward
 
@@ -114,8 +134,8 @@ class SimulationEnv(OneAgentView):
 class PlannerEnv(SimulationEnv):
     """The single view of an agent whose planner is being asked, for ``branch`` and the functions built on it.
 
-    The decision is pending until the planner returns an action. A branch is an ordinary environment of the agent, which
-    can be stepped; policies or rules answer for all other agents.
+    The decision is pending until the planner returns an action. A branch is an ordinary environment
+    of the agent, which can be stepped; policies or rules answer for all other agents.
     """
 
     _solo = True
@@ -164,6 +184,9 @@ class PlannerEnv(SimulationEnv):
         super().close()
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        raise CopyError("the environment that a policy is given cannot be copied; use branch or clone to continue it")
+        raise CopyError(
+            "the environment that a policy is given cannot be copied; use branch or clone to"
+            " continue it"
+        )
 
     __deepcopy__ = __reduce_ex__  # type: ignore[assignment]

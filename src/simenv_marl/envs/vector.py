@@ -33,7 +33,8 @@ from .vector_batch import SimulationBatch
 class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     """Many simulations as one ``gymnasium.vector.VectorEnv``. Made by ``vector_env``.
 
-    It behaves like ``gymnasium.vector.SyncVectorEnv`` with as many single (or joint) views, step by step.
+    It behaves like ``gymnasium.vector.SyncVectorEnv`` with as many single (or joint) views, step by
+    step.
 
     Attributes:
         num_envs: The number of simulations.
@@ -69,7 +70,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
             raise OptionValueError(
-                f"autoreset_mode must be one of {', '.join(repr(known.value) for known in AutoresetMode)}, not"
+                "autoreset_mode must be one of"
+                f" {', '.join(repr(known.value) for known in AutoresetMode)}, not"
                 f" {short_repr(autoreset_mode)}"
             ) from None
         self._copy = bool(copy)
@@ -81,12 +83,16 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = batch.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._checks_alone = batch.joint is None and batch.plan.active[0].legal is None  # what is legal is known here
+        # what is legal is known here
+        self._checks_alone = batch.joint is None and batch.plan.active[0].legal is None
         self._begun = False
-        self._ended: frozenset[int] = frozenset()  # where the next episode begins with the next step or a reset
+        # where the next episode begins with the next step or a reset
+        self._ended: frozenset[int] = frozenset()
         self._simulations: SimulationBatch | WorkerPool = batch
         if workers:
-            self._simulations = WorkerPool(SimulationBatch, batch.arguments, self.num_envs, workers, context)
+            self._simulations = WorkerPool(
+                SimulationBatch, batch.arguments, self.num_envs, workers, context
+            )
             self._observations = create_empty_array(self.single_observation_space, self.num_envs)
         weakref.finalize(self, self._simulations.abandon)
         self._guard = _Guard()
@@ -95,15 +101,19 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     # -- episodes ---------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all simulations, or some of them, and run them to their first decisions.
 
         Args:
-            seed: An integer: the simulations get ``seed``, ``seed + 1``, ... A sequence: each simulation gets its own
-                seed (or None). None: each simulation draws a seed from its own generator.
-            options: Options for the simulations' ``reset``, if it takes them. ``"reset_mask"``, a bool array of shape
-                ``(num_envs,)``, selects the simulations to reset.
+            seed: An integer: the simulations get ``seed``, ``seed + 1``, ... A sequence: each
+                simulation gets its own seed (or None). None: each simulation draws a seed from its
+                own generator.
+            options: Options for the simulations' ``reset``, if it takes them. ``"reset_mask"``, a
+                bool array of shape ``(num_envs,)``, selects the simulations to reset.
 
         Returns:
             The observations of all simulations, and the infos of those that were reset.
@@ -111,8 +121,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             OptionValueError: The seeds or the mask are invalid.
             ClosedError: The environment is closed.
-            BaseException: Any exception of a simulation or a mapping, with a note that names the simulation. Then all
-                of them need a reset; the ones after it have not been reset.
+            BaseException: Any exception of a simulation or a mapping, with a note that names the
+                simulation. Then all of them need a reset; the ones after it have not been reset.
         """
         with self._guard:
             seeds = self._seeds(seed)
@@ -129,26 +139,31 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         """Answer the pending decision of each simulation and run it to its next one.
 
         Args:
-            actions: A batch of the action space. The actions of simulations that are reset by this step are not used.
+            actions: A batch of the action space. The actions of simulations that are reset by this
+                step are not used.
 
         Returns:
-            Observations, rewards (float64), terminations and truncations (bool), each of shape ``(num_envs, ...)``, and
-            infos.
+            Observations, rewards (float64), terminations and truncations (bool), each of shape
+            ``(num_envs, ...)``, and infos.
 
         Raises:
-            InvalidActionError: An action is not legal; the message names the simulation. None of them has moved.
+            InvalidActionError: An action is not legal; the message names the simulation. None of
+                them has moved.
             ResetNeededError: There is no running episode.
-            BaseException: Any exception of a simulation or a mapping, with a note that names the simulation. Then all
-                of them need a reset.
+            BaseException: Any exception of a simulation or a mapping, with a note that names the
+                simulation. Then all of them need a reset.
         """
         with self._guard:
             if not self._begun:
                 raise NotResetError("there is no episode yet; call reset() first")
             if self._simulations.failed:
-                raise EpisodeOverError("an error has ended the episodes; call reset() to begin the next ones")
+                raise EpisodeOverError(
+                    "an error has ended the episodes; call reset() to begin the next ones"
+                )
             if self._ended and self._mode == AutoresetMode.DISABLED:
                 raise EpisodeOverError(
-                    f"the episodes of the sub-environments {sorted(self._ended)[:10]} are over; begin the next ones"
+                    f"the episodes of the sub-environments {sorted(self._ended)[:10]} are over;"
+                    " begin the next ones"
                     ' with reset(options={"reset_mask": ...})'
                 )
             answers = self._simulations.ask("step", self._split(actions), self._ended)
@@ -163,7 +178,10 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             return answers[0]
         observations, *columns = zip(*answers, strict=True)
         self._observations = _join(self.single_observation_space, observations, self._observations)
-        lists = [np.concatenate(p) if isinstance(p[0], np.ndarray) else [*chain.from_iterable(p)] for p in columns]
+        lists = [
+            np.concatenate(p) if isinstance(p[0], np.ndarray) else [*chain.from_iterable(p)]
+            for p in columns
+        ]
         return self._observations, *lists
 
     def _merged(self, infos: list[tuple[int, dict[str, Any]]]) -> dict[str, Any]:
@@ -184,7 +202,9 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     def _split(self, actions: Any) -> list[Any]:
         """Split a batch of actions, and check each action that will be used, before any simulation moves."""
         if actions is RULE:
-            raise InvalidActionError("RULE is not an action in vector environments; use single_env, or policies=")
+            raise InvalidActionError(
+                "RULE is not an action in vector environments; use single_env, or policies="
+            )
         space = self.single_action_space
         if type(actions) is np.ndarray and self._checks_alone:
             if not isinstance(space, spaces.Discrete):
@@ -197,7 +217,9 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 and actions.max() < space.start + space.n
             ):
                 return actions.tolist()  # type: ignore[no-any-return]
-        return list(chain.from_iterable(self._simulations.ask("check", self._apart(actions), self._ended)))
+        return list(
+            chain.from_iterable(self._simulations.ask("check", self._apart(actions), self._ended))
+        )
 
     def _apart(self, actions: Any) -> list[Any]:
         try:
@@ -209,7 +231,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             ) from error
         if len(apart) != self.num_envs:
             raise InvalidActionError(
-                f"there are {len(apart)} actions for {self.num_envs} simulations: {short_repr(actions)}"
+                f"there are {len(apart)} actions for {self.num_envs} simulations:"
+                f" {short_repr(actions)}"
             )
         return apart
 
@@ -222,21 +245,32 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             raise OptionValueError(f"there are {len(seeds)} seeds for {self.num_envs} simulations")
         return seeds
 
-    def _chosen(self, options: dict[str, Any] | None) -> tuple[NDArray[np.bool_], dict[str, Any] | None]:
+    def _chosen(
+        self, options: dict[str, Any] | None
+    ) -> tuple[NDArray[np.bool_], dict[str, Any] | None]:
         """Return which simulations to reset, and the options for them."""
         if options is None or "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_), options
         mask = options["reset_mask"]
-        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.dtype != np.bool_
+            or mask.shape != (self.num_envs,)
+        ):
             raise OptionValueError(
-                f"reset_mask must be a bool array of shape ({self.num_envs},), not {short_repr(mask)}"
+                f"reset_mask must be a bool array of shape ({self.num_envs},), not"
+                f" {short_repr(mask)}"
             )
         if not mask.any():
             raise OptionValueError("reset_mask selects no simulation to reset")
         if not (self._begun or mask.all()):
-            raise NotResetError("there are no episodes yet; call reset() without a reset_mask first")
+            raise NotResetError(
+                "there are no episodes yet; call reset() without a reset_mask first"
+            )
         if self._simulations.failed and not mask.all():
-            raise EpisodeOverError("an error has ended the episodes; call reset() without a reset_mask")
+            raise EpisodeOverError(
+                "an error has ended the episodes; call reset() without a reset_mask"
+            )
         return mask, {name: value for name, value in options.items() if name != "reset_mask"}
 
     # -- the simulations --------------------------------------------------------------------------
@@ -245,14 +279,17 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     def envs(self) -> list[OneAgentView]:
         """The Gymnasium environments of the simulations, in order."""
         if isinstance(self._simulations, WorkerPool):
-            raise AttributeError("the sub-environments are in other processes; use call(), get_attr() and set_attr()")
+            raise AttributeError(
+                "the sub-environments are in other processes; use call(), get_attr() and set_attr()"
+            )
         return list(self._simulations.views)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each sub-environment, or get its attribute.
 
         Args:
-            name: The name of a method or attribute of a single (or joint) view, such as ``simulation``.
+            name: The name of a method or attribute of a single (or joint) view, such as
+                ``simulation``.
             *args: The positional arguments of the method.
             **kwargs: The keyword arguments of the method.
 
@@ -275,7 +312,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             name: The name of the attribute.
-            values: A list or tuple with one value for each sub-environment, or a single value for all of them.
+            values: A list or tuple with one value for each sub-environment, or a single value for
+                all of them.
 
         Raises:
             OptionValueError: There are more or fewer values than sub-environments.
@@ -283,7 +321,9 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         if not isinstance(values, (list, tuple)):
             values = [values] * self.num_envs
         if len(values) != self.num_envs:
-            raise OptionValueError(f"there are {len(values)} values for {self.num_envs} simulations")
+            raise OptionValueError(
+                f"there are {len(values)} values for {self.num_envs} simulations"
+            )
         with self._guard:
             self._simulations.ask("set_attr", name, list(values))
 
@@ -298,7 +338,10 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         return self.get_attr("np_random_seed")
 
     def render(self) -> tuple[Any, ...]:
-        """Render each simulation in ``render_mode``. Without a render mode, warn and return a tuple of None."""
+        """Render each simulation in ``render_mode``.
+
+        Without a render mode, warn and return a tuple of None.
+        """
         return self.call("render")
 
     def close(self, **kwargs: Any) -> None:
@@ -306,7 +349,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
         Raises:
             ReentrancyError, WrongThreadError: It cannot be closed from here, and stays open.
-            BaseException: The exception of the first simulation that fails to unwind; all others are unwound, too.
+            BaseException: The exception of the first simulation that fails to unwind; all others
+                are unwound, too.
         """
         if self.closed:
             return
@@ -316,7 +360,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             finally:
                 self.closed = self._guard.closed = self._simulations.idle
 
-    def __del__(self) -> None:  # that of Gymnasium before 1.3 closes and raises; the finalizer warns
+    # that of Gymnasium before 1.3 closes and raises; the finalizer warns
+    def __del__(self) -> None:
         """Leave the end to the finalizer."""
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -337,8 +382,8 @@ class _Guard:
             raise ClosedError("the environment is closed; make a new one")
         if not self._lock.acquire(blocking=False):
             raise ReentrancyError(
-                "the environment was used from inside its own simulations or mappings, or while another thread was"
-                " stepping, resetting or closing it"
+                "the environment was used from inside its own simulations or mappings, or while"
+                " another thread was stepping, resetting or closing it"
             )
 
     def __exit__(self, *error: object) -> None:
@@ -347,16 +392,24 @@ class _Guard:
 
 def _count(value: Any, name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise OptionValueError(f"{name} must be an integer of at least {least}, not {short_repr(value)}")
+        raise OptionValueError(
+            f"{name} must be an integer of at least {least}, not {short_repr(value)}"
+        )
     return int(value)
 
 
 def _join(space: spaces.Space[Any], parts: Sequence[Any], out: Any) -> Any:
     """Join batches of a space into one, which is written into ``out`` where it consists of arrays."""
     if isinstance(space, spaces.Dict):
-        return {key: _join(inner, [part[key] for part in parts], out[key]) for key, inner in space.spaces.items()}
+        return {
+            key: _join(inner, [part[key] for part in parts], out[key])
+            for key, inner in space.spaces.items()
+        }
     if isinstance(space, spaces.Tuple):
-        return tuple(_join(inner, [part[i] for part in parts], out[i]) for i, inner in enumerate(space.spaces))
+        return tuple(
+            _join(inner, [part[i] for part in parts], out[i])
+            for i, inner in enumerate(space.spaces)
+        )
     if isinstance(out, np.ndarray):
         return np.concatenate(parts, out=out)
     return tuple(chain.from_iterable(parts))

@@ -32,7 +32,8 @@ class SimulationBatch:
     Lists and arrays among the arguments and results have an item for each of them.
 
     Attributes:
-        arguments: The arguments that make the same in another process, with what only this process can find out.
+        arguments: The arguments that make the same in another process, with what only this process
+            can find out.
         plan, view_plan: The plans of the sessions and of views of them, whose class is ``view``.
         joint: What joint views share. None if the views are single ones.
         failed: Whether an error has left them at different steps, so that all of them need a reset.
@@ -61,7 +62,9 @@ class SimulationBatch:
         if view == "single":
             self.view, self.view_plan, self.plan = SimulationEnv, plan, SimulationEnv._adapt(plan)
             own = self.plan.active[0].definition
-            self.observation_space, self.action_space = deepcopy((own.observation_space, own.action_space))
+            self.observation_space, self.action_space = deepcopy(
+                (own.observation_space, own.action_space)
+            )
         elif view == "joint":
             first = SimulationJointEnv(plan)
             first.close()
@@ -70,7 +73,9 @@ class SimulationBatch:
             options = {**options, "possible_agents": self.plan.options.possible_agents}
             self.observation_space, self.action_space = first.observation_space, first.action_space
         else:
-            raise OptionValueError(f'view must be None, "single" or "joint", not {short_repr(view)}')
+            raise OptionValueError(
+                f'view must be None, "single" or "joint", not {short_repr(view)}'
+            )
         self.arguments = simulation, points, options, view, mode
         self._mode, self._part = mode, part
         self._agent = str(self.plan.one_agent)
@@ -92,7 +97,10 @@ class SimulationBatch:
             raise
 
     def ask(self, method: str, *arguments: Any) -> list[Any]:
-        """Call a method. The list has its result, as that of ``WorkerPool.ask`` has one of each worker."""
+        """Call a method.
+
+        The list has its result, as that of ``WorkerPool.ask`` has one of each worker.
+        """
         return [getattr(self, method)(*arguments)]
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -100,10 +108,15 @@ class SimulationBatch:
     def reset(
         self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: NDArray[np.bool_]
     ) -> tuple[Any, Infos]:
-        """Begin new episodes of the chosen sub-environments. Return all observations, and the infos of these."""
+        """Begin new episodes of the chosen sub-environments.
+
+        Return all observations, and the infos of these.
+        """
         numbers = chosen.nonzero()[0].tolist()
         self._first = next(iter(numbers), None)
-        infos = [(self._part[number], self._begin(number, seeds[number], options)) for number in numbers]
+        infos = [
+            (self._part[number], self._begin(number, seeds[number], options)) for number in numbers
+        ]
         self.failed = False
         return self._stacked(), infos
 
@@ -132,7 +145,8 @@ class SimulationBatch:
         """Answer all pending decisions by checked actions, or begin the next episode where one has ended.
 
         Returns:
-            Observations, rewards, terminations, truncations, the numbers of those that have ended now, and infos.
+            Observations, rewards, terminations, truncations, the numbers of those that have ended
+            now, and infos.
         """
         begun = [number for number, own in enumerate(self._part) if own in ended] if ended else []
         self._first = None if begun else 0
@@ -145,7 +159,10 @@ class SimulationBatch:
         waiting, own = episodes, actions
         if begun:
             moving = [number for number, own in enumerate(self._part) if own not in ended]
-            waiting, own = [episodes[number] for number in moving], [actions[number] for number in moving]
+            waiting, own = (
+                [episodes[number] for number in moving],
+                [actions[number] for number in moving],
+            )
         if self.joint is not None:
             own = list(map(self.joint.actions, waiting, own))
         step_all(waiting, own, lambda place, error: self._fail(moving[place], error))
@@ -153,11 +170,16 @@ class SimulationBatch:
         rewards = np.array(earned, np.float64)
         if begun:
             rewards[begun] = 0.0
-        terminations, truncations = np.zeros(len(episodes), np.bool_), np.zeros(len(episodes), np.bool_)
+        terminations, truncations = (
+            np.zeros(len(episodes), np.bool_),
+            np.zeros(len(episodes), np.bool_),
+        )
         ends: list[int] = []
         infos: Infos = []
         eventful = any(news) or None in [episode.pending for episode in episodes]
-        for number, (episode, info) in enumerate(zip(episodes, news, strict=True)) if eventful else ():
+        for number, (episode, info) in (
+            enumerate(zip(episodes, news, strict=True)) if eventful else ()
+        ):
             if episode.over and not episode.unreported_end:  # which the next step reports
                 removed = self.joint is None and self._agent in episode.ended
                 terminations[number] = removed or episode.terminated
@@ -174,7 +196,9 @@ class SimulationBatch:
             view._show()
         return self._stacked(), rewards, terminations, truncations, ends, infos
 
-    def _begin(self, number: int, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
+    def _begin(
+        self, number: int, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> dict[str, Any]:
         """Begin an episode, note its first observation, and return its first info."""
         session = self.sessions[number]
         try:
@@ -197,7 +221,10 @@ class SimulationBatch:
                 [joint.inform(episode) for episode in episodes],
             )
         if episodes != self._episodes:
-            self._episodes, self._agents = episodes, [episode.agent(self._agent) for episode in episodes]
+            self._episodes, self._agents = (
+                episodes,
+                [episode.agent(self._agent) for episode in episodes],
+            )
         agents = self._agents
         return (
             [agent.observation for agent in agents],
@@ -211,10 +238,15 @@ class SimulationBatch:
         return self._observations
 
     def _fail(self, number: int, error: BaseException) -> None:
-        """Say in an error which sub-environment raised it. Nothing has moved if it is the first and still waits."""
+        """Say in an error which sub-environment raised it.
+
+        Nothing has moved if it is the first and still waits.
+        """
         annotate(error, f"simenv_marl: in sub-environment {self._part[number]}")
         episode = self.sessions[number].episode
-        self.failed = self.failed or number != self._first or episode is None or episode.pending is None
+        self.failed = (
+            self.failed or number != self._first or episode is None or episode.pending is None
+        )
 
     # -- views ------------------------------------------------------------------------------------
 

@@ -55,7 +55,8 @@ class Factor:
         """Map numbers in [0, 1], inclusive, to values of a range."""
         if self.is_whole and max(-self.low, self.high) >= EXACT:
             return [self.low + round(Fraction(u) * (self.high - self.low)) for u in unit.tolist()]
-        values = [self.low * (1 - u) + self.high * u for u in unit.tolist()]  # this form cannot overflow
+        # this form cannot overflow
+        values = [self.low * (1 - u) + self.high * u for u in unit.tolist()]
         values = [float(min(max(value, self.low), self.high)) for value in values]
         return [round(value) for value in values] if self.is_whole else values
 
@@ -72,57 +73,72 @@ class Factor:
         values = (self.low, self.high) if self.levels is None else self.levels
         if len(values) != 2:
             raise OptionValueError(
-                f"this method needs two levels of each factor, but {self.name!r} has {len(values)}; give it two,"
-                " or a range (low, high)"
+                f"this method needs two levels of each factor, but {self.name!r} has"
+                f" {len(values)}; give it two, or a range (low, high)"
             )
         return values
 
 
 def design(
-    factors: Mapping[str, Any], method: str = "full_factorial", n: int | None = None, *, seed: int | None = None
+    factors: Mapping[str, Any],
+    method: str = "full_factorial",
+    n: int | None = None,
+    *,
+    seed: int | None = None,
 ) -> "DataFrame":
     """Return a design: a table of the combinations of factors to run.
 
     Args:
-        factors: A dict from the name of a factor to its values: a range, given as the tuple ``(low, high)`` (a range of
-            integers if both are integers), or a list of levels of any type.
+        factors: A dict from the name of a factor to its values: a range, given as the tuple
+            ``(low, high)`` (a range of integers if both are integers), or a list of levels of any
+            type.
         method: How combinations are chosen:
 
-            - ``"full_factorial"``: all combinations. A range has ``n`` values (default 2) from bound to bound.
-            - ``"fractional_factorial"``: two levels per factor, a fraction of all combinations in ``n`` runs. ``n`` is
-              a power of two (default: as many as main effects need). Effects are confounded as little as possible.
+            - ``"full_factorial"``: all combinations. A range has ``n`` values (default 2) from
+              bound to bound.
+            - ``"fractional_factorial"``: two levels per factor, a fraction of all combinations in
+              ``n`` runs. ``n`` is a power of two (default: as many as main effects need). Effects
+              are confounded as little as possible.
             - ``"plackett_burman"``: two levels per factor, main effects in a multiple of four runs.
-            - ``"central_composite"``: two or more ranges, for a quadratic response surface: corners, star points and
-              the centre, all within the ranges; once for each combination of levels.
+            - ``"central_composite"``: two or more ranges, for a quadratic response surface:
+              corners, star points and the centre, all within the ranges; once for each combination
+              of levels.
             - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space.
-            - ``"one_at_a_time"``: the centre of ranges and the first of levels; then each factor alone at its other
-              values, for a range ``n`` (default 2) values from bound to bound.
-            - ``"saltelli"``: ``n`` samples (a power of two) for ``sobol_indices``, in ``n * (2 * factors + 2)`` rows.
+            - ``"one_at_a_time"``: the centre of ranges and the first of levels; then each factor
+              alone at its other values, for a range ``n`` (default 2) values from bound to bound.
+            - ``"saltelli"``: ``n`` samples (a power of two) for ``sobol_indices``, in
+              ``n * (2 * factors + 2)`` rows.
         n: The number of samples, runs or values per range, for methods that use it.
-        seed: The seed of random designs. None: always the same design, so that a script that runs again continues its
-            experiment.
+        seed: The seed of random designs. None: always the same design, so that a script that runs
+            again continues its experiment.
 
     Returns:
-        A ``DataFrame`` with one row for each run and one column for each factor, in the factor's own type.
+        A ``DataFrame`` with one row for each run and one column for each factor, in the factor's
+        own type.
 
     Raises:
-        OptionValueError: A factor has no levels, the method does not exist, or it does not fit these factors and ``n``.
+        OptionValueError: A factor has no levels, the method does not exist, or it does not fit
+            these factors and ``n``.
         MissingExtraError: pandas, pyDOE or SALib is missing.
     """
     pandas = import_extra("pandas", "design")
     if not isinstance(factors, Mapping) or not factors:
         raise OptionValueError(
-            f"factors must be a dict from names to ranges or lists of levels, not {short_repr(factors)}"
+            "factors must be a dict from names to ranges or lists of levels, not"
+            f" {short_repr(factors)}"
         )
     parsed = [_factor(name, values) for name, values in factors.items()]
     if method not in list(METHODS):
         raise OptionValueError(
-            f"method must be one of {', '.join(METHODS)}, not {short_repr(method)}{did_you_mean(method, METHODS)}"
+            f"method must be one of {', '.join(METHODS)}, not"
+            f" {short_repr(method)}{did_you_mean(method, METHODS)}"
         )
     if n is not None and (isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1):
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     if seed is not None and not is_seed(seed):
-        raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
+        raise OptionValueError(
+            f"seed must be a non-negative integer or None, not {short_repr(seed)}"
+        )
     columns = METHODS[method](parsed, None if n is None else int(n), int(seed or 0))
     table: DataFrame = pandas.DataFrame(
         {
@@ -143,30 +159,35 @@ def _factor(name: Any, values: Any) -> Factor:
         finite = (type(value) in (int, float) and abs(value) <= float_info.max for value in numbers)
         if len(numbers) != 2 or not all(finite):
             raise OptionValueError(
-                f"the factor {name!r} is {short_repr(values)}: a tuple is a range (low, high) of two finite numbers"
-                " that a float can hold; levels come as a list"
+                f"the factor {name!r} is {short_repr(values)}: a tuple is a range (low, high) of"
+                " two finite numbers that a float can hold; levels come as a list"
             )
         low, high = numbers
         if not low < high:
             raise OptionValueError(
-                f"the range of {name!r} is empty: in {short_repr(values)}, low must be less than high"
+                f"the range of {name!r} is empty: in {short_repr(values)}, low must be less than"
+                " high"
             )
         kind = int if type(low) is type(high) is int else float
         return Factor(name, low=kind(low), high=kind(high))
     if isinstance(values, (set, frozenset)):
         raise OptionValueError(
-            f"the levels of {name!r} must have an order, as in a list: {short_repr(values)} has none"
+            f"the levels of {name!r} must have an order, as in a list: {short_repr(values)} has"
+            " none"
         )
     if isinstance(values, (str, bytes, Mapping)) or not isinstance(values, Iterable):
         raise OptionValueError(
-            f"the factor {name!r} must be a range (low, high) or a list of levels, not {short_repr(values)}"
+            f"the factor {name!r} must be a range (low, high) or a list of levels, not"
+            f" {short_repr(values)}"
         )
     levels = tuple(value.item() if isinstance(value, np.generic) else value for value in values)
     if not levels:
         raise OptionValueError(f"the factor {name!r} has no levels")
     alike: dict[Any, list[Any]] = {}  # so that only few levels are compared
     for level in levels:
-        others = alike.setdefault((type(level), level if isinstance(level, (str, int, float)) else None), [])
+        others = alike.setdefault(
+            (type(level), level if isinstance(level, (str, int, float)) else None), []
+        )
         if any(_is_same(level, other) for other in others):
             raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
         others.append(level)
@@ -211,8 +232,8 @@ def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -
         n = least
     if n & (n - 1) or not least <= n <= min(2**number, MOST_ROWS):
         raise OptionValueError(
-            f"a fractional design of {number} factors cannot have {n} runs: n must be a power of two, from {least} to"
-            f" {2**number}"
+            f"a fractional design of {number} factors cannot have {n} runs: n must be a power of"
+            f" two, from {least} to {2**number}"
         )
     if n == 2**number:
         return _of_two_levels(factors, pydoe.ff2n(number))
@@ -222,13 +243,15 @@ def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -
 def _generators(basic: int, number: int) -> str:
     """Return the generators of a fractional design, chosen so that low-order effects are confounded least.
 
-    ``basic`` of the ``number`` factors have all their combinations. Columns are bits: the product of two columns is
-    their exclusive or.
+    ``basic`` of the ``number`` factors have all their combinations. Columns are bits: the product
+    of two columns is their exclusive or.
     """
     for resolution in range(min(basic + 1, 8), 2, -1):
         columns: list[int] = []
-        sums: list[set[int]] = [{0}, *(set() for _ in range(resolution - 2))]  # the sums of 0, 1, 2, ... columns
-        # First the basic factors; then greedily in this order: a lexicographic code, which is large.
+        # the sums of 0, 1, 2, ... columns
+        sums: list[set[int]] = [{0}, *(set() for _ in range(resolution - 2))]
+        # First the basic factors; then greedily in this order: a lexicographic code, which is
+        # large.
         for word in [*(1 << place for place in range(basic)), *range(3, 2**basic)]:
             if len(columns) < number and not any(word in own for own in sums):
                 columns.append(word)
@@ -237,7 +260,10 @@ def _generators(basic: int, number: int) -> str:
         if len(columns) == number:
             break
     letters = ascii_lowercase
-    return " ".join("".join(letters[place] for place in range(basic) if column >> place & 1) for column in columns)
+    return " ".join(
+        "".join(letters[place] for place in range(basic) if column >> place & 1)
+        for column in columns
+    )
 
 
 def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
@@ -249,7 +275,9 @@ def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Col
     else:
         raise OptionValueError(f"no Plackett-Burman design of {number} factors is known")
     if n is not None and n != len(matrix):
-        raise OptionValueError(f"a Plackett-Burman design of {number} factors has {len(matrix)} runs, not {n}")
+        raise OptionValueError(
+            f"a Plackett-Burman design of {number} factors has {len(matrix)} runs, not {n}"
+        )
     return _of_two_levels(factors, matrix)
 
 
@@ -257,16 +285,26 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
     ranges = [factor for factor in factors if factor.levels is None]
     lists = [factor for factor in factors if factor.levels is not None]
     if len(ranges) < 2:
-        raise OptionValueError(f"a central composite design needs at least two ranges (low, high), not {len(ranges)}")
+        raise OptionValueError(
+            f"a central composite design needs at least two ranges (low, high), not {len(ranges)}"
+        )
     levels = [factor.steps(None) for factor in lists]
     number = _rows((2 ** len(ranges) + 2 * len(ranges) + 1) * prod(map(len, levels)))
     if n is not None and n != number:
-        raise OptionValueError(f"a central composite design of these {len(factors)} factors has {number} runs, not {n}")
+        raise OptionValueError(
+            f"a central composite design of these {len(factors)} factors has {number} runs, not {n}"
+        )
     # The centre occurs once: a simulation with the same seed would have the same result.
-    matrix = (_pydoe().ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T + 1) / 2
+    matrix = (
+        _pydoe().ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T + 1
+    ) / 2
     surface = list(zip(*map(Factor.scale, ranges, matrix), strict=True))
     names = [factor.name for factor in (*lists, *ranges)]
-    rows = [dict(zip(names, (*own, *values), strict=True)) for own in product(*levels) for values in surface]
+    rows = [
+        dict(zip(names, (*own, *values), strict=True))
+        for own in product(*levels)
+        for values in surface
+    ]
     return [[row[factor.name] for row in rows] for factor in factors]
 
 
@@ -275,22 +313,31 @@ def _latin_hypercube(factors: Sequence[Factor], n: int | None, seed: int) -> Col
 
 
 def _sobol(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    points = _pydoe().sobol_sequence(_rows(n), len(factors), scramble=True, seed=seed, use_pow_of_2=False)
+    points = _pydoe().sobol_sequence(
+        _rows(n), len(factors), scramble=True, seed=seed, use_pow_of_2=False
+    )
     return _spread(factors, points)
 
 
 def _halton(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     pydoe = _pydoe()
-    return _spread(factors, pydoe.cranley_patterson_shift(pydoe.halton_sequence(_rows(n), len(factors)), seed=seed))
+    return _spread(
+        factors,
+        pydoe.cranley_patterson_shift(pydoe.halton_sequence(_rows(n), len(factors)), seed=seed),
+    )
 
 
 def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     rows, names = _rows(n), [factor.name for factor in factors]
     if rows & (rows - 1):
-        raise OptionValueError(f"the number of samples of a Saltelli design must be a power of two, not {rows}")
+        raise OptionValueError(
+            f"the number of samples of a Saltelli design must be a power of two, not {rows}"
+        )
     _rows(rows * (2 * len(names) + 2))
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
-    return _spread(factors, import_extra("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
+    return _spread(
+        factors, import_extra("SALib.sample.sobol", "design").sample(problem, rows, seed=seed)
+    )
 
 
 def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
@@ -309,13 +356,16 @@ def _rows(number: int | None) -> int:
         raise OptionValueError("this method needs n, the number of rows")
     if number > MOST_ROWS:
         raise OptionValueError(
-            f"the design would have {number:,} rows, more than {MOST_ROWS:,}; choose another method or a smaller n"
+            f"the design would have {number:,} rows, more than {MOST_ROWS:,}; choose another"
+            " method or a smaller n"
         )
     return number
 
 
 def _spread(factors: Sequence[Factor], points: Any) -> Columns:
-    return [factor.spread(column) for factor, column in zip(factors, np.asarray(points).T, strict=True)]
+    return [
+        factor.spread(column) for factor, column in zip(factors, np.asarray(points).T, strict=True)
+    ]
 
 
 METHODS: Final[Mapping[str, Callable[[Sequence[Factor], int | None, int], Columns]]] = {

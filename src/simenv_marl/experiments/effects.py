@@ -25,14 +25,16 @@ class Effects:
     """The effects of factors on a value. Made by ``effects``.
 
     Attributes:
-        main: One row for each level of each factor, the index: ``mean`` (of the seeds' means at this level), the bounds
-            of its interval ``low`` and ``high`` (as ``Evaluation.summary`` has them, nan where nothing is known),
-            ``effect`` (the mean minus the same mean of all levels), and ``count``.
-        interactions: One row for each pair of factors, the strongest first. ``strength`` is the standard deviation of
-            the differences between the means of their combinations and the sum of both main effects.
+        main: One row for each level of each factor, the index: ``mean`` (of the seeds' means at
+            this level), the bounds of its interval ``low`` and ``high`` (as ``Evaluation.summary``
+            has them, nan where nothing is known), ``effect`` (the mean minus the same mean of all
+            levels), and ``count``.
+        interactions: One row for each pair of factors, the strongest first. ``strength`` is the
+            standard deviation of the differences between the means of their combinations and the
+            sum of both main effects.
         metric: The name of the value.
-        levels: The levels of each factor with their types. An index cannot distinguish 1, True and 1.0, so it has texts
-            for the levels of a factor among which there are equal ones.
+        levels: The levels of each factor with their types. An index cannot distinguish 1, True and
+            1.0, so it has texts for the levels of a factor among which there are equal ones.
     """
 
     main: "DataFrame"
@@ -57,7 +59,9 @@ class Effects:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        return plot_factors(self.main, self.interactions, self._cells, self.levels, self.metric, figure)
+        return plot_factors(
+            self.main, self.interactions, self._cells, self.levels, self.metric, figure
+        )
 
 
 def effects(
@@ -70,14 +74,15 @@ def effects(
 ) -> Effects:
     """Estimate the effects of an experiment's factors.
 
-    Numeric factors with more than eight values are grouped into quarters of their values. Failed runs are left out.
-    Means and intervals are over the seeds, for the given rows: the effects of other factors at a level do not widen its
-    interval. With a single seed, they are over the rows.
+    Numeric factors with more than eight values are grouped into quarters of their values. Failed
+    runs are left out. Means and intervals are over the seeds, for the given rows: the effects of
+    other factors at a level do not widen its interval. With a single seed, they are over the rows.
 
     Args:
         frame: The result of ``run_experiment``.
         metric: The value: ``"return"``, ``"length"`` or the name of a metric.
-        contender: The contender whose runs are used. None: all runs, with the contender as one more factor.
+        contender: The contender whose runs are used. None: all runs, with the contender as one more
+            factor.
         agent: The agent whose rows are used. Default: the team.
         confidence: The confidence level of the intervals.
 
@@ -85,7 +90,8 @@ def effects(
         The effects.
 
     Raises:
-        OptionValueError: There is no such column, contender or agent, the values are not numbers, or nothing varies.
+        OptionValueError: There is no such column, contender or agent, the values are not numbers,
+            or nothing varies.
     """
     pandas = import_extra("pandas", "effects")
     check_probability("confidence", confidence, 0.95)
@@ -98,7 +104,10 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    labels = {name: own if len(set(own)) == len(own) else list(map(repr, own)) for name, own in levels.items()}
+    labels = {
+        name: own if len(set(own)) == len(own) else list(map(repr, own))
+        for name, own in levels.items()
+    }
     seeds = table["seed"].to_numpy()
     zero_or_one = is_proportion(table[metric].to_numpy())
     whole = _over_seeds(values, seeds)[0].mean()
@@ -107,7 +116,13 @@ def effects(
         for code, here in values.groupby(codes):
             sample, single = _over_seeds(here, seeds[here.index])
             low, high, _ = interval(sample, confidence, proportion=zero_or_one and single)
-            main[name, labels[name][code]] = [sample.mean(), low, high, sample.mean() - whole, len(here)]
+            main[name, labels[name][code]] = [
+                sample.mean(),
+                low,
+                high,
+                sample.mean() - whole,
+                len(here),
+            ]
     index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
     columns = ["mean", "low", "high", "effect", "count"]
     rows = pandas.DataFrame(main.values(), index, columns).astype({"count": int})
@@ -116,13 +131,23 @@ def effects(
     for one, other in combinations(levels, 2):
         means = values.groupby([coded[one][0], coded[other][0]]).mean().unstack()
         means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
-        means.index, means.columns = pandas.Index(labels[one], name=one), pandas.Index(labels[other], name=other)
+        means.index, means.columns = (
+            pandas.Index(labels[one], name=one),
+            pandas.Index(labels[other], name=other),
+        )
         cells |= {(one, other): means, (other, one): means.T}
         grid = means.to_numpy(np.float64)
-        rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0, keepdims=True) + grid.mean()
-        strengths.append([one, other, float(np.sqrt((rest**2).mean()))])  # nan if a combination is missing
-    interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(["factor", "other"])
-    return Effects(rows, interactions.sort_values("strength", ascending=False), metric, levels, cells)
+        rest = (
+            grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0, keepdims=True) + grid.mean()
+        )
+        # nan if a combination is missing
+        strengths.append([one, other, float(np.sqrt((rest**2).mean()))])
+    interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(
+        ["factor", "other"]
+    )
+    return Effects(
+        rows, interactions.sort_values("strength", ascending=False), metric, levels, cells
+    )
 
 
 def _over_seeds(values: Any, seeds: NDArray[Any]) -> tuple[NDArray[np.float64], bool]:
@@ -131,7 +156,9 @@ def _over_seeds(values: Any, seeds: NDArray[Any]) -> tuple[NDArray[np.float64], 
     return (means if len(means) > 1 else values).to_numpy(), len(means) in (1, len(values))
 
 
-def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) -> "tuple[DataFrame, list[str]]":
+def _select(
+    frame: "DataFrame", metric: str, contender: str | None, agent: str
+) -> "tuple[DataFrame, list[str]]":
     """Return the rows to use, and the names of the factors."""
     columns = list(getattr(frame, "columns", ()))
     if not {*RUN_COLUMNS, "status"} <= set(columns):
@@ -145,7 +172,8 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
         names = sorted(set(frame[what]))
         if value not in names:
             raise OptionValueError(
-                f"there is no {what} {short_repr(value)}; there are {names}{did_you_mean(value, names)}"
+                f"there is no {what} {short_repr(value)}; there are"
+                f" {names}{did_you_mean(value, names)}"
             )
         selection &= frame[what] == value
     if not selection.any():
@@ -156,7 +184,8 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
 def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     """Return the place of each row's level, and the levels: numbers sorted, others as they appear, missing ones last.
 
-    Numeric factors with more than eight values are grouped into quarters of these values, however often each occurs.
+    Numeric factors with more than eight values are grouped into quarters of these values, however
+    often each occurs.
     """
     pandas = import_extra("pandas", "effects")
     if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
@@ -186,20 +215,21 @@ def sobol_indices(
     """Estimate the share of each factor in the variance of a value (Sobol indices), by SALib.
 
     Args:
-        frame: The result of ``run_experiment`` for ``design(..., method="saltelli")``. The value of a row is its mean
-            over the seeds.
+        frame: The result of ``run_experiment`` for ``design(..., method="saltelli")``. The value of
+            a row is its mean over the seeds.
         metric: As ``effects`` takes it.
         contender: As ``effects`` takes it.
         agent: As ``effects`` takes it.
         confidence: The confidence level of the error bounds.
 
     Returns:
-        A table indexed by factor: ``first`` (first-order index, the share of the factor alone), ``total`` (total-order
-        index, which includes its interactions), and the half-widths of their intervals, ``first_error`` and
-        ``total_error``.
+        A table indexed by factor: ``first`` (first-order index, the share of the factor alone),
+        ``total`` (total-order index, which includes its interactions), and the half-widths of their
+        intervals, ``first_error`` and ``total_error``.
 
     Raises:
-        OptionValueError: The design is another or has one sample, runs have failed, or the value is no number or equal.
+        OptionValueError: The design is another or has one sample, runs have failed, or the value is
+            no number or equal.
         MissingExtraError: SALib is missing.
     """
     pandas = import_extra("pandas", "sobol_indices")
@@ -207,26 +237,39 @@ def sobol_indices(
     check_probability("confidence", confidence, 0.95)
     table, names = _select(frame, metric, contender, agent)
     if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():
-        raise OptionValueError("some runs have failed, but shares of the variance need all rows of the design")
+        raise OptionValueError(
+            "some runs have failed, but shares of the variance need all rows of the design"
+        )
     seeds = table["seed"].nunique()
     values, rows = numbers(table[metric], metric).to_numpy(), table[names].to_numpy(object)
     if not np.isfinite(values).all():
-        raise OptionValueError(f"{metric!r} is missing or not finite in some rows, but shares of the variance need all")
+        raise OptionValueError(
+            f"{metric!r} is missing or not finite in some rows, but shares of the variance need all"
+        )
     if len(values) % seeds or not _is_saltelli(rows[::seeds]):
-        raise OptionValueError("shares of the variance need all rows of design(..., method='saltelli'), in their order")
+        raise OptionValueError(
+            "shares of the variance need all rows of design(..., method='saltelli'), in their order"
+        )
     means = values.reshape(-1, seeds).mean(axis=1)
     if len(means) == 2 * len(names) + 2:
-        raise OptionValueError("one sample tells nothing of shares of the variance; give design n=64 or more samples")
+        raise OptionValueError(
+            "one sample tells nothing of shares of the variance; give design n=64 or more samples"
+        )
     if (means == means[0]).all():
         raise OptionValueError(f"{metric!r} is {means[0]:g} in all rows, so it has no variance")
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     indices = analyze(problem, means, conf_level=confidence, seed=0)
     columns = {"first": "S1", "first_error": "S1_conf", "total": "ST", "total_error": "ST_conf"}
-    return pandas.DataFrame({name: indices[key] for name, key in columns.items()}, pandas.Index(names, name="factor"))
+    return pandas.DataFrame(
+        {name: indices[key] for name, key in columns.items()}, pandas.Index(names, name="factor")
+    )
 
 
 def _is_saltelli(rows: NDArray[Any]) -> bool:
-    """Return whether rows are blocks of: A; A with each factor of B in turn; B with each factor of A in turn; B."""
+    """Return whether rows are blocks of: A.
+
+    A with each factor of B in turn; B with each factor of A in turn; B.
+    """
     count = rows.shape[1]
     if not count or len(rows) % (2 * count + 2):
         return False

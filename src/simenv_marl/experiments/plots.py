@@ -75,9 +75,18 @@ def plot_factors(
             if axes is not upper[0]:
                 axes.sharey(upper[0])
             own = main.loc[factor]
-            bars = [(own["mean"] - own["low"]).clip(lower=0), (own["high"] - own["mean"]).clip(lower=0)]
+            bars = [
+                (own["mean"] - own["low"]).clip(lower=0),
+                (own["high"] - own["mean"]).clip(lower=0),
+            ]
             axes.errorbar(
-                range(len(own)), own["mean"], yerr=bars, fmt="o-", color=COLOURS[0], linewidth=1, markersize=4
+                range(len(own)),
+                own["mean"],
+                yerr=bars,
+                fmt="o-",
+                color=COLOURS[0],
+                linewidth=1,
+                markersize=4,
             )
             _label_levels(axes, levels[factor], factor)
         for axes in rows[:above, 0]:
@@ -87,28 +96,53 @@ def plot_factors(
             for place, level in enumerate(levels[other]):
                 colour = COLOURS[place % len(COLOURS)]
                 axes.plot(
-                    range(len(table)), table.iloc[:, place], "o-", color=colour, markersize=4, label=_short(level)
+                    range(len(table)),
+                    table.iloc[:, place],
+                    "o-",
+                    color=colour,
+                    markersize=4,
+                    label=_short(level),
                 )
             _label_levels(axes, levels[one], one)
-            axes.legend(title=other, fontsize=7, title_fontsize=8, frameon=True, framealpha=0.8, edgecolor="none")
+            axes.legend(
+                title=other,
+                fontsize=7,
+                title_fontsize=8,
+                frameon=True,
+                framealpha=0.8,
+                edgecolor="none",
+            )
         for axes in [*upper[len(levels) :], *(rows[-1][len(pairs) :] if pairs else ())]:
             axes.set_visible(False)
     return figure
 
 
-def _draw_dots(axes: Any, values: "DataFrame", names: list[str], marks: "DataFrame", spread: float) -> None:
+def _draw_dots(
+    axes: Any, values: "DataFrame", names: list[str], marks: "DataFrame", spread: float
+) -> None:
     """Draw a column of dots for each contender, one for each seed, and the mean with its interval from ``marks``.
 
-    The dots are at most ``spread`` from the middle of their column. All ``names`` together determine the colours.
+    The dots are at most ``spread`` from the middle of their column. All ``names`` together
+    determine the colours.
     """
     for place, name in enumerate(values.columns):
-        across = place + spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)  # even, in irregular order
+        # even, in irregular order
+        across = place + spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)
         colour = COLOURS[names.index(name) % len(COLOURS)]
         axes.scatter(across, values[name], 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
         mean, low, high = marks.loc[name]
         bars = None if np.isnan(low) else [[max(0.0, mean - low)], [max(0.0, high - mean)]]
-        axes.errorbar([place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5)
-        axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), textcoords="offset points", va="center", fontsize=8.5)
+        axes.errorbar(
+            [place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5
+        )
+        axes.annotate(
+            f"{mean:.4g}",
+            (place, mean),
+            (8, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8.5,
+        )
     axes.set_xlim(-0.5, len(values.columns) - 0.5)
 
 
@@ -117,7 +151,11 @@ def _label_below(axes: Any, names: list[str]) -> None:
     axes.grid(axis="y", color=ABSENT, linewidth=0.7)
     axes.set_axisbelow(True)
     axes.set_xticks(range(len(names)), names)
-    inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
+    inches = (
+        axes.get_subplotspec().get_position(axes.figure).width
+        * axes.figure.bbox.width
+        / axes.figure.dpi
+    )
     if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter
         for label in axes.get_xticklabels():
             label.set(rotation=30, ha="right", rotation_mode="anchor")

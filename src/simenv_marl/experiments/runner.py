@@ -75,7 +75,8 @@ class Returns(tuple[float, ...]):
             return super().__getitem__(key)
         if key not in self._by_agent:
             raise KeyError(
-                f"{key!r} did not decide in this episode; these agents did: {', '.join(self._by_agent) or 'none'}"
+                f"{key!r} did not decide in this episode; these agents did:"
+                f" {', '.join(self._by_agent) or 'none'}"
             )
         return self._by_agent[key]
 
@@ -107,29 +108,45 @@ class Runner:
         self, contenders: Any, points: Any, options: Mapping[str, Any], metric: Any, team: Any, *, batched: bool,
         batch_size: int, concurrency: int, workers: int, factors: Collection[str] = (),
     ) -> None:  # fmt: skip
-        """Check the arguments. ``factors`` are the columns of the design, whose names metrics must not have."""
+        """Check the arguments.
+
+        ``factors`` are the columns of the design, whose names metrics must not have.
+        """
         check_options(batch_size, workers, None, concurrency)
         if not isinstance(contenders, Mapping):
-            raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
+            raise OptionValueError(
+                f"contenders must be a dict from a name to policies, not {short_repr(contenders)}"
+            )
         for name, policies in contenders.items():
             if not isinstance(name, str) or not name:
-                raise OptionValueError(f"the name of a contender must be a string, not {short_repr(name)}")
+                raise OptionValueError(
+                    f"the name of a contender must be a string, not {short_repr(name)}"
+                )
             if not isinstance(policies, Mapping):
                 raise OptionValueError(
-                    f"the contender {name!r} must be a dict from agents or points to policies, {{}} for the model as"
-                    f" it is, not {short_repr(policies)}"
+                    f"the contender {name!r} must be a dict from agents or points to policies,"
+                    f" {{}} for the model as it is, not {short_repr(policies)}"
                 )
             for key, policy in policies.items():
-                if callable(policy) and policy is not RULE and not batched and takes_identities(policy):
+                if (
+                    callable(policy)
+                    and policy is not RULE
+                    and not batched
+                    and takes_identities(policy)
+                ):
                     raise OptionValueError(
-                        f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)}, answers many decisions at"
-                        " once, as mixtures do; pass batched=True, and only policies as simulate_many takes them"
+                        f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)},"
+                        " answers many decisions at once, as mixtures do; pass batched=True, and"
+                        " only policies as simulate_many takes them"
                     )
         if team is not None and not callable(team):
-            raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
+            raise OptionValueError(
+                f"team must be a callable of the returns, or None, not {short_repr(team)}"
+            )
         if "policies" in options:
             raise OptionValueError(
-                "there is no option policies here; pass the policies of each contender in contenders="
+                "there is no option policies here; pass the policies of each contender in"
+                " contenders="
             )
         self.contenders: Mapping[str, Mapping[Any, Any]] = contenders
         self.metrics: Mapping[str, Callable[[Any], Any]] = {"metric": metric}
@@ -138,52 +155,77 @@ class Runner:
         for name, function in self.metrics.items():
             if not isinstance(name, str) or not callable(function):
                 raise OptionValueError(
-                    f"metric must be a callable of the simulation, or a dict of them, not {short_repr(metric)}"
+                    "metric must be a callable of the simulation, or a dict of them, not"
+                    f" {short_repr(metric)}"
                 )
             if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS, *factors):
-                raise OptionValueError(f"the metric {name!r} has the name of another column; rename it")
+                raise OptionValueError(
+                    f"the metric {name!r} has the name of another column; rename it"
+                )
         self.batch_size, self._concurrency = int(batch_size) if batched else 0, int(concurrency)
         policies = [policy for own in contenders.values() for policy in own.values()]
         self._fallbacks = (FALLBACKS,) if any(map(has_fallback, policies)) else ()
         self._team = team
         # They may be iterators, and every plan reads them.
         self._points = list(points) if isinstance(points, Iterator) else points
-        self._options = {n: list(value) if isinstance(value, Iterator) else value for n, value in options.items()}
+        self._options = {
+            n: list(value) if isinstance(value, Iterator) else value for n, value in options.items()
+        }
 
     def plan(self, simulation: Any, contender: str) -> Plan:
-        """Return the plan of a contender's episodes. All agents whose rewards count decide in it."""
+        """Return the plan of a contender's episodes.
+
+        All agents whose rewards count decide in it.
+        """
         policies, points, options = self.contenders[contender], self._points, self._options
         alone = not self.batch_size
         with noting(f"of the contender {contender!r}"):
             try:
-                return learners_plan(simulation, policies, points, options, all_points=True, alone=alone)
+                return learners_plan(
+                    simulation, policies, points, options, all_points=True, alone=alone
+                )
             except (AgentError, UnknownPointError) as error:
                 if points is not None:
                     raise
-                # The points are not known: those that the contenders name are used, if there are any.
+                # The points are not known: those that the contenders name are used, if there are
+                # any.
                 keys = dict.fromkeys(key for own in self.contenders.values() for key in own)
                 points = [key for key in keys if not isinstance(key, str) or "." in key] or None
                 with suppress(AgentError, UnknownPointError):
                     plan = learners_plan(
-                        simulation, policies, points, options, all_points=points is not None, alone=alone
+                        simulation,
+                        policies,
+                        points,
+                        options,
+                        all_points=points is not None,
+                        alone=alone,
                     )
                     if points is None and decision_points():
-                        warn_user(f"returns are not counted, because the decision points are not known: {error}")
+                        warn_user(
+                            "returns are not counted, because the decision points are not known:"
+                            f" {error}"
+                        )
                     return plan
                 raise
 
     def unproven_agents(self, plan: Plan, contender: str) -> set[str]:
         """Return the names in a contender of which only episodes tell whether they are agents'."""
-        known = {point.agent for point in plan.points}.union(declared_agents(plan.options.possible_agents))
-        return {name for name in self.contenders[contender] if name in plan.policies and name not in known}
+        known = {point.agent for point in plan.points}.union(
+            declared_agents(plan.options.possible_agents)
+        )
+        return {
+            name
+            for name in self.contenders[contender]
+            if name in plan.policies and name not in known
+        }
 
     def check_agents(self, contender: str, names: set[str], present: Collection[str]) -> None:
         """Check that agents of these names have decided."""
         for name in sorted(names.difference(present)):
             raise AgentError(
-                f"the contender {contender!r} has a policy for {name!r}, but no agent of that name has decided; declare"
-                f" it in possible_agents= if it may appear later; these have decided: {', '.join(present) or 'none'}"
-                f"{did_you_mean(name, present)}"
+                f"the contender {contender!r} has a policy for {name!r}, but no agent of that name"
+                " has decided; declare it in possible_agents= if it may appear later; these have"
+                f" decided: {', '.join(present) or 'none'}{did_you_mean(name, present)}"
             )
 
     def together(self, contender: str) -> int:
@@ -191,8 +233,17 @@ class Runner:
         waiting = any(map(waits, self.contenders[contender].values()))
         return self.batch_size or (self._concurrency if waiting else 1)
 
-    def run(self, plan: Plan, contender: str, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
-        """Run one episode for each seed. ``report`` gets the seed and its results when the simulation is closed."""
+    def run(
+        self,
+        plan: Plan,
+        contender: str,
+        seeds: Sequence[int],
+        report: Callable[[int, Outcome], None],
+    ) -> None:
+        """Run one episode for each seed.
+
+        ``report`` gets the seed and its results when the simulation is closed.
+        """
         tally = Tally()
 
         def finish(place: int, simulation: Any) -> Callable[[], None]:
@@ -212,10 +263,17 @@ class Runner:
         for agent, of_agent in outcome.returns.items():
             own = [outcome.fallbacks.get(agent, 0) for _ in self._fallbacks]
             rows.append((agent, of_agent, outcome.lengths[agent], *own, *metrics))
-        value: Any = sum(outcome.returns.values()) if self._team is None else self._team(Returns(outcome.returns))
+        value: Any = (
+            sum(outcome.returns.values())
+            if self._team is None
+            else self._team(Returns(outcome.returns))
+        )
         fallbacks = [sum(outcome.fallbacks.values()) for _ in self._fallbacks]
         try:
-            return [*rows, (TEAM, float(value), sum(outcome.lengths.values()), *fallbacks, *metrics)]
+            return [
+                *rows,
+                (TEAM, float(value), sum(outcome.lengths.values()), *fallbacks, *metrics),
+            ]
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
 
@@ -224,13 +282,16 @@ class Tally:
     """Counts the returns of agents while episodes run: a ``Watcher`` for ``run``, and for one episode alone."""
 
     def __init__(self) -> None:
-        self._accounts: dict[int, dict[str, list[Any]]] = {}  # by place and agent: return, length, fallbacks
+        # by place and agent: return, length, fallbacks
+        self._accounts: dict[int, dict[str, list[Any]]] = {}
 
     def count(self, place: int, agent: Agent) -> None:
         """Count a decision of an agent."""
         account = agent.notes
         if account is None:
-            account = agent.notes = self._accounts.setdefault(place, {}).setdefault(agent.name, [0.0, 0, 0])
+            account = agent.notes = self._accounts.setdefault(place, {}).setdefault(
+                agent.name, [0.0, 0, 0]
+            )
         account[1] += 1
 
     def record(self, group: Group, places: list[int], waiting: list[Any], *_: Any) -> None:
@@ -249,14 +310,22 @@ class Tally:
                 agent.notes[0] += agent.reward
                 agent.notes[2] = agent.fallbacks
 
-    def outcome(self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]) -> Outcome:
+    def outcome(
+        self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]
+    ) -> Outcome:
         """Return the results of an episode that is over."""
         accounts = self._accounts.pop(place, {})
         if TEAM in accounts:
-            raise AgentError(f"an agent is called {TEAM!r}, as is the row of all agents together; rename the agent")
+            raise AgentError(
+                f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
+                " agent"
+            )
         returns = {name: float(account[0]) for name, account in accounts.items()}
         lengths = {name: account[1] for name, account in accounts.items()}
-        values = {name: plain_value(f"the metric {name!r}", metric(simulation)) for name, metric in metrics.items()}
+        values = {
+            name: plain_value(f"the metric {name!r}", metric(simulation))
+            for name, metric in metrics.items()
+        }
         fallbacks = {name: account[2] for name, account in accounts.items() if account[2]}
         return Outcome(returns, lengths, values, fallbacks)
 
@@ -279,7 +348,10 @@ def plain_value(what: str, value: Any, advice: str = "") -> Any:
     """Return a number, a string, a bool or None as an object of Python; refuse any other value."""
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
         value = value.item()
-    plain = type(value) in (bool, float, str) or (type(value) is int and value.bit_length() < 14_000)  # 4,214 digits
+    # 4,214 digits
+    plain = type(value) in (bool, float, str) or (
+        type(value) is int and value.bit_length() < 14_000
+    )
     if value is not None and not plain:
         what += " must be a number of no more than 4,200 digits, a string or None"
         raise OptionValueError(f"{what}, not {short_repr(value)}{advice}")
@@ -287,11 +359,17 @@ def plain_value(what: str, value: Any, advice: str = "") -> Any:
 
 
 def make_table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> DataFrame:
-    """Return a table whose columns keep the types of their values. A numeric column with missing values is float."""
+    """Return a table whose columns keep the types of their values.
+
+    A numeric column with missing values is float.
+    """
     pandas = import_extra("pandas", "a table")
     columns = dict(zip(names, zip(*rows, strict=True), strict=True))
     table: DataFrame = pandas.DataFrame(
-        {name: pandas.Series(values, dtype=dtype_of(values, missing=True)) for name, values in columns.items()}
+        {
+            name: pandas.Series(values, dtype=dtype_of(values, missing=True))
+            for name, values in columns.items()
+        }
     )
     return table
 
@@ -299,7 +377,8 @@ def make_table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> DataFrame
 def dtype_of(values: Collection[Any], *, missing: bool) -> Any:
     """Return the dtype of a column that keeps the types of its values.
 
-    With ``missing``, None is a missing number, and numbers of both types become floats where that is exact.
+    With ``missing``, None is a missing number, and numbers of both types become floats where that
+    is exact.
     """
     kinds = set(map(type, values))
     if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
@@ -307,4 +386,8 @@ def dtype_of(values: Collection[Any], *, missing: bool) -> Any:
     if missing and kinds & {int, float} and kinds <= {int, float, type(None)}:
         exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
         return np.float64 if exact else object
-    return {str: "str", float: np.float64, bool: np.bool_}.get(kinds.pop(), object) if len(kinds) == 1 else object
+    return (
+        {str: "str", float: np.float64, bool: np.bool_}.get(kinds.pop(), object)
+        if len(kinds) == 1
+        else object
+    )

@@ -1,4 +1,7 @@
-"""Experiments: every row of a design with every contender on every seed, stored and resumed; variants of a model."""
+"""Experiments: every row of a design with every contender on every seed, stored and resumed.
+
+Variants of a model.
+"""
 
 import inspect
 import json
@@ -24,7 +27,14 @@ from ..core.packing import pack
 from ..core.plan import Plan, source_name
 from ..core.points import Points, portable
 from ..core.provenance import as_json, describe
-from ..errors import OptionValueError, SimEnvError, SimulationError, StoreError, describe_error, short_repr
+from ..errors import (
+    OptionValueError,
+    SimEnvError,
+    SimulationError,
+    StoreError,
+    describe_error,
+    short_repr,
+)
 from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
 from ..simulation import make_simulation
 from .runner import (
@@ -67,13 +77,16 @@ def run_experiment(
 ) -> "DataFrame":
     """Run every row of a design with every contender on every seed. Stored runs are not repeated.
 
-    Each run is stored as soon as it is finished. A process that is killed loses only the runs it was working on. Call
-    this again with the same rows, contenders and seeds, or with more, and it does the missing runs.
+    Each run is stored as soon as it is finished. A process that is killed loses only the runs it
+    was working on. Call this again with the same rows, contenders and seeds, or with more, and it
+    does the missing runs.
 
     Args:
-        make: A callable that gets the factors of a row as keyword arguments and returns a simulation or a ``Variant``;
-            or a ``Variant``, whose parameters the factors become. It is called anew for each run.
-        design: One row for each combination of factors, as ``design`` makes it: a ``DataFrame``, or data for one.
+        make: A callable that gets the factors of a row as keyword arguments and returns a
+            simulation or a ``Variant``; or a ``Variant``, whose parameters the factors become. It
+            is called anew for each run.
+        design: One row for each combination of factors, as ``design`` makes it: a ``DataFrame``, or
+            data for one.
         contenders: As ``evaluate`` takes them. ``"rule"``, the model as it is, is always added.
         seeds: As ``evaluate`` takes them.
         points: As ``evaluate`` takes them.
@@ -89,13 +102,14 @@ def run_experiment(
         **options: As ``evaluate`` takes them.
 
     Returns:
-        One row for each agent of each run, and one for the team (``agent`` is ``"team"``), in the order of the design,
-        the contenders and the seeds. The columns: the factors, ``contender``, ``seed``, ``agent``, ``return``,
-        ``length``, the metrics, ``status`` (``"ok"`` or ``"error"``; a failed run has only the team's row) and
-        ``error``.
+        One row for each agent of each run, and one for the team (``agent`` is ``"team"``), in the
+        order of the design, the contenders and the seeds. The columns: the factors, ``contender``,
+        ``seed``, ``agent``, ``return``, ``length``, the metrics, ``status`` (``"ok"`` or
+        ``"error"``; a failed run has only the team's row) and ``error``.
 
     Raises:
-        OptionValueError: An argument has an invalid value, or the store belongs to another experiment. Nothing has run.
+        OptionValueError: An argument has an invalid value, or the store belongs to another
+            experiment. Nothing has run.
         StoreError: The store cannot be read or written. What was stored before stays.
         MissingExtraError: pandas, joblib or tqdm is missing.
         SimEnvError: Something else cannot work. The subclass tells what.
@@ -110,34 +124,53 @@ def run_experiment(
     )  # fmt: skip
     if runner.contenders.get(BY_RULE):
         raise OptionValueError(
-            f"the contender {BY_RULE!r} is always the model as it is; give your policies another name"
+            f"the contender {BY_RULE!r} is always the model as it is; give your policies another"
+            " name"
         )
     runner.contenders = {BY_RULE: {}, **runner.contenders}
     if isinstance(make, Variant):
         _source(make, rows[0])  # a variant checks its parameters
     else:
         what = "make must be a callable of the factors, such as a class, or a Variant"
-        check_call(make, rows[0], OptionValueError, what, f"the factors {', '.join(rows[0]) or '(none)'}")
+        check_call(
+            make, rows[0], OptionValueError, what, f"the factors {', '.join(rows[0]) or '(none)'}"
+        )
     try:
         folder = Path(store).absolute()  # other processes may have another working directory
     except TypeError as error:
-        raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
+        raise OptionValueError(
+            f"store must be the path of a folder, not {short_repr(store)}"
+        ) from error
     storage = Store(folder, rows[0], runner.metrics)
     storage.read(keys)
     storage.check_rows(keys)
-    session = f"{time_ns():016x}{uuid4().hex[:8]}"  # of all processes that do runs now; later ones sort after it
+    # of all processes that do runs now; later ones sort after it
+    session = f"{time_ns():016x}{uuid4().hex[:8]}"
     if workers:
-        pack((make, runner))  # errors of pickling come before any run, and so do those of contenders
-    row, prepared = _try_contenders(make, runner, sorted(keys, key=lambda key: key != storage.sample))
+        # errors of pickling come before any run, and so do those of contenders
+        pack((make, runner))
+    row, prepared = _try_contenders(
+        make, runner, sorted(keys, key=lambda key: key != storage.sample)
+    )
     storage.create()
-    storage.warn_of_changes(row, {contender: provenance for contender, (_, provenance) in prepared.items()})
-    finished = {run for run, result in storage.runs.items() if not (retry_errors and isinstance(result, str))}
+    storage.warn_of_changes(
+        row, {contender: provenance for contender, (_, provenance) in prepared.items()}
+    )
+    finished = {
+        run
+        for run, result in storage.runs.items()
+        if not (retry_errors and isinstance(result, str))
+    }
     # A row that occurs twice has the same results.
     runs = list(product(dict.fromkeys(keys), runner.contenders, all_seeds))
     missing = [run for run in runs if run not in finished]
-    with progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar, TemporaryDirectory() as notes:
+    with (
+        progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar,
+        TemporaryDirectory() as notes,
+    ):
         work = make, runner, folder, session, notes if workers else ""
-        firsts = []  # for each contender whose agents are not known: these, and the runs of its first row
+        # for each contender whose agents are not known: these, and the runs of its first row
+        firsts = []
         for contender, (names, _) in prepared.items():
             own = [run for run in missing if run[1] == contender]
             unseen = {name for name in names if (contender, name) not in storage.seen}
@@ -171,27 +204,40 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
         if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS):
-            raise OptionValueError(f"the factor {name!r} has the name of another column of the table; rename it")
+            raise OptionValueError(
+                f"the factor {name!r} has the name of another column of the table; rename it"
+            )
         if names.count(name) > 1:
             raise OptionValueError(f"the factor {name!r} occurs twice")
     if not len(table):
         raise OptionValueError("the design has no rows")
     advice = "; other values cannot be stored: use a name as the value, and look it up in make"
-    levels = {name: [plain_value(f"the factor {name!r}", value, advice) for value in table[name]] for name in names}
+    levels = {
+        name: [plain_value(f"the factor {name!r}", value, advice) for value in table[name]]
+        for name in names
+    }
     return table, [{name: levels[name][place] for name in names} for place in range(len(table))]
 
 
 def _try_contenders(
     make: Any, runner: Runner, keys: Sequence[str]
 ) -> tuple[str, dict[str, tuple[set[str], Provenance]]]:
-    """Check that all contenders can be set up; return a row, as JSON, and their unproven agents and provenance.
+    """Check that all contenders can be set up.
 
-    Both are empty if the simulations of the first ten rows cannot be made: the runs of all rows tell why.
+    Return a row, as JSON, and their unproven agents and provenance.
+
+    Both are empty if the simulations of the first ten rows cannot be made: the runs of all rows
+    tell why.
     """
     for key in keys[:10]:
         try:
-            prepared = {contender: _prepare(make, runner, key, contender) for contender in runner.contenders}
-            return key, {name: (runner.unproven_agents(plan, name), made) for name, (plan, made) in prepared.items()}
+            prepared = {
+                contender: _prepare(make, runner, key, contender) for contender in runner.contenders
+            }
+            return key, {
+                name: (runner.unproven_agents(plan, name), made)
+                for name, (plan, made) in prepared.items()
+            }
         except SimEnvError:
             raise
         except Exception:  # this row fails; another may not
@@ -218,7 +264,8 @@ def _source(make: Any, row: Mapping[str, Any]) -> Any:
         if ready:
             return ready.pop()
         made = make(**row)
-        return make_simulation(first) if made is first else made  # each run has a simulation of its own
+        # each run has a simulation of its own
+        return make_simulation(first) if made is first else made
 
     return factory
 
@@ -228,25 +275,42 @@ def _prepare(make: Any, runner: Runner, key: str, contender: str) -> tuple[Plan,
     source = _source(make, json.loads(key))
     plan = runner.plan(source, contender)
     name = make.name if isinstance(make, Variant) else source_name(make)
-    policies = {**(source.policies if isinstance(source, Variant) else {}), **runner.contenders[contender]}
+    policies = {
+        **(source.policies if isinstance(source, Variant) else {}),
+        **runner.contenders[contender],
+    }
     return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
 
 
 def _run_all(
-    work: tuple[Any, ...], missing: list[Run], workers: int, least: int, bar: Any, storage: Store, keys: Sequence[str]
+    work: tuple[Any, ...],
+    missing: list[Run],
+    workers: int,
+    least: int,
+    bar: Any,
+    storage: Store,
+    keys: Sequence[str],
 ) -> None:
-    """Do all runs. A run that has killed its worker, and does so again while nothing else runs, becomes an error."""
+    """Do all runs.
+
+    A run that has killed its worker, and does so again while nothing else runs, becomes an error.
+    """
     _, runner, folder, session, notes = work
     while missing:
         try:
-            spread(_run_part, work, missing, workers, least, bar, share=16)  # few parts cost nothing
+            # few parts cost nothing
+            spread(_run_part, work, missing, workers, least, bar, share=16)
             return
         except BrokenExecutor:  # a worker has died, and joblib has ended all others
             suspects: list[Run] = []
             storage.read(keys, session)
             for path in sorted(Path(notes).iterdir()):
                 with suppress(ValueError):  # its process was killed while it wrote
-                    left = [run for run in map(tuple, json.loads(path.read_bytes())) if run not in storage.runs]
+                    left = [
+                        run
+                        for run in map(tuple, json.loads(path.read_bytes()))
+                        if run not in storage.runs
+                    ]
                     suspects += left[: max(runner.batch_size, 1)]
                 path.unlink()
             if not suspects:
@@ -256,7 +320,11 @@ def _run_all(
                 spread(_run_part, work, [run], max(workers, 2), 1, bar)
             except BrokenExecutor:
                 with closing(Writer(folder, session)) as writer:
-                    writer.write(run, "WorkerError: the worker died in this run, twice; see retry_errors=", {})
+                    writer.write(
+                        run,
+                        "WorkerError: the worker died in this run, twice; see retry_errors=",
+                        {},
+                    )
         storage.read(keys, session)
         missing = [run for run in missing if run not in storage.runs]
 
@@ -268,17 +336,30 @@ def _note(notes: str, runs: Sequence[Run]) -> None:
             Path(notes, uuid4().hex).write_text(to_json(runs), encoding="ascii")
 
 
-def _run_first(make: Any, runner: Runner, folder: Path, session: str, notes: str, firsts: list[Any], bar: Any) -> None:
-    """Run the first row of contenders, until the agents that they name have appeared; only then store the results.
+def _run_first(
+    make: Any, runner: Runner, folder: Path, session: str, notes: str, firsts: list[Any], bar: Any
+) -> None:
+    """Run the first row of contenders, until the agents that they name have appeared.
 
-    Each item consists of these names and of the runs of the row. An agent that has not appeared is an ``AgentError``.
+    Only then store the results.
+
+    Each item consists of these names and of the runs of the row. An agent that has not appeared is
+    an ``AgentError``.
     """
     for names, runs in firsts:
         _note(notes, runs)
         held: list[Any] = []
         present: dict[str, float] = {}
         for key, contender, seed in runs:
-            _run_seeds(make, runner, lambda *entry, held=held: held.append(entry), key, contender, [seed], bar)
+            _run_seeds(
+                make,
+                runner,
+                lambda *entry, held=held: held.append(entry),
+                key,
+                contender,
+                [seed],
+                bar,
+            )
             result = held[-1][1]
             present |= {} if isinstance(result, str) else result.returns
             if present.keys() >= names:
@@ -290,16 +371,25 @@ def _run_first(make: Any, runner: Runner, folder: Path, session: str, notes: str
                 writer.write(*entry)
 
 
-def _run_part(make: Any, runner: Runner, folder: Path, session: str, notes: str, runs: Sequence[Run], bar: Any) -> None:
+def _run_part(
+    make: Any, runner: Runner, folder: Path, session: str, notes: str, runs: Sequence[Run], bar: Any
+) -> None:
     """Do runs and store their results."""
     _note(notes, runs)
     with closing(Writer(folder, session)) as writer, reuse_resources():
         for (key, contender), group in groupby(runs, lambda run: run[:2]):
-            _run_seeds(make, runner, writer.write, key, contender, [seed for *_, seed in group], bar)
+            _run_seeds(
+                make, runner, writer.write, key, contender, [seed for *_, seed in group], bar
+            )
 
 
-def _run_seeds(make: Any, runner: Runner, write: Any, key: str, contender: str, seeds: Sequence[int], bar: Any) -> None:
-    """Run seeds of a row with a contender, and ``write`` the result of each. An error is a result, too."""
+def _run_seeds(
+    make: Any, runner: Runner, write: Any, key: str, contender: str, seeds: Sequence[int], bar: Any
+) -> None:
+    """Run seeds of a row with a contender, and ``write`` the result of each.
+
+    An error is a result, too.
+    """
     remaining = dict.fromkeys(seeds)
 
     def report(seed: int, result: Result, trace: str | None = None) -> None:
@@ -329,7 +419,11 @@ def _run_seeds(make: Any, runner: Runner, write: Any, key: str, contender: str, 
 
 
 def _make_frame(
-    table: "DataFrame", keys: Sequence[str], seeds: Sequence[int], results: Mapping[Run, Result], runner: Runner
+    table: "DataFrame",
+    keys: Sequence[str],
+    seeds: Sequence[int],
+    results: Mapping[Run, Result],
+    runner: Runner,
 ) -> "DataFrame":
     """Return the table of all runs, in the order of the design, the contenders and the seeds."""
     places: list[int] = []
@@ -342,7 +436,9 @@ def _make_frame(
                 own = [(*row, "ok", None) for row in runner.rows(result)]
             except Exception as error:  # raised by team=, which is called for stored runs, too
                 result = describe_error(error)
-        for row in own or [(TEAM, nan, 0, *[None] * (len(runner.columns) - len(RUN_COLUMNS)), "error", result)]:
+        for row in own or [
+            (TEAM, nan, 0, *[None] * (len(runner.columns) - len(RUN_COLUMNS)), "error", result)
+        ]:
             places.append(place)
             rows.append((contender, seed, *row))
     factors = table.iloc[places].reset_index(drop=True)
@@ -363,8 +459,8 @@ class Variant:
         simulation: A simulation (which is copied), its class, or a factory.
         parameters: The keyword arguments of the class or factory.
         points: The decision points and their definitions, as ``generate_env`` takes them.
-        plugins: Handlers for its simulations alone, as the option ``plugins`` takes them. Handlers that are given where
-            the variant is used run after these.
+        plugins: Handlers for its simulations alone, as the option ``plugins`` takes them. Handlers
+            that are given where the variant is used run after these.
         policies: Policies that decide without being agents, as the option ``policies`` takes them.
         options: All other options of its environments.
     """
@@ -384,32 +480,44 @@ class Variant:
         source = self.simulation
         if isinstance(source, Variant):
             raise SimulationError(
-                f"the variant {self.name!r} needs a simulation, not the variant {source.name!r}; derive one"
-                " variant from another with dataclasses.replace"
+                f"the variant {self.name!r} needs a simulation, not the variant {source.name!r};"
+                " derive one variant from another with dataclasses.replace"
             )
         for name in ("parameters", "policies", "options"):
             value = getattr(self, name)
             if not isinstance(value, Mapping):
-                raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {short_repr(value)}")
+                raise OptionValueError(
+                    f"{name} of the variant {self.name!r} must be a dict, not {short_repr(value)}"
+                )
             # Copied, so that later changes of the arguments do not change the variant.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         object.__setattr__(self, "plugins", tuple(self.plugins))
         twice = [name for name in ("plugins", "policies") if name in self.options]
         if twice:
             raise OptionValueError(
-                f"{' and '.join(twice)} must be arguments of the variant {self.name!r} itself, not among its options"
+                f"{' and '.join(twice)} must be arguments of the variant {self.name!r} itself, not"
+                " among its options"
             )
         if self.parameters:
             what = f"the variant {self.name!r} has parameters, so its simulation must be a class or a factory"
-            check_call(source, self.parameters, SimulationError, what, f"the parameters of the variant {self.name!r}")
+            check_call(
+                source,
+                self.parameters,
+                SimulationError,
+                what,
+                f"the parameters of the variant {self.name!r}",
+            )
 
     def __reduce__(self) -> Any:
-        # Functions are pickled by name: while environments are in use, hooks may stand in their places.
+        # Functions are pickled by name: while environments are in use, hooks may stand in their
+        # places.
         points = self.points
         if isinstance(points, Mapping):
             points = {portable(key): definition for key, definition in points.items()}
         elif points is not None and not isinstance(points, str):
-            points = [portable(key) for key in (points if isinstance(points, Iterable) else [points])]
+            points = [
+                portable(key) for key in (points if isinstance(points, Iterable) else [points])
+            ]
         return partial(
             Variant,
             self.name,
@@ -421,7 +529,9 @@ class Variant:
             options=dict(self.options),
         ), ()
 
-    def environment_arguments(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
+    def environment_arguments(
+        self, points: Any, options: Mapping[str, Any]
+    ) -> tuple[Any, Any, dict[str, Any]]:
         """Return simulation, points and options of an environment of this variant, with those that are given to it."""
         source = partial(self.simulation, **self.parameters) if self.parameters else self.simulation
         merged = {**self.options, **options}
@@ -435,7 +545,11 @@ class Variant:
 
 
 def check_call(
-    source: Any, arguments: Mapping[str, Any], error: type[SimEnvError], requirement: str, described: str
+    source: Any,
+    arguments: Mapping[str, Any],
+    error: type[SimEnvError],
+    requirement: str,
+    described: str,
 ) -> None:
     """Check that something is a class or a factory, as ``requirement`` says, and takes the described arguments."""
     if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):

@@ -1,8 +1,9 @@
 """Hooks: one for each function of a model that is decided or extended, with wrappers in front of it.
 
-A *wrapper* looks and behaves like the function, has its signature, and costs almost nothing while the hook has no
-*interceptors*. A call finds its interceptor by the greenlet it runs in. For an episode, a driver enters its
-simulation's stack, with the environment's decision inside and the handlers around it; at the end it removes the entry.
+A *wrapper* looks and behaves like the function, has its signature, and costs almost nothing while
+the hook has no *interceptors*. A call finds its interceptor by the greenlet it runs in. For an
+episode, a driver enters its simulation's stack, with the environment's decision inside and the
+handlers around it; at the end it removes the entry.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ from .handlers import CALLS, ITEMS, Handler, each, run, slots, wait
 from .stacks import EVALUATING, LOCK, OUTSIDE, STACKS, Interceptor, spawner_of, stack_of
 
 _ROOTS: Final[set[greenlet]] = set()
-"""Roots of threads on which no simulation runs. Hooks without handlers run their rule there at once."""
+"""Roots of threads on which no simulation runs.
+
+Hooks without handlers run their rule there at once.
+"""
 
 _THREAD: Final = local()
 """Has a mark in each thread whose root is in ``_ROOTS``. It is freed with the thread."""
@@ -45,9 +49,14 @@ _MADE_WITH: Final = "__simenv_marl__"
 _RULE = "not INTERCEPTORS or getcurrent() in INTERCEPTORS.roots"
 _INTERCEPT = "(INTERCEPTORS.get(getcurrent()) or intercept)"
 
-_RETURN = {"function": "return {}", "generator": "return (yield from {})", "coroutine": "return (await {})"}
+_RETURN = {
+    "function": "return {}",
+    "generator": "return (yield from {})",
+    "coroutine": "return (await {})",
+}
 
-# These determine the cost of a call without interceptors: two plain calls if no call can be incomplete, else three.
+# These determine the cost of a call without interceptors: two plain calls if no call can be
+# incomplete, else three.
 _INCOMPLETE = """
     if {incomplete}:
         args = {passed}
@@ -69,9 +78,12 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
     names = [f"_{number}" for number in range(len(positional))]
     incomplete, doubtful, template = "True", "True", _INCOMPLETE + _COMPLETE
     passed, accepted = "args", "*args, **kwargs"
-    if (hook.alone and parameters[0].name not in scope) or (signature is not None and not parameters):
+    if (hook.alone and parameters[0].name not in scope) or (
+        signature is not None and not parameters
+    ):
         template = _COMPLETE
-        names = [p.name for p in positional]  # a staticmethod that looks like a method may be passed it by keyword
+        # a staticmethod that looks like a method may be passed it by keyword
+        names = [p.name for p in positional]
         accepted = ", ".join(names)
     elif positional and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
         required = sum(p.default is p.empty for p in positional)
@@ -103,9 +115,16 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
 def _binder(signature: inspect.Signature) -> Callable[..., tuple[tuple[Any, ...], dict[str, Any]]]:
     """Make a function with a signature that returns its arguments: by position where they can be, with defaults."""
     parameters = signature.parameters.values()
-    prefixes: dict[Any, str] = {inspect.Parameter.VAR_POSITIONAL: "*", inspect.Parameter.VAR_KEYWORD: "**"}
-    # Short defaults, and no annotations: code can name neither. The defaults themselves are set below.
-    declared = [p.replace(annotation=p.empty, default=p.empty if p.default is p.empty else 0) for p in parameters]
+    prefixes: dict[Any, str] = {
+        inspect.Parameter.VAR_POSITIONAL: "*",
+        inspect.Parameter.VAR_KEYWORD: "**",
+    }
+    # Short defaults, and no annotations: code can name neither. The defaults themselves are set
+    # below.
+    declared = [
+        p.replace(annotation=p.empty, default=p.empty if p.default is p.empty else 0)
+        for p in parameters
+    ]
     names = {p.name: prefixes.get(p.kind, "") + p.name for p in parameters}
     placed = [f"{names[p.name]}," for p in parameters if p.kind < inspect.Parameter.KEYWORD_ONLY]
     keyed = [
@@ -131,8 +150,11 @@ def unbind(value: Any) -> Any:
 def hook_of(value: Any) -> Hook | None:
     """Return the hook of a wrapper, also as an attribute of a class; None for anything else."""
     function = unbind(value)
-    # A wrapper is known by its globals, not by an attribute: other decorators copy a function's attributes.
-    if isinstance(function, FunctionType) and isinstance(function.__globals__.get("INTERCEPTORS"), Interceptors):
+    # A wrapper is known by its globals, not by an attribute: other decorators copy a function's
+    # attributes.
+    if isinstance(function, FunctionType) and isinstance(
+        function.__globals__.get("INTERCEPTORS"), Interceptors
+    ):
         hook: Hook = vars(function)[_MADE_WITH][0]
         return hook
     return None
@@ -178,30 +200,39 @@ class Hook:
         function: The function. Its signature is its own, not that of what it wraps.
         rule: The innermost part of a call: the function, or its temporary replacement.
         kind: What a call returns: "function" (a value), "generator" or "coroutine".
-        bound: Whether its first argument is the object it is called on, which is never passed by keyword.
+        bound: Whether its first argument is the object it is called on, which is never passed by
+            keyword.
         alone: Whether every call has only that argument.
-        interceptors: Those of calls on the stacks of simulations. An entry for None says that all other calls do not
-            just run the function.
+        interceptors: Those of calls on the stacks of simulations. An entry for None says that all
+            other calls do not just run the function.
         slot: Its handlers, as ``slots`` returns them. Empty while it has none.
         stale: Whether another object has replaced it while nothing was set in its place.
         permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
-        threads: The names of threads that called it before anything else, and where its rule decides.
-        definition: The latest definition of a decision function, which its name means; None for all other functions.
-        removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
+        threads: The names of threads that called it before anything else, and where its rule
+            decides.
+        definition: The latest definition of a decision function, which its name means; None for all
+            other functions.
+        removed_by: Functions (or names) whose calls end its agents, under every definition: see
+            ``make_step``.
     """
 
     permanent = True
     stale = False
 
     def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None) -> None:
-        """Make the hook of a function with a dotted name; raise a ``PatchError`` for an async generator function.
+        """Make the hook of a function with a dotted name.
 
-        ``bound`` tells whether, in a class, its first argument is the object it is called on; ``like`` determines what
-        calls return if the function only forwards to it.
+        Raise a ``PatchError`` for an async generator function.
+
+        ``bound`` tells whether, in a class, its first argument is the object it is called on;
+        ``like`` determines what calls return if the function only forwards to it.
         """
         like = function if like is None else like
         if inspect.isasyncgenfunction(like):
-            raise PatchError(f"{name} is an async generator function, which cannot return a decision or call handlers")
+            raise PatchError(
+                f"{name} is an async generator function, which cannot return a decision or call"
+                " handlers"
+            )
         awaited = "coroutine" if inspect.iscoroutinefunction(like) else "function"
         self.kind = "generator" if inspect.isgeneratorfunction(like) else awaited
         self.function = self.rule = function
@@ -209,20 +240,26 @@ class Hook:
         self.signature: inspect.Signature | None = None
         with suppress(TypeError, ValueError):  # the signature is unknown
             self.signature = inspect.signature(function, follow_wrapped=False)
-        self.bound = bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
+        self.bound = (
+            bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
+        )
         parameters = () if self.signature is None else self.signature.parameters.values()
         first = [
-            p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+            p
+            for p in parameters
+            if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
         ]
         self.alone = self.bound and len(first) == len(parameters) == 1
-        self._binder: Callable[..., tuple[tuple[Any, ...], dict[str, Any]]] | None = None  # made when it is needed
+        # made when it is needed
+        self._binder: Callable[..., tuple[tuple[Any, ...], dict[str, Any]]] | None = None
         self.interceptors = Interceptors(self)
         self.threads: set[str] = set()
         self.definition: Any = None
         self.removed_by: dict[Any, Any] = {}
         self.slot: dict[Any, list[list[list[Handler]]]] = {}
         self.exposed = self._applied = False
-        # The users of each handler, and those of the hook itself under None, in the order in which they came.
+        # The users of each handler, and those of the hook itself under None, in the order in which
+        # they came.
         self._users: dict[Handler | None, set[object]] = {}
         _HOOKS[id(self)] = self
 
@@ -230,7 +267,11 @@ class Hook:
         return f"<{type(self).__name__} {self.name}>"
 
     def __reduce__(self) -> Any:
-        return _restored, (self.function, self.name, self.bound, self.kind, self.exposed), self.definition
+        return (
+            _restored,
+            (self.function, self.name, self.bound, self.kind, self.exposed),
+            self.definition,
+        )
 
     def __setstate__(self, definition: Any) -> None:
         """Set the definition after unpickling, unless the hook has one of this process."""
@@ -249,13 +290,19 @@ class Hook:
         }  # fmt: skip
         exec(compile(_source(self, scope), f"<wrapper of {self.name}>", "exec"), scope)
         made: FunctionType = scope["wrapper"]
-        made.__code__ = made.__code__.replace(co_name=getattr(self.function, "__name__", "call"))  # for tracebacks
+        # for tracebacks
+        made.__code__ = made.__code__.replace(co_name=getattr(self.function, "__name__", "call"))
         update_wrapper(made, self.function)
         vars(made)[_MADE_WITH] = self, made_with
         return made
 
-    def bind(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
-        """Bind a call to the function's own signature, with defaults. None if the function does not take it."""
+    def bind(
+        self, args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
+        """Bind a call to the function's own signature, with defaults.
+
+        None if the function does not take it.
+        """
         if self.signature is None:
             return args, kwargs
         if self._binder is None:
@@ -277,7 +324,8 @@ class Hook:
         if here.parent is None and here not in STACKS:
             if not hasattr(_THREAD, "mark"):
                 _THREAD.mark = set()
-                finalize(_THREAD.mark, _ROOTS.discard, here)  # a root that outlives its thread makes greenlets crash
+                # a root that outlives its thread makes greenlets crash
+                finalize(_THREAD.mark, _ROOTS.discard, here)
             _ROOTS.add(here)
             self.threads.add(current_thread().name)
         return self.around(decide or self.run_rule, plugins)
@@ -287,7 +335,8 @@ class Hook:
     def enter(self, stack: greenlet, decide: Interceptor | None, plugins: Any) -> None:
         """Enter an interceptor for calls on the stack of a simulation, whose environment has these plugins.
 
-        ``decide`` decides instead of the rule. None: the rule decides, with handlers if the plugins have some.
+        ``decide`` decides instead of the rule. None: the rule decides, with handlers if the plugins
+        have some.
         """
         _ROOTS.discard(stack)
         if decide is None and plugins not in self.slot:
@@ -336,7 +385,8 @@ class Hook:
         with LOCK:
             user = user if handler is None else handler.owner and user
             try:
-                # Noted first: garbage collection may close another environment that uses it meanwhile.
+                # Noted first: garbage collection may close another environment that uses it
+                # meanwhile.
                 users = self._users.get(handler, set())
                 users.add(user)
                 self._users[handler] = users
@@ -350,7 +400,10 @@ class Hook:
                 raise
 
     def uninstall(self, user: object, handler: Handler | None = None) -> None:
-        """Undo ``install``; the last user restores the original. After an interrupt, call it again."""
+        """Undo ``install``; the last user restores the original.
+
+        After an interrupt, call it again.
+        """
         with LOCK:
             users = self._users.get(handler, set())
             users.discard(user if handler is None else handler.owner and user)

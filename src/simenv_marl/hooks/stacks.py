@@ -1,9 +1,10 @@
 """The stacks of simulations, and the environment for which code on a stack is evaluated.
 
-A *stack* is a greenlet; a thread without greenlets has one, too, its root. ``STACKS`` has the driver of each simulation
-by its stack. A greenlet belongs to the simulation whose stack is the nearest among itself and its parents. All other
-code is the user's: there, decision functions run their rule. While an environment evaluates something on the user's
-side (mappings, policies, the clock), ``EVALUATING`` has an entry for the greenlet that runs it.
+A *stack* is a greenlet; a thread without greenlets has one, too, its root. ``STACKS`` has the
+driver of each simulation by its stack. A greenlet belongs to the simulation whose stack is the
+nearest among itself and its parents. All other code is the user's: there, decision functions run
+their rule. While an environment evaluates something on the user's side (mappings, policies, the
+clock), ``EVALUATING`` has an entry for the greenlet that runs it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from typing import Any, Final
 from greenlet import getcurrent, greenlet
 
 Interceptor = Callable[[tuple[Any, ...], dict[str, Any]], Any]
-"""A function that intercepts a call. It gets the positional and keyword arguments, and returns the call's result."""
+"""A function that intercepts a call.
+
+It gets the positional and keyword arguments, and returns the call's result.
+"""
 
 LOCK: Final = RLock()
 """Held while patches or handlers change. Calls do not need it."""
@@ -28,12 +32,15 @@ OUTSIDE: Final = object()
 """The entry in ``STACKS`` for a simulation's stack on which another environment runs."""
 
 STACKS: Final[dict[greenlet, Any]] = {}
-"""The driver of each simulation by its stack, or ``OUTSIDE``; and its driver for each thread that a simulation
+"""The driver of each simulation by its stack, or ``OUTSIDE``.
+
+And its driver for each thread that a simulation
 has started, by its root."""
 
 EVALUATING: Final[dict[greenlet, Any]] = {}
 """For each greenlet, the agent or the plugins of the environment for which it evaluates something: an object with the
-``plugins`` that take part, and the ``memory`` of differences. Code that sets an entry restores the previous one."""
+``plugins`` that take part, and the ``memory`` of differences. Code that sets an entry restores the
+previous one."""
 
 DIFFERENCES: Final[list[str]] = []
 """Not empty once a difference was made. While it is empty and there are no plugins, mappings need no entry in
@@ -41,7 +48,10 @@ DIFFERENCES: Final[list[str]] = []
 
 
 def stack_of(here: greenlet | None) -> Any:
-    """Return the entry of the nearest stack to which a greenlet belongs; None if it belongs to none."""
+    """Return the entry of the nearest stack to which a greenlet belongs.
+
+    None if it belongs to none.
+    """
     while here is not None:
         driver = STACKS.get(here)
         if driver is not None:
@@ -51,7 +61,10 @@ def stack_of(here: greenlet | None) -> Any:
 
 
 def spawner_of(here: Any) -> Any:
-    """Return the entry of the stack whose code has spawned a greenlet with gevent; None if none has."""
+    """Return the entry of the stack whose code has spawned a greenlet with gevent.
+
+    None if none has.
+    """
     driver = None
     while driver is None and (spawner := getattr(here, "spawning_greenlet", None)) is not None:
         here = spawner()  # None if it is gone
@@ -69,8 +82,9 @@ def plugins_at_work() -> Any:
 class outside_simulation:  # noqa: N801 - it is used like a function
     """Separate code in this greenlet from a simulation or an evaluation that runs around it.
 
-    Inside, decision functions run their rule, and only the given evaluation's plugins take part. This is a class
-    because the context manager of a generator cannot pass on immutable errors, such as frozen dataclasses.
+    Inside, decision functions run their rule, and only the given evaluation's plugins take part.
+    This is a class because the context manager of a generator cannot pass on immutable errors, such
+    as frozen dataclasses.
     """
 
     __slots__ = ("_before", "_entry", "_evaluation", "_here")
@@ -93,7 +107,8 @@ class outside_simulation:  # noqa: N801 - it is used like a function
             EVALUATING.pop(here, None)
 
     def __exit__(self, *error: object) -> None:
-        here, self._here = self._here, None  # tracebacks keep this object, and a root must not outlive its thread
+        # tracebacks keep this object, and a root must not outlive its thread
+        here, self._here = self._here, None
         if here is None:
             return
         if self._before is not None:

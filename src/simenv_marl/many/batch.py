@@ -2,12 +2,13 @@
 
 ``step_all`` steps many episodes in one thread. Vector environments use it, too.
 
-Each simulation has a session and an episode, as in an environment. Where a batched policy decides, the episode waits
-until many decisions wait for the same policy. The number of simulations determines which decisions share a batch; it
-does not change the course of any simulation.
+Each simulation has a session and an episode, as in an environment. Where a batched policy decides,
+the episode waits until many decisions wait for the same policy. The number of simulations
+determines which decisions share a batch; it does not change the course of any simulation.
 
-In the plan, a ``PolicyKey`` stands for each key of ``policies``. Keys of the same policy share one ``BatchPolicy``. Its
-decisions are asked in ``Group``s; all decisions of a group have the same spaces, so that they can be stacked.
+In the plan, a ``PolicyKey`` stands for each key of ``policies``. Keys of the same policy share one
+``BatchPolicy``. Its decisions are asked in ``Group``s; all decisions of a group have the same
+spaces, so that they can be stacked.
 """
 
 from __future__ import annotations
@@ -63,9 +64,14 @@ class BatchPolicy:
         self.groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
-        return f"the policy of {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
+        return (
+            "the policy of"
+            f" {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
+        )
 
-    def answers(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
+    def answers(
+        self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]
+    ) -> Any:
         """Call the policy with as many of the arguments as it takes, and return what it returns."""
         if self.identifying:
             return self.policy(observations, infos, identities)
@@ -75,7 +81,9 @@ class BatchPolicy:
         """Return the group of the decisions at a point."""
         group = self.groups.get(point.point)
         if group is None:
-            group = next((known for known in self.groups.values() if known.takes(point)), None) or Group(self, point)
+            group = next(
+                (known for known in self.groups.values() if known.takes(point)), None
+            ) or Group(self, point)
             self.groups[point.point] = group
         return group
 
@@ -109,11 +117,14 @@ class AskingKey(AskingPolicy, PolicyKey):
         PolicyKey.__init__(self, place, asked)
 
 
-def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False, alone: bool = False) -> dict[Any, Any]:
+def policy_keys(
+    policies: Mapping[Any, Any], *, rewarded: bool = False, alone: bool = False
+) -> dict[Any, Any]:
     """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
-    ``rewarded``: whether episodes wait for all policies. Otherwise, a policy that is asked one decision at a time is
-    called where it decides, unless it has to be awaited. ``alone``: all are asked so.
+    ``rewarded``: whether episodes wait for all policies. Otherwise, a policy that is asked one
+    decision at a time is called where it decides, unless it has to be awaited. ``alone``: all are
+    asked so.
     """
     known: dict[int, BatchPolicy] = {}
     found: dict[Any, Any] = {}
@@ -132,7 +143,8 @@ class Group:
 
     Attributes:
         point: One of the points of the decisions; the others have the same spaces.
-        waiting, places, observations: The episodes whose decisions wait, the indices of their seeds, and what they see.
+        waiting, places, observations: The episodes whose decisions wait, the indices of their
+            seeds, and what they see.
     """
 
     __slots__ = ("_discrete", "asked", "observations", "places", "point", "stack", "waiting")
@@ -142,7 +154,8 @@ class Group:
         self.stack = stacker(point.definition.observation_space, cast=True)
         self.waiting: list[Episode] = []
         self.places: list[int] = []
-        # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
+        # Kept outside the episodes: reading them from many suspended episodes would miss the
+        # processor's caches.
         self.observations: list[Any] = []
         self._discrete = not point.definition.action_space.shape
 
@@ -156,20 +169,29 @@ class Group:
         )
 
     def ask(self, observations: Any, waiting: Sequence[Episode], agents: Sequence[Any]) -> Answers:
-        """Ask the policy about the stacked observations of waiting episodes; return the actions, and the extras."""
+        """Ask the policy about the stacked observations of waiting episodes.
+
+        Return the actions, and the extras.
+        """
         asked = self.asked
         infos: list[Any] = []
         for agent in agents if asked.informed else ():
             infos.append(agent.info)
             agent.info = {}  # a policy may change its info; the next decision gets a new one
         try:
-            identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
+            identities = (
+                [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
+            )
             answers = asked.answers(observations, infos, identities)
             return read_answers(answers, asked, len(waiting), integers=self._discrete)
         except BaseException as error:
             number, seeds = len(waiting), ", ".join(str(episode.seed) for episode in waiting[:5])
-            seeds = f"{'seed' if number == 1 else 'seeds'} {seeds}{' and others' if number > 5 else ''}"
-            annotate(error, f"simenv_marl: in {asked!r}, asked for {number} decisions at once; {seeds}")
+            seeds = (
+                f"{'seed' if number == 1 else 'seeds'} {seeds}{' and others' if number > 5 else ''}"
+            )
+            annotate(
+                error, f"simenv_marl: in {asked!r}, asked for {number} decisions at once; {seeds}"
+            )
             raise
 
 
@@ -182,8 +204,9 @@ def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = Fal
     if actions is None or len(actions) != number:
         returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
         raise InvalidActionError(
-            f"{short_repr(policy)} was asked for {number} decisions at once and returned {returned}; it must return"
-            " one action for each row of the observations, in their order"
+            f"{short_repr(policy)} was asked for {number} decisions at once and returned"
+            f" {returned}; it must return one action for each row of the observations, in their"
+            " order"
         )
     return actions, extras
 
@@ -194,8 +217,18 @@ def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = Fal
 class Watcher(Protocol):
     """An observer of the episodes."""
 
-    def record(self, group: Group, places: list[int], waiting: list[Any], observations: Any, answers: Answers) -> None:
-        """Note what a policy has answered, before the simulations move. The list has an observation for each."""
+    def record(
+        self,
+        group: Group,
+        places: list[int],
+        waiting: list[Any],
+        observations: Any,
+        answers: Answers,
+    ) -> None:
+        """Note what a policy has answered, before the simulations move.
+
+        The list has an observation for each.
+        """
 
     def pay(self, episode: Episode) -> None:
         """Note the rewards when an episode has reached its next decision or its end."""
@@ -203,7 +236,8 @@ class Watcher(Protocol):
 
 CROWD: Final = 256
 """The number of simulations at first. With more, each has left the processor's caches when its turn comes again, and
-takes twice as long. If the policy takes longer than all simulations together, more simulations pay off."""
+takes twice as long. If the policy takes longer than all simulations together, more simulations pay
+off."""
 
 
 def run(
@@ -218,8 +252,9 @@ def run(
 
     After an error, these policies are cancelled, and all simulations are unwound.
 
-    The plan has a ``PolicyKey`` for each policy. ``finish`` is called with the index of a seed and its simulation when
-    the simulation has ended. If it returns a callable, that is called after the simulation is closed.
+    The plan has a ``PolicyKey`` for each policy. ``finish`` is called with the index of a seed and
+    its simulation when the simulation has ended. If it returns a callable, that is called after the
+    simulation is closed.
     """
     simulations = _Simulations(plan, seeds, size, finish, watcher, concurrency)
     with outside_simulation(), reuse_resources():
@@ -230,7 +265,10 @@ def run(
         except BaseException as error:
             simulations.awaited.cancel()
             left = simulations.sessions.items()
-            close_all(((f"the simulation of seed {seeds[place]}", session) for place, session in left), error)
+            close_all(
+                ((f"the simulation of seed {seeds[place]}", session) for place, session in left),
+                error,
+            )
             raise
 
 
@@ -247,7 +285,8 @@ class _Simulations:
 
     def __post_init__(self) -> None:
         self.crowd = min(self.size, CROWD)
-        self.backlog: deque[tuple[int, Episode]] = deque()  # decisions for policies that are awaited
+        # decisions for policies that are awaited
+        self.backlog: deque[tuple[int, Episode]] = deque()
         self.awaited = Awaited()
         self.next = 0
         self.sessions: dict[int, Session] = {}  # by the place of their seed
@@ -279,7 +318,9 @@ class _Simulations:
         places, group.places = group.places, []
         observations, group.observations = group.observations, []
         number, start = len(waiting), perf_counter()
-        answers = group.ask(group.stack(observations), waiting, [episode.pending for episode in waiting])
+        answers = group.ask(
+            group.stack(observations), waiting, [episode.pending for episode in waiting]
+        )
         asked = perf_counter()
         actions = list(map(_checked, waiting, answers[0]))
         if self.watcher is not None:
@@ -345,7 +386,8 @@ class _Simulations:
             self.groups[group] = None
         group.waiting.append(episode)
         group.places.append(place)
-        # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
+        # Kept outside the episodes: reading them from many suspended episodes would miss the
+        # processor's caches.
         group.observations.append(agent.observation)
         if self.watcher is None:
             agent.observation = None
@@ -377,7 +419,8 @@ def _checked(episode: Episode, action: Any) -> Any:
 def _seen(episode: Episode) -> tuple[Any, ...]:
     """Return what a policy of one decision is asked with: the episode, the agent, its observation and its info."""
     agent: Any = episode.pending
-    info, agent.info = agent.info, {}  # a policy may change its info; the next decision gets a new one
+    # a policy may change its info; the next decision gets a new one
+    info, agent.info = agent.info, {}
     return episode, agent, duplicate(agent.observation), info
 
 
@@ -398,15 +441,17 @@ def step_all(
 ) -> None:
     """Answer the pending decisions of episodes of one plan with checked actions, and run each to its next decision.
 
-    All simulations move before any agent is updated, so that the data of each loop stays in the processor's caches. If
-    an episode raises, ``blame`` is called with its number and the error. The others may have moved or not; they can be
-    closed.
+    All simulations move before any agent is updated, so that the data of each loop stays in the
+    processor's caches. If an episode raises, ``blame`` is called with its number and the error. The
+    others may have moved or not; they can be closed.
     """
     if not episodes:
         return
     agents: list[Any] = [episode.pending for episode in episodes]
     callers = {episode.driver.caller for episode in episodes}
-    together = callers == {getcurrent()} and not (EVALUATING or None in agents or episodes[0].in_rounds)
+    together = callers == {getcurrent()} and not (
+        EVALUATING or None in agents or episodes[0].in_rounds
+    )
     number = 0
     event: Any = None
     events: Any = []
@@ -422,7 +467,8 @@ def step_all(
             resume = episode.driver.resume
             events.append(resume(replies[number]))
         del replies
-        events.reverse()  # popped one by one, so that the list keeps nothing alive that a model frees
+        # popped one by one, so that the list keeps nothing alive that a model frees
+        events.reverse()
         for number, episode in enumerate(episodes):  # noqa: B007 - the handler below needs the number
             event, args, kwargs = events.pop()
             reply = event.handle(episode, args, kwargs)
@@ -430,7 +476,8 @@ def step_all(
                 event = args = kwargs = None
                 episode.advance(reply)
     except BaseException as error:
-        events = event = args = kwargs = resume = None  # so that the error's traceback does not keep them alive
+        # so that the error's traceback does not keep them alive
+        events = event = args = kwargs = resume = None
         culprit = episodes[number]
         for episode in episodes:
             if episode.pending is None and not episode.over and episode is not culprit:

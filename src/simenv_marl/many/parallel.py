@@ -1,7 +1,7 @@
 """Work on many simulations in several processes.
 
-``spread`` runs work that needs nothing from earlier work in processes of joblib, local or remote. A ``WorkerPool`` has
-processes of its own, in which objects live on between calls.
+``spread`` runs work that needs nothing from earlier work in processes of joblib, local or remote. A
+``WorkerPool`` has processes of its own, in which objects live on between calls.
 """
 
 from __future__ import annotations
@@ -26,7 +26,15 @@ import numpy as np
 
 from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from ..core.policies import COUNTS, count
-from ..errors import MissingExtraError, OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
+from ..errors import (
+    MissingExtraError,
+    OptionValueError,
+    WorkerError,
+    annotate,
+    describe_error,
+    short_repr,
+    warn_user,
+)
 
 EXTRAS: Final = {
     "joblib": "many",
@@ -49,7 +57,9 @@ def import_extra(module: str, feature: str) -> Any:
     except ImportError as error:
         package = module.partition(".")[0]
         extra = EXTRAS.get(package, "experiments")
-        raise MissingExtraError(f"{feature} needs {package}: install simenv-marl[{extra}] ({error})") from None
+        raise MissingExtraError(
+            f"{feature} needs {package}: install simenv-marl[{extra}] ({error})"
+        ) from None
 
 
 NO_BAR: Final[Any] = SimpleNamespace(update=lambda number=1: None)
@@ -57,7 +67,10 @@ NO_BAR: Final[Any] = SimpleNamespace(update=lambda number=1: None)
 
 
 def progress_bar(total: int, progress: bool, unit: str = "simulation", done: int = 0) -> Any:
-    """Return a context with a progress bar over ``total`` units, of which some are done; without ``progress``, none."""
+    """Return a context with a progress bar over ``total`` units, of which some are done.
+
+    Without ``progress``, none.
+    """
     if not progress:
         return nullcontext(NO_BAR)
     return import_extra("tqdm.auto", "progress=True").tqdm(total=total, unit=unit, initial=done)
@@ -77,8 +90,9 @@ def spread(
 ) -> list[Any]:
     """Call ``work``, a function of this package, for all items in this process, or for parts of them in workers.
 
-    It gets the arguments, the items, and a progress bar. Results have the order of the items. -1 workers are as many as
-    joblib's backend has. A worker gets about ``share`` parts of at least ``least`` items, unless one would get none.
+    It gets the arguments, the items, and a progress bar. Results have the order of the items. -1
+    workers are as many as joblib's backend has. A worker gets about ``share`` parts of at least
+    ``least`` items, unless one would get none.
     """
     if not workers or not items:
         return [work(*arguments, items, bar)]
@@ -92,7 +106,9 @@ def spread(
     except ValueError:  # this backend returns nothing before all work is done
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
     # Errors are packed in the worker, because each backend would pass them on in its own way.
-    outcomes = parallel(joblib.delayed(pack_outcome)(pack, _work, parcel, home, part) for part in parts)
+    outcomes = parallel(
+        joblib.delayed(pack_outcome)(pack, _work, parcel, home, part) for part in parts
+    )
     results = []
     try:
         for part, outcome in zip(parts, outcomes, strict=True):
@@ -121,13 +137,19 @@ _received: Final[set[str]] = set()
 def _pack_with_names(thing: Any) -> bytes:
     """Pickle an object for workers, with the functions of this process's script that it refers to by dotted name."""
     parcel, main = pack((thing, {})), sys.modules["__main__"]
-    named = {name.decode(): getattr(main, name.decode(), None) for name in _IN_SCRIPT.findall(parcel)}
-    named = {name: found for name, found in named.items() if isinstance(found, (type, FunctionType))}
+    named = {
+        name.decode(): getattr(main, name.decode(), None) for name in _IN_SCRIPT.findall(parcel)
+    }
+    named = {
+        name: found for name, found in named.items() if isinstance(found, (type, FunctionType))
+    }
     return pack((thing, named)) if named else parcel
 
 
 def _work(parcel: bytes, home: int, items: list[Any]) -> tuple[Any, dict[str, dict[str, float]]]:
-    """Call the function, in a worker; return its result, and what policies have counted, unless it is at ``home``.
+    """Call the function, in a worker.
+
+    Return its result, and what policies have counted, unless it is at ``home``.
 
     The functions it refers to by name are put into the main module.
     """
@@ -157,7 +179,8 @@ def serve(pipe: Connection, other_end: Connection | None) -> None:
 
     ``other_end`` is the user's end of the pipe, if a fork has copied it.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the user's process, which decides what to do
+    # Ctrl-C goes to the user's process, which decides what to do
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if other_end is not None:
         other_end.close()
     made: Any = None
@@ -206,7 +229,10 @@ class Worker:
             raise self._died() from None
 
     def receive(self, seconds: float | None = None) -> tuple[Any, BaseException | None] | None:
-        """Wait for the answer: a result, or None and an error. Return None if it does not come within some seconds."""
+        """Wait for the answer: a result, or None and an error.
+
+        Return None if it does not come within some seconds.
+        """
         if not wait([self.pipe, self._process.sentinel], seconds):
             return None
         try:
@@ -226,13 +252,15 @@ class Worker:
         code = self._process.exitcode
         how = "closed its pipe" if code is None else f"died with exit code {code}"
         script = (
-            '. In a script, make environments with workers under `if __name__ == "__main__":`, because each worker'
+            '. In a script, make environments with workers under `if __name__ == "__main__":`,'
+            " because each worker"
             " imports the script"
             if code == 1  # an error has ended it before it could send a message
             else ""
         )
         return WorkerError(
-            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts new workers{script}"
+            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts"
+            f" new workers{script}"
         )
 
     def stop(self, seconds: float) -> None:
@@ -251,23 +279,31 @@ class Worker:
 class WorkerPool:
     """Worker processes, each of which has an object with a part of the simulations.
 
-    No wait lasts for ever: a wait for an answer also ends when the worker dies, and a worker's pipe closes when its
-    user ends.
+    No wait lasts for ever: a wait for an answer also ends when the worker dies, and a worker's pipe
+    closes when its user ends.
 
     Attributes:
-        broken: Whether a worker has died, or a wait for an answer was interrupted. Then a reset starts all anew.
-        failed: Whether an error has left the simulations at different steps, so that all of them need a reset.
+        broken: Whether a worker has died, or a wait for an answer was interrupted. Then a reset
+            starts all anew.
+        failed: Whether an error has left the simulations at different steps, so that all of them
+            need a reset.
         idle: True: no simulation runs in this process.
     """
 
     failed, idle = False, True
 
     def __init__(
-        self, make: Callable[..., Any], arguments: tuple[Any, ...], number: int, workers: int, context: Any
+        self,
+        make: Callable[..., Any],
+        arguments: tuple[Any, ...],
+        number: int,
+        workers: int,
+        context: Any,
     ) -> None:
         """Start at most so many workers, each of which calls ``make`` with the arguments and a range of the numbers.
 
-        ``make`` is a function of this package. It returns an object that has the methods ``close`` and ``abandon``.
+        ``make`` is a function of this package. It returns an object that has the methods ``close``
+        and ``abandon``.
         """
         try:
             self._context = context
@@ -275,12 +311,16 @@ class WorkerPool:
                 self._context = multiprocessing.get_context("spawn" if context is None else context)
         except (TypeError, ValueError):
             raise OptionValueError(
-                f"context must be one of {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
+                "context must be one of"
+                f" {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
                 f" of multiprocessing, not {short_repr(context)}"
             ) from None
         cuts = [number * place // min(workers, number) for place in range(min(workers, number) + 1)]
         try:
-            self._recipes = {part: pack_plainly((make, (*arguments, part))) for part in map(range, cuts, cuts[1:])}
+            self._recipes = {
+                part: pack_plainly((make, (*arguments, part)))
+                for part in map(range, cuts, cuts[1:])
+            }
         except Exception as error:
             raise OptionValueError(
                 "the simulation, its points or its options cannot be sent to another process"
@@ -323,16 +363,22 @@ class WorkerPool:
         """
         if os.getpid() != self._process:
             raise WorkerError(
-                "the workers belong to the process from which this one was forked; make a new environment"
+                "the workers belong to the process from which this one was forked; make a new"
+                " environment"
             )
         if self.broken and method == "reset":
             self.abandon()
             self._start()
         elif self.broken:
-            raise WorkerError("a worker is dead, or a wait for it was interrupted; reset() starts new workers")
+            raise WorkerError(
+                "a worker is dead, or a wait for it was interrupted; reset() starts new workers"
+            )
         messages = []
         for part in self._recipes:
-            own = [a[part.start : part.stop] if isinstance(a, (list, np.ndarray)) else a for a in arguments]
+            own = [
+                a[part.start : part.stop] if isinstance(a, (list, np.ndarray)) else a
+                for a in arguments
+            ]
             messages.append(pack_plainly((method, own)))
         moves = method in ("reset", "step")
         self.failed = self.failed or moves
@@ -341,7 +387,10 @@ class WorkerPool:
         return answers
 
     def close(self) -> None:
-        """Close the objects and end the workers, by force after some seconds. Raise the first error of an object."""
+        """Close the objects and end the workers, by force after some seconds.
+
+        Raise the first error of an object.
+        """
         deadline = monotonic() + SECONDS_TO_CLOSE
         asked = [] if self.broken or os.getpid() != self._process else self._workers
         answers: list[Any] = []
@@ -351,7 +400,10 @@ class WorkerPool:
                     worker.send(pack_plainly(("close", ())))
                 answers = [worker.receive(max(deadline - monotonic(), 0.0)) for worker in asked]
             if None in answers:
-                warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are killed", ResourceWarning)
+                warn_user(
+                    f"workers did not close within {SECONDS_TO_CLOSE} s and are killed",
+                    ResourceWarning,
+                )
             for _, error in filter(None, answers):
                 if error is not None:
                     raise error

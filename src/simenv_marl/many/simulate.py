@@ -24,15 +24,19 @@ def simulate(
     seed: int | None = None,
     **options: Unpack[EpisodeOptions],
 ) -> Any:
-    """Run a simulation's own loop to its end. Policies answer decisions; all other decisions follow the model's rule.
+    """Run a simulation's own loop to its end. Policies answer decisions.
+
+    All other decisions follow the model's rule.
 
     Args:
-        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
-        policies: The policies: a dict from an agent or a decision point to a callable. The callable gets the
-            observation, or the observation and the info, and returns an action.
-        points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor ``policies``, there are
-            no decision points and the plain model runs.
-        seed: The seed for the simulation's ``reset``, where ``reset`` takes one. None: a seed is drawn.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a
+            ``Variant``.
+        policies: The policies: a dict from an agent or a decision point to a callable. The callable
+            gets the observation, or the observation and the info, and returns an action.
+        points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor
+            ``policies``, there are no decision points and the plain model runs.
+        seed: The seed for the simulation's ``reset``, where ``reset`` takes one. None: a seed is
+            drawn.
         **options: The options of ``aec_env``, without ``max_steps``.
 
     Returns:
@@ -69,33 +73,39 @@ def simulate_many(
 ) -> list[Any]:
     """Run one simulation per seed, with policies that answer the decisions of many simulations in batches.
 
-    Each simulation ends as it would end with ``simulate`` and the same policies. The results do not depend on
-    ``batch_size``, ``concurrency`` and ``workers``, as long as a policy's answer to one row does not depend on others.
+    Each simulation ends as it would end with ``simulate`` and the same policies. The results do not
+    depend on ``batch_size``, ``concurrency`` and ``workers``, as long as a policy's answer to one
+    row does not depend on others.
 
     Args:
-        simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
-        policies: The policies: a dict from an agent or a decision point to a callable. The callable gets the
-            observations of all decisions that wait for it; or the observations and the infos; or the observations, the
-            infos and the identities. Observations are stacked, ``(batch, *shape)``; for a ``Dict`` or ``Tuple`` space
-            they are a dict or a tuple of stacks. The infos are a list of dicts. The identities are a list of pairs: the
-            seed of the episode, and the number of the decision among all decisions of the episode. The callable returns
-            as many actions, in the same order: an array, something that NumPy can convert to one (a tensor), a
-            sequence, or a dict of these. ``RULE`` in place of one action, or of all, leaves the decision to the model.
-            A tuple of actions and a dict is allowed; the dict is ignored here (see ``collect_episodes``). If several
-            keys have the same policy object, their decisions share batches. One batch never mixes different spaces. The
-            policies of a ``Variant`` answer one decision at a time; so do policies that ask for ``_environment`` or
-            ``_decision``, and coroutine functions, which are awaited.
+        simulation: A simulation (which is copied for each seed), its class, a zero-argument
+            factory, or a ``Variant``.
+        policies: The policies: a dict from an agent or a decision point to a callable. The callable
+            gets the observations of all decisions that wait for it; or the observations and the
+            infos; or the observations, the infos and the identities. Observations are stacked,
+            ``(batch, *shape)``; for a ``Dict`` or ``Tuple`` space they are a dict or a tuple of
+            stacks. The infos are a list of dicts. The identities are a list of pairs: the seed of
+            the episode, and the number of the decision among all decisions of the episode. The
+            callable returns as many actions, in the same order: an array, something that NumPy can
+            convert to one (a tensor), a sequence, or a dict of these. ``RULE`` in place of one
+            action, or of all, leaves the decision to the model. A tuple of actions and a dict is
+            allowed; the dict is ignored here (see ``collect_episodes``). If several keys have the
+            same policy object, their decisions share batches. One batch never mixes different
+            spaces. The policies of a ``Variant`` answer one decision at a time; so do policies that
+            ask for ``_environment`` or ``_decision``, and coroutine functions, which are awaited.
         seeds: The seeds of the simulations, non-negative integers.
-        points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor ``policies``, there are
-            no decision points and the plain models run.
-        collect: A callable of a simulation that has just ended. It returns what to keep of it. None: keep the
-            simulation itself.
-        batch_size: The largest number of simulations that are suspended together, in each worker process. At most 256
-            are suspended while the policies take less time than the simulations.
-        concurrency: How many decisions of each process wait at once for policies that are coroutine functions.
-        workers: The number of worker processes, which ``joblib`` runs. 0: this process alone. -1: as many as joblib's
-            backend has. The simulation, points, policies, options and collected values must be picklable, by reference
-            or by value.
+        points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor
+            ``policies``, there are no decision points and the plain models run.
+        collect: A callable of a simulation that has just ended. It returns what to keep of it.
+            None: keep the simulation itself.
+        batch_size: The largest number of simulations that are suspended together, in each worker
+            process. At most 256 are suspended while the policies take less time than the
+            simulations.
+        concurrency: How many decisions of each process wait at once for policies that are coroutine
+            functions.
+        workers: The number of worker processes, which ``joblib`` runs. 0: this process alone. -1:
+            as many as joblib's backend has. The simulation, points, policies, options and collected
+            values must be picklable, by reference or by value.
         progress: Whether to show a progress bar, by ``tqdm``.
         **options: The options of ``simulate``.
 
@@ -107,27 +117,36 @@ def simulate_many(
         InvalidActionError: A policy did not return one legal action for each decision.
         MissingExtraError: joblib or tqdm is missing.
         SimEnvError: Something else cannot work. The subclass tells what.
-        BaseException: Any exception of a model, a mapping, a policy or ``collect``, with a note that names the seed.
-            All other simulations are unwound first.
+        BaseException: Any exception of a model, a mapping, a policy or ``collect``, with a note
+            that names the seed. All other simulations are unwound first.
     """
-    checked, episodes = checked_seeds(seeds), (simulation, checked_policies(policies), points, options)
+    checked, episodes = (
+        checked_seeds(seeds),
+        (simulation, checked_policies(policies), points, options),
+    )
     check_options(batch_size, workers, collect, concurrency)
     plan = _draw_up_keyed(*episodes)  # errors show up before any work starts
     arguments = episodes, None if workers else plan, collect, batch_size, concurrency
     with progress_bar(len(checked), progress) as bar:
-        return list(chain.from_iterable(spread(_simulate, arguments, checked, workers, batch_size, bar)))
+        return list(
+            chain.from_iterable(spread(_simulate, arguments, checked, workers, batch_size, bar))
+        )
 
 
-def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
+def _draw_up(
+    simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
+) -> Plan:
     if options.get("max_steps") is not None:
         raise OptionValueError(
-            "max_steps has no effect where simulations run to their own end; evaluate, collect_episodes and"
-            " environments truncate episodes"
+            "max_steps has no effect where simulations run to their own end; evaluate,"
+            " collect_episodes and environments truncate episodes"
         )
     return Plan(simulation, points, {**options, "policies": policies}, unattended=True)
 
 
-def _draw_up_keyed(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
+def _draw_up_keyed(
+    simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
+) -> Plan:
     return _draw_up(simulation, policy_keys(policies), points, options)
 
 
@@ -154,11 +173,15 @@ def _simulate(
 def checked_seeds(seeds: Any) -> list[int]:
     """Return seeds as a list of Python integers, or raise an error that says why they are not valid."""
     if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
-        raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {short_repr(seeds)}")
+        raise OptionValueError(
+            f"seeds must be an iterable of integers, such as range(100), not {short_repr(seeds)}"
+        )
     checked = []
     for seed in seeds:
         if seed is None:
-            raise OptionValueError("seeds must be integers, not None: an unknown seed could not be repeated")
+            raise OptionValueError(
+                "seeds must be integers, not None: an unknown seed could not be repeated"
+            )
         checked.append(checked_seed(seed))
     return checked  # type: ignore[return-value]
 
@@ -167,7 +190,8 @@ def checked_policies(policies: Any) -> Mapping[Any, Any]:
     """Return policies as a mapping."""
     if policies is not None and not isinstance(policies, Mapping):
         raise OptionValueError(
-            f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
+            "policies must be a dict from agents or points to callables, not"
+            f" {short_repr(policies)}"
         )
     return policies or {}
 
@@ -175,18 +199,25 @@ def checked_policies(policies: Any) -> Mapping[Any, Any]:
 def check_options(batch_size: Any, workers: Any, collect: Any = None, concurrency: Any = 1) -> None:
     """Check the options that all functions for many simulations have."""
     if collect is not None and not callable(collect):
-        raise OptionValueError(f"collect must be a callable of a simulation, or None, not {short_repr(collect)}")
+        raise OptionValueError(
+            f"collect must be a callable of a simulation, or None, not {short_repr(collect)}"
+        )
     for name, value, least in (
         ("batch_size", batch_size, 1),
         ("concurrency", concurrency, 1),
         ("workers", workers, -1),
     ):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"
+            what = (
+                "a positive integer"
+                if least == 1
+                else "a non-negative integer, or -1 for as many as joblib has"
+            )
             raise OptionValueError(f"{name} must be {what}, not {short_repr(value)}")
     if workers:
         backend, _ = import_extra("joblib.parallel", f"workers={workers}").get_active_backend()
         if type(backend).__name__ == "MultiprocessingBackend":
             raise OptionValueError(
-                "joblib's backend 'multiprocessing' waits for ever for a worker that has died; use 'loky'"
+                "joblib's backend 'multiprocessing' waits for ever for a worker that has died; use"
+                " 'loky'"
             )

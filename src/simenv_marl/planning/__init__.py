@@ -1,4 +1,7 @@
-"""Planning: estimates the values of actions on possible futures of an episode; policies that decide by these values."""
+"""Planning: estimates the values of actions on possible futures of an episode.
+
+Policies that decide by these values.
+"""
 
 from .rollouts import RolloutPolicy, action_values
 from .tree import TreeSearchPolicy

@@ -1,7 +1,8 @@
 """The agent whose decision is pending, in each view: it takes a candidate in a branch, and then follows its base.
 
-The environment may have wrappers. The agent's actions go through them, and its observations and rewards come from them.
-``RULE``, which only the unwrapped environment knows, replaces the action that the wrappers let through.
+The environment may have wrappers. The agent's actions go through them, and its observations and
+rewards come from them. ``RULE``, which only the unwrapped environment knows, replaces the action
+that the wrappers let through.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ from ..simulation import RULE
 
 
 class Player:
-    """The agent whose decision is pending, in the single view; ``base`` decides after the candidate.
+    """The agent whose decision is pending, in the single view.
+
+    ``base`` decides after the candidate.
 
     Attributes:
         env, view: The environment, with or without wrappers, and the unwrapped one.
@@ -61,23 +64,30 @@ class Player:
     # -- checks, before anything moves ------------------------------------------------------------
 
     def candidates(self, actions: Any, *, legal: bool = False) -> list[Any]:
-        """Check the candidates for the pending decision, and return them; without masked ones if ``legal``."""
+        """Check the candidates for the pending decision, and return them.
+
+        Without masked ones if ``legal``.
+        """
         if actions is None:
             space = self._space_of(self.agent)
             if not isinstance(space, spaces.Discrete):
                 raise OptionValueError(
-                    f"actions=None needs a Discrete action space; list candidates of {short_repr(space)}"
+                    "actions=None needs a Discrete action space; list candidates of"
+                    f" {short_repr(space)}"
                 )
             actions, legal = list(range(int(space.start), int(space.start + space.n))), True
         listed = actions if isinstance(actions, list) else []
         if not listed:
-            raise OptionValueError(f"actions must be a list of candidates, not {short_repr(actions)}")
+            raise OptionValueError(
+                f"actions must be a list of candidates, not {short_repr(actions)}"
+            )
         for action in listed:
             self._check(action, None if legal else self.record.mask)
         found = [action for action in listed if self.allows(action)] if legal else listed
         if not found:
             raise InvalidActionError(
-                f"all candidates of {self.agent!r} are masked; its mask is {short_repr(self.record.mask)}"
+                f"all candidates of {self.agent!r} are masked; its mask is"
+                f" {short_repr(self.record.mask)}"
             )
         return found
 
@@ -90,20 +100,27 @@ class Player:
         return True
 
     def _check(self, action: Any, mask: Any) -> None:
-        """Refuse an action that is not legal. The mask does not apply if wrappers have replaced the action space."""
+        """Refuse an action that is not legal.
+
+        The mask does not apply if wrappers have replaced the action space.
+        """
         point, space = self.record.point, self._space_of(self.agent)
         if action is RULE:
             return
         if space == point.definition.action_space:
             point.checked(action, self.agent, mask)
         elif action_check(space)(action) is ILLEGAL:
-            raise InvalidActionError(f"the action {short_repr(action)} of {self.agent!r} is not in {short_repr(space)}")
+            raise InvalidActionError(
+                f"the action {short_repr(action)} of {self.agent!r} is not in {short_repr(space)}"
+            )
 
     def check_base(self) -> None:
         """Refuse a base that is not a policy, or that names an agent that does not exist."""
         bases = self.base if isinstance(self.base, Mapping) else {self.agent: self.base}
         if any(policy is not RULE and not callable(policy) for policy in bases.values()):
-            raise OptionValueError(f"base must be RULE, a policy, or policies by agent, not {short_repr(self.base)}")
+            raise OptionValueError(
+                f"base must be RULE, a policy, or policies by agent, not {short_repr(self.base)}"
+            )
         for name in bases if bases is self.base else ():
             if not self.may_be(name):
                 known = [*self.episode.agents, *self.episode.others]
@@ -162,12 +179,19 @@ class Player:
         return space(name) if callable(space) else space
 
     def _step_env(self, action: Any, name: str) -> Any:
-        """Step through the wrappers. ``RULE``, also as a part of a dict of actions, reaches the view unchanged."""
+        """Step through the wrappers.
+
+        ``RULE``, also as a part of a dict of actions, reaches the view unchanged.
+        """
         view, parts = self.view, action if isinstance(action, Mapping) else {}
         rules = {agent: RULE for agent, part in parts.items() if part is RULE}
         if self.env is view or not (rules or action is RULE):
             return self.env.step(action)
-        sample = {**parts, **{agent: self._sample(agent) for agent in rules}} if rules else self._sample(name)
+        sample = (
+            {**parts, **{agent: self._sample(agent) for agent in rules}}
+            if rules
+            else self._sample(name)
+        )
 
         def step(through: Any) -> Any:
             return type(view).step(view, {**through, **rules} if rules else RULE)
@@ -180,8 +204,13 @@ class Player:
 
     def _sample(self, name: str) -> Any:
         """Return a legal action of an agent, which wrappers see in place of ``RULE``."""
-        space, agent = copy.deepcopy(self._space_of(name)), self.episode.agents.get(name)  # whose generator stays
-        masked = agent is not None and agent.mask is not None and space == agent.point.definition.action_space
+        # whose generator stays
+        space, agent = copy.deepcopy(self._space_of(name)), self.episode.agents.get(name)
+        masked = (
+            agent is not None
+            and agent.mask is not None
+            and space == agent.point.definition.action_space
+        )
         return space.sample(agent.mask) if masked else space.sample()
 
 
@@ -194,7 +223,8 @@ class JointPlayer(Player):
         self.may_be = self.view.joint.roster.__contains__
         if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
             raise OptionValueError(
-                "a base by agent needs a joint view without flatten=True; pass one policy for all agents"
+                "a base by agent needs a joint view without flatten=True; pass one policy for all"
+                " agents"
             )
 
     def _space_of(self, name: str) -> Any:
@@ -205,7 +235,13 @@ class JointPlayer(Player):
         if self._space_of(self.agent) == self.view.action_space:
             self.episode.round.check(self.episode, self.view.joint.actions(self.episode, action))
         elif isinstance(action, Mapping):
-            super()._check({name: self._sample(name) if part is RULE else part for name, part in action.items()}, mask)
+            super()._check(
+                {
+                    name: self._sample(name) if part is RULE else part
+                    for name, part in action.items()
+                },
+                mask,
+            )
         else:
             super()._check(action, mask)
 
@@ -214,7 +250,10 @@ class JointPlayer(Player):
         if not isinstance(self.base, Mapping):
             return super().decide()
         agents = self.episode.agents
-        return {name: self._decide_for(name) if name in agents else RULE for name in self.view.joint.roster}
+        return {
+            name: self._decide_for(name) if name in agents else RULE
+            for name in self.view.joint.roster
+        }
 
     def _observe(self, name: str) -> Any:
         if name == self.agent and not self.seen:
@@ -229,8 +268,8 @@ class AECPlayer(Player):
         super().__init__(env, base)
         if self.view.agent_selection != self.agent:
             raise EpisodeOverError(
-                f"{self.view.agent_selection!r} is selected, but its episode has ended: call step(None) before you"
-                f" plan the decision of {self.agent!r}"
+                f"{self.view.agent_selection!r} is selected, but its episode has ended: call"
+                f" step(None) before you plan the decision of {self.agent!r}"
             )
 
     def step(self, action: Any) -> float:
@@ -265,8 +304,12 @@ class ParallelPlayer(Player):
 
     def _play(self, actions: dict[str, Any]) -> float:
         """Play a round in which the other agents follow their bases."""
-        others = {name: self._decide_for(name) for name in self.episode.agents if name != self.agent}
-        observations, rewards, terminations, truncations, infos = self._step_env(actions | others, self.agent)
+        others = {
+            name: self._decide_for(name) for name in self.episode.agents if name != self.agent
+        }
+        observations, rewards, terminations, truncations, infos = self._step_env(
+            actions | others, self.agent
+        )
         self.seen = {name: (observations[name], infos.get(name, {})) for name in observations}
         over = terminations.get(self.agent, True) or truncations[self.agent]
         self.over = bool(over or self.record.ended)  # pad_agents keeps ended agents
@@ -276,8 +319,14 @@ class ParallelPlayer(Player):
 def player_of(env: Any, base: Any) -> Player:
     """Return the player of the agent whose decision is pending in an environment of one simulation."""
     view = pending_view(env, "planning")
-    players = {SimulationAECEnv: AECPlayer, SimulationParallelEnv: ParallelPlayer, SimulationJointEnv: JointPlayer}
-    return next((player for kind, player in players.items() if isinstance(view, kind)), Player)(env, base)
+    players = {
+        SimulationAECEnv: AECPlayer,
+        SimulationParallelEnv: ParallelPlayer,
+        SimulationJointEnv: JointPlayer,
+    }
+    return next((player for kind, player in players.items() if isinstance(view, kind)), Player)(
+        env, base
+    )
 
 
 @dataclass
@@ -324,12 +373,21 @@ def try_out(env: Any, number: int, tries: Sequence[tuple[list[Any], int]], polic
 
 
 def rollout_from(
-    env: Any, actions: Sequence[Any], policy: Any, progress: Progress, *, stop: int | None = None, future: int = 0
+    env: Any,
+    actions: Sequence[Any],
+    policy: Any,
+    progress: Progress,
+    *,
+    stop: int | None = None,
+    future: int = 0,
 ) -> tuple[Progress, Outcome]:
-    """In a branch, continue a rollout up to its end, or before decision number ``stop``; return it and its outcome.
+    """In a branch, continue a rollout up to its end, or before decision number ``stop``.
 
-    Take actions, one after the other, and continue with the base. If an action is illegal when its decision arises, the
-    base decides. The terminal value is added to the last reward. ``policy`` is a ``RolloutPolicy``.
+    Return it and its outcome.
+
+    Take actions, one after the other, and continue with the base. If an action is illegal when its
+    decision arises, the base decides. The terminal value is added to the last reward. ``policy`` is
+    a ``RolloutPolicy``.
     """
     began = perf_counter()
     env.unwrapped._session.move_to(Where.PLAN)
@@ -341,7 +399,9 @@ def rollout_from(
         made.seen, made.over = player.seen, player.over
         made.seconds += perf_counter() - began
         digest = _digest((player.record.observation, player.record.info))
-        return made, Outcome(made.rewards, digest, made.times, made.seconds / max(1, len(made.rewards)))
+        return made, Outcome(
+            made.rewards, digest, made.times, made.seconds / max(1, len(made.rewards))
+        )
     except BaseException as error:
         tried = ", ".join(map(short_repr, actions))
         annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
@@ -355,7 +415,9 @@ def _digest(seen: Any) -> int:
         return crc32(repr(seen).encode(errors="replace"))
 
 
-def _continue(made: Progress, player: Player, actions: Sequence[Any], options: Any, stop: int | None) -> None:
+def _continue(
+    made: Progress, player: Player, actions: Sequence[Any], options: Any, stop: int | None
+) -> None:
     """Take steps, and add their rewards."""
     rewards, timed = made.rewards, player.episode.clock is not None
     now = player.now() if timed else 0.0
@@ -381,7 +443,9 @@ def _terminal_value(function: Callable[[Any], Any], env: Any) -> float:
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
     if not is_number(value):
-        raise OptionValueError(f"terminal_value must return a finite number, not {short_repr(value)}")
+        raise OptionValueError(
+            f"terminal_value must return a finite number, not {short_repr(value)}"
+        )
     return float(value)
 
 

@@ -1,4 +1,7 @@
-"""The values of candidate actions for a pending decision, from rollouts in branches; policies that decide by them."""
+"""The values of candidate actions for a pending decision, from rollouts in branches.
+
+Policies that decide by them.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,8 @@ from ..simulation import RULE
 from .player import Outcome, is_count, is_number, player_of, try_out
 from .values import ActionValues, correlation_of, warn_of_futures, warn_of_times
 
-_KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
+# separates the seeds of futures from others that are derived from the episode's seed
+_KEY: Final = 0x706C616E
 
 _FRESH: Final = 8
 """The least number of fresh futures in which a candidate is compared with the rule."""
@@ -47,36 +51,39 @@ def action_values(
 ) -> ActionValues:
     """Estimate the value of each candidate action of the pending decision by trying it in branches.
 
-    In a branch the action is taken, and the agent's base decides from then on, up to the horizon or the agent's end.
-    All candidates meet the same futures. ``env`` itself does not move.
+    In a branch the action is taken, and the agent's base decides from then on, up to the horizon or
+    the agent's end. All candidates meet the same futures. ``env`` itself does not move.
 
     Args:
-        env: An environment of one simulation with a pending decision, in any view, with or without wrappers. In the
-            parallel view, the agent is the one that is ``"deciding"``, and the others play the same rounds. In the
-            joint view, it is the one agent that stands for all.
-        actions: The candidates; ``RULE`` may be among them. None: all legal actions of a ``Discrete``.
-        base: What decides after the candidate: ``RULE``, a policy of the agent (a callable of the observation, or of
-            the observation and the info), or a dict of these by agent. Other agents of the environment follow their
-            entry in the dict, else their rule. Agents in the option ``policies`` keep their policies.
+        env: An environment of one simulation with a pending decision, in any view, with or without
+            wrappers. In the parallel view, the agent is the one that is ``"deciding"``, and the
+            others play the same rounds. In the joint view, it is the one agent that stands for all.
+        actions: The candidates; ``RULE`` may be among them. None: all legal actions of a
+            ``Discrete``.
+        base: What decides after the candidate: ``RULE``, a policy of the agent (a callable of the
+            observation, or of the observation and the info), or a dict of these by agent. Other
+            agents of the environment follow their entry in the dict, else their rule. Agents in the
+            option ``policies`` keep their policies.
         futures: The number of futures in which each candidate is tried.
-        horizon: The number of the agent's decisions whose rewards count, including the candidate. With
-            ``horizon_by="time"``: a duration; rewards count up to the agent's first decision after at least that time.
-            None: up to the agent's end.
+        horizon: The number of the agent's decisions whose rewards count, including the candidate.
+            With ``horizon_by="time"``: a duration; rewards count up to the agent's first decision
+            after at least that time. None: up to the agent's end.
         horizon_by: The unit of the horizon: "decision", or "time" for the simulation's time.
-        terminal_value: The value of what comes after the horizon: a callable of the environment. It is called in the
-            branch if the agent still lives at the horizon.
+        terminal_value: The value of what comes after the horizon: a callable of the environment. It
+            is called in the branch if the agent still lives at the horizon.
         discount: The discount factor, from 0 to 1.
-        discount_by: The unit of discounting: "decision" for each decision of the agent before the rewarded one, or
-            "time" for each unit of the simulation's time between the candidate and the rewarded decision.
-        seed: A number that distinguishes the futures from others of the same decision. None: the futures that follow
-            from the seed of the episode and the number of the decision.
+        discount_by: The unit of discounting: "decision" for each decision of the agent before the
+            rewarded one, or "time" for each unit of the simulation's time between the candidate and
+            the rewarded decision.
+        seed: A number that distinguishes the futures from others of the same decision. None: the
+            futures that follow from the seed of the episode and the number of the decision.
         method: The method of branching, as ``branch`` takes it.
         time_limit: The time after which a branch is ended, in seconds.
         progress: Whether to show a progress bar, by ``tqdm``.
 
     Returns:
-        The values. If the simulation has no ``reseed`` and the environment was not made with ``global_rng=True``, there
-        is only the one exact future, and a warning says so.
+        The values. If the simulation has no ``reseed`` and the environment was not made with
+        ``global_rng=True``, there is only the one exact future, and a warning says so.
 
     Raises:
         ViewError: ``env`` is not an environment of one simulation.
@@ -108,30 +115,46 @@ def _is_planned(env: Any) -> bool:
 
 
 def base_value(env: Any, base: Any) -> ActionValues:
-    """Return the base's answer as the best action, without rollouts. In branches, planners act as their bases."""
+    """Return the base's answer as the best action, without rollouts.
+
+    In branches, planners act as their bases.
+    """
     action, unknown = player_of(env, base).decide(), np.full(1, np.nan)
-    return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)), np.nan)
+    return ActionValues(
+        (action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)), np.nan
+    )
 
 
 class Rollouts:
-    """The rollouts of the candidates for a pending decision. Future number i is the same for all candidates."""
+    """The rollouts of the candidates for a pending decision.
+
+    Future number i is the same for all candidates.
+    """
 
     def __init__(self, env: Any, policy: RolloutPolicy, *, planner: bool = False) -> None:
-        """Check the candidates and the base of a policy. For a ``planner``, leave out masked ones, and add ``RULE``."""
+        """Check the candidates and the base of a policy.
+
+        For a ``planner``, leave out masked ones, and add ``RULE``.
+        """
         self.env, self._policy = env, policy
         player = player_of(env, policy.base)
         player.check_base()
         if policy.timed and player.episode.clock is None:
-            raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
+            raise OptionValueError(
+                'discount_by="time" and horizon_by="time" need a simulation with a method time()'
+            )
         self.actions = player.candidates(policy.actions, legal=planner)
-        self.added = planner and len(self.actions) > 1 and not any(action is RULE for action in self.actions)
+        self.added = (
+            planner and len(self.actions) > 1 and not any(action is RULE for action in self.actions)
+        )
         if self.added:
             self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         self.outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
         self.states: Any = None  # those that are kept, if a search keeps some: see ``tree``
         self.seconds = 0.0  # for a step
-        self._times: list[list[float]] = []  # the simulation's times between decisions, in each rollout
+        # the simulation's times between decisions, in each rollout
+        self._times: list[list[float]] = []
         consulted = isinstance(player.record.policy, AskingPolicy)
         number = player.record.answered if consulted else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
@@ -143,9 +166,10 @@ class Rollouts:
         except BranchError:
             self.reseeds = False
             warn_user(
-                f"{self._name} cannot draw new random numbers in a branch: the planner tries all candidates on the one"
-                " future that will happen, and so foresees chance. Give it a method reseed(seed), empty if nothing is"
-                " random, or set global_rng=True if it draws from random or numpy.random"
+                f"{self._name} cannot draw new random numbers in a branch: the planner tries all"
+                " candidates on the one future that will happen, and so foresees chance. Give it a"
+                " method reseed(seed), empty if nothing is random, or set global_rng=True if it"
+                " draws from random or numpy.random"
             )
 
     def seeds(self, number: int) -> list[int]:
@@ -153,7 +177,10 @@ class Rollouts:
         return [int(word) for word in np.random.SeedSequence(self._entropy).generate_state(number)]
 
     def add(self, candidates: Iterable[int], number: int) -> None:
-        """Try candidates, given by their places, in some more futures; at most in one if there is only one."""
+        """Try candidates, given by their places, in some more futures.
+
+        At most in one if there is only one.
+        """
         rollouts = [
             ((place,), future)
             for place in candidates
@@ -163,7 +190,10 @@ class Rollouts:
         self.run(rollouts)
 
     def run(self, rollouts: Sequence[tuple[Plan, int]]) -> list[list[float]]:
-        """Run rollouts, given by their plans and the numbers of their futures; note and return the rewards of each."""
+        """Run rollouts, given by their plans and the numbers of their futures.
+
+        Note and return the rewards of each.
+        """
         outcomes = self._outcomes_of(rollouts)
         for (plan, _), outcome in zip(rollouts, outcomes, strict=True):
             self.returns[plan[0]].append(sum(outcome.rewards))
@@ -195,7 +225,9 @@ class Rollouts:
             return self.certain(plan) > self.certain((rule,))
         begin = max(map(len, self.returns))
         futures = range(begin, begin + max(_FRESH, self._policy.futures))
-        outcomes = self._outcomes_of([(tried, future) for tried in (plan, (rule,)) for future in futures])
+        outcomes = self._outcomes_of(
+            [(tried, future) for tried in (plan, (rule,)) for future in futures]
+        )
         returns = np.array([sum(outcome.rewards) for outcome in outcomes]).reshape(2, -1)
         gains = returns[0] - returns[1]
         return bool(gains.mean() > self._policy.margin * gains.std(ddof=1) / np.sqrt(len(gains)))
@@ -205,7 +237,10 @@ class Rollouts:
         return float(sum(self.outcomes[plan][0][0]))
 
     def values(self, finalists: Sequence[int]) -> ActionValues:
-        """Estimate the values; the best candidate is one of the finalists, which are given by their places."""
+        """Estimate the values.
+
+        The best candidate is one of the finalists, which are given by their places.
+        """
         counts = np.array([len(values) for values in self.returns], np.int64)
         returns = np.full((len(counts), counts.max()), np.nan)
         means, errors = np.full((2, len(counts)), np.nan)
@@ -221,7 +256,9 @@ class Rollouts:
         if self._policy.horizon is not None and self._policy.horizon_by == "decision":
             warn_of_times(self._name, self._times)
         correlation = correlation_of(returns)
-        return ActionValues(tuple(self.actions), means, errors, counts, self.actions[best], returns, correlation)
+        return ActionValues(
+            tuple(self.actions), means, errors, counts, self.actions[best], returns, correlation
+        )
 
 
 # -- policies -------------------------------------------------------------------------------------
@@ -231,22 +268,24 @@ class Rollouts:
 class RolloutPolicy:
     """A policy that looks one decision ahead: it tries candidate actions in branches and takes the best one.
 
-    It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds. In each round, all
-    remaining candidates are tried on the same futures, and the better half of them remains.
+    It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds.
+    In each round, all remaining candidates are tried on the same futures, and the better half of
+    them remains.
 
-    ``RULE`` is always a candidate. Another one is taken only if its paired advantage over ``RULE``, on at least eight
-    fresh futures, exceeds ``margin`` standard errors. Where there is one exact future, any gain is taken.
+    ``RULE`` is always a candidate. Another one is taken only if its paired advantage over ``RULE``,
+    on at least eight fresh futures, exceeds ``margin`` standard errors. Where there is one exact
+    future, any gain is taken.
 
-    The policy can be used like any policy that answers one decision at a time; it gets the environment as
-    ``_environment``. In a branch of a planner it acts as its own base.
+    The policy can be used like any policy that answers one decision at a time; it gets the
+    environment as ``_environment``. In a branch of a planner it acts as its own base.
 
     Its attributes are its arguments. ``action_values`` describes those that are not described here.
 
     Attributes:
-        actions: The candidates. Candidates that are masked at a decision are left out there. None: all legal actions of
-            a ``Discrete``.
-        budget: The number of branches per decision. None: the number of candidates times ``futures``. The comparison
-            with the rule comes on top.
+        actions: The candidates. Candidates that are masked at a decision are left out there. None:
+            all legal actions of a ``Discrete``.
+        budget: The number of branches per decision. None: the number of candidates times
+            ``futures``. The comparison with the rule comes on top.
         margin: By how many standard errors a candidate must be better than ``RULE`` to be taken.
         futures: The mean number of futures per candidate, if there is no ``budget``.
         seed: A number that distinguishes the futures from those of another planner.
@@ -280,12 +319,18 @@ class RolloutPolicy:
         else:
             fine, kind = is_count(horizon), "a number of decisions, 1 or more, or None"
         self.require("horizon", horizon is None or fine, kind)
-        self.require("discount", is_number(self.discount) and 0 <= self.discount <= 1, "a number from 0 to 1")
+        self.require(
+            "discount", is_number(self.discount) and 0 <= self.discount <= 1, "a number from 0 to 1"
+        )
         fine = self.terminal_value is None or callable(self.terminal_value)
         self.require("terminal_value", fine, "a callable of the environment")
         self.seed = checked_seed(self.seed)
-        self.require("margin", is_number(self.margin) and self.margin >= 0, "a number that is not negative")
-        self.require("budget", self.budget is None or is_count(self.budget), "a number of branches or None")
+        self.require(
+            "margin", is_number(self.margin) and self.margin >= 0, "a number that is not negative"
+        )
+        self.require(
+            "budget", self.budget is None or is_count(self.budget), "a number of branches or None"
+        )
         if isinstance(self.actions, Iterable) and not isinstance(self.actions, (str, Mapping)):
             self.actions = list(self.actions)  # an iterator would be used up by the first decision
 
@@ -301,7 +346,8 @@ class RolloutPolicy:
             env: The environment, as ``action_values`` takes it. It does not move.
 
         Returns:
-            The values. ``best`` is ``RULE`` or a candidate of the last round. A single candidate is not tried.
+            The values. ``best`` is ``RULE`` or a candidate of the last round. A single candidate is
+            not tried.
 
         Raises:
             OptionValueError: The budget is too small to try each candidate.
@@ -313,7 +359,9 @@ class RolloutPolicy:
         number = len(rollouts.actions)
         budget = number * self.futures if self.budget is None else self.budget
         if budget < number:
-            raise OptionValueError(f"a budget of {budget} branches is too small to try {number} candidates once")
+            raise OptionValueError(
+                f"a budget of {budget} branches is too small to try {number} candidates once"
+            )
         if number == 1:
             return rollouts.values([0])
         finalists = self._search(rollouts, budget)
@@ -335,5 +383,8 @@ class RolloutPolicy:
         return [(place,) for place in left]
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
-        """Answer a decision, as policies do, with the best action; within a branch, with the answer of the base."""
+        """Answer a decision, as policies do, with the best action.
+
+        Within a branch, with the answer of the base.
+        """
         return self.choose(_environment).best

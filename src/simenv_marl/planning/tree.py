@@ -18,7 +18,10 @@ from .player import Progress, is_count, is_number, rollout_from, try_out
 from .rollouts import Plan, RolloutPolicy, Rollouts
 
 _AT_ONCE: Final = 8
-"""The number of branches that run before a tree is updated. It does not depend on the number of cores."""
+"""The number of branches that run before a tree is updated.
+
+It does not depend on the number of cores.
+"""
 
 _MOST: Final = 200
 """The largest number of states that are kept. Each takes some megabytes."""
@@ -28,16 +31,17 @@ _MOST: Final = 200
 class TreeSearchPolicy(RolloutPolicy):
     """A policy that looks several decisions ahead, by open-loop UCT over branches.
 
-    At each of the next ``depth`` decisions it tries the candidates that seem best, and those of which it knows little
-    (UCB1); then the base decides. A node of the tree is a sequence of candidates, whatever chance events lie between
-    them. All candidates for the pending decision meet the same futures in the same order.
+    At each of the next ``depth`` decisions it tries the candidates that seem best, and those of
+    which it knows little (UCB1); then the base decides. A node of the tree is a sequence of
+    candidates, whatever chance events lie between them. All candidates for the pending decision
+    meet the same futures in the same order.
 
-    It needs more branches than ``RolloutPolicy``. They pay off if an action is only good with the right actions after
-    it.
+    It needs more branches than ``RolloutPolicy``. They pay off if an action is only good with the
+    right actions after it.
 
     Attributes:
-        actions: The candidates for this decision and the next ones. If a candidate is masked at a next decision, the
-            base decides there.
+        actions: The candidates for this decision and the next ones. If a candidate is masked at a
+            next decision, the base decides there.
         depth: The number of decisions that are tried, including this one.
         exploration: The weight of exploration, in units of the spread of the returns.
 
@@ -80,19 +84,24 @@ class TreeSearchPolicy(RolloutPolicy):
             root = clone(rollouts.env, method="fork", time_limit=self.time_limit)
         except (BranchError, OptionValueError):  # only a replay is possible
             return None
-        if rollouts.seconds * self.depth / 2 > perf_counter() - began:  # a try repeats half of the depth in the mean
+        # a try repeats half of the depth in the mean
+        if rollouts.seconds * self.depth / 2 > perf_counter() - began:
             return States(root, self, rollouts.actions)
         root.close()
         return None
 
 
 class _Tree:
-    """The results of sequences of candidates. If ``RULE`` was ``added`` as the last one, it is a leaf."""
+    """The results of sequences of candidates.
+
+    If ``RULE`` was ``added`` as the last one, it is a leaf.
+    """
 
     def __init__(self, candidates: int, depth: int, exploration: float, added: bool) -> None:
         self._first, self._others = range(candidates), range(candidates - added)
         self._depth, self._exploration = depth, exploration
-        self.visits: dict[Plan, int] = {}  # the tries of each node, including those that are running
+        # the tries of each node, including those that are running
+        self.visits: dict[Plan, int] = {}
         self._returns: dict[Plan, list[float]] = {}  # returns from the node's own decision on
         self._least, self._most = inf, -inf
 
@@ -114,10 +123,15 @@ class _Tree:
     def _bound(self, node: Plan, doubt: float) -> float:
         """Return the confidence bound of a node's value: upper for a positive ``doubt``, lower for a negative one."""
         returns, spread = self._returns[node], self._most - self._least
-        return sum(returns) / len(returns) + doubt * self._exploration * spread / sqrt(self.visits[node])
+        return sum(returns) / len(returns) + doubt * self._exploration * spread / sqrt(
+            self.visits[node]
+        )
 
     def learn(self, node: Plan, rewards: list[float]) -> None:
-        """Add the rewards of a try, decision by decision; the agent may have ended before the node."""
+        """Add the rewards of a try, decision by decision.
+
+        The agent may have ended before the node.
+        """
         for depth in range(min(len(node), len(rewards))):
             self._returns.setdefault(node[: depth + 1], []).append(sum(rewards[depth:]))
         self._least, self._most = min(self._least, sum(rewards)), max(self._most, sum(rewards))
@@ -133,7 +147,7 @@ class _Tree:
         return plan
 
 
-# -- states that are kept where there is one exact future: none is reached twice --------------------
+# -- states that are kept where there is one exact future: none is reached twice -------------------
 
 
 class Node:
@@ -174,13 +188,16 @@ class States:
         try:
             with parent.lock:
                 env = clone(parent.env, method="fork", time_limit=self._policy.time_limit)
-        except BranchError:  # it has opened something since; a replay belongs to the thread that makes it
+        # it has opened something since; a replay belongs to the thread that makes it
+        except BranchError:
             once = partial(try_out, tries=[(actions, 0)], policy=self._policy)
             with root.lock:
                 [node.outcome] = branch(root.env, once, time_limit=self._policy.time_limit)
             return node
         try:
-            node.progress, node.outcome = env.unwrapped.call(_take, actions, self._policy, parent.progress)
+            node.progress, node.outcome = env.unwrapped.call(
+                _take, actions, self._policy, parent.progress
+            )
             if len(self._nodes) < _MOST:
                 node.env = env
             return node
@@ -197,10 +214,15 @@ class States:
 
 
 def _take(env: Any, actions: list[Any], policy: Any, progress: Progress) -> tuple[Progress, Any]:
-    """In a clone, take the actions that are still to take; return the progress, and the outcome with the base."""
+    """In a clone, take the actions that are still to take.
+
+    Return the progress, and the outcome with the base.
+    """
     progress, outcome = rollout_from(env, actions, policy, progress, stop=len(actions))
     if not progress.over:
         [outcome] = branch(
-            env, lambda twin, number: rollout_from(twin, actions, policy, progress)[1], time_limit=policy.time_limit
+            env,
+            lambda twin, number: rollout_from(twin, actions, policy, progress)[1],
+            time_limit=policy.time_limit,
         )
     return progress, outcome

@@ -19,7 +19,10 @@ _MANY: Final = 16
 """The number of futures, or of times between decisions, from which on their statistics are trusted."""
 
 _UNRELATED: Final = (-0.5, 0.1)
-"""Between these correlations of returns, the user is warned. Far below, the same chance meets all candidates, too."""
+"""Between these correlations of returns, the user is warned.
+
+Far below, the same chance meets all candidates, too.
+"""
 
 _VARIATION: Final = 0.1
 """The coefficient of variation of times above which the user is warned."""
@@ -35,14 +38,17 @@ class ActionValues:
     Attributes:
         actions: The candidates.
         means: ``(candidates,)``: the mean return of each candidate; nan if it was not tried.
-        standard_errors: ``(candidates,)``: the standard errors of the means; nan with fewer than two returns.
+        standard_errors: ``(candidates,)``: the standard errors of the means; nan with fewer than
+            two returns.
         counts: ``(candidates,)`` int: the number of futures in which each candidate was tried.
         best: The best candidate.
-        returns: ``(candidates, futures)``: the returns, nan where a candidate was not tried. A column is one future, so
-            that the difference of two rows excludes the chance that affects both.
-        correlation: The mean correlation of the returns of pairs of candidates over their common futures; nan with
-            fewer than three of these, or where the returns do not vary. Where it is low, the same chance does not meet
-            all candidates, and differences take many futures to see.
+        returns: ``(candidates, futures)``: the returns, nan where a candidate was not tried. A
+            column is one future, so that the difference of two rows excludes the chance that
+            affects both.
+        correlation: The mean correlation of the returns of pairs of candidates over their common
+            futures; nan with fewer than three of these, or where the returns do not vary. Where it
+            is low, the same chance does not meet all candidates, and differences take many futures
+            to see.
     """
 
     actions: tuple[Any, ...]
@@ -55,7 +61,9 @@ class ActionValues:
 
 
 def correlation_of(returns: NDArray[np.float64], least: int = 3) -> float:
-    """Return the mean correlation of pairs of rows over their common columns; nan if no pair has the ``least`` number.
+    """Return the mean correlation of pairs of rows over their common columns.
+
+    Nan if no pair has the ``least`` number.
 
     Rows that do not vary do not count.
     """
@@ -77,23 +85,26 @@ def warn_of_futures(name: str, outcomes: Iterable[list[Any]], returns: NDArray[n
     """
     several = [seen for seen in outcomes if len(seen) >= _SEVERAL]
     if any(seen.count(seen[0]) != len(seen) for seen in several):
-        _SETTLED.add((name, "same futures"))  # it draws; by chance, or near the end, futures can be the same later
+        # it draws; by chance, or near the end, futures can be the same later
+        _SETTLED.add((name, "same futures"))
     elif several:
         _warn_once(
             name,
             "same futures",
-            f"all futures of {name} are the same, although it was reseeded for each: it is deterministic from here, or"
-            " its reseed does not reach the generators that it draws from, and the planner foresees chance. reseed"
-            " must seed each of them; global_rng=True reaches those of random and numpy.random alone",
+            f"all futures of {name} are the same, although it was reseeded for each: it is"
+            " deterministic from here, or its reseed does not reach the generators that it draws"
+            " from, and the planner foresees chance. reseed must seed each of them;"
+            " global_rng=True reaches those of random and numpy.random alone",
         )
     correlation = correlation_of(returns, _MANY)
     if _UNRELATED[0] < correlation < _UNRELATED[1]:
         _warn_once(
             name,
             "correlation",
-            f"the same future of {name} is a different one for each candidate: their returns correlate by"
-            f" {correlation:.2f}, so that differences take many futures to see. Give each process or entity a"
-            " generator for itself, and reseed each of them: an action then changes no chance but its own",
+            f"the same future of {name} is a different one for each candidate: their returns"
+            f" correlate by {correlation:.2f}, so that differences take many futures to see. Give"
+            " each process or entity a generator for itself, and reseed each of them: an action"
+            " then changes no chance but its own",
         )
 
 
@@ -104,7 +115,9 @@ def warn_of_times(name: str, rollouts: Sequence[list[float]]) -> None:
         name: The name of the simulation.
         rollouts: The times between decisions, in each rollout.
     """
-    at_each = [np.array([time for time in times if time is not None]) for times in zip_longest(*rollouts)]
+    at_each = [
+        np.array([time for time in times if time is not None]) for times in zip_longest(*rollouts)
+    ]
     times = np.concatenate([np.zeros(0), *at_each])
     if len(times) < _MANY or times.mean() <= 0:
         return
@@ -113,7 +126,8 @@ def warn_of_times(name: str, rollouts: Sequence[list[float]]) -> None:
         _warn_once(
             name,
             "times",
-            f"the times between the decisions of {name} vary, so that a horizon in decisions ends at another time for"
+            f"the times between the decisions of {name} vary, so that a horizon in decisions ends"
+            " at another time for"
             ' each candidate; use horizon_by="time"',
         )
 

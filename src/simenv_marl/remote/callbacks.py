@@ -9,7 +9,8 @@ from typing import Any
 class CallbackGuard:
     """Carries exceptions of callbacks (errors, Ctrl-C, the exit from an episode) past the C code that called them.
 
-    The first one is raised at the end of the block ``with guard:`` around the call into C. ``stop`` asks C to return.
+    The first one is raised at the end of the block ``with guard:`` around the call into C. ``stop``
+    asks C to return.
     """
 
     def __init__(self, stop: Callable[[], Any] | None = None) -> None:
@@ -17,9 +18,13 @@ class CallbackGuard:
         self._error: BaseException | None = None
 
     def callback(self, function: Callable[..., Any], result: Any = 0) -> Callable[..., Any]:
-        """Wrap a function for C, which gets ``result`` after an exception; void functions of cffi need None."""
+        """Wrap a function for C, which gets ``result`` after an exception.
 
-        @wraps(function, updated=())  # the wrapper of a decision function is not a decision function
+        Void functions of cffi need None.
+        """
+
+        # the wrapper of a decision function is not a decision function
+        @wraps(function, updated=())
         def callback(*args: Any) -> Any:
             try:
                 return function(*args) if self._error is None else result

@@ -14,8 +14,9 @@ from ..simulation import RULE
 class RemoteCall:
     """An entity's latest call of a decision point: the argument of mappings, ``agent`` and ``apply``.
 
-    The call's arguments are its attributes and items: ``call.level``, ``call["queue-length"]``. Each entity at a point
-    has one object, which changes from call to call. A copy of it does not change.
+    The call's arguments are its attributes and items: ``call.level``, ``call["queue-length"]``.
+    Each entity at a point has one object, which changes from call to call. A copy of it does not
+    change.
 
     Attributes:
         point: The name of the decision point.
@@ -28,10 +29,16 @@ class RemoteCall:
     def __init__(self, point: str, entity: Any) -> None:
         self.point, self.entity = point, entity
         self.time: float | None = None
-        self._rule: Callable[[], Any] | None = None  # returns the rule's decision, while one is due and can be known
+        # returns the rule's decision, while one is due and can be known
+        self._rule: Callable[[], Any] | None = None
 
     def __getstate__(self) -> Any:
-        return self.__dict__, {"point": self.point, "entity": self.entity, "time": self.time, "_rule": None}
+        return self.__dict__, {
+            "point": self.point,
+            "entity": self.entity,
+            "time": self.time,
+            "_rule": None,
+        }
 
     def __getitem__(self, name: str) -> Any:
         if name in ("entity", "time"):
@@ -52,7 +59,10 @@ class RemoteCall:
         raise AttributeError(self._missing(name))
 
     def _missing(self, name: str) -> str:
-        return f"the call of {self.point} has no argument {name!r}; it has {', '.join(self.__dict__) or 'none'}"
+        return (
+            f"the call of {self.point} has no argument {name!r}; it has"
+            f" {', '.join(self.__dict__) or 'none'}"
+        )
 
     def __repr__(self) -> str:
         arguments = "".join(f", {name}={value!r}" for name, value in self.__dict__.items())
@@ -63,7 +73,10 @@ class PointFunctions(NamedTuple):
     """The functions that represent a decision point of a simulator."""
 
     decide: Callable[[RemoteCall], Any]
-    """The decision function. Its rule has the process decide, and returns what it decided; ``RULE`` if it tells not."""
+    """The decision function.
+
+    Its rule has the process decide, and returns what it decided; ``RULE`` if it tells not.
+    """
 
     remove: Callable[[RemoteCall], None]
     """Ends the agent of an entity that is gone."""

@@ -14,7 +14,14 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from ..core.rng import is_seed
-from ..errors import OptionValueError, ProcessDiedError, ProcessError, WireError, did_you_mean, short_repr
+from ..errors import (
+    OptionValueError,
+    ProcessDiedError,
+    ProcessError,
+    WireError,
+    did_you_mean,
+    short_repr,
+)
 from ..simulation import RULE
 from .child import MOST_FRAMES, Child
 from .wire import DESCRIPTORS, KEYS, decode, encode, encode_answer
@@ -31,7 +38,10 @@ INVALID: Final = {
     "half a line, then the end of its input": b'{"act',
     "the end of its input in mid-episode": b"",
 }
-"""What a simulator must refuse in place of an answer. Its input ends after a line without an end."""
+"""What a simulator must refuse in place of an answer.
+
+Its input ends after a line without an end.
+"""
 
 ABILITIES: Final = ("decided", "expect", "reseed")
 """What the "can" of a hello may list."""
@@ -70,9 +80,13 @@ class WireReport:
         return {"ok": self.ok, "findings": [finding._asdict() for finding in self.findings]}
 
     def __str__(self) -> str:
-        lines = [f"{finding.verdict:5}  {finding.tried}: {finding.text}" for finding in self.findings]
+        lines = [
+            f"{finding.verdict:5}  {finding.tried}: {finding.text}" for finding in self.findings
+        ]
         wrong = sum(finding.verdict == WRONG for finding in self.findings)
-        return "\n".join([*lines, "", f"{wrong} of {len(lines)} tests failed" if wrong else "nothing is wrong"])
+        return "\n".join(
+            [*lines, "", f"{wrong} of {len(lines)} tests failed" if wrong else "nothing is wrong"]
+        )
 
 
 def check_wire(
@@ -85,9 +99,9 @@ def check_wire(
 ) -> WireReport:
     """Run episodes of a simulator, and report its errors in the use of the protocol.
 
-    The check runs episodes by the simulator's rule, in one process and in new ones; breaks episodes off; sends long
-    lines, ``reseed``, other seeds, other decisions and invalid frames; closes the input; and runs the simulator without
-    an environment.
+    The check runs episodes by the simulator's rule, in one process and in new ones; breaks episodes
+    off; sends long lines, ``reseed``, other seeds, other decisions and invalid frames; closes the
+    input; and runs the simulator without an environment.
 
     Args:
         command: The program and its arguments.
@@ -101,9 +115,13 @@ def check_wire(
         WireError: The options are not JSON data.
     """
     if not is_seed(seed) or seed >= 2**31:
-        raise OptionValueError(f"seed must be an integer from 0 to 2**31 - 1, not {short_repr(seed)}")
+        raise OptionValueError(
+            f"seed must be an integer from 0 to 2**31 - 1, not {short_repr(seed)}"
+        )
     if decisions < 1 or not 0 < timeout < inf:
-        raise OptionValueError(f"decisions and timeout must be positive, not {decisions} and {timeout}")
+        raise OptionValueError(
+            f"decisions and timeout must be positive, not {decisions} and {timeout}"
+        )
     start = encode({"start": {"seed": seed, "options": options or {}}})
     return _Check(command, start, decisions, timeout).run()
 
@@ -114,7 +132,8 @@ class _Check:
     def __init__(self, command: Sequence[str], start: bytes, most: int, timeout: float) -> None:
         self._command, self._start, self._most, self._timeout = command, start, most, timeout
         self._report = WireReport()
-        self._first: list[dict[str, Any]] = []  # the frames of an episode by the rule, in a new process
+        # the frames of an episode by the rule, in a new process
+        self._first: list[dict[str, Any]] = []
         self._decisions = 0  # of that episode
         self._draws = False  # whether other random numbers are known to change an episode
 
@@ -127,7 +146,9 @@ class _Check:
             return self._report
         self._try("two episodes in a row with the same seed", self._repeat)
         for number in sorted({1, (self._decisions + 1) // 2, self._decisions}):
-            self._try(f"stop in place of the answer to call {number}", partial(self._repeat, stop=number))
+            self._try(
+                f"stop in place of the answer to call {number}", partial(self._repeat, stop=number)
+            )
         self._try("a line of 1 MiB", self._long_line)
         self._try("reseed", self._reseed)
         self._try("other seeds", self._seeds)
@@ -160,8 +181,8 @@ class _Check:
     ) -> list[dict[str, Any]]:
         """Play an episode by the rule; return its frames.
 
-        ``start`` replaces the usual line. ``stop`` is the call at which to break off, ``reseed`` a call and a seed.
-        ``decisions`` has a value for each point at which the rule does not decide.
+        ``start`` replaces the usual line. ``stop`` is the call at which to break off, ``reseed`` a
+        call and a seed. ``decisions`` has a value for each point at which the rule does not decide.
         """
         frames, removed = [child.begin(start or self._start)], set[tuple[str, Any]]()
         while True:
@@ -176,8 +197,10 @@ class _Check:
                 number = child.number
                 if who in removed:
                     raise WireError(
-                        f"call {number} is of {who[1]!r} at {who[0]}, which was removed before; an entity that comes"
-                        ' needs a name that none had in the episode, and "remove" comes after the last call'
+                        f"call {number} is of {who[1]!r} at {who[0]}, which was removed before; an"
+                        " entity that comes"
+                        ' needs a name that none had in the episode, and "remove" comes after the'
+                        " last call"
                     )
                 if number in (stop, self._most) or len(frames) > MOST_FRAMES:
                     child.break_off()
@@ -185,7 +208,9 @@ class _Check:
                 if who[0] in decisions:
                     child.answer(encode_answer(number, decisions[who[0]]))
                 else:
-                    value = child.leave_to_rule(encode({"reseed": reseed[1]}) if number == reseed[0] else b"")
+                    value = child.leave_to_rule(
+                        encode({"reseed": reseed[1]}) if number == reseed[0] else b""
+                    )
                     frames += [] if value is RULE else [{"decided": number, "value": value}]
             frames.append(child.next_frame())
 
@@ -194,7 +219,13 @@ class _Check:
         for number, (one, other) in enumerate(zip_longest(self._first, frames)):
             if one != other:
                 what = f"frame {number} is {short_repr(other)}, and in a new process it was {short_repr(one)}"
-                return WRONG, f'{what}; seed all generators by the seed of "start", and keep nothing of other episodes'
+                return (
+                    WRONG,
+                    (
+                        f'{what}; seed all generators by the seed of "start", and keep nothing of'
+                        " other episodes"
+                    ),
+                )
         return OK, "the same as in a new process"
 
     # -- tests ------------------------------------------------------------------------------------
@@ -237,19 +268,33 @@ class _Check:
         with self._child() as child:
             verdict, text = self._compare(self._play(child))
         if verdict == OK:
-            return NOTE, "it exits with code 0 after an episode, and plays the same in a new process: one for each"
+            return (
+                NOTE,
+                (
+                    "it exits with code 0 after an episode, and plays the same in a new process:"
+                    " one for each"
+                ),
+            )
         return verdict, text
 
     def _long_line(self) -> Outcome:
         with self._child() as child:
-            return self._compare(self._play(child, start=self._start.replace(b"\n", b" " * PADDING + b"\n")))
+            return self._compare(
+                self._play(child, start=self._start.replace(b"\n", b" " * PADDING + b"\n"))
+            )
 
     def _reseed(self) -> Outcome:
         middle, futures = (self._decisions + 1) // 2, []
         for seed in (11, 11, 12):
             with self._child() as child:
                 if "reseed" not in child.can:
-                    return NOTE, 'the "can" of its hello does not list "reseed": no branches with other futures'
+                    return (
+                        NOTE,
+                        (
+                            'the "can" of its hello does not list "reseed": no branches with other'
+                            " futures"
+                        ),
+                    )
                 futures.append(self._play(child, reseed=(middle, seed)))
         one, again, other = futures
         if one != again:
@@ -257,7 +302,13 @@ class _Check:
         if one == other:
             return NOTE, "two seeds have led to the same future; is nothing in the model random?"
         self._draws = True
-        return OK, f"at call {middle}, two seeds lead to two futures, and the same seed to the same future"
+        return (
+            OK,
+            (
+                f"at call {middle}, two seeds lead to two futures, and the same seed to the same"
+                " future"
+            ),
+        )
 
     def _seeds(self) -> Outcome:
         """Play episodes with four low seeds, and with four that differ from them in the highest bit alone."""
@@ -265,15 +316,30 @@ class _Check:
         if all(one == low[0] for one in [*low, *high]):
             text = "seeds 1 to 4 lead to the same episode"
             if self._draws:
-                return WRONG, f'{text}, though "reseed" changes it: seed the generators with the seed of "start"'
-            return NOTE, f'{text}; is nothing in the model random, or does it ignore the seed of "start"?'
+                return (
+                    WRONG,
+                    (
+                        f'{text}, though "reseed" changes it: seed the generators with the seed of'
+                        ' "start"'
+                    ),
+                )
+            return (
+                NOTE,
+                f'{text}; is nothing in the model random, or does it ignore the seed of "start"?',
+            )
         different = sum(one not in low[:number] for number, one in enumerate(low))
         for same, what in (
             (low == high, f"seeds 1 to 4 lead to the same episodes as {HIGH + 1} to {HIGH + 4}"),
-            (all(one == high[0] for one in high), f"seeds {HIGH + 1} to {HIGH + 4} lead to the same episode"),
+            (
+                all(one == high[0] for one in high),
+                f"seeds {HIGH + 1} to {HIGH + 4} lead to the same episode",
+            ),
         ):
             if same and different > 2:  # with fewer, it can be chance
-                return WRONG, f"{what}: keep all 31 bits of the seed, in an integer of 32 or 64 bits"
+                return (
+                    WRONG,
+                    f"{what}: keep all 31 bits of the seed, in an integer of 32 or 64 bits",
+                )
         return OK, f"four seeds lead to {different} different episodes, and all their bits count"
 
     def _seeded(self, seed: int) -> list[dict[str, Any]]:
@@ -284,7 +350,11 @@ class _Check:
 
     def _values(self, point: str) -> Outcome:
         """Play episodes in which all decisions of a point have the same value."""
-        calls = {frame["decide"] for frame in self._first if frame.get("point") == point and "decide" in frame}
+        calls = {
+            frame["decide"]
+            for frame in self._first
+            if frame.get("point") == point and "decide" in frame
+        }
         told = [frame["value"] for frame in self._first if frame.get("decided") in calls]
         known = next(([told[0], value] for value in told if value != told[0]), None)
         for values in GUESSES if known is None else [known]:
@@ -296,9 +366,18 @@ class _Check:
                 continue  # it does not take such a value
             shown = ", ".join(map(short_repr, values))
             if all(episode == episodes[0] for episode in episodes):
-                return WRONG, f'the decisions {shown} lead to the same episode: continue with the "value" of "act"'
+                return (
+                    WRONG,
+                    (
+                        f"the decisions {shown} lead to the same episode: continue with the"
+                        ' "value" of "act"'
+                    ),
+                )
             return OK, f"the decisions {shown} lead to different episodes"
-        return NOTE, "it takes neither numbers nor booleans here, so that other decisions were not tried"
+        return (
+            NOTE,
+            "it takes neither numbers nor booleans here, so that other decisions were not tried",
+        )
 
     def _valued(self, point: str, value: Any) -> list[dict[str, Any]]:
         with self._child() as child:
@@ -336,7 +415,14 @@ class _Check:
     def _plain_run(self) -> Outcome:
         env = {name: value for name, value in os.environ.items() if name != DESCRIPTORS}
         try:
-            done = run(self._command, env=env, stdin=DEVNULL, stdout=DEVNULL, stderr=PIPE, timeout=self._timeout)
+            done = run(
+                self._command,
+                env=env,
+                stdin=DEVNULL,
+                stdout=DEVNULL,
+                stderr=PIPE,
+                timeout=self._timeout,
+            )
         except TimeoutExpired:
             return NOTE, f"it still ran after {self._timeout:g} s"
         if done.returncode != 0:
@@ -358,5 +444,8 @@ def _check_keys(frame: Mapping[str, Any]) -> None:
     for part, keys in parts:
         for key in part:
             if key not in keys:
-                hint = did_you_mean(key, keys) or "; an argument belongs into args, another result into result"
+                hint = (
+                    did_you_mean(key, keys)
+                    or "; an argument belongs into args, another result into result"
+                )
                 raise WireError(f"the key {key!r} of {short_repr(frame)} does not exist{hint}")

@@ -1,7 +1,8 @@
 """The process of a simulator: starting it, its frames, waiting for it, ending it.
 
-Every wait has an end. The standard error of the process is read while the process is waited for, so that it never
-blocks; errors show the last part of it. The process leads its own process group, which ends with it.
+Every wait has an end. The standard error of the process is read while the process is waited for, so
+that it never blocks; errors show the last part of it. The process leads its own process group,
+which ends with it.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ GRACE: Final = 2.0
 """The time in seconds that a process has to end by itself."""
 
 MOST_FRAMES: Final = 100_000
-"""The number of frames that may come between two calls. A birth, an update and a removal are one each."""
+"""The number of frames that may come between two calls.
+
+A birth, an update and a removal are one each.
+"""
 
 MOST_BYTES: Final = 1 << 30
 """The number of bytes that may come between two calls."""
@@ -63,7 +67,8 @@ class Child:
         points: The names of its decision points.
         can: Its further abilities, such as "reseed".
         timeout: The time to wait for each line, in seconds.
-        state: "idle" between episodes, "running" its model, "waiting" for the answer to a call, or "stopped".
+        state: "idle" between episodes, "running" its model, "waiting" for the answer to a call, or
+            "stopped".
         number: The number of its latest call in the episode; 0 before the first one.
         time: Its latest time in the episode; None if it sent none.
         origin: What it was started with, and in; equal for processes that can replace each other.
@@ -72,12 +77,19 @@ class Child:
     origin: Any = None
 
     def __init__(
-        self, command: Sequence[str], timeout: float, env: Mapping[str, str] | None = None, cwd: Any = None
+        self,
+        command: Sequence[str],
+        timeout: float,
+        env: Mapping[str, str] | None = None,
+        cwd: Any = None,
     ) -> None:
-        """Start the process, and read its first frame; the arguments are those of ``ProcessSimulation``.
+        """Start the process, and read its first frame.
+
+        The arguments are those of ``ProcessSimulation``.
 
         Raises:
-            ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or breaks the rules of the wire.
+            ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or breaks the rules
+                of the wire.
             RemoteError: It reported an error.
         """
         self.timeout, self.state, self.number = timeout, "idle", 0
@@ -88,7 +100,9 @@ class Child:
         try:
             self._start(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
-            raise ProcessDiedError(f"{command[0]!r} cannot be started: {describe_error(error)}") from error
+            raise ProcessDiedError(
+                f"{command[0]!r} cannot be started: {describe_error(error)}"
+            ) from error
         self.pid = self._popen.pid
         _children.add(self)
         self._name = f"the process {self.pid} ({command[0]})"
@@ -104,7 +118,12 @@ class Child:
         if version is None:
             self.refuse(hello, f"began with {short_repr(hello)}, not with a hello")
         if type(version) is not int or version != VERSION:
-            self.fail(WireError(f"{self} speaks version {short_repr(version)} of the wire; this is version {VERSION}"))
+            self.fail(
+                WireError(
+                    f"{self} speaks version {short_repr(version)} of the wire; this is version"
+                    f" {VERSION}"
+                )
+            )
         for names in (points, can):
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 what = f'{short_repr(hello)}; its "points" and "can" must be lists of strings'
@@ -126,7 +145,8 @@ class Child:
                 pass_fds=(child_reading, child_writing),
                 env={**env, DESCRIPTORS: f"{child_reading},{child_writing}"},
                 cwd=cwd,
-                start_new_session=True,  # so that its group can be ended, and a terminal's interrupts miss it
+                # so that its group can be ended, and a terminal's interrupts miss it
+                start_new_session=True,
             )
         except BaseException:
             for end in ends:
@@ -155,7 +175,13 @@ class Child:
         self.send(start)
         frame = self.next_frame()
         if stopped and "end" in frame:
-            self.refuse(frame, f'has sent {short_repr(frame)} after "stop"; it must be silent until the next start')
+            self.refuse(
+                frame,
+                (
+                    f'has sent {short_repr(frame)} after "stop"; it must be silent until the next'
+                    " start"
+                ),
+            )
         return frame
 
     def next_frame(self) -> dict[str, Any]:
@@ -180,11 +206,19 @@ class Child:
         elif "decide" in frame:
             number, due = frame["decide"], self.number + 1
             if type(number) is not int or number != due:
-                self.fail(WireError(f"{self} has made call {short_repr(number)} where call {due} was due"))
+                self.fail(
+                    WireError(f"{self} has made call {short_repr(number)} where call {due} was due")
+                )
             self.number, self.state, self._frames = number, "waiting", 0
-        elif not ("update" in frame or "remove" in frame or ("expect" in frame and "expect" in self.can)):
+        elif not (
+            "update" in frame or "remove" in frame or ("expect" in frame and "expect" in self.can)
+        ):
             unasked = [name for name in ("decided", "expect") if name in frame]
-            why = 'is not due, or not in the "can" of its hello' if unasked else "is not a frame of the wire"
+            why = (
+                'is not due, or not in the "can" of its hello'
+                if unasked
+                else "is not a frame of the wire"
+            )
             self.refuse(frame, f"has sent {short_repr(frame)}, which {why}")
         if self.state == "running":
             self._check_flood()
@@ -197,7 +231,11 @@ class Child:
         self._frames, self._bytes = self._frames + 1, self._bytes + self._length
         if self._frames > MOST_FRAMES or self._bytes > MOST_BYTES:
             what = f"{self._frames:,} frames of {self._bytes:,} bytes"
-            self.fail(WireError(f"{self} has sent {what} since its latest call, and neither a call nor an end"))
+            self.fail(
+                WireError(
+                    f"{self} has sent {what} since its latest call, and neither a call nor an end"
+                )
+            )
         if monotonic() - self._since > MOST_WAITS * self.timeout:
             what = f"has sent updates and removals for {MOST_WAITS * self.timeout:g} s, and neither a call nor an end"
             self.fail(ProcessTimeoutError(f"{self} {what}"))
@@ -215,7 +253,11 @@ class Child:
         if "decided" not in self.can:
             return RULE
         frame = self.receive()
-        if frame.get("decided") != self.number or type(frame["decided"]) is not int or "value" not in frame:
+        if (
+            frame.get("decided") != self.number
+            or type(frame["decided"]) is not int
+            or "value" not in frame
+        ):
             due = f'{{"decided": {self.number}, "value": ...}} was due: what its rule decided'
             self.refuse(frame, f"has sent {short_repr(frame)} where {due}")
         return frame["value"]
@@ -252,7 +294,9 @@ class Child:
             if not chunk:
                 self._wait_for_exit(GRACE)
                 where = " in the middle of a line" if line else ""
-                self.fail(ProcessDiedError(f"{self} has closed its pipe{where}, and {self._exit()}"))
+                self.fail(
+                    ProcessDiedError(f"{self} has closed its pipe{where}, and {self._exit()}")
+                )
             part, complete, self._rest = chunk.partition(b"\n")
             line += part
             if len(line) >= LONGEST:
@@ -266,7 +310,8 @@ class Child:
     def send(self, lines: bytes) -> None:
         """Send lines.
 
-        If the process is gone, nothing happens here: ``receive`` raises the error, which may have the reason.
+        If the process is gone, nothing happens here: ``receive`` raises the error, which may have
+        the reason.
 
         Raises:
             ProcessTimeoutError: It does not read.
@@ -274,7 +319,8 @@ class Child:
         begun = 0.0
         if self._owner != os.getpid():
             raise WrongThreadError(
-                f"{self} belongs to the process from which this one was forked; reset() starts another one"
+                f"{self} belongs to the process from which this one was forked; reset() starts"
+                " another one"
             )
         while lines:
             try:
@@ -310,13 +356,18 @@ class Child:
         found = False
         while not found:
             left = begun + self.timeout - monotonic()
-            for which, _ in poll.poll(1000 * max(0, min(left, 3600))):  # it takes no more than some weeks
+            # it takes no more than some weeks
+            for which, _ in poll.poll(1000 * max(0, min(left, 3600))):
                 if which == descriptor:
                     found = True
                 elif not self._read_stderr():
                     poll.unregister(which)
             if left <= 0:  # even if data keeps trickling in
-                self.fail(ProcessTimeoutError(f"{self} {self._exit()}; it has sent {sent} for {self.timeout:g} s"))
+                self.fail(
+                    ProcessTimeoutError(
+                        f"{self} {self._exit()}; it has sent {sent} for {self.timeout:g} s"
+                    )
+                )
 
     # -- ends -------------------------------------------------------------------------------------
 
@@ -326,7 +377,10 @@ class Child:
         return not self._closed and self._owner == os.getpid()
 
     def exit_code(self) -> int | None:
-        """Return its exit code, or minus the signal that ended it; None while it runs; ``LOST`` if it is not known."""
+        """Return its exit code, or minus the signal that ended it.
+
+        None while it runs; ``LOST`` if it is not known.
+        """
         if self._popen.returncode is None:
             try:
                 os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
@@ -338,7 +392,9 @@ class Child:
         """End the process at once, and raise an error with the last part of its standard error."""
         self.close(patience=0.0)
         text = self._tail.decode(errors="replace").strip()
-        raise type(error)(f"{error}. The end of its standard error:\n{text}" if text else str(error))
+        raise type(error)(
+            f"{error}. The end of its standard error:\n{text}" if text else str(error)
+        )
 
     def refuse(self, frame: Mapping[str, Any], what: str) -> NoReturn:
         """Raise the error that a frame reports, or say that the frame is invalid or not due."""
@@ -347,7 +403,9 @@ class Child:
             self.fail(WireError(f"{self} {what}"))
         kind, text, trace = (error.get(name) or "" for name in ("type", "text", "trace"))
         where = f"\n{trace}" if trace else ""
-        self.fail(RemoteError(f"the model in {self} has raised {kind or 'an error'}: {text}{where}"))
+        self.fail(
+            RemoteError(f"the model in {self} has raised {kind or 'an error'}: {text}{where}")
+        )
 
     def close_input(self) -> None:
         """Close its input; its output can still be received."""
@@ -356,10 +414,12 @@ class Child:
             self._writing, self._without_input = -1, monotonic()  # when it was closed
 
     def close(self, patience: float = GRACE) -> None:
-        """Close its pipes; ``patience`` seconds after the end of its input at the latest, kill it and its group.
+        """Close its pipes.
 
-        So processes whose inputs were closed together end together. A fork of this process only closes its copies of
-        the pipes.
+        ``patience`` seconds after the end of its input at the latest, kill it and its group.
+
+        So processes whose inputs were closed together end together. A fork of this process only
+        closes its copies of the pipes.
         """
         if self._closed:
             return
@@ -401,7 +461,10 @@ class Child:
         if code is None:
             return "still runs"
         if code == LOST:
-            return "has ended; its exit code is lost, because this process ignores SIGCHLD or other code has read it"
+            return (
+                "has ended; its exit code is lost, because this process ignores SIGCHLD or other"
+                " code has read it"
+            )
         if code >= 0:
             return f"has exited with code {code}"
         try:
@@ -423,5 +486,6 @@ def _close_inputs() -> None:
             child.close_input()
 
 
-finalize(Child, int).detach()  # registers the hook by which finalizers run at exit, for this one to run before it
+# registers the hook by which finalizers run at exit, for this one to run before it
+finalize(Child, int).detach()
 atexit.register(_close_inputs)

@@ -1,8 +1,9 @@
 """The guardian of a process's simulators: it ends them when the process has ended, also if that was killed.
 
-A simulator that computes does not notice the end of its pipe. On Linux, the kernel can signal a process when its parent
-ends, but means the thread that started it, and no further processes of the simulator. So a shell waits for the end of
-this process instead, and then kills the groups of its simulators. It runs while there are simulators.
+A simulator that computes does not notice the end of its pipe. On Linux, the kernel can signal a
+process when its parent ends, but means the thread that started it, and no further processes of the
+simulator. So a shell waits for the end of this process instead, and then kills the groups of its
+simulators. It runs while there are simulators.
 """
 
 from __future__ import annotations
@@ -37,7 +38,13 @@ def guard(group: int) -> None:
         if _shell is None:
             command = ["/bin/sh", "-c", _SCRIPT]
             _shell = Popen(
-                command, bufsize=0, cwd="/", stdin=PIPE, stdout=DEVNULL, stderr=DEVNULL, start_new_session=True
+                command,
+                bufsize=0,
+                cwd="/",
+                stdin=PIPE,
+                stdout=DEVNULL,
+                stderr=DEVNULL,
+                start_new_session=True,
             )
         _groups.add(group)
         _tell(_shell, f"+ {group}\n")

@@ -31,13 +31,14 @@ from .wire import encode, encode_answer
 class ProcessSimulation(SimulationInterface):
     """A simulation whose model runs in a process of its own (POSIX), in any language.
 
-    The first ``reset`` starts the process. It plays one episode after the other, and is ended when the environment is
-    closed or garbage-collected. It calls for decisions in its own order. Decisions that are left to ``RULE`` it takes
-    itself.
+    The first ``reset`` starts the process. It plays one episode after the other, and is ended when
+    the environment is closed or garbage-collected. It calls for decisions in its own order.
+    Decisions that are left to ``RULE`` it takes itself.
 
-    Mappings, ``agent`` and ``apply`` get one object for each entity at a point. The call's arguments are its attributes
-    and items (``call.level``, ``call["queue-length"]``); it also has ``entity`` and ``time``. The result of ``apply``
-    is sent as the decision; ``RULE`` leaves it to the process.
+    Mappings, ``agent`` and ``apply`` get one object for each entity at a point. The call's
+    arguments are its attributes and items (``call.level``, ``call["queue-length"]``); it also has
+    ``entity`` and ``time``. The result of ``apply`` is sent as the decision; ``RULE`` leaves it to
+    the process.
 
     Attributes:
         points: The decision points with their definitions.
@@ -56,10 +57,13 @@ class ProcessSimulation(SimulationInterface):
         """Define how the process is started, and its decision points.
 
         Args:
-            command: The program and its arguments; a program without arguments may be given as a string.
-            points: A dict from the process's name of a decision point to its definition. The name can be used wherever
-                a dotted name can. At points that are not in the dict, the process follows its own rule.
-            timeout: The time to wait for each line of the process, and for it to read a message, in seconds.
+            command: The program and its arguments; a program without arguments may be given as a
+                string.
+            points: A dict from the process's name of a decision point to its definition. The name
+                can be used wherever a dotted name can. At points that are not in the dict, the
+                process follows its own rule.
+            timeout: The time to wait for each line of the process, and for it to read a message, in
+                seconds.
             env: The environment variables of the process. None: those of this process.
             cwd: The folder in which it runs. None: that of this process.
 
@@ -69,13 +73,25 @@ class ProcessSimulation(SimulationInterface):
             ProcessError: The platform is not POSIX.
         """
         if os.name != "posix":
-            raise ProcessError("ProcessSimulation needs POSIX: elsewhere a process cannot inherit the descriptors")
+            raise ProcessError(
+                "ProcessSimulation needs POSIX: elsewhere a process cannot inherit the descriptors"
+            )
         self.command = _words(command)
-        if isinstance(timeout, bool) or not isinstance(timeout, (int, float, np.number)) or not 0 < timeout < inf:
-            raise OptionValueError(f"timeout must be a positive number of seconds, not {short_repr(timeout)}")
+        if (
+            isinstance(timeout, bool)
+            or not isinstance(timeout, (int, float, np.number))
+            or not 0 < timeout < inf
+        ):
+            raise OptionValueError(
+                f"timeout must be a positive number of seconds, not {short_repr(timeout)}"
+            )
         words = [word for pair in env.items() for word in pair] if isinstance(env, Mapping) else []
-        if not (env is None or isinstance(env, Mapping)) or not all(isinstance(word, str) for word in words):
-            raise OptionValueError(f"env must be a dict from names to values, all strings, not {short_repr(env)}")
+        if not (env is None or isinstance(env, Mapping)) or not all(
+            isinstance(word, str) for word in words
+        ):
+            raise OptionValueError(
+                f"env must be a dict from names to values, all strings, not {short_repr(env)}"
+            )
         if cwd is not None and not isinstance(cwd, (str, os.PathLike)):
             raise OptionValueError(f"cwd must be the path of a folder, not {short_repr(cwd)}")
         self.timeout, self.env, self.cwd = float(timeout), None if env is None else dict(env), cwd
@@ -87,14 +103,19 @@ class ProcessSimulation(SimulationInterface):
 
     def _clear(self) -> None:
         """Forget the latest episode."""
-        self._frame: dict[str, Any] | None = None  # the first frame of an episode that does not run yet
-        self._calls: dict[tuple[str, Any], RemoteCall] = {}  # the latest call of each entity at each point
-        self._expected: dict[tuple[str, Any], RemoteCall] = {}  # those of entities that are going to decide
+        # the first frame of an episode that does not run yet
+        self._frame: dict[str, Any] | None = None
+        # the latest call of each entity at each point
+        self._calls: dict[tuple[str, Any], RemoteCall] = {}
+        # those of entities that are going to decide
+        self._expected: dict[tuple[str, Any], RemoteCall] = {}
         self._time: float | None = None
         self._seed: int | None = None  # the seed to send with the next answer
 
     def __getstate__(self) -> dict[str, Any]:
-        points = {getattr(function, BY_NAME): definition for function, definition in self.points.items()}
+        points = {
+            getattr(function, BY_NAME): definition for function, definition in self.points.items()
+        }
         of_this_process = dict.fromkeys(("_child", "_finalizer", "_frame", "_calls", "_expected"))
         return {**vars(self), "points": points, **of_this_process}
 
@@ -112,7 +133,8 @@ class ProcessSimulation(SimulationInterface):
             options: Further data for the episode, as JSON data.
 
         Raises:
-            WireError: The options are not JSON data, and nothing was sent; or the process breaks the rules of the wire.
+            WireError: The options are not JSON data, and nothing was sent; or the process breaks
+                the rules of the wire.
             ProcessDiedError, ProcessTimeoutError: It does not start, or does not answer.
             UnknownPointError: It does not have the named points.
         """
@@ -152,7 +174,11 @@ class ProcessSimulation(SimulationInterface):
         missing = [name for name in self._functions() if name not in child.points]
         if missing:
             has = ", ".join(sorted(child.points)) or "none"
-            child.fail(UnknownPointError(f"{child} has no decision point {', '.join(missing)}; it has {has}"))
+            child.fail(
+                UnknownPointError(
+                    f"{child} has no decision point {', '.join(missing)}; it has {has}"
+                )
+            )
         try:
             self._frame = child.begin(start)
         except BaseException:
@@ -207,17 +233,25 @@ class ProcessSimulation(SimulationInterface):
 
     @property
     def time(self) -> Callable[[], float]:
-        """A method that returns the process's time. The attribute is missing if the process tells no time."""
+        """A method that returns the process's time.
+
+        The attribute is missing if the process tells no time.
+        """
         if self._time is None:
             raise AttributeError("the process has not sent a time")
         return lambda: self._time  # type: ignore[return-value]
 
     @property
     def expected_calls(self) -> Callable[[str], list[tuple[RemoteCall]]]:
-        """A method that returns the coming calls of a point. Missing if the process did not announce "expect"."""
+        """A method that returns the coming calls of a point.
+
+        Missing if the process did not announce "expect".
+        """
         if self._child is None or "expect" not in self._child.can:
             raise AttributeError('the process has not announced "expect" in its hello')
-        return lambda point: [(call,) for (name, _), call in self._expected.items() if name == point]
+        return lambda point: [
+            (call,) for (name, _), call in self._expected.items() if name == point
+        ]
 
     def reseed(self, seed: int) -> None:
         """Ask the process to reseed its generators, so that it draws new random numbers from here on.
@@ -227,12 +261,17 @@ class ProcessSimulation(SimulationInterface):
         """
         child = self._child
         if child is None or "reseed" not in child.can:
-            raise BranchError(f'{child or "a process that was not started"} has not announced "reseed" in its hello')
+            raise BranchError(
+                f'{child or "a process that was not started"} has not announced "reseed" in its'
+                " hello"
+            )
         self._seed = int(seed)
 
     # -- frames -----------------------------------------------------------------------------------
 
-    def _handle(self, child: Child, frame: dict[str, Any], function: Callable[[RemoteCall], Any]) -> None:
+    def _handle(
+        self, child: Child, frame: dict[str, Any], function: Callable[[RemoteCall], Any]
+    ) -> None:
         """Handle a frame of an entity at a point, or an item of an "expect", given the point's decision function."""
         key = frame["point"], frame["entity"]
         call = self._calls.get(key)
@@ -252,8 +291,13 @@ class ProcessSimulation(SimulationInterface):
         elif "update" not in frame:
             self._expected[key] = call
 
-    def _decide(self, child: Child, call: RemoteCall, function: Callable[[RemoteCall], Any]) -> None:
-        """Get the decision of a call, and send it; if the rule is run, the process decides at once."""
+    def _decide(
+        self, child: Child, call: RemoteCall, function: Callable[[RemoteCall], Any]
+    ) -> None:
+        """Get the decision of a call, and send it.
+
+        If the rule is run, the process decides at once.
+        """
         ruled: list[Any] = []
 
         def rule() -> Any:
@@ -269,9 +313,10 @@ class ProcessSimulation(SimulationInterface):
         if ruled:
             if value is not ruled[0] and value is not RULE:
                 raise SimulationError(
-                    f"the rule of {call.point} has decided {short_repr(ruled[0])} for {call.entity!r}, and the process"
-                    f" continues with that: {short_repr(value)} cannot replace it. A handler or apply that asks the"
-                    " rule must return what it decided; of a call that is split, answer all items by RULE, or none"
+                    f"the rule of {call.point} has decided {short_repr(ruled[0])} for"
+                    f" {call.entity!r}, and the process continues with that: {short_repr(value)}"
+                    " cannot replace it. A handler or apply that asks the rule must return what it"
+                    " decided; of a call that is split, answer all items by RULE, or none"
                 )
         elif value is RULE:
             rule()
@@ -296,9 +341,14 @@ class ProcessSimulation(SimulationInterface):
 def _words(command: Any) -> list[str]:
     """Return the program and its arguments, as strings."""
     words = [command] if isinstance(command, (str, os.PathLike)) else command
-    if not isinstance(words, Sequence) or not words or not all(isinstance(word, (str, os.PathLike)) for word in words):
+    if (
+        not isinstance(words, Sequence)
+        or not words
+        or not all(isinstance(word, (str, os.PathLike)) for word in words)
+    ):
         raise OptionValueError(
-            f"command must be a program and its arguments, a list of strings, not {short_repr(command)}"
+            "command must be a program and its arguments, a list of strings, not"
+            f" {short_repr(command)}"
         )
     return [os.fspath(word) for word in words]
 
@@ -307,12 +357,13 @@ def _by_function(points: Any) -> dict[Any, Definition]:
     """Return the definitions by the decision functions of their names."""
     if not isinstance(points, Mapping) or not points:
         raise DefinitionError(
-            f"points must be a dict from the process's names to definitions, not {short_repr(points)}"
+            "points must be a dict from the process's names to definitions, not"
+            f" {short_repr(points)}"
         )
     for name, definition in points.items():
         if not isinstance(name, str) or not name or not isinstance(definition, Definition):
             raise DefinitionError(
-                f"points must be a dict from the process's names to what make_step returns, not {short_repr(name)}:"
-                f" {short_repr(definition)}"
+                "points must be a dict from the process's names to what make_step returns, not"
+                f" {short_repr(name)}: {short_repr(definition)}"
             )
     return {point_functions(name).decide: definition for name, definition in points.items()}

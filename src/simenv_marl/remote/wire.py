@@ -1,7 +1,7 @@
 """The wire between an environment and a simulator in another process: one JSON object, a *frame*, per line, version 1.
 
-It only uses what every language can represent: keys are strings, and numbers that are not finite are sent as
-``{"float": "nan"}``, ``{"float": "inf"}`` and ``{"float": "-inf"}``.
+It only uses what every language can represent: keys are strings, and numbers that are not finite
+are sent as ``{"float": "nan"}``, ``{"float": "inf"}`` and ``{"float": "-inf"}``.
 """
 
 from __future__ import annotations
@@ -58,9 +58,13 @@ def encode(frame: Mapping[str, Any]) -> bytes:
     except WireError:
         raise
     except (ValueError, RecursionError) as error:
-        raise WireError(f"the message cannot be written as JSON ({describe_error(error)})") from None
+        raise WireError(
+            f"the message cannot be written as JSON ({describe_error(error)})"
+        ) from None
     if len(line) > LONGEST:
-        raise WireError(f"a line of {len(line):,} bytes is too long to be sent; the limit is {LONGEST:,}")
+        raise WireError(
+            f"a line of {len(line):,} bytes is too long to be sent; the limit is {LONGEST:,}"
+        )
     return line
 
 
@@ -93,7 +97,8 @@ def _to_json(value: Any, where: str = "") -> Any:
         for key in value:
             if not isinstance(key, str):
                 raise WireError(
-                    f"{short_repr(key)} cannot be a key in a message to a process; keys must be strings{_at(where)}"
+                    f"{short_repr(key)} cannot be a key in a message to a process; keys must be"
+                    f" strings{_at(where)}"
                 )
         return {key: _to_json(item, f"{where}[{key!r}]") for key, item in value.items()}
     raise WireError(f"{short_repr(value)} cannot be sent to a process: it is not JSON{_at(where)}")
@@ -115,7 +120,9 @@ def decode(line: bytes) -> dict[str, Any]:
         if end < len(text):
             raise ValueError(f"more follows after {end} characters")
     except (ValueError, RecursionError) as error:
-        raise WireError(f"a line that is not JSON in UTF-8 ({describe_error(error)}): {short_repr(line)}") from None
+        raise WireError(
+            f"a line that is not JSON in UTF-8 ({describe_error(error)}): {short_repr(line)}"
+        ) from None
     if not isinstance(frame, dict):
         raise WireError(f"a line that is not a JSON object: {short_repr(line)}")
     return frame
@@ -142,29 +149,41 @@ def check_frame(frame: dict[str, Any], points: Collection[str]) -> float | None:
             raise WireError(f"sent the end {short_repr(end)}; {what}")
     elif "expect" in frame:
         items = frame["expect"]
-        if not isinstance(items, list) or not all(isinstance(item, dict) and item.keys() <= _CALL for item in items):
+        if not isinstance(items, list) or not all(
+            isinstance(item, dict) and item.keys() <= _CALL for item in items
+        ):
             what = 'it must be a list of objects with "point", "entity" and "args"'
             raise WireError(f'sent "expect" with {short_repr(items)}; {what}')
         times = [_check_call(item, item.get("entity"), points) for item in items]
         return next((time for time in reversed(times) if time is not None), None)
     elif kinds & {"decide", "update", "remove"}:
-        entity = frame.get("entity") if "decide" in frame else frame.get("update", frame.get("remove"))
+        entity = (
+            frame.get("entity") if "decide" in frame else frame.get("update", frame.get("remove"))
+        )
         return _check_call(frame, entity, points)
     return None
 
 
 def _check_call(frame: dict[str, Any], entity: Any, points: Collection[str]) -> float | None:
-    """Check the point, entity, arguments and time of a frame; note the entity in it, and return the time."""
+    """Check the point, entity, arguments and time of a frame.
+
+    Note the entity in it, and return the time.
+    """
     name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
     if not isinstance(name, str) or name not in points:
         raise WireError(f"named the point {short_repr(name)}, which is not in its hello")
     if type(entity) not in (str, int, NoneType):
-        raise WireError(f"sent the entity {short_repr(entity)} for {name}; an entity must be a string or an integer")
+        raise WireError(
+            f"sent the entity {short_repr(entity)} for {name}; an entity must be a string or an"
+            " integer"
+        )
     if arguments is not None and not isinstance(arguments, dict):
         raise WireError(f"sent args for {name} that are not an object: {short_repr(arguments)}")
     if arguments and not RESERVED.isdisjoint(arguments):
         what = min(RESERVED & arguments.keys())
-        raise WireError(f"sent an argument {what!r} for {name}; calls have that besides: rename the argument")
+        raise WireError(
+            f"sent an argument {what!r} for {name}; calls have that besides: rename the argument"
+        )
     if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
         time = float(time)
     if time is not None and type(time) is not float:
@@ -180,7 +199,9 @@ def _number(found: dict[str, Any]) -> Any:
 
 
 def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not in JSON; numbers that are not finite travel as {{'float': 'nan'}}")
+    raise ValueError(
+        f"{constant} is not in JSON; numbers that are not finite travel as {{'float': 'nan'}}"
+    )
 
 
 _ENCODER: Final = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False)

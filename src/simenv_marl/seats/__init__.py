@@ -1,7 +1,8 @@
 """Seats: people and language models decide in a running simulation.
 
-``describe`` and ``parse`` put a pending decision into words, and words into an action. Policies that are slow or fail
-are wrapped: ``FallbackPolicy`` answers for them, and ``RecordedPolicy`` repeats their answers.
+``describe`` and ``parse`` put a pending decision into words, and words into an action. Policies
+that are slow or fail are wrapped: ``FallbackPolicy`` answers for them, and ``RecordedPolicy``
+repeats their answers.
 """
 
 from ..core.pending import Decision
@@ -9,4 +10,11 @@ from .descriptions import describe, parse
 from .language import LanguageModelPolicy
 from .policies import FallbackPolicy, RecordedPolicy
 
-__all__ = ["Decision", "FallbackPolicy", "LanguageModelPolicy", "RecordedPolicy", "describe", "parse"]
+__all__ = [
+    "Decision",
+    "FallbackPolicy",
+    "LanguageModelPolicy",
+    "RecordedPolicy",
+    "describe",
+    "parse",
+]

@@ -24,11 +24,11 @@ def describe(env_or_decision: Any, *, as_json: bool = False) -> Any:
     """Describe the pending decision: who decides, when, what is observed, which actions are legal, the last reward.
 
     Args:
-        env_or_decision: An environment in mid-episode, with or without wrappers; or a ``Decision``, which policies get
-            as ``_decision``.
-        as_json: Whether to return a dict for ``json.dumps`` instead of a text. Its keys are ``agent``, ``point``,
-            ``number``, ``time``, ``observation``, ``actions`` and ``reward``; ``actions`` is a JSON schema of what
-            ``parse`` takes.
+        env_or_decision: An environment in mid-episode, with or without wrappers; or a ``Decision``,
+            which policies get as ``_decision``.
+        as_json: Whether to return a dict for ``json.dumps`` instead of a text. Its keys are
+            ``agent``, ``point``, ``number``, ``time``, ``observation``, ``actions`` and ``reward``;
+            ``actions`` is a JSON schema of what ``parse`` takes.
 
     Raises:
         ResetNeededError: No decision is pending.
@@ -58,9 +58,10 @@ def describe(env_or_decision: Any, *, as_json: bool = False) -> Any:
 def parse(env_or_decision: Any, text: str) -> Any:
     """Return the action that a text names: by its label, by its value, or as JSON such as ``{"action": "open"}``.
 
-    Components of arrays and dicts are a JSON list, or a JSON object with their labels or keys. Other text may stand
-    around a JSON object, and around the only label that it names. The action is one of the agent whose decision is
-    pending, for ``env.unwrapped``: wrappers may take other actions.
+    Components of arrays and dicts are a JSON list, or a JSON object with their labels or keys.
+    Other text may stand around a JSON object, and around the only label that it names. The action
+    is one of the agent whose decision is pending, for ``env.unwrapped``: wrappers may take other
+    actions.
 
     Raises:
         InvalidActionError: The text names no legal action. The error says which are legal.
@@ -70,9 +71,15 @@ def parse(env_or_decision: Any, text: str) -> Any:
         return pending_view(env_or_decision, "parse").call(_parse_pending, text)
     decision, space = env_or_decision, env_or_decision.action_space
     legal = legal_labels(decision)
-    for value in _values(text, unwrap=not (isinstance(space, spaces.Dict) and "action" in space.spaces)):
+    for value in _values(
+        text, unwrap=not (isinstance(space, spaces.Dict) and "action" in space.spaces)
+    ):
         with suppress(InvalidActionError, ValueError, TypeError, LookupError, OverflowError):
-            action = _choice(decision, legal, value) if legal else _action(space, decision.action_labels, value)
+            action = (
+                _choice(decision, legal, value)
+                if legal
+                else _action(space, decision.action_labels, value)
+            )
             decision.checked(action)
             return action
     words = "|".join(re.escape(label) for label in sorted(legal, key=len, reverse=True))
@@ -81,7 +88,8 @@ def parse(env_or_decision: Any, text: str) -> Any:
         return legal[named.pop()]
     listed = "\n".join(_legal_lines(decision))
     raise InvalidActionError(
-        f"{short_repr(text)} names no legal action of {decision.agent!r}; these are legal:\n{listed}"
+        f"{short_repr(text)} names no legal action of {decision.agent!r}; these are"
+        f" legal:\n{listed}"
     )
 
 
@@ -97,7 +105,11 @@ def _values(text: str, *, unwrap: bool) -> Iterator[Any]:
     with suppress(ValueError):
         found.insert(0, json.loads(text))
     for value in found:
-        yield value["action"] if unwrap and isinstance(value, Mapping) and set(value) == {"action"} else value
+        yield (
+            value["action"]
+            if unwrap and isinstance(value, Mapping) and set(value) == {"action"}
+            else value
+        )
 
 
 def _choice(decision: Decision, legal: Mapping[str, int], value: Any) -> int:
@@ -106,7 +118,8 @@ def _choice(decision: Decision, legal: Mapping[str, int], value: Any) -> int:
     if said in legal:
         return legal[said]
     labels: Any = decision.action_labels
-    every = [*legal.items(), *((label, action) for action, label in labels.items())]  # those of masked actions, too
+    # those of masked actions, too
+    every = [*legal.items(), *((label, action) for action, label in labels.items())]
     meant = {action for label, action in every if _normal(label) == _normal(said)}
     if not meant:
         number = float(said)
@@ -147,11 +160,17 @@ def _parse_pending(env: Any, text: str) -> Any:
 def labelled(value: Any, labels: Any) -> Any:
     """Return an observation as values for JSON, by the labels of its parts."""
     if isinstance(value, Mapping):
-        return {str((labels or {}).get(key, key)): labelled(part, None) for key, part in value.items()}
+        return {
+            str((labels or {}).get(key, key)): labelled(part, None) for key, part in value.items()
+        }
     if isinstance(value, tuple):
         return [labelled(part, None) for part in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        plain = [_plain(number) for number in value.tolist()] if np.ndim(value) == 1 else _plain(value.tolist())
+        plain = (
+            [_plain(number) for number in value.tolist()]
+            if np.ndim(value) == 1
+            else _plain(value.tolist())
+        )
         if isinstance(labels, Sequence) and labels and np.ndim(value) == 1:
             return dict(zip(labels, plain, strict=True))
         value = plain
@@ -174,7 +193,11 @@ def _listed(observation: Any) -> list[str]:
 
 
 def _text(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else json.dumps(value, default=str, ensure_ascii=False)
+    return (
+        f"{value:.6g}"
+        if isinstance(value, float)
+        else json.dumps(value, default=str, ensure_ascii=False)
+    )
 
 
 # -- what is legal --------------------------------------------------------------------------------
@@ -187,10 +210,16 @@ def legal_labels(decision: Decision) -> dict[str, int]:
         return {}
     mask, start = decision.mask, int(space.start)
     labels: Any = decision.action_labels
-    legal = [action for action in range(start, start + int(space.n)) if mask is None or mask[action - start]]
+    legal = [
+        action
+        for action in range(start, start + int(space.n))
+        if mask is None or mask[action - start]
+    ]
     occurrences = Counter(labels[action] for action in legal)
     return {
-        labels[action] if occurrences[labels[action]] == 1 else f"{labels[action]} ({action})": action
+        labels[action]
+        if occurrences[labels[action]] == 1
+        else f"{labels[action]} ({action})": action
         for action in legal
     }
 
@@ -209,14 +238,19 @@ def _legal_lines(decision: Decision) -> list[str]:
 def _parts(space: spaces.Space[Any], labels: Any) -> list[str]:
     """Return lines that say what the parts of an action are."""
     if isinstance(space, spaces.Dict):
-        return [f"- {labels[key] if labels else key}: {_limits(part)}" for key, part in space.spaces.items()]
+        return [
+            f"- {labels[key] if labels else key}: {_limits(part)}"
+            for key, part in space.spaces.items()
+        ]
     if isinstance(space, spaces.Tuple):
         return [f"- {place}: {_limits(part)}" for place, part in enumerate(space.spaces)]
     if labels and isinstance(space, spaces.Box) and labels != ("0",):
         limits = zip(labels, space.low.tolist(), space.high.tolist(), strict=True)
         return [f"- {label}: a number from {low:.6g} to {high:.6g}" for label, low, high in limits]
     if labels and isinstance(space, spaces.MultiDiscrete):
-        limits = zip(labels, space.start.tolist(), (space.start + space.nvec - 1).tolist(), strict=True)
+        limits = zip(
+            labels, space.start.tolist(), (space.start + space.nvec - 1).tolist(), strict=True
+        )
         return [f"- {label}: an integer from {low} to {high}" for label, low, high in limits]
     return [f"- {_limits(space)}"]
 
@@ -233,19 +267,31 @@ def action_schema(decision: Decision) -> dict[str, Any]:
     """Return the JSON schema of the actions that ``parse`` takes."""
     labels = legal_labels(decision)
     return (
-        {"type": "string", "enum": list(labels)} if labels else _schema(decision.action_space, decision.action_labels)
+        {"type": "string", "enum": list(labels)}
+        if labels
+        else _schema(decision.action_space, decision.action_labels)
     )
 
 
 def _schema(space: spaces.Space[Any], labels: Any) -> dict[str, Any]:
     parts: dict[str, Any] | None = None
     if isinstance(space, spaces.Discrete):
-        return {"type": "integer", "minimum": int(space.start), "maximum": int(space.start + space.n - 1)}
+        return {
+            "type": "integer",
+            "minimum": int(space.start),
+            "maximum": int(space.start + space.n - 1),
+        }
     if isinstance(space, spaces.Dict):
-        parts = {labels[key] if labels else str(key): _schema(part, None) for key, part in space.spaces.items()}
+        parts = {
+            labels[key] if labels else str(key): _schema(part, None)
+            for key, part in space.spaces.items()
+        }
     elif isinstance(space, spaces.Tuple):
         parts = {str(place): _schema(part, None) for place, part in enumerate(space.spaces)}
-    elif isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)) and len(space.shape) < 2:
+    elif (
+        isinstance(space, (spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary))
+        and len(space.shape) < 2
+    ):
         numbers = [_bounded(*bounds) for bounds in zip(*_bounds(space), strict=True)]
         names = labels or tuple(map(str, range(len(numbers))))
         if len(numbers) == 1 and isinstance(space, spaces.Box):
@@ -253,14 +299,23 @@ def _schema(space: spaces.Space[Any], labels: Any) -> dict[str, Any]:
         parts = dict(zip(names, numbers, strict=True))
     if parts is None:
         raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
-    return {"type": "object", "properties": parts, "required": list(parts), "additionalProperties": False}
+    return {
+        "type": "object",
+        "properties": parts,
+        "required": list(parts),
+        "additionalProperties": False,
+    }
 
 
 def _bounds(space: Any) -> tuple[list[Any], list[Any]]:
     """Return the smallest and the largest value of each component."""
     if isinstance(space, spaces.MultiBinary):
         return [0] * space.shape[0], [1] * space.shape[0]
-    low, high = (space.start, space.start + space.nvec - 1) if hasattr(space, "nvec") else (space.low, space.high)
+    low, high = (
+        (space.start, space.start + space.nvec - 1)
+        if hasattr(space, "nvec")
+        else (space.low, space.high)
+    )
     return low.reshape(-1).tolist(), high.reshape(-1).tolist()
 
 
@@ -274,7 +329,10 @@ def _bounded(low: Any, high: Any) -> dict[str, Any]:
 
 
 def _action(space: spaces.Space[Any], labels: Any, value: Any) -> Any:
-    """Return the action that a value of JSON means, which may be illegal; raise a builtin error if it means none."""
+    """Return the action that a value of JSON means, which may be illegal.
+
+    Raise a builtin error if it means none.
+    """
     if isinstance(space, spaces.Discrete):
         return int(value)
     if isinstance(space, spaces.Dict):
@@ -282,7 +340,11 @@ def _action(space: spaces.Space[Any], labels: Any, value: Any) -> Any:
         given = {keys.get(name, name): part for name, part in dict(value).items()}
         return {key: _action(part, None, given[key]) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        listed = [value[str(place)] for place in range(len(value))] if isinstance(value, Mapping) else value
+        listed = (
+            [value[str(place)] for place in range(len(value))]
+            if isinstance(value, Mapping)
+            else value
+        )
         return tuple(_action(part, None, listed[place]) for place, part in enumerate(space.spaces))
     if isinstance(value, Mapping):
         names = labels or tuple(map(str, range(len(value))))
@@ -292,6 +354,10 @@ def _action(space: spaces.Space[Any], labels: Any, value: Any) -> Any:
     if isinstance(value, str):
         value = [float(part) for part in value.replace(",", " ").split()]
     numbers = np.asarray(value, np.float64).reshape(space.shape)
-    if space.dtype is not None and space.dtype.kind in "iu" and (numbers != np.round(numbers)).any():
+    if (
+        space.dtype is not None
+        and space.dtype.kind in "iu"
+        and (numbers != np.round(numbers)).any()
+    ):
         raise ValueError("these must be integers")
     return numbers.astype(space.dtype)

@@ -17,7 +17,13 @@ from weakref import finalize
 from ..core.awaiting import Answer
 from ..core.pending import Decision
 from ..core.policies import COUNTS, count
-from ..errors import InvalidActionError, LanguageModelError, OptionValueError, describe_error, short_repr
+from ..errors import (
+    InvalidActionError,
+    LanguageModelError,
+    OptionValueError,
+    describe_error,
+    short_repr,
+)
 from ..many.parallel import import_extra
 from .descriptions import action_schema, describe, parse, pending
 
@@ -28,14 +34,16 @@ LONGEST_WAIT: Final = 30.0
 class LanguageModelPolicy:
     """A coroutine policy that asks a language model for each decision.
 
-    The model gets the decision as ``describe`` puts it, and the JSON schema of the legal actions; endpoints without
-    structured output are asked without it, and an answer in plain text is parsed. An answer is checked here, and where
-    it is wrong, or the endpoint fails for a time, the model is asked again. If it gives no legal answer, the policy
-    raises an error, which a ``FallbackPolicy`` catches. In clones, the rule decides.
+    The model gets the decision as ``describe`` puts it, and the JSON schema of the legal actions;
+    endpoints without structured output are asked without it, and an answer in plain text is parsed.
+    An answer is checked here, and where it is wrong, or the endpoint fails for a time, the model is
+    asked again. If it gives no legal answer, the policy raises an error, which a ``FallbackPolicy``
+    catches. In clones, the rule decides.
 
     Attributes:
         model: The name of the model.
-        structured: Whether requests ask for structured output. It becomes False when the endpoint refuses that.
+        structured: Whether requests ask for structured output. It becomes False when the endpoint
+            refuses that.
     """
 
     def __init__(
@@ -57,17 +65,20 @@ class LanguageModelPolicy:
 
         Args:
             model: The name of the model, as the endpoint knows it.
-            base_url: The address of the endpoint, such as ``http://localhost:11434/v1``. None: OpenAI's, or that of the
-                environment variable ``OPENAI_BASE_URL``.
-            api_key: The key of the endpoint. None: that of the environment variable ``OPENAI_API_KEY``.
+            base_url: The address of the endpoint, such as ``http://localhost:11434/v1``. None:
+                OpenAI's, or that of the environment variable ``OPENAI_BASE_URL``.
+            api_key: The key of the endpoint. None: that of the environment variable
+                ``OPENAI_API_KEY``.
             instructions: What the model is told besides, at the beginning.
-            describe: A callable of the ``Decision`` that puts it into words. None: ``simenv_marl.seats.describe``.
-            history: How many of the latest decisions of the same agent, with their answers, each request contains.
+            describe: A callable of the ``Decision`` that puts it into words. None:
+                ``simenv_marl.seats.describe``.
+            history: How many of the latest decisions of the same agent, with their answers, each
+                request contains.
             retries: How often the model is asked again for a decision.
             timeout: The time limit of a request, in seconds.
             structured: Whether to ask for structured output.
-            client: An ``openai.AsyncOpenAI``, or an object like it, to use instead of another one. It must not be used
-                in another event loop.
+            client: An ``openai.AsyncOpenAI``, or an object like it, to use instead of another one.
+                It must not be used in another event loop.
             **request: Further arguments of each request, such as ``temperature=0.0``.
 
         Raises:
@@ -75,9 +86,13 @@ class LanguageModelPolicy:
         """
         for name, value in (("history", history), ("retries", retries)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise OptionValueError(f"{name} must be a non-negative integer, not {short_repr(value)}")
+                raise OptionValueError(
+                    f"{name} must be a non-negative integer, not {short_repr(value)}"
+                )
         if describe is not None and not callable(describe):
-            raise OptionValueError(f"describe must be a callable of a Decision, or None, not {short_repr(describe)}")
+            raise OptionValueError(
+                f"describe must be a callable of a Decision, or None, not {short_repr(describe)}"
+            )
         self.model, self.structured = model, structured
         self._base_url, self._api_key, self._instructions = base_url, api_key, instructions
         self._describe, self._most_turns, self._retries = describe, history, retries
@@ -92,7 +107,10 @@ class LanguageModelPolicy:
     def usage(self) -> dict[str, float]:
         """The numbers of ``requests``, ``prompt_tokens`` and ``completion_tokens``, and the ``seconds`` they took."""
         counted = COUNTS.get(self._token, {})
-        return {name: counted.get(name, 0) for name in ("requests", "prompt_tokens", "completion_tokens", "seconds")}
+        return {
+            name: counted.get(name, 0)
+            for name in ("requests", "prompt_tokens", "completion_tokens", "seconds")
+        }
 
     def prompt(self, env_or_decision: Any) -> str:
         """Return what the model is told about the pending decision of an environment: instructions and description.
@@ -114,7 +132,11 @@ class LanguageModelPolicy:
         """
         history = self._history(_decision)
         asked = {"role": "user", "content": self._words(_decision)}
-        messages = [{"role": "system", "content": self._system(_decision)}, *chain.from_iterable(history), asked]
+        messages = [
+            {"role": "system", "content": self._system(_decision)},
+            *chain.from_iterable(history),
+            asked,
+        ]
         tries = 0
         while True:
             error: Exception
@@ -125,7 +147,10 @@ class LanguageModelPolicy:
                 return action
             except InvalidActionError as problem:
                 error = problem
-                messages += [{"role": "assistant", "content": text}, {"role": "user", "content": str(problem)}]
+                messages += [
+                    {"role": "assistant", "content": text},
+                    {"role": "user", "content": str(problem)},
+                ]
             except _PassingError as problem:
                 error = LanguageModelError(f"{self.model} gave no answer: {problem}")
                 if tries < self._retries:
@@ -141,7 +166,9 @@ class LanguageModelPolicy:
         if decision.doc:
             parts.append(f"What it decides: {cleandoc(decision.doc)}")
         schema = json.dumps(self._answer_schema(decision), ensure_ascii=False)
-        parts.append(f"Answer with one JSON object that fits this JSON schema, and nothing else: {schema}")
+        parts.append(
+            f"Answer with one JSON object that fits this JSON schema, and nothing else: {schema}"
+        )
         return "\n".join([*parts, self._instructions] if self._instructions else parts)
 
     def _words(self, decision: Decision) -> str:
@@ -158,7 +185,9 @@ class LanguageModelPolicy:
 
     def _history(self, decision: Decision) -> deque[list[dict[str, str]]]:
         """Return the latest decisions of an agent in an episode, each as a question and an answer."""
-        history: deque[list[dict[str, str]]] = decision.memory.setdefault(self._token, deque(maxlen=self._most_turns))
+        history: deque[list[dict[str, str]]] = decision.memory.setdefault(
+            self._token, deque(maxlen=self._most_turns)
+        )
         return history
 
     # -- requests ---------------------------------------------------------------------------------
@@ -181,8 +210,13 @@ class LanguageModelPolicy:
             if status in (400, 404, 422) and self.structured and "response_format" in str(error):
                 self.structured = False
                 return await self._ask(messages, decision)
-            if status is None and type(error).__name__ not in ("APIConnectionError", "APITimeoutError"):
-                raise LanguageModelError(f"{self.model} cannot be asked: {describe_error(error)}") from error
+            if status is None and type(error).__name__ not in (
+                "APIConnectionError",
+                "APITimeoutError",
+            ):
+                raise LanguageModelError(
+                    f"{self.model} cannot be asked: {describe_error(error)}"
+                ) from error
             if status is not None and status not in (408, 409, 429) and status < 500:
                 raise LanguageModelError(
                     f"the endpoint refuses to ask {self.model}: {describe_error(error)}"
@@ -199,7 +233,9 @@ class LanguageModelPolicy:
         try:
             message = response.choices[0].message
         except (AttributeError, LookupError, TypeError):
-            raise _PassingError(f"the endpoint returned no chat completion but {short_repr(response)}") from None
+            raise _PassingError(
+                f"the endpoint returned no chat completion but {short_repr(response)}"
+            ) from None
         if not isinstance(message.content, str) or not message.content.strip():
             raise _PassingError(f"it refused: {short_repr(getattr(message, 'refusal', None))}")
         return message.content
@@ -213,7 +249,10 @@ class LanguageModelPolicy:
 
 
 class _PassingError(Exception):
-    """A request failed in a way that may not happen again. It may say how long to wait, in seconds."""
+    """A request failed in a way that may not happen again.
+
+    It may say how long to wait, in seconds.
+    """
 
     def __init__(self, text: str, seconds: float = 0.0) -> None:
         super().__init__(text)

@@ -28,24 +28,28 @@ KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
 class FallbackPolicy(PolicyWrapper):
     """A policy that answers by a fallback where another policy is late, raises an exception, or answers illegally.
 
-    Evaluations show the share of decisions that a fallback has answered. In clones it counts nothing, and where the
-    other policy waits or records, the fallback answers.
+    Evaluations show the share of decisions that a fallback has answered. In clones it counts
+    nothing, and where the other policy waits or records, the fallback answers.
 
     Attributes:
         policy, fallback: The two policies.
-        last_error: What was wrong with the latest answer that was not used, as text; None if all were used.
+        last_error: What was wrong with the latest answer that was not used, as text; None if all
+            were used.
     """
 
     counts_fallbacks = True
 
-    def __init__(self, policy: Any, fallback: Any = RULE, *, timeout: float | None = None, retries: int = 0) -> None:
+    def __init__(
+        self, policy: Any, fallback: Any = RULE, *, timeout: float | None = None, retries: int = 0
+    ) -> None:
         """Wrap a policy.
 
         Args:
-            policy: The policy, as ``simulate`` takes them: a callable, which may be a coroutine function.
+            policy: The policy, as ``simulate`` takes them: a callable, which may be a coroutine
+                function.
             fallback: What answers instead: ``RULE``, or a policy.
-            timeout: The time that an answer may take, in seconds. A coroutine is cancelled then; the time of other
-                functions is measured afterwards. None: there is no limit.
+            timeout: The time that an answer may take, in seconds. A coroutine is cancelled then;
+                the time of other functions is measured afterwards. None: there is no limit.
             retries: How often the policy is asked again before the fallback answers.
 
         Raises:
@@ -54,11 +58,17 @@ class FallbackPolicy(PolicyWrapper):
         if fallback is not RULE and not callable(fallback):
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
         self._ask_fallback = None if fallback is RULE else Caller(fallback)
-        super().__init__(policy, asks=("_decision", *(self._ask_fallback.names if self._ask_fallback else ())))
+        super().__init__(
+            policy, asks=("_decision", *(self._ask_fallback.names if self._ask_fallback else ()))
+        )
         if timeout is not None and not (isinstance(timeout, (int, float)) and timeout > 0):
-            raise OptionValueError(f"timeout must be a number of seconds or None, not {short_repr(timeout)}")
+            raise OptionValueError(
+                f"timeout must be a number of seconds or None, not {short_repr(timeout)}"
+            )
         if isinstance(retries, bool) or not isinstance(retries, int) or retries < 0:
-            raise OptionValueError(f"retries must be a non-negative integer, not {short_repr(retries)}")
+            raise OptionValueError(
+                f"retries must be a non-negative integer, not {short_repr(retries)}"
+            )
         self.fallback, self.timeout, self.retries = fallback, timeout, retries
         self.waits = self.waits or waits(fallback)
         self.last_error: str | None = None
@@ -68,12 +78,15 @@ class FallbackPolicy(PolicyWrapper):
     def counts(self) -> dict[str, int]:
         """How often it was asked and retried, was late, failed or answered illegally, and the fallback answered.
 
-        ``evaluate``, ``run_experiment``, ``simulate_many`` and ``collect_episodes`` add what their workers count.
+        ``evaluate``, ``run_experiment``, ``simulate_many`` and ``collect_episodes`` add what their
+        workers count.
         """
         counted = COUNTS.get(self._token, {})
         return {kind: int(counted.get(kind, 0)) for kind in KINDS}
 
-    def __call__(self, observation: Any, info: Any = None, *, _decision: Decision, **asked: Any) -> Any:
+    def __call__(
+        self, observation: Any, info: Any = None, *, _decision: Decision, **asked: Any
+    ) -> Any:
         """Answer a decision. Return an awaitable if one of the two policies has to be awaited."""
         answer = self._answer(observation, info, {**asked, "_decision": _decision})
         return answer if self.waits else _finished(answer)
@@ -131,9 +144,10 @@ def _finished(coroutine: Coroutine[Any, Any, Any]) -> Any:
 class RecordedPolicy(PolicyWrapper):
     """A policy that records the answers of another one in a file, and repeats them without asking it.
 
-    Each answer is a line of JSON: the seed of the episode, the agent, the number of the decision, a digest of the
-    observation, and the answer. An answer is repeated where all of these agree. A line is written at once, so that the
-    file can be used after a crash. In clones, the fallback of the other policy answers, or the rule.
+    Each answer is a line of JSON: the seed of the episode, the agent, the number of the decision, a
+    digest of the observation, and the answer. An answer is repeated where all of these agree. A
+    line is written at once, so that the file can be used after a crash. In clones, the fallback of
+    the other policy answers, or the rule.
 
     Attributes:
         policy: The other policy.
@@ -141,19 +155,29 @@ class RecordedPolicy(PolicyWrapper):
     """
 
     def __init__(self, policy: Any, path: str | os.PathLike[str]) -> None:
-        """Wrap a policy, as ``simulate`` takes them; it may be a coroutine function. The file is created if needed."""
+        """Wrap a policy, as ``simulate`` takes them; it may be a coroutine function.
+
+        The file is created if needed.
+        """
         super().__init__(policy, asks=("_decision",))
         self.path, self.records = Path(path), True
         if not self.path.parent.is_dir():
-            raise OptionValueError(f"{self.path} cannot be written: {self.path.parent} is no folder")
+            raise OptionValueError(
+                f"{self.path} cannot be written: {self.path.parent} is no folder"
+            )
         self.fallback: Any = getattr(policy, "fallback", RULE)
         self._known: dict[tuple[Any, ...], Any] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_known": None}
 
-    def __call__(self, observation: Any, info: Any = None, *, _decision: Decision, **asked: Any) -> Any:
-        """Answer a decision. Return an awaitable if the answer is not known and the policy has to be awaited."""
+    def __call__(
+        self, observation: Any, info: Any = None, *, _decision: Decision, **asked: Any
+    ) -> Any:
+        """Answer a decision.
+
+        Return an awaitable if the answer is not known and the policy has to be awaited.
+        """
         known = self._read() if self._known is None else self._known
         key = _decision.seed, _decision.agent, _decision.number, digest_of(observation)
         if key in known:
@@ -174,7 +198,10 @@ class RecordedPolicy(PolicyWrapper):
                 known[key] = entry["answer"]
             except (ValueError, TypeError, LookupError):
                 if number <= content.count(b"\n"):
-                    warn_user(f"line {number} of {self.path} cannot be read, so its decision is asked again")
+                    warn_user(
+                        f"line {number} of {self.path} cannot be read, so its decision is asked"
+                        " again"
+                    )
         if content and not content.endswith(b"\n"):
             self._write(b"\n")
         self._known = known
@@ -206,7 +233,11 @@ def _in_form(space: spaces.Space[Any], action: Any) -> Any:
         return {key: _in_form(part, action[key]) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
         return tuple(_in_form(part, action[place]) for place, part in enumerate(space.spaces))
-    return np.asarray(action, space.dtype).reshape(space.shape) if isinstance(space, spaces.Box) else action
+    return (
+        np.asarray(action, space.dtype).reshape(space.shape)
+        if isinstance(space, spaces.Box)
+        else action
+    )
 
 
 def digest_of(observation: Any) -> str:

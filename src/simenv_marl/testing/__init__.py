@@ -1,7 +1,8 @@
 """Checks of a simulation and its decision points, to run before trusting an environment.
 
-``check_simulation`` runs a simulation by itself and in environments, plays episodes of random actions, and explains
-what is wrong. ``inspect_simulation`` lists the decision points and their calls. Both are also on the command line::
+``check_simulation`` runs a simulation by itself and in environments, plays episodes of random
+actions, and explains what is wrong. ``inspect_simulation`` lists the decision points and their
+calls. Both are also on the command line::
 
     python -m simenv_marl check package.module:Simulation
     python -m simenv_marl inspect package.module:Simulation
@@ -49,37 +50,45 @@ def check_simulation(
 ) -> CheckReport:
     """Check a simulation before its environments are used.
 
-    The checks compare plain runs with runs of ``RULE`` throughout in every view that fits; episodes of the same seed in
-    new and used environments and side by side; and observations with their spaces. They run PettingZoo's and
-    Gymnasium's own tests. Every exception of the model is a finding. Python's and NumPy's global generators are left as
-    they were.
+    The checks compare plain runs with runs of ``RULE`` throughout in every view that fits; episodes
+    of the same seed in new and used environments and side by side; and observations with their
+    spaces. They run PettingZoo's and Gymnasium's own tests. Every exception of the model is a
+    finding. Python's and NumPy's global generators are left as they were.
 
     Args:
         simulation: A simulation (which is copied), its class, or a zero-argument factory.
         points: The active decision points, as ``generate_env`` takes them.
         seeds: The seeds of plain runs that are compared; at least one.
         episodes: The number of episodes of random legal actions.
-        max_steps: The number of decisions after which a run is cut, so that models that never end can be checked, too.
-        time_limit: The approximate limit for all checks, in seconds; a single run may take a quarter of it. Running
-            Python code is interrupted; waiting outside of Python (in a sleep, for example) is not.
-        fingerprint: What simulations are compared by after a run: a callable of the simulation that returns numbers,
-            arrays, strings, or containers of these. None: its ``state()``, or else all its attributes.
+        max_steps: The number of decisions after which a run is cut, so that models that never end
+            can be checked, too.
+        time_limit: The approximate limit for all checks, in seconds; a single run may take a
+            quarter of it. Running Python code is interrupted; waiting outside of Python (in a
+            sleep, for example) is not.
+        fingerprint: What simulations are compared by after a run: a callable of the simulation that
+            returns numbers, arrays, strings, or containers of these. None: its ``state()``, or else
+            all its attributes.
         **options: The options of the environments, as ``aec_env`` takes them.
 
     Returns:
         The report: ``print`` it, or call its ``raise_for_errors`` in tests.
 
     Raises:
-        SimEnvError: The simulation, the points or the options cannot be used at all. The subclass tells why.
+        SimEnvError: The simulation, the points or the options cannot be used at all. The subclass
+            tells why.
     """
     chosen = tuple(dict.fromkeys(seeds))
     if not chosen or not all(map(is_seed, chosen)):
-        raise OptionValueError(f"seeds must be non-negative integers, at least one, not {short_repr(seeds)}")
+        raise OptionValueError(
+            f"seeds must be non-negative integers, at least one, not {short_repr(seeds)}"
+        )
     for name, number in (("episodes", episodes), ("max_steps", max_steps)):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise OptionValueError(f"{name} must be a positive integer, not {short_repr(number)}")
     if not 0 < time_limit < math.inf:
-        raise OptionValueError(f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}")
+        raise OptionValueError(
+            f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
+        )
     report, calls = Report(), ""
     with quietly() as caught:
         try:
@@ -108,7 +117,9 @@ def check_simulation(
         report.add("warned", str(warning.message)[:300])
     return CheckReport(
         simulation=str(getattr(simulation, "__name__", None) or type(simulation).__name__),
-        findings=tuple(sorted(dict.fromkeys(report.findings), key=lambda f: SEVERITIES.index(f.severity))),
+        findings=tuple(
+            sorted(dict.fromkeys(report.findings), key=lambda f: SEVERITIES.index(f.severity))
+        ),
         checked=tuple(report.checked),
         statistics=report.statistics,
         episodes=report.episodes,
@@ -127,24 +138,31 @@ def inspect_simulation(
 ) -> Inspection:
     """List the decision points of a simulation and the order of their calls, by running one episode of its own rules.
 
-    The arguments are those of ``check_simulation``. The episode is cut after ``max_steps`` decisions, or after
-    ``time_limit`` seconds.
+    The arguments are those of ``check_simulation``. The episode is cut after ``max_steps``
+    decisions, or after ``time_limit`` seconds.
 
     Returns:
         The inspection; ``print`` it.
 
     Raises:
-        SimEnvError: The simulation, the points or the options cannot be used at all. The subclass tells why.
+        SimEnvError: The simulation, the points or the options cannot be used at all. The subclass
+            tells why.
         Exception: Any exception of the model's constructor.
     """
     if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
     with quietly():
         plan = Plan(simulation, points, options)
-        subject = Subject(plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None)
+        subject = Subject(
+            plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None
+        )
         run = subject.run_plainly(seed)
         views = fitting_views(plan)
-    how = "truncated (a limit of time)" if run.result is TRUNCATED else "terminated (an end of the task)"
+    how = (
+        "truncated (a limit of time)"
+        if run.result is TRUNCATED
+        else "terminated (an end of the task)"
+    )
     how = describe_with_place(run.error) if run.error is not None else "cut" if run.cut else how
     uses = ("action_mask_mapping", "choices", "apply", "removed_by", "goal_space")
     return Inspection(

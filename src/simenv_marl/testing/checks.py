@@ -1,4 +1,7 @@
-"""The checks: functions of a ``Subject`` and a ``Report``. Each adds what it finds to the report."""
+"""The checks: functions of a ``Subject`` and a ``Report``.
+
+Each adds what it finds to the report.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,9 @@ class Report:
     findings: list[Finding] = field(default_factory=list)
     checked: list[str] = field(default_factory=list)
     statistics: tuple[PointStatistics, ...] = ()
-    episodes: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("terminated", "truncated", "cut"), 0))
+    episodes: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys(("terminated", "truncated", "cut"), 0)
+    )
     errors: set[tuple[str, str]] = field(default_factory=set)  # by class and place
 
     def add(self, name: str, evidence: str = "", **words: Any) -> None:
@@ -59,12 +64,17 @@ class Report:
         self.findings.append(Finding(severity, title, " ".join(text.split()), evidence))
 
     def add_error(self, run: Run, where: str, view: str = "aec") -> None:
-        """Add the finding for the exception of a run; the same one from the same place is reported once."""
+        """Add the finding for the exception of a run.
+
+        The same one from the same place is reported once.
+        """
         error: Any = run.error
         if view == "joint" and isinstance(error, AgentError):
             return  # that view needs to know all agents
         if isinstance(error, LimitReached):
-            self.add("stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.calls)} steps")
+            self.add(
+                "stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.calls)} steps"
+            )
             return
         key = type(error).__name__, place_of(error) or error_text(error)
         if key not in self.errors:
@@ -98,13 +108,17 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
             report.add_error(run, f"in a plain run without any environment, seed {seed}")
             return
     if not any(run.calls for run in subject.plain.values()):
-        report.add("no_decision", points=", ".join(bound.point.name for bound in subject.plan.active))
+        report.add(
+            "no_decision", points=", ".join(bound.point.name for bound in subject.plan.active)
+        )
         return
     subject.views = fitting_views(subject.plan)
     if any(run.cut for run in subject.plain.values()):
         report.add("cut_runs", most=subject.max_steps)
     first, *others = subject.plain.values()
-    if others and not any(first.difference(run) or subject.differences(first, run) for run in others):
+    if others and not any(
+        first.difference(run) or subject.differences(first, run) for run in others
+    ):
         report.add("same_seeds", f"seeds {', '.join(map(str, subject.seeds))}")
 
 
@@ -123,10 +137,15 @@ def check_repeated_run(subject: Subject, report: Report) -> None:
         name = "unseeded_generators" if differs else "shared_generators"
         report.add(name, subject.sources_of_chance().lstrip(), names=names)
     parts = subject.differences(first, runs[0])
-    difference = first.difference(runs[0]) or describe_differences([part for part in parts if STATE in part[0]])
+    difference = first.difference(runs[0]) or describe_differences(
+        [part for part in parts if STATE in part[0]]
+    )
     if difference:
         subject.repeats = False
-        report.add("unrepeatable", f"two plain runs of seed {seed}: {difference}{subject.sources_of_chance()}")
+        report.add(
+            "unrepeatable",
+            f"two plain runs of seed {seed}: {difference}{subject.sources_of_chance()}",
+        )
     elif parts:
         report.add("unstable", describe_differences(parts))
         subject.unstable = frozenset(general(path) for path, _, _ in parts)
@@ -147,7 +166,8 @@ def check_views(subject: Subject, report: Report) -> None:
         if subject.late or not plain.calls:
             continue
         seed_global_generators(seed)
-        asking = {"policies": policies, "max_steps": None, "skip_forced": False}  # so that rules take all decisions
+        # so that rules take all decisions
+        asking = {"policies": policies, "max_steps": None, "skip_forced": False}
         with report.opened(subject, view, driver=driver, **asking) as env:
             run = subject.run_rules(env, seed)
         where = f"{view} view, driver {driver}, seed {seed}"
@@ -155,19 +175,26 @@ def check_views(subject: Subject, report: Report) -> None:
             report.add_error(run, f"in the {where}, with RULE throughout", view)
             continue
         if run.drawn - subject.drawn:
-            report.add("unseeded_generators", f"in the {where}", names=" and ".join(sorted(run.drawn - subject.drawn)))
+            report.add(
+                "unseeded_generators",
+                f"in the {where}",
+                names=" and ".join(sorted(run.drawn - subject.drawn)),
+            )
             subject.drawn |= run.drawn
         decisions, parts = plain.difference(run), subject.differences(plain, run)
         if decisions or parts:
-            evidence = f"plain run, then {where}: {decisions}\n{describe_differences(parts)}".rstrip()
+            evidence = (
+                f"plain run, then {where}: {decisions}\n{describe_differences(parts)}".rstrip()
+            )
             only_more = not decisions and all(here is ABSENT for _, here, _ in parts)
             report.add("writing_mappings" if only_more else "changed_model", evidence)
             return
     most = max(len(run.calls) for run in subject.plain.values())
     views, seeds = ", ".join(subject.views), ", ".join(map(str, subject.seeds))
     report.checked.append(
-        f"plain runs against RULE throughout ({views}; drivers {', '.join(drivers)}; seeds {seeds}; up to {most}"
-        f" decisions each): the decisions, and {len(plain.fingerprint)} parts that the simulation holds then"
+        f"plain runs against RULE throughout ({views}; drivers {', '.join(drivers)}; seeds"
+        f" {seeds}; up to {most} decisions each): the decisions, and {len(plain.fingerprint)}"
+        " parts that the simulation holds then"
     )
 
 
@@ -196,15 +223,27 @@ class PointRecord:
                 self.record(f"{name}.{number}", part)
         elif isinstance(value, (np.ndarray, np.generic, int, float)):
             array = np.array(value, float)
-            number, low, total, high = self.values.get(name, (0, array, np.zeros_like(array), array))
+            number, low, total, high = self.values.get(
+                name, (0, array, np.zeros_like(array), array)
+            )
             if array.shape == low.shape:
-                self.values[name] = number + 1, np.minimum(low, array), total + array, np.maximum(high, array)
+                self.values[name] = (
+                    number + 1,
+                    np.minimum(low, array),
+                    total + array,
+                    np.maximum(high, array),
+                )
 
     def results(self, report: Report, called: set[str]) -> PointStatistics:
         """Return the statistics, and report what they show; plain runs have called some points."""
         ranges = {
             name: [
-                Range(f"{name}{list(place)}" if place else name, low[place].item(), mean.item(), high[place].item())
+                Range(
+                    f"{name}{list(place)}" if place else name,
+                    low[place].item(),
+                    mean.item(),
+                    high[place].item(),
+                )
                 for place, mean in np.ndenumerate(total / number)
             ]
             for name, (number, low, total, high) in self.values.items()
@@ -222,12 +261,19 @@ class PointRecord:
             report.add("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=point)
         if rewards and rewards.minimum == rewards.maximum and self.values["reward"][0] > 1:
             name = "same_rewards" if rewards.minimum else "zero_rewards"
-            report.add(name, f"{self.values['reward'][0]} rewards of {rewards.mean:.6g}", point=point)
-        agents, observations = self.point.agent or "agents named by each call", tuple(chain(*ranges.values()))
+            report.add(
+                name, f"{self.values['reward'][0]} rewards of {rewards.mean:.6g}", point=point
+            )
+        agents, observations = (
+            self.point.agent or "agents named by each call",
+            tuple(chain(*ranges.values())),
+        )
         return PointStatistics(point, agents, self.decisions, observations, rewards, never)
 
 
-def _collect(records: Mapping[Any, PointRecord], acted: dict[str, Any], env: Any, agent: str, step: Any) -> None:
+def _collect(
+    records: Mapping[Any, PointRecord], acted: dict[str, Any], env: Any, agent: str, step: Any
+) -> None:
     """Record a step of an episode. Rewards count only for agents that have acted in it."""
     bound = env._point(agent)
     record = records[bound.point.name, bound.agent]
@@ -246,7 +292,10 @@ def _collect(records: Mapping[Any, PointRecord], acted: dict[str, Any], env: Any
 
 
 def check_episodes(subject: Subject, report: Report) -> None:
-    """Play episodes with random legal actions; collect statistics; compare episodes of the same seed."""
+    """Play episodes with random legal actions.
+
+    Collect statistics; compare episodes of the same seed.
+    """
     records = {(bound.point.name, bound.agent): PointRecord(bound) for bound in subject.plan.active}
     first, failures = None, 0
     acted: dict[str, Any] = {}
@@ -265,7 +314,9 @@ def check_episodes(subject: Subject, report: Report) -> None:
                 continue
             if number == 1:
                 first = run
-                _compare_generators(report, env.simulation, [agent for agent in acted if acted[agent].agent is None])
+                _compare_generators(
+                    report, env.simulation, [agent for agent in acted if acted[agent].agent is None]
+                )
             report.episodes[run.result if len(run.actions) < subject.max_steps else "cut"] += 1
         called = {name for run in subject.plain.values() for name in run.calls}
         report.statistics = tuple(record.results(report, called) for record in records.values())
@@ -280,11 +331,17 @@ def check_episodes(subject: Subject, report: Report) -> None:
 
 
 def _compare_generators(report: Report, simulation: Any, entities: list[str]) -> None:
-    """Report fewer generators than entities that decide. A model without any was reported before."""
+    """Report fewer generators than entities that decide.
+
+    A model without any was reported before.
+    """
     generators = list(generators_of(simulation))
     number = sum(len(found) if isinstance(found, Streams) else 1 for found in generators)
     if 0 < number < len(entities):
-        report.add("few_generators", f"{number} for {len(entities)} agents, {entities[0]} and {entities[1]} among them")
+        report.add(
+            "few_generators",
+            f"{number} for {len(entities)} agents, {entities[0]} and {entities[1]} among them",
+        )
 
 
 def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -> None:
@@ -292,7 +349,11 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -
     seed = subject.seeds[0]
     with report.opened(subject, max_steps=subject.max_steps) as new:
         subject.run_randomly(used, seed, most=1 + len(first.calls) // 2)  # broken off
-        for name, env, beside in (("unrepeatable", new, None), ("left_over", used, None), ("disturbance", new, used)):
+        for name, env, beside in (
+            ("unrepeatable", new, None),
+            ("left_over", used, None),
+            ("disturbance", new, used),
+        ):
             again = subject.run_randomly(env, seed, beside=beside)
             if again.error is not None:
                 report.add_error(again, "after an episode that was closed in mid-episode")
@@ -304,9 +365,15 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -
                 report.add(name, f"seed {seed}, the same actions: {difference}{sources}")
                 return
         other = subject.run_randomly(used, seed, salt=1)
-        if len(other.calls) > 1 and repr(first.actions) != repr(other.actions) and not first.difference(other):
+        if (
+            len(other.calls) > 1
+            and repr(first.actions) != repr(other.actions)
+            and not first.difference(other)
+        ):
             report.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
-    report.checked.append("the same seed and actions in a new environment, in a used one, and beside another one")
+    report.checked.append(
+        "the same seed and actions in a new environment, in a used one, and beside another one"
+    )
 
 
 # -- the tests of PettingZoo and Gymnasium --------------------------------------------------------
@@ -316,8 +383,16 @@ _TESTS: Final[tuple[tuple[str, str, Callable[[Callable[[], Any]], Any]], ...]] =
     ("seed_test", "aec", lambda make: seed_test(make, num_cycles=20)),
     ("parallel_api_test", "parallel", lambda make: parallel_api_test(make(), num_cycles=50)),
     ("parallel_seed_test", "parallel", lambda make: parallel_seed_test(make, num_cycles=20)),
-    ("Gymnasium's check_env (single view)", "single", lambda make: check_env(make(), skip_render_check=True)),
-    ("Gymnasium's check_env (joint view)", "joint", lambda make: check_env(make(), skip_render_check=True)),
+    (
+        "Gymnasium's check_env (single view)",
+        "single",
+        lambda make: check_env(make(), skip_render_check=True),
+    ),
+    (
+        "Gymnasium's check_env (joint view)",
+        "joint",
+        lambda make: check_env(make(), skip_render_check=True),
+    ),
 )
 """The tests and their views; each test is called with a factory of environments."""
 
@@ -327,7 +402,12 @@ def check_conformance(subject: Subject, report: Report) -> None:
     passed = []
     for name, view, test in _TESTS:
         failed = any(finding.severity == "error" for finding in report.findings)
-        if failed or subject.late or view not in subject.views or (subject.drawn and "seed" in name):
+        if (
+            failed
+            or subject.late
+            or view not in subject.views
+            or (subject.drawn and "seed" in name)
+        ):
             continue
         make = partial(make_environment, subject.plan, view, max_steps=subject.max_steps)
         run = subject.play(partial(test, make))
@@ -335,7 +415,8 @@ def check_conformance(subject: Subject, report: Report) -> None:
             passed.append(name)
         elif isinstance(run.error, AssertionError):
             report.add("failed_test", describe_with_place(run.error), test=name)
-        elif not isinstance(run.error, (LimitReached, InvalidActionError)):  # tests ignore masks, or that these change
+        # tests ignore masks, or that these change
+        elif not isinstance(run.error, (LimitReached, InvalidActionError)):
             report.add_error(run, f"in {name}", view)
     if passed:
         report.checked.append(", ".join(passed))

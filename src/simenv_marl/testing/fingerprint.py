@@ -1,8 +1,8 @@
 """Fingerprints: everything that a simulation holds after a run, to compare two runs.
 
-Models need not be comparable. Therefore their attributes are followed down to numbers, strings, arrays and the states
-of random generators. Each of these *parts* has a path, which a difference reports. What cannot be followed (open files,
-generators, locks) is compared by its class.
+Models need not be comparable. Therefore their attributes are followed down to numbers, strings,
+arrays and the states of random generators. Each of these *parts* has a path, which a difference
+reports. What cannot be followed (open files, generators, locks) is compared by its class.
 """
 
 from __future__ import annotations
@@ -25,7 +25,19 @@ MOST_PARTS: Final = 50_000  # larger models are compared by the parts that both 
 ABSENT: Final = Sentinel("nothing")  # in differences, the value of a part that does not exist
 STATE: Final = "state of the generator"
 
-_ATOMS: Final = (int, float, complex, str, bytes, bool, type(None), range, type(Ellipsis), Enum, np.generic)
+_ATOMS: Final = (
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    bool,
+    type(None),
+    range,
+    type(Ellipsis),
+    Enum,
+    np.generic,
+)
 _NAMED: Final = (type, FunctionType, BuiltinFunctionType, ModuleType)
 
 Fingerprint = dict[str, Any]
@@ -41,8 +53,10 @@ def fingerprint(name: str, root: Any, *, follow: bool = True) -> Fingerprint:
     Without ``follow``, only lists, tuples and dicts are followed.
     """
     parts: Fingerprint = {}
-    found: dict[int, tuple[str, Any]] = {}  # paths of objects, which are referred to so that no id is used again
-    queue = deque([(name, root)])  # breadth first, so that a long history in the model does not hide the rest
+    # paths of objects, which are referred to so that no id is used again
+    found: dict[int, tuple[str, Any]] = {}
+    # breadth first, so that a long history in the model does not hide the rest
+    queue = deque([(name, root)])
     while queue and len(parts) < MOST_PARTS:
         path, value = queue.popleft()
         if isinstance(value, _ATOMS):
@@ -59,7 +73,8 @@ def fingerprint(name: str, root: Any, *, follow: bool = True) -> Fingerprint:
             parts[path] = name_of(type(value))
             if not follow and not isinstance(value, (list, tuple, dict)):
                 continue
-            if not isinstance(value, (tuple, frozenset)):  # equal ones may or may not be the same object
+            # equal ones may or may not be the same object
+            if not isinstance(value, (tuple, frozenset)):
                 found[id(value)] = path, value
             try:
                 queue += [(path + end, part) for end, part in _members(value)]
@@ -72,7 +87,11 @@ def _state_of(generator: Any) -> str:
     """Return the state of a random generator as a text."""
     if isinstance(generator, np.random.Generator):
         return str(generator.bit_generator.state)
-    return str(generator.getstate() if isinstance(generator, random.Random) else generator.get_state(legacy=False))
+    return str(
+        generator.getstate()
+        if isinstance(generator, random.Random)
+        else generator.get_state(legacy=False)
+    )
 
 
 def _members(value: Any) -> Iterator[tuple[str, Any]]:
@@ -80,25 +99,39 @@ def _members(value: Any) -> Iterator[tuple[str, Any]]:
     attributes = object.__getstate__(value)
     for state in attributes if isinstance(attributes, tuple) else (attributes,):
         for name, part in (state or {}).items():
-            if not isinstance(getattr(type(value), str(name), None), cached_property):  # computed when it is first read
+            # computed when it is first read
+            if not isinstance(getattr(type(value), str(name), None), cached_property):
                 yield f".{name}", part
     if isinstance(value, (set, frozenset)):  # it has no order: of other objects, only the classes
-        yield " (members)", sorted(repr(item) if isinstance(item, _ATOMS) else name_of(type(item)) for item in value)
+        yield (
+            " (members)",
+            sorted(
+                repr(item) if isinstance(item, _ATOMS) else name_of(type(item)) for item in value
+            ),
+        )
     elif isinstance(value, (list, tuple, deque, np.ndarray)):
         items = value.ravel() if isinstance(value, np.ndarray) else value
         yield from ((f"[{number}]", item) for number, item in enumerate(items))
     elif isinstance(value, Mapping):
         for number, (key, item) in enumerate(list(value.items())):
-            simple = all(isinstance(part, _ATOMS) for part in (key if isinstance(key, tuple) else (key,)))
+            simple = all(
+                isinstance(part, _ATOMS) for part in (key if isinstance(key, tuple) else (key,))
+            )
             yield f"[{key!r}]" if simple else f"[key {number}]", item
             if not simple:
                 yield f" (key {number})", key
-    elif attributes is None and not hasattr(value, "__dict__"):  # an iterator or a counter, for example
+    # an iterator or a counter, for example
+    elif attributes is None and not hasattr(value, "__dict__"):
         reduced = value.__reduce_ex__(4)
-        yield " (itself)", [list(part) if isinstance(part, Iterator) else part for part in reduced[1:]]
+        yield (
+            " (itself)",
+            [list(part) if isinstance(part, Iterator) else part for part in reduced[1:]],
+        )
 
 
-def differences(one: Fingerprint, other: Fingerprint, ignored: frozenset[str] = frozenset()) -> list[Difference]:
+def differences(
+    one: Fingerprint, other: Fingerprint, ignored: frozenset[str] = frozenset()
+) -> list[Difference]:
     """Return the differences in all parts but those whose paths, as ``general`` writes them, are ignored."""
     cut = max(len(one), len(other)) >= MOST_PARTS
     found = []
@@ -115,7 +148,11 @@ def _same(one: Any, other: Any) -> bool:
     if type(one) is not type(other):
         return False
     if isinstance(one, (np.ndarray, np.generic)):
-        return bool(one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes())
+        return bool(
+            one.dtype == other.dtype
+            and one.shape == other.shape
+            and one.tobytes() == other.tobytes()
+        )
     return bool(one == other or (one != one and other != other))
 
 
@@ -126,5 +163,8 @@ def general(path: str) -> str:
 
 def describe_differences(parts: list[Difference]) -> str:
     """Describe the differences of two fingerprints."""
-    texts = [f"{path} is first {short_repr(one, 60)}, then {short_repr(other, 60)}" for path, one, other in parts]
+    texts = [
+        f"{path} is first {short_repr(one, 60)}, then {short_repr(other, 60)}"
+        for path, one, other in parts
+    ]
     return "; ".join(texts[:3]) + (f"; {len(texts) - 3} more" if len(texts) > 3 else "")

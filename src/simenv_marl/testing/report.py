@@ -20,7 +20,8 @@ SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 class Finding:
     """A finding of a check."""
 
-    severity: Severity  #: "error": results would be wrong. "warning": learning may suffer. "note": good to know.
+    # : "error": results would be wrong. "warning": learning may suffer. "note": good to know.
+    severity: Severity
     title: str  #: The finding in one line.
     explanation: str  #: What it means, and what to do.
     evidence: str = ""  #: Where and when it was seen; may be empty.
@@ -132,8 +133,13 @@ class PointStatistics:
 
     def __str__(self) -> str:
         ranges = [*([self.rewards] if self.rewards else []), *self.observations]
-        lines = [f"{self.agents}, at {self.point}: {self.decisions} decisions", *map(str, ranges[:12])]
-        return "\n    ".join(lines if len(ranges) <= 12 else [*lines, f"and {len(ranges) - 12} more"])
+        lines = [
+            f"{self.agents}, at {self.point}: {self.decisions} decisions",
+            *map(str, ranges[:12]),
+        ]
+        return "\n    ".join(
+            lines if len(ranges) <= 12 else [*lines, f"and {len(ranges) - 12} more"]
+        )
 
 
 @dataclass(frozen=True)
@@ -143,9 +149,12 @@ class CheckReport:
     simulation: str  #: What was checked.
     findings: tuple[Finding, ...]  #: The findings, the most important first.
     checked: tuple[str, ...]  #: What was examined, in words.
-    statistics: tuple[PointStatistics, ...] = ()  #: By decision point, what random legal actions have shown.
-    episodes: dict[str, int] = field(default_factory=dict)  #: The numbers of those episodes, by the way they ended.
-    calls: str = ""  #: The order in which the decision points were called in a plain run: ``(a b){30} c``.
+    # : By decision point, what random legal actions have shown.
+    statistics: tuple[PointStatistics, ...] = ()
+    # : The numbers of those episodes, by the way they ended.
+    episodes: dict[str, int] = field(default_factory=dict)
+    # : The order in which the decision points were called in a plain run: ``(a b){30} c``.
+    calls: str = ""
 
     @property
     def ok(self) -> bool:
@@ -173,18 +182,24 @@ class CheckReport:
     def __str__(self) -> str:
         parts = [self._heading(), *map(str, self.findings)]
         if self.checked:
-            parts.append("\n".join(["What was checked", *(_wrapped(line, 2) for line in self.checked)]))
+            parts.append(
+                "\n".join(["What was checked", *(_wrapped(line, 2) for line in self.checked)])
+            )
         if self.statistics:
             ends = ", ".join(f"{number} {end}" for end, number in self.episodes.items() if number)
             statistics = [f"  {point}" for point in self.statistics]
-            parts.append("\n".join([f"Episodes of random legal actions: {ends or 'none'}", *statistics]))
+            parts.append(
+                "\n".join([f"Episodes of random legal actions: {ends or 'none'}", *statistics])
+            )
         if self.calls:
             parts.append(_wrapped(f"Order of the decisions in a plain run: {self.calls}", 0))
         return "\n\n".join(parts)
 
     def _heading(self) -> str:
         counts = [(len(self.of(severity)), severity) for severity in SEVERITIES]
-        named = [f"{number} {severity}{'s' * (number != 1)}" for number, severity in counts if number]
+        named = [
+            f"{number} {severity}{'s' * (number != 1)}" for number, severity in counts if number
+        ]
         return f"{self.simulation}: {', '.join(named) or 'nothing to complain of'}"
 
 
@@ -193,7 +208,8 @@ class Inspection:
     """The result of ``inspect_simulation``. Its ``str`` is a text for people."""
 
     simulation: str  #: What was inspected.
-    points: tuple[dict[str, str], ...]  #: Of each decision point, its name, its agents, its spaces, and more.
+    # : Of each decision point, its name, its agents, its spaces, and more.
+    points: tuple[dict[str, str], ...]
     views: tuple[str, ...]  #: The views that its environments may have.
     calls: str  #: The order in which the points were called in one plain episode: ``(a b){30} c``.
     counts: dict[str, int]  #: The number of calls of each point.
@@ -206,12 +222,18 @@ class Inspection:
     def __str__(self) -> str:
         counts = ", ".join(f"{point} {number} times" for point, number in self.counts.items())
         episode = f"calls    {counts or 'none'}\norder    {self.calls or '-'}"
-        parts = [f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}"]
-        parts += ["\n  ".join(f"{key:<13} {text}" for key, text in point.items()) for point in self.points]
+        parts = [
+            f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}"
+        ]
+        parts += [
+            "\n  ".join(f"{key:<13} {text}" for key, text in point.items()) for point in self.points
+        ]
         options = {"single": "single with agent=", "joint": "joint with possible_agents="}
         views = [*self.views, *(text for view, text in options.items() if view not in self.views)]
         parts.append(f"Possible views: {', '.join(views)}")
-        parts.append(f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}")
+        parts.append(
+            f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}"
+        )
         return "\n\n".join(parts)
 
 
@@ -235,5 +257,7 @@ def _fold(match: re.Match[str]) -> str:
 
 def _wrapped(text: str, margin: int) -> str:
     """Wrap the lines of a text, with a margin that is wider after the first line of each."""
-    wrapper = TextWrapper(100, " " * margin, " " * (margin + 2), break_long_words=False, break_on_hyphens=False)
+    wrapper = TextWrapper(
+        100, " " * margin, " " * (margin + 2), break_long_words=False, break_on_hyphens=False
+    )
     return "\n".join(wrapper.fill(line) for line in text.splitlines())

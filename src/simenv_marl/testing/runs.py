@@ -1,7 +1,8 @@
 """Recorded runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
 
-Every run has an end, whatever the model does. At its limit of decisions, an exit is raised at the next decision. When
-its time is up, an exit is raised in whatever Python code the model is executing.
+Every run has an end, whatever the model does. At its limit of decisions, an exit is raised at the
+next decision. When its time is up, an exit is raised in whatever Python code the model is
+executing.
 """
 
 from __future__ import annotations
@@ -51,14 +52,17 @@ class LimitReached(LoopExit):
 def within(seconds: float, function: Callable[[], Any]) -> None:
     """Call a function, and raise ``LimitReached`` in it when the time is up.
 
-    This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
+    This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted
+    when it returns.
     """
     thread, over = threading.get_ident(), threading.Event()
 
     def watch() -> None:
         pause = seconds
         while not over.wait(pause):
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(LimitReached))
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(
+                ctypes.c_ulong(thread), ctypes.py_object(LimitReached)
+            )
             pause = 0.5  # raise it again in a model that swallows it
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
@@ -66,8 +70,8 @@ def within(seconds: float, function: Callable[[], Any]) -> None:
         watcher.start()
         function()
     finally:
-        # It may still be raised until the watcher has ended, and is then delivered at once. (It is not revoked: in
-        # CPython that would leave the interpreter checking for it forever.)
+        # It may still be raised until the watcher has ended, and is then delivered at once. (It is
+        # not revoked: in CPython that would leave the interpreter checking for it forever.)
         while True:
             try:
                 over.set()
@@ -95,7 +99,10 @@ def global_generators() -> dict[str, Any]:
 
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Ignore what a model prints and warns; restore the global generators; yield warnings that are findings."""
+    """Ignore what a model prints and warns.
+
+    Restore the global generators; yield warnings that are findings.
+    """
     states, silenced = global_generators(), io.StringIO()
     try:
         with (
@@ -120,21 +127,27 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
 class Run:
     """What is recorded of a run."""
 
-    calls: list[str] = field(default_factory=list)  # the names of the points that were called, or of the agents
+    # the names of the points that were called, or of the agents
+    calls: list[str] = field(default_factory=list)
     steps: Fingerprint = field(default_factory=dict)  # the decisions, or the results of ``last()``
     actions: list[Any] = field(default_factory=list)  # the random ones
     simulation: Any = None
     in_main_loop: bool = False  # whether a plain run is in the simulation's main loop
-    fingerprint: Fingerprint = field(default_factory=dict)  # of the simulation at its end, or when it was cut
+    # of the simulation at its end, or when it was cut
+    fingerprint: Fingerprint = field(default_factory=dict)
     cut: bool = False  # whether it has reached its limit of decisions
     error: BaseException | None = None
-    result: Any = None  # what run() returned in a plain run, or how an episode of random actions ended
+    # what run() returned in a plain run, or how an episode of random actions ended
+    result: Any = None
     drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
     latest: float = field(default_factory=time.monotonic)  # the time of the latest call
     stuck: bool = False  # whether its time was up long after the latest call
 
     def begin_step(self, name: str) -> str:
-        """Record that a point was called or an agent asked; return the name of this step in ``steps``."""
+        """Record that a point was called or an agent asked.
+
+        Return the name of this step in ``steps``.
+        """
         self.calls.append(name)
         self.latest = time.monotonic()
         step = f"in step {len(self.calls)}, {name}"
@@ -166,7 +179,8 @@ class Subject:
     repeats: bool = True  # whether the same seed gives the same plain run
     drawn: set[str] = field(default_factory=set)  # the global generators that it draws from
     unstable: frozenset[str] = frozenset()  # parts that are not compared
-    views: tuple[str, ...] = ()  # that the plan allows; none if the plain runs fail or decide nothing
+    # that the plan allows; none if the plain runs fail or decide nothing
+    views: tuple[str, ...] = ()
 
     @property
     def late(self) -> bool:
@@ -179,7 +193,11 @@ class Subject:
             if self.own is not None:
                 return fingerprint("fingerprint", self.own(simulation))
             state = getattr(simulation, "state", None)
-            return fingerprint("state()", state()) if callable(state) else fingerprint("simulation", simulation)
+            return (
+                fingerprint("state()", state())
+                if callable(state)
+                else fingerprint("simulation", simulation)
+            )
 
     def differences(self, run: Run, other: Run) -> list[Difference]:
         """Return the parts in which the simulations differ after two runs."""
@@ -195,11 +213,17 @@ class Subject:
         except (Exception, SystemExit, LimitReached) as error:
             run.error = None if run.cut else error
             run.stuck = time.monotonic() - run.latest > self.seconds / 2
-        run.drawn = {name for name, state in global_generators().items() if dumps(state) != dumps(states[name])}
+        run.drawn = {
+            name
+            for name, state in global_generators().items()
+            if dumps(state) != dumps(states[name])
+        }
         return run
 
     def run_plainly(self, seed: int, *, shared_seed: int | None = None) -> Run:
-        """Run the simulation's own loop, with the plan's handlers and generators; record the results of its rules.
+        """Run the simulation's own loop, with the plan's handlers and generators.
+
+        Record the results of its rules.
 
         The global generators get the same seed, or a ``shared_seed``.
         """
@@ -224,7 +248,10 @@ class Subject:
         return self._record(run, start, seed if shared_seed is None else shared_seed)
 
     def run_rules(self, env: Any, seed: int) -> Run:
-        """Run an environment of any view with ``RULE`` throughout; the results of rules are recorded."""
+        """Run an environment of any view with ``RULE`` throughout.
+
+        The results of rules are recorded.
+        """
         run = Run(simulation=env.simulation)
 
         def start() -> None:
@@ -233,7 +260,10 @@ class Subject:
                 while not any(env.step(RULE)[2:4]):
                     pass
             while getattr(env, "agents", ()):
-                over = hasattr(env, "agent_selection") and (env.terminations | env.truncations)[env.agent_selection]
+                over = (
+                    hasattr(env, "agent_selection")
+                    and (env.terminations | env.truncations)[env.agent_selection]
+                )
                 env.step(None if over else RULE)
             run.fingerprint = self.look(run.simulation)
 
@@ -279,12 +309,22 @@ class Subject:
         return decide
 
     def run_randomly(
-        self, env: Any, seed: int, *, salt: int = 0, most: int | None = None, beside: Any = None, collect: Any = None
+        self,
+        env: Any,
+        seed: int,
+        *,
+        salt: int = 0,
+        most: int | None = None,
+        beside: Any = None,
+        collect: Any = None,
     ) -> Run:
-        """Play an episode with random legal actions in an AEC environment; a salt gives others with the same seed.
+        """Play an episode with random legal actions in an AEC environment.
 
-        The episode is broken off after ``most`` steps. The environment ``beside`` is stepped in turns with this one.
-        ``collect`` is called with the environment, the agent and the result of ``last()`` at each step.
+        A salt gives others with the same seed.
+
+        The episode is broken off after ``most`` steps. The environment ``beside`` is stepped in
+        turns with this one. ``collect`` is called with the environment, the agent and the result of
+        ``last()`` at each step.
         """
         run = Run()
 
@@ -305,7 +345,11 @@ class Subject:
             source = _CHANCE.get(argument) if event == "c_call" else None
             if frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
                 source = "a random.Random is made without a seed"
-            while source and frame is not None and frame.f_code.co_filename.startswith((_LIBRARY, "<")):
+            while (
+                source
+                and frame is not None
+                and frame.f_code.co_filename.startswith((_LIBRARY, "<"))
+            ):
                 frame = frame.f_back
             if source and frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
                 code = frame.f_code
@@ -339,7 +383,14 @@ def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[st
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
 _LIBRARY: Final = random.__file__.rpartition("random.py")[0]
-_CLOCKS: Final = (time.time, time.time_ns, time.monotonic, time.perf_counter, datetime.now, date.today)
+_CLOCKS: Final = (
+    time.time,
+    time.time_ns,
+    time.monotonic,
+    time.perf_counter,
+    datetime.now,
+    date.today,
+)
 _CHANCE: Final[dict[Any, str]] = {
     **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},
     **dict.fromkeys((random.random, random.getrandbits), "Python's global generator is used"),
@@ -349,7 +400,10 @@ _CHANCE: Final[dict[Any, str]] = {
 
 
 def place_of(error: BaseException) -> str:
-    """Return where an error was raised, outside of this library: file, line and function; empty if nowhere."""
+    """Return where an error was raised, outside of this library: file, line and function.
+
+    Empty if nowhere.
+    """
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename:
             return f"{frame.filename}:{frame.lineno}, in {frame.name}"

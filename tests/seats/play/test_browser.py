@@ -46,7 +46,10 @@ def open_page(browser):
         page = browser.new_context(**context).new_page()
         page.set_default_timeout(60_000)
         page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+        page.on(
+            "console",
+            lambda message: problems.append(message.text) if message.type == "error" else None,
+        )
         page.goto(f"{server.base}seat/{seat}?key={server.keys(seat)[0]}" if seat else server.base)
         return page
 
@@ -69,8 +72,16 @@ def wait_for_turn(page, turn):
 
 def test_two_people_play_the_greenhouse_to_its_end(open_page, start, tmp_path):
     path = tmp_path / "game.jsonl"
-    server = start("--seed", "3", "--record", str(path), simulation="examples.greenhouse_coop.env:GreenhouseSim")
-    airing = open_page(server, "ventilator_0", viewport={"width": 390, "height": 844}, color_scheme="dark")
+    server = start(
+        "--seed",
+        "3",
+        "--record",
+        str(path),
+        simulation="examples.greenhouse_coop.env:GreenhouseSim",
+    )
+    airing = open_page(
+        server, "ventilator_0", viewport={"width": 390, "height": 844}, color_scheme="dark"
+    )
     watering = open_page(server, "waterer_0", viewport={"width": 1280, "height": 800})
     watering.locator("#status", has_text="Waiting for ventilator_0").wait_for()
 
@@ -115,7 +126,9 @@ def test_two_people_play_the_greenhouse_to_its_end(open_page, start, tmp_path):
     assert [line["action"] for line in lines if line.get("turn") == 5] == [[0.05], [0.06]]
     found = replay(path, GreenhouseSim)
     for agent, trajectories in found.items():
-        assert trajectories.rewards.tolist() == [row["reward"] for row in history if row["agent"] == agent]
+        assert trajectories.rewards.tolist() == [
+            row["reward"] for row in history if row["agent"] == agent
+        ]
     assert found["waterer_0"].actions[:3, 0].tolist() == pytest.approx([0.05, 0.05, 0.06])
     assert not found["waterer_0"].by_rule[:3].any()
     assert found["waterer_0"].by_rule[3:].all()
@@ -143,8 +156,11 @@ def test_buttons_and_grids_are_played_by_keys_and_texts_of_the_game_are_no_marku
     wait_for_turn(seller, 3)
     assert seller.evaluate("state.history[2].by") == "rule"
     spectator = open_page(server, "")
-    spectator.get_by_text("Decide for seller").wait_for()  # and sees the futures, and has no controls
+    # and sees the futures, and has no controls
+    spectator.get_by_text("Decide for seller").wait_for()
     spectator.wait_for_selector("#actions polygon")
     spectator.keyboard.press("r")
-    assert spectator.evaluate("document.querySelector('#decision').inert && document.querySelector('#controls').hidden")
+    assert spectator.evaluate(
+        "document.querySelector('#decision').inert && document.querySelector('#controls').hidden"
+    )
     assert server.end()[0] == 0

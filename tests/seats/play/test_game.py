@@ -84,11 +84,20 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ga
     actions = [3, 1, 0, 2, 1, 1, 0, 2]
     game = make_game()
     state = settle(game)
-    assert (state["turn"], state["pending"]["agent"], state["pending"]["doc"]) == (0, "buyer", "Order pieces.")
+    assert (state["turn"], state["pending"]["agent"], state["pending"]["doc"]) == (
+        0,
+        "buyer",
+        "Order pieces.",
+    )
     state = play(game, actions[:1])
-    assert [(row["agent"], row["by"]) for row in state["history"][:2]] == [("buyer", "person"), ("seller", "rule")]
+    assert [(row["agent"], row["by"]) for row in state["history"][:2]] == [
+        ("buyer", "person"),
+        ("seller", "rule"),
+    ]
     assert (state["turn"], state["pending"]["agent"], state["pending"]["time"]) == (2, "buyer", 1.0)
-    assert state["pending"]["mask"] == [int(game.env.simulation.stock + amount < 7) for amount in range(4)]
+    assert state["pending"]["mask"] == [
+        int(game.env.simulation.stock + amount < 7) for amount in range(4)
+    ]
     state = play(game, actions[1:])
     turns, profit = as_by_hand(actions)
     assert state["over"] == "terminated"
@@ -201,7 +210,10 @@ def test_without_reseed_there_is_one_future_and_a_note(make_game):
 
 
 def test_observations_and_actions_have_a_form_in_json():
-    assert jsonable({1: np.array([np.inf, 1.5]), "time": -np.inf}) == {"1": ["inf", 1.5], "time": "-inf"}
+    assert jsonable({1: np.array([np.inf, 1.5]), "time": -np.inf}) == {
+        "1": ["inf", 1.5],
+        "time": "-inf",
+    }
     pair = spaces.Tuple([spaces.Discrete(3), spaces.MultiDiscrete([2, 2])])
     space = spaces.Dict({"amount": spaces.Discrete(4), "pair": pair})
     action = action_of(space, {"amount": 2, "pair": [1, [0, 1]]})
@@ -214,7 +226,10 @@ def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_game):
     settle(game)
     assert [one["action"] for one in think(game)["candidates"]] == [None]
     game.handle("seller", {"do": "try", "turn": 1, "action": [0, 2]})
-    assert [(one["action"], one["n"]) for one in think(game)["candidates"]] == [(None, 16), ([0, 2], 16)]
+    assert [(one["action"], one["n"]) for one in think(game)["candidates"]] == [
+        (None, 16),
+        ([0, 2], 16),
+    ]
     with pytest.raises(InvalidActionError):
         game.handle("seller", {"do": "try", "turn": 1, "action": [2, 2]})
     game.handle("seller", {"do": "horizon", "n": 2})
@@ -223,9 +238,15 @@ def test_an_action_of_the_person_becomes_a_candidate_if_it_is_legal(make_game):
 
 def test_a_decision_ends_the_thinking(make_game):
     game = make_game()
-    connection = Connection((1, "buyer", {"do": "act", "turn": 0, "action": 1}), (1, "buyer", {"do": "nothing"}))
+    connection = Connection(
+        (1, "buyer", {"do": "act", "turn": 0, "action": 1}), (1, "buyer", {"do": "nothing"})
+    )
     game.serve(connection)
-    turns = [update["turn"] for number, update in connection.sent if number is None and update["type"] == "state"]
+    turns = [
+        update["turn"]
+        for number, update in connection.sent
+        if number is None and update["type"] == "state"
+    ]
     assert turns[0] == 0
     assert len(game.line) > 1
 
@@ -235,7 +256,10 @@ def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_game):
     settle(game)
     game.handle("buyer", {"do": "delegate", "n": 2})
     pending = settle(game)["pending"]
-    assert (pending["agent"], pending["space"]) == ("seller", {"kind": "grid", "sizes": [2, 3], "starts": [0, 0]})
+    assert (pending["agent"], pending["space"]) == (
+        "seller",
+        {"kind": "grid", "sizes": [2, 3], "starts": [0, 0]},
+    )
     game.handle("seller", {"do": "skip"})
     state = settle(game)
     assert (state["turn"], state["pending"]["agent"]) == (1, "seller")  # it is its turn
@@ -266,7 +290,11 @@ def test_errors_of_the_model_and_of_labels_end_the_episode_and_can_be_undone(mak
     assert "the till is broken" in play(game, [1, 3])["over"]
     game.handle("buyer", {"do": "undo"})
     state = play(game, [2])
-    assert (state["over"], state["turn"], state["pending"]["labels"]["3"]) == ("", 2, "order 3 of 3")
+    assert (state["over"], state["turn"], state["pending"]["labels"]["3"]) == (
+        "",
+        2,
+        "order 3 of 3",
+    )
     assert "division" in play(game, [1])["over"]
     game.handle("buyer", {"do": "undo"})
     assert settle(game)["turn"] == 2
@@ -296,7 +324,9 @@ def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_game, 
     state = settle(game)
     assert state["over"]
     found = replay(tmp_path / "game.jsonl", Shop)
-    assert {agent: float(trajectories.returns[0]) for agent, trajectories in found.items()} == state["returns"]
+    assert {
+        agent: float(trajectories.returns[0]) for agent, trajectories in found.items()
+    } == state["returns"]
     rows = [row for row in game.line if row["agent"] == "buyer"]
     assert found["buyer"].rewards.tolist() == [row["reward"] for row in rows]
     assert found["buyer"].by_rule.tolist() == [row["action"] is None for row in rows]
@@ -339,7 +369,10 @@ def test_a_recording_has_agents_that_end_before_others(make_game, tmp_path):
     game = make_game(Closing, record=tmp_path / "game.jsonl")
     assert play(game, [1, 1, 1])["over"] == "terminated"
     found = replay(tmp_path / "game.jsonl", Closing)
-    assert {agent: len(trajectories) for agent, trajectories in found.items()} == {"buyer": 3, "seller": 2}
+    assert {agent: len(trajectories) for agent, trajectories in found.items()} == {
+        "buyer": 3,
+        "seller": 2,
+    }
 
 
 def test_a_recording_that_cannot_be_written_is_told_and_the_game_goes_on(make_game, tmp_path):

@@ -1,4 +1,6 @@
-"""The command and its server: links, keys, hosts, limits of messages and connections, and the end."""
+"""The command and its server: links, keys, hosts, limits of messages and connections, and the
+end.
+"""
 
 import asyncio
 import json
@@ -35,7 +37,16 @@ class Server:
 
     def __init__(self, *arguments, simulation=SHOP):
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
-        command = [sys.executable, "-m", "simenv_marl", "play", simulation, "--port", "0", *arguments]
+        command = [
+            sys.executable,
+            "-m",
+            "simenv_marl",
+            "play",
+            simulation,
+            "--port",
+            "0",
+            *arguments,
+        ]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT,
             start_new_session=True,
@@ -132,7 +143,10 @@ def test_two_people_play_and_a_spectator_sees_it():
     seller.send(do="act", turn=1, action=[1, 1])
     buyer.wait_for_turn(2)
     state = spectator.wait_for_turn(2)
-    assert [(row["agent"], row["action"]) for row in state["history"][:2]] == [("buyer", 2), ("seller", [1, 1])]
+    assert [(row["agent"], row["action"]) for row in state["history"][:2]] == [
+        ("buyer", 2),
+        ("seller", [1, 1]),
+    ]
     fan = buyer.wait("fan", lambda fan: fan["turn"] == 2 and fan["candidates"][-1]["n"] > 1)
     assert fan["candidates"][0]["action"] is None
     again = server.page("buyer")  # as after a reload
@@ -144,10 +158,22 @@ def test_two_people_play_and_a_spectator_sees_it():
 
 def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer):
     (key,) = server.keys("seller")
-    for stranger in (page("buyer", key), page("buyer", "0" * 32), page("nobody", key), page("", "")):
+    for stranger in (
+        page("buyer", key),
+        page("buyer", "0" * 32),
+        page("nobody", key),
+        page("", ""),
+    ):
         stranger.send(do="act", turn=0, action=1)
         assert "key" in stranger.wait("error")["text"]
-    for text in ("{", "[]", "[" * 60_000, "1", '{"seat": "buyer"}', json.dumps({"seat": "büyer", "key": "\ud800"})):
+    for text in (
+        "{",
+        "[]",
+        "[" * 60_000,
+        "1",
+        '{"seat": "buyer"}',
+        json.dumps({"seat": "büyer", "key": "\ud800"}),
+    ):
         stranger.socket.send(text)
         assert stranger.wait("error")
     stranger.socket.send(b"\xff\xfe")
@@ -160,11 +186,21 @@ def test_messages_without_the_key_of_their_seat_move_nothing(server, page, buyer
 def test_an_illegal_action_comes_back_as_text(buyer):
     buyer.send(do="act", turn=0, action=17)
     assert "17" in buyer.wait("error")["text"]
-    for action in ("<b>", float("nan"), [[1]], {"a": 1}, 1e400, 10**400, json.loads("[" * 300 + "]" * 300)):
+    for action in (
+        "<b>",
+        float("nan"),
+        [[1]],
+        {"a": 1},
+        1e400,
+        10**400,
+        json.loads("[" * 300 + "]" * 300),
+    ):
         buyer.send(do="act", turn=0, action=action)
         assert buyer.wait("error")["text"]
     buyer.socket.send(
-        json.dumps({"seat": "buyer", "key": buyer.key, "action": "deep"}).replace('"deep"', "[" * 800 + "]" * 800)
+        json.dumps({"seat": "buyer", "key": buyer.key, "action": "deep"}).replace(
+            '"deep"', "[" * 800 + "]" * 800
+        )
     )
     assert buyer.wait("error")["text"]
     buyer.send(do="act", turn=0, action=1)
@@ -173,7 +209,11 @@ def test_an_illegal_action_comes_back_as_text(buyer):
 
 @pytest.mark.parametrize(
     "headers",
-    [{"Host": "evil.example"}, {"Host": "evil.example:80", "Origin": "http://evil.example:80"}, {"Host": "[::1"}],
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:80", "Origin": "http://evil.example:80"},
+        {"Host": "[::1"},
+    ],
 )
 def test_another_host_is_refused(server, headers):
     with pytest.raises(HTTPError, match="403") as caught:
@@ -247,7 +287,11 @@ def test_the_end_leaves_no_process(tmp_path):
 
 def test_the_end_of_the_game_ends_the_server():
     server = Server()
-    (game,) = [child for child in server.children() if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+    (game,) = [
+        child
+        for child in server.children()
+        if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()
+    ]
     os.kill(game, signal.SIGKILL)
     _, err = server.process.communicate(timeout=60)
     assert server.process.returncode == 2
@@ -282,5 +326,7 @@ def test_a_missing_extra_is_told(monkeypatch, capsys):
 def test_the_command_line_imports_the_server_only_to_play():
     names = ("starlette", "uvicorn", "websockets")
     code = f"import simenv_marl.__main__, sys; print([name for name in {names} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "src")
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "src"
+    )
     assert done.stdout.strip() == "[]"

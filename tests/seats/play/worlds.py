@@ -14,7 +14,10 @@ ORDER = make_step(
     observation_space=spaces.Dict(
         {"stock": spaces.Discrete(100), "mean": spaces.Box(-np.inf, np.inf, (1,), np.float32)}
     ),
-    observation_space_mapping=lambda shop: {"stock": shop.stock, "mean": [shop.profit / (shop.day + 1)]},
+    observation_space_mapping=lambda shop: {
+        "stock": shop.stock,
+        "mean": [shop.profit / (shop.day + 1)],
+    },
     action_space=spaces.Discrete(4),
     action_space_mapping={0: 0, 1: 1, 2: 2, 3: 3},
     rule_action_mapping=int,

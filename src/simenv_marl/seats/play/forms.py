@@ -36,7 +36,10 @@ def jsonable(value: Any) -> Any:
 
 
 def pending_decision(env: Any) -> dict[str, Any]:
-    """Return the pending decision of an AEC environment as JSON; called in the process where it lives."""
+    """Return the pending decision of an AEC environment as JSON.
+
+    Called in the process where it lives.
+    """
     decision = pending(env)
     return {
         "agent": decision.agent,
@@ -75,7 +78,12 @@ def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
         return {"kind": "discrete", "start": int(space.start), "n": int(space.n)}
     if isinstance(space, spaces.Box):
         whole = space.dtype is not None and space.dtype.kind in "iu"
-        return {"kind": "box", "low": jsonable(space.low), "high": jsonable(space.high), "whole": whole}
+        return {
+            "kind": "box",
+            "low": jsonable(space.low),
+            "high": jsonable(space.high),
+            "whole": whole,
+        }
     if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
         return {"kind": "grid", "sizes": space.nvec.tolist(), "starts": space.start.tolist()}
     if isinstance(space, spaces.MultiBinary) and isinstance(space.n, int):
@@ -89,7 +97,9 @@ def candidates_of(space: spaces.Space[Any], mask: Any) -> list[Any]:
         legal = np.arange(space.n) if mask is None else np.flatnonzero(mask)
         return [int(space.start) + int(place) for place in legal[: MOST - 1]]
     if isinstance(space, spaces.Box) and space.low.size == 1 and space.is_bounded():
-        found: list[Any] = np.unique(np.linspace(space.low, space.high, 5).astype(space.dtype), axis=0).tolist()
+        found: list[Any] = np.unique(
+            np.linspace(space.low, space.high, 5).astype(space.dtype), axis=0
+        ).tolist()
         return found
     return []
 
@@ -102,31 +112,54 @@ def picture_of(env: Any) -> dict[str, Any] | None:
         rendered = f"render has failed: {describe_error(error)}"
     if not isinstance(rendered, np.ndarray):
         return None if rendered is None else {"text": str(rendered)[:20_000]}
-    if rendered.ndim != 3 or rendered.shape[2] != 3 or rendered.dtype != np.uint8 or not rendered.size:
+    if (
+        rendered.ndim != 3
+        or rendered.shape[2] != 3
+        or rendered.dtype != np.uint8
+        or not rendered.size
+    ):
         return {"text": f"an array of shape {rendered.shape}"}
     height, width, _ = rendered.shape
-    lines = np.hstack([np.zeros((height, 1), np.uint8), rendered.reshape(height, -1)])  # 0: an unfiltered line
+    # 0: an unfiltered line
+    lines = np.hstack([np.zeros((height, 1), np.uint8), rendered.reshape(height, -1)])
     header = struct.pack("!IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = [b"IHDR" + header, b"IDAT" + zlib.compress(lines.tobytes()), b"IEND"]
-    parts = [struct.pack("!I", len(chunk) - 4) + chunk + struct.pack("!I", zlib.crc32(chunk)) for chunk in chunks]
+    parts = [
+        struct.pack("!I", len(chunk) - 4) + chunk + struct.pack("!I", zlib.crc32(chunk))
+        for chunk in chunks
+    ]
     return {"png": b64encode(b"\x89PNG\r\n\x1a\n" + b"".join(parts)).decode()}
 
 
 def action_of(space: spaces.Space[Any], value: Any) -> Any:
-    """Return the action for its JSON; what does not fit stays as it is, and the environment refuses it."""
+    """Return the action for its JSON.
+
+    What does not fit stays as it is, and the environment refuses it.
+    """
     if isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)):
         with suppress(ValueError, OverflowError):
             array = np.asarray(value)
             return array.astype(space.dtype) if array.dtype.kind == "i" else value
-    if isinstance(space, spaces.Dict) and isinstance(value, dict) and value.keys() == space.spaces.keys():
+    if (
+        isinstance(space, spaces.Dict)
+        and isinstance(value, dict)
+        and value.keys() == space.spaces.keys()
+    ):
         return {key: action_of(part, value[key]) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple) and isinstance(value, list) and len(value) == len(space.spaces):
+    if (
+        isinstance(space, spaces.Tuple)
+        and isinstance(value, list)
+        and len(value) == len(space.spaces)
+    ):
         return tuple(map(action_of, space.spaces, value))
     return value
 
 
 def write(path: Path | None, line: Mapping[str, Any]) -> str:
-    """Append a line, if there is a path; return what is wrong. It is open only meanwhile: clones need not copy it."""
+    """Append a line, if there is a path; return what is wrong.
+
+    It is open only meanwhile: clones need not copy it.
+    """
     try:
         if path is not None:
             with path.open("a", encoding="utf-8") as file:

@@ -1,8 +1,9 @@
 """The process with the simulation: its decisions, checkpoints to go back to, and futures while people think.
 
-A message from the server has the number of a connection, its seat (None: the server itself), and a dict from the page
-(None: the end). Each is answered with the number, and with an error or None; what all see has the number None.
-What takes time is a generator, which is left between two steps of the simulation when a message has come.
+A message from the server has the number of a connection, its seat (None: the server itself), and a
+dict from the page (None: the end). Each is answered with the number, and with an error or None;
+what all see has the number None. What takes time is a generator, which is left between two steps of
+the simulation when a message has come.
 """
 
 from __future__ import annotations
@@ -19,21 +20,45 @@ from typing import Any, Final
 import numpy as np
 
 from ... import RULE, aec_env, clone
-from ...errors import InvalidActionError, OptionValueError, SimEnvError, describe_error, did_you_mean, short_repr
-from .forms import MOST, action_of, candidates_of, entries_of, jsonable, pending_decision, picture_of, write
+from ...errors import (
+    InvalidActionError,
+    OptionValueError,
+    SimEnvError,
+    describe_error,
+    did_you_mean,
+    short_repr,
+)
+from .forms import (
+    MOST,
+    action_of,
+    candidates_of,
+    entries_of,
+    jsonable,
+    pending_decision,
+    picture_of,
+    write,
+)
 
 FUTURES: Final = 16  # in which each candidate is tried out
 CHECKPOINTS: Final = 24  # at most: each is a process
 SHOWN: Final = 150  # decisions that the page gets
 
-Row = dict[str, Any]  # a decision, as the page and the recording have it; "before" is the agent's return before it
+# a decision, as the page and the recording have it; "before" is the agent's return before it
+Row = dict[str, Any]
 
 
 class Game:
     """An episode with its past: a line of decisions, a place in it, and checkpoints."""
 
     def __init__(
-        self, simulation: Any, *, name: str, seats: Sequence[str], seed: int, limit: float | None, record: Path | None
+        self,
+        simulation: Any,
+        *,
+        name: str,
+        seats: Sequence[str],
+        seed: int,
+        limit: float | None,
+        record: Path | None,
     ) -> None:
         """Begin an episode. Without ``seats``, people play all agents."""
         if limit is not None and not 0 < limit < 1e6:
@@ -43,7 +68,9 @@ class Game:
         self.root = aec_env(simulation, render_mode=mode)
         known: list[str] = getattr(self.root, "possible_agents", [])
         for seat in set(seats).difference(known or seats):
-            raise OptionValueError(f"there is no agent {seat!r}; the agents are {known}{did_you_mean(seat, known)}")
+            raise OptionValueError(
+                f"there is no agent {seat!r}; the agents are {known}{did_you_mean(seat, known)}"
+            )
         self.name, self.given, self.limit, self.record = name, seats, limit, record
         self.known = dict.fromkeys(self.given or known)
         self.taken: Collection[str] = ()  # the seats that people have
@@ -60,14 +87,18 @@ class Game:
         self.forget(-1)
         self.seed, self.notice = seed, ""
         self.line: list[Row] = []
-        self.delegated: Counter[str] = Counter()  # how many decisions of a seat are left to the rule
+        # how many decisions of a seat are left to the rule
+        self.delegated: Counter[str] = Counter()
         self.skipping: str | None = None  # the seat for whose next decision the rule plays on
         self._return_to(None)
         head = {"simulation": self.name, "seed": seed, "seats": list(self.known)}
         self.notice = write(self.record, head) or self.notice
 
     def decide(self, action: Any, by: str) -> None:
-        """Take the pending decision, by JSON or None for the rule. After an ``InvalidActionError``, it is pending."""
+        """Take the pending decision, by JSON or None for the rule.
+
+        After an ``InvalidActionError``, it is pending.
+        """
         row = self.line[self.turn]
         self._step(row["agent"], action)
         self.forget(self.turn)
@@ -78,14 +109,18 @@ class Game:
         end = {"end": self.over, "returns": self.returns()} if self.over else {}
         absent = [seat for seat in self.given if seat not in self.latest]
         if self.over and absent:
-            self.notice = f"No decision was one of {', '.join(absent)}; {', '.join(self.latest)} decided."
+            self.notice = (
+                f"No decision was one of {', '.join(absent)}; {', '.join(self.latest)} decided."
+            )
         self.notice = write(self.record, kept | end) or self.notice
 
     def jump(self, turn: int) -> None:
         """Go to the end, or to a person's decision at or before a turn: from a checkpoint, or from the beginning."""
         persons = [row["turn"] for row in self.line if self.plays(row["agent"])]
         if turn < len(self.line) or "action" not in self.line[-1]:
-            turn = max((place for place in persons if place <= turn), default=min(persons, default=0))
+            turn = max(
+                (place for place in persons if place <= turn), default=min(persons, default=0)
+            )
         self._return_to(max((key for key in self.checkpoints if key <= turn), default=None))
         for row in self.line[self.turn : turn]:
             if not self.over and self.line[self.turn] is row:  # else it does not repeat itself
@@ -108,10 +143,16 @@ class Game:
         return going | {agent: total for agent, (_, total) in self.ends.items()}
 
     def _step(self, agent: str, action: Any) -> None:
-        self._attempt(self.env.step, RULE if action is None else action_of(self.env.action_space(agent), action))
+        self._attempt(
+            self.env.step,
+            RULE if action is None else action_of(self.env.action_space(agent), action),
+        )
 
     def _attempt(self, function: Callable[..., Any], argument: Any) -> Any:
-        """Call a function of the environment. An error ends the episode, unless it refuses an action."""
+        """Call a function of the environment.
+
+        An error ends the episode, unless it refuses an action.
+        """
         try:
             return function(argument)
         except InvalidActionError:
@@ -122,7 +163,9 @@ class Game:
     def _return_to(self, key: int | None) -> None:
         """Continue at a checkpoint, or at the beginning."""
         old, self.env = self.env, self.root if key is None else clone(self.checkpoints[key])
-        self.ends = {} if key is None else {agent: end for agent, end in self.ends.items() if end[0] <= key}
+        self.ends = (
+            {} if key is None else {agent: end for agent, end in self.ends.items() if end[0] <= key}
+        )
         self.latest: dict[str, int] = {row["agent"]: row["turn"] for row in self.line[: key or 0]}
         self.failure = ""
         if key is None:
@@ -156,7 +199,11 @@ class Game:
     def _stand_at(self, row: Row, now: dict[str, Any]) -> None:
         """Note the pending decision in the line, where it may be already, with its action."""
         turn, agent = row["turn"], row["agent"]
-        row |= {"seen": now["seen"], "time": now["time"], "values": [value for _, value in now["observation"][:MOST]]}
+        row |= {
+            "seen": now["seen"],
+            "time": now["time"],
+            "values": [value for _, value in now["observation"][:MOST]],
+        }
         there = self.line[turn : turn + 1]
         if there != [(there[0] if there else {}) | row]:
             self.line[turn:] = [row]
@@ -197,7 +244,10 @@ class Game:
                     changed = self.handle(seat, message)
                 except Exception as error:
                     text = str(error) if isinstance(error, SimEnvError) else describe_error(error)
-                    reply, changed = {"type": "error", "text": text}, not isinstance(error, ValueError)
+                    reply, changed = (
+                        {"type": "error", "text": text},
+                        not isinstance(error, ValueError),
+                    )
                 connection.send((number, reply))
                 if not changed:
                     continue
@@ -229,9 +279,17 @@ class Game:
         elif do == "skip":
             self.skipping = seat
         elif do in ("undo", "redo"):
-            own = [row["turn"] for row in self.line if row["agent"] == seat and row["turn"] != self.turn]
+            own = [
+                row["turn"]
+                for row in self.line
+                if row["agent"] == seat and row["turn"] != self.turn
+            ]
             before = max((turn for turn in own if turn < self.turn), default=0)
-            self.jump(before if do == "undo" else min((t for t in own if t > self.turn), default=len(self.line)))
+            self.jump(
+                before
+                if do == "undo"
+                else min((t for t in own if t > self.turn), default=len(self.line))
+            )
         elif do == "jump":
             self.jump(_whole(message, 0, len(self.line)))
         elif do == "restart":
@@ -257,7 +315,10 @@ class Game:
     # -- what takes time ---------------------------------------------------------------------------
 
     def work(self) -> Iterator[dict[str, Any] | None]:
-        """Let the rule decide where no person does; then show the decision, and try out what may be decided."""
+        """Let the rule decide where no person does.
+
+        Then show the decision, and try out what may be decided.
+        """
         shown = monotonic()
         while self.now is not None and self._leaves_to_rule(self.now["agent"]):
             self.decide(None, "rule")
@@ -293,12 +354,18 @@ class Game:
             self.checkpoints[self.turn] = clone(self.env, method="fork")
         except SimEnvError:
             self.forks = False  # from now on, the way back is a replay
-        for key in sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2] if len(self.checkpoints) > CHECKPOINTS else ():
+        for key in (
+            sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2]
+            if len(self.checkpoints) > CHECKPOINTS
+            else ()
+        ):
             self.checkpoints.pop(key).close()
 
     def _think(self, agent: str) -> Iterator[dict[str, Any] | None]:
         """Try out the candidates, in futures that are the same for all of them."""
-        seeds: list[Any] = [(self.seed * 1_000_003 + self.turn * 1009 + place) % 2**31 for place in range(FUTURES)]
+        seeds: list[Any] = [
+            (self.seed * 1_000_003 + self.turn * 1009 + place) % 2**31 for place in range(FUTURES)
+        ]
         try:
             clone(self.env, seed=seeds[0]).close()
         except Exception as error:
@@ -310,11 +377,18 @@ class Game:
                     yield from self._play_future(agent, candidate["action"], seed, course)
                 except Exception as error:
                     self.told["note"] = f"A future has failed: {describe_error(error)[:300]}"
-                candidate["courses"].append(course or [[0.0, *self._measured(self.env.observe(agent))]])
+                candidate["courses"].append(
+                    course or [[0.0, *self._measured(self.env.observe(agent))]]
+                )
             yield self._fans()
 
-    def _play_future(self, agent: str, action: Any, seed: int | None, course: list[list[float]]) -> Iterator[None]:
-        """Play a future; yield after each step. Add to the course, after each decision of the agent, what is measured.
+    def _play_future(
+        self, agent: str, action: Any, seed: int | None, course: list[list[float]]
+    ) -> Iterator[None]:
+        """Play a future.
+
+        Yield after each step. Add to the course, after each decision of the agent, what is
+        measured.
 
         This is the agent's return, and the numbers that it observes.
         """
@@ -348,10 +422,15 @@ class Game:
         """Return the median and the 80 % band of each candidate after each decision, for all that is measured."""
         fans = []
         for candidate in self.fan:
-            courses = [course + course[-1:] * (self.horizon - len(course)) for course in candidate["courses"]]
+            courses = [
+                course + course[-1:] * (self.horizon - len(course))
+                for course in candidate["courses"]
+            ]
             numbers = np.nan_to_num(courses)
             bands = (
-                np.quantile(numbers, (0.1, 0.5, 0.9), axis=0).transpose(2, 0, 1).round(6).tolist() if courses else []
+                np.quantile(numbers, (0.1, 0.5, 0.9), axis=0).transpose(2, 0, 1).round(6).tolist()
+                if courses
+                else []
             )
             fans.append({"action": candidate["action"], "n": len(courses), "bands": bands})
         shown = {"measures": ["return", *self._measures().values()], "candidates": fans}
@@ -381,7 +460,9 @@ def _whole(message: Mapping[str, Any], low: int, high: int) -> int:
     """Return the number ``n`` of a message, or raise ``OptionValueError``."""
     value = message.get("n")
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise OptionValueError(f"n must be a whole number from {low} to {high}, not {short_repr(value)}")
+        raise OptionValueError(
+            f"n must be a whole number from {low} to {high}, not {short_repr(value)}"
+        )
     return value
 
 

@@ -71,14 +71,20 @@ class Link:
 class Table:
     """Links to pages, around a connection to the game."""
 
-    def __init__(self, connection: Any, state: dict[str, Any], announce: Callable[[str], None]) -> None:
-        """Take over the game's connection and its first state; ``announce`` is called with the path of each seat."""
+    def __init__(
+        self, connection: Any, state: dict[str, Any], announce: Callable[[str], None]
+    ) -> None:
+        """Take over the game's connection and its first state.
+
+        ``announce`` is called with the path of each seat.
+        """
         self.connection, self.announce, self.secret = connection, announce, secrets.token_bytes(32)
         self.links: dict[int, Link] = {}
         self.numbers = count(1)
         self.latest: dict[str, str] = {}  # by type of message, for those who come
         self.seats: set[str] = set()
-        self.inbox: asyncio.Queue[Any] = asyncio.Queue()  # of the game; each link has few messages in it
+        # of the game; each link has few messages in it
+        self.inbox: asyncio.Queue[Any] = asyncio.Queue()
         self.taken: Counter[str] | None = None  # seats of which the game is to be told
         self._show(state)
 
@@ -120,7 +126,9 @@ class Table:
             parcel = pickle.dumps((number, seat, message))  # not later, because it may be too deep
         except (ValueError, RecursionError, TypeError, LookupError, AttributeError):
             return "the message is not one of this page"
-        if seat not in self.seats or not hmac.compare_digest(self.key(seat).encode(), key.encode(errors="replace")):
+        if seat not in self.seats or not hmac.compare_digest(
+            self.key(seat).encode(), key.encode(errors="replace")
+        ):
             return "the link of this page has no key of this game: ask for the link of your seat"
         if message.get("do") == "take":
             link.seat = seat
@@ -135,7 +143,9 @@ class Table:
     def _tell_people(self) -> None:
         """Tell pages and game who is there."""
         taken = Counter(link.seat for link in self.links.values())
-        self._send_all(json.dumps({"type": "people", "spectators": taken.pop("", 0), "taken": taken}), "people")
+        self._send_all(
+            json.dumps({"type": "people", "spectators": taken.pop("", 0), "taken": taken}), "people"
+        )
         if self.taken is None:
             self.inbox.put_nowait(None)
         self.taken = taken
@@ -182,16 +192,24 @@ class _Protocol(H11Protocol):
         super().connection_made(transport)
         if len(self.connections) > CONNECTIONS:
             transport.abort()
-        self.loop.call_later(PATIENCE, lambda: self.cycle is None and self in self.connections and transport.abort())
+        self.loop.call_later(
+            PATIENCE, lambda: self.cycle is None and self in self.connections and transport.abort()
+        )
 
 
 def make_app(table: Table, host: str, lifespan: Any = None) -> Any:
     """Make the application, which answers only to its own names, and only to its own pages."""
-    texts = {path: Path(__file__).with_name(path[1:]).read_bytes() for path in ("/page.html", *FILES)}
+    texts = {
+        path: Path(__file__).with_name(path[1:]).read_bytes() for path in ("/page.html", *FILES)
+    }
 
     async def page(request: Any) -> Response:
         path = request.url.path
-        return Response(texts.get(path, texts["/page.html"]), media_type=FILES.get(path, "text/html"), headers=HEADERS)
+        return Response(
+            texts.get(path, texts["/page.html"]),
+            media_type=FILES.get(path, "text/html"),
+            headers=HEADERS,
+        )
 
     routes = [Route(path, page) for path in ("/", "/seat/{seat}", *FILES)]
     app = Starlette(routes=[*routes, WebSocketRoute("/ws", table.serve)], lifespan=lifespan)
@@ -224,7 +242,8 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
     """Play until an interrupt; return a summary.
 
     Args:
-        find: A callable that returns the simulation. It is pickled, and called in the process that plays.
+        find: A callable that returns the simulation. It is pickled, and called in the process that
+            plays.
         seed: The seed of the first episode; None: a random one.
         host: The address to listen on.
         port: The port; 0: any free one.
@@ -236,7 +255,8 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
     """
     if not 0 <= port < 65_536:
         raise OptionValueError(f"there is no port {port}")
-    context = get_context("spawn")  # which inherits nothing: neither threads nor sockets reach the clones
+    # which inherits nothing: neither threads nor sockets reach the clones
+    context = get_context("spawn")
     connection, there = context.Pipe()
     options["seed"] = secrets.randbelow(2**31) if seed is None else seed
     process = context.Process(target=run_game, args=(there, find, options))
@@ -255,15 +275,27 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
         _, state = connection.recv()
         if state["type"] == "failed":
             raise OptionValueError(state["text"])
-        with socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET) as listening:
-            shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        with socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        ) as listening:
+            shown = (
+                socket.gethostname()
+                if host in ("0.0.0.0", "::")
+                else f"[{host}]"
+                if ":" in host
+                else host
+            )
             base = f"http://{shown}:{listening.getsockname()[1]}"
-            print(f"Everybody sees the game at {base}/ and plays at the link of a seat:", flush=True)
+            print(
+                f"Everybody sees the game at {base}/ and plays at the link of a seat:", flush=True
+            )
             table = Table(connection, state, lambda path: print(f"  {base}{path}", flush=True))
             _run(table, host, listening, end)
     except EOFError:
         process.join()
-        raise ProcessDiedError(f"the process of the game has ended, with exit code {process.exitcode}") from None
+        raise ProcessDiedError(
+            f"the process of the game has ended, with exit code {process.exitcode}"
+        ) from None
     except OSError as error:
         raise OptionValueError(f"nobody can connect to {host}, port {port}: {error}") from error
     finally:
@@ -278,14 +310,21 @@ def _run(table: Table, host: str, listening: socket.socket, end: Callable[[], No
 
     @asynccontextmanager
     async def lifespan(app: Any) -> AsyncIterator[None]:
-        reader, _writer = asyncio.create_task(table.read_game()), asyncio.create_task(table.write_game())
+        reader, _writer = (
+            asyncio.create_task(table.read_game()),
+            asyncio.create_task(table.write_game()),
+        )
         reader.add_done_callback(lambda task: setattr(server, "should_exit", True))
         yield
         died.append(reader.done())
         await asyncio.to_thread(end)
         await reader
 
-    config: dict[str, Any] = {"http": _Protocol, "ws_max_size": LONGEST, "timeout_graceful_shutdown": 1}
+    config: dict[str, Any] = {
+        "http": _Protocol,
+        "ws_max_size": LONGEST,
+        "timeout_graceful_shutdown": 1,
+    }
     quiet: dict[str, Any] = {"log_level": "error", "server_header": False, "lifespan": "on"}
     server = uvicorn.Server(uvicorn.Config(make_app(table, host, lifespan), **config, **quiet))
     with suppress(KeyboardInterrupt):

@@ -1,6 +1,7 @@
 """MyModel: rabbits in Mesa that are born and starve, and one policy, shared by all of them. Replace the model by yours.
 
-``python -m simenv_marl.testing.templates.mesa`` trains the policy and compares it with the model's own rule.
+``python -m simenv_marl.testing.templates.mesa`` trains the policy and compares it with the model's
+own rule.
 """
 
 import sys
@@ -11,7 +12,15 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from mesa.discrete_space import CellAgent, OrthogonalVonNeumannGrid
 
-from simenv_marl import SteppedSimulation, Streams, aec_env, difference, evaluate, make_step, reseed_generators
+from simenv_marl import (
+    SteppedSimulation,
+    Streams,
+    aec_env,
+    difference,
+    evaluate,
+    make_step,
+    reseed_generators,
+)
 
 # -- 1. The model: Mesa's agents, and a rule of their own -----------------------------------------
 
@@ -22,7 +31,8 @@ class Rabbit(CellAgent):
     def __init__(self, model: Any, cell: Any, energy: float) -> None:
         super().__init__(model)
         self.cell, self.energy, self.eaten = cell, energy, 0.0
-        self.chance = model.streams[f"rabbit_{self.unique_id}"]  # its own, which no other rabbit changes
+        # its own, which no other rabbit changes
+        self.chance = model.streams[f"rabbit_{self.unique_id}"]
 
     def places(self) -> list[Any]:
         """List the cells that it can be in next: its own, and the four beside it."""
@@ -75,7 +85,10 @@ def observe(rabbit: Rabbit) -> list[list[float]]:
     """See a row for each place that it can be in next: the grass, and the other rabbits there."""
     places = rabbit.places()
     others = [min(len(place.agents) - (place is rabbit.cell), 5) for place in places]
-    return [[rabbit.model.grass[place.coordinate], number] for place, number in zip(places, others, strict=True)]
+    return [
+        [rabbit.model.grass[place.coordinate], number]
+        for place, number in zip(places, others, strict=True)
+    ]
 
 
 move = make_step(
@@ -113,21 +126,36 @@ def env() -> Any:
 
 
 def policy_of(weights: Any) -> Any:
-    """Make a policy that gives points to each place, and takes the place with the most; for one rabbit or many."""
+    """Make a policy that gives points to each place, and takes the place with the most.
+
+    For one rabbit or many.
+    """
     return lambda seen: (seen @ np.asarray(weights)).argmax(-1)
 
 
 def train(candidates: int, meadows: int) -> Any:
     """Train one policy for all rabbits by random search: all candidates meet the same meadows, and the best wins."""
-    policies = [policy_of(weights) for weights in np.random.default_rng(1).normal(size=(candidates, 2))]
-    contenders: dict[str, Any] = {str(number): {Rabbit.choose_cell: policy} for number, policy in enumerate(policies)}
+    policies = [
+        policy_of(weights) for weights in np.random.default_rng(1).normal(size=(candidates, 2))
+    ]
+    contenders: dict[str, Any] = {
+        str(number): {Rabbit.choose_cell: policy} for number, policy in enumerate(policies)
+    }
     found = evaluate(MySimulation, contenders, seeds=range(meadows), batched=True)
     return policies[int(found.summary()["mean"].idxmax())]
 
 
 if __name__ == "__main__":
     quick = "--quick" in sys.argv  # only to see that everything runs
-    policies: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: train(*(5, 1) if quick else (20, 2))}}
+    policies: dict[str, Any] = {
+        "rule": {},
+        "trained": {Rabbit.choose_cell: train(*(5, 1) if quick else (20, 2))},
+    }
     seeds = range(100_000, 100_005 if quick else 100_030)  # meadows that it was not trained on
     print("What all rabbits have eaten; differences are paired by seed, with 95 % intervals:")
-    print(evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True).summary().round(1).to_string())
+    print(
+        evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
+        .summary()
+        .round(1)
+        .to_string()
+    )

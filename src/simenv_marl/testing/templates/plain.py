@@ -1,6 +1,7 @@
 """MyModel: a home battery, and an agent that learns when to charge it. Replace the model by yours, section by section.
 
-``python -m simenv_marl.testing.templates.plain`` trains the agent and compares it with the model's own rule.
+``python -m simenv_marl.testing.templates.plain`` trains the agent and compares it with the model's
+own rule.
 """
 
 import math
@@ -17,12 +18,16 @@ from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, ma
 
 
 class MyModel:
-    """A house with solar panels and a battery. Each hour, the rule decides how much flows into the battery."""
+    """A house with solar panels and a battery.
+
+    Each hour, the rule decides how much flows into the battery.
+    """
 
     capacity, power, losses = 10.0, 3.0, 0.1  # kWh, kWh in an hour, share of what is charged
 
     def __init__(self, seed: int | None = None) -> None:
-        self.random = random.Random(seed)  # the model's own generator: the same seed brings the same run
+        # the model's own generator: the same seed brings the same run
+        self.random = random.Random(seed)
         self.hour, self.charge, self.cost = 0, 5.0, 0.0
         self.begin_hour()
 
@@ -32,7 +37,9 @@ class MyModel:
         daylight = max(0.0, math.sin((clock - 6) / 12 * math.pi))
         self.sun = 3.5 * daylight * self.random.uniform(0.2, 1.0)
         self.use = (1.8 if 17 <= clock < 22 else 0.7) * self.random.uniform(0.7, 1.3)
-        self.price = (0.45 if 17 <= clock < 22 else 0.12 if clock < 6 else 0.28) * self.random.uniform(0.9, 1.1)
+        self.price = (
+            0.45 if 17 <= clock < 22 else 0.12 if clock < 6 else 0.28
+        ) * self.random.uniform(0.9, 1.1)
 
     def choose_flow(self) -> float:
         """The rule, as sold with most batteries: store what the sun leaves over, and give what the house lacks."""
@@ -40,10 +47,15 @@ class MyModel:
 
     def end_hour(self) -> None:
         """Let one hour go by."""
-        flow = min(max(self.choose_flow(), -self.power, -self.charge), self.power, self.capacity - self.charge)
+        flow = min(
+            max(self.choose_flow(), -self.power, -self.charge),
+            self.power,
+            self.capacity - self.charge,
+        )
         self.charge += flow * (1 - self.losses) if flow > 0 else flow
         bought = self.use - self.sun + flow
-        self.cost += bought * (self.price if bought > 0 else 0.05)  # what is fed into the grid earns little
+        # what is fed into the grid earns little
+        self.cost += bought * (self.price if bought > 0 else 0.05)
         self.hour += 1
         self.begin_hour()
 
@@ -54,7 +66,14 @@ class MyModel:
 def observe(model: MyModel) -> list[float]:
     """See the time of day on a circle, and the hour's numbers, each of them between -1 and 1 or so."""
     angle = model.hour % 24 / 24 * 2 * math.pi
-    return [math.sin(angle), math.cos(angle), model.charge / 10, model.sun / 4, model.use / 4, model.price]
+    return [
+        math.sin(angle),
+        math.cos(angle),
+        model.charge / 10,
+        model.sun / 4,
+        model.use / 4,
+        model.price,
+    ]
 
 
 flow = make_step(
@@ -80,7 +99,10 @@ class MySimulation(SimulationInterface):
         self.model = MyModel(seed)
 
     def run(self) -> Any:
-        """Run the model's own loop. It is suspended at each decision; nothing here has to be stepped."""
+        """Run the model's own loop.
+
+        It is suspended at each decision; nothing here has to be stepped.
+        """
         while self.model.hour < 7 * 24:
             self.model.end_hour()
         return TRUNCATED  # time is up, but the house goes on: no end of the task
@@ -107,7 +129,15 @@ def train(steps: int) -> Any:
 
 if __name__ == "__main__":
     quick = "--quick" in sys.argv  # only to see that everything runs
-    policies: dict[str, Any] = {"rule": {}, "trained": {"battery_0": train(1500 if quick else 100_000)}}
+    policies: dict[str, Any] = {
+        "rule": {},
+        "trained": {"battery_0": train(1500 if quick else 100_000)},
+    }
     seeds = range(100_000, 100_005 if quick else 100_030)  # weeks that it was not trained on
     print("Minus the costs of a week; differences are paired by seed, with 95 % intervals:")
-    print(evaluate(MySimulation, policies, seeds=seeds, baseline="rule").summary().round(2).to_string())
+    print(
+        evaluate(MySimulation, policies, seeds=seeds, baseline="rule")
+        .summary()
+        .round(2)
+        .to_string()
+    )

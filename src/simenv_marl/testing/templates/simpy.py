@@ -1,6 +1,7 @@
 """MyModel: a paint shop in SimPy, and an agent that learns which job comes next. Replace the model by yours.
 
-``python -m simenv_marl.testing.templates.simpy`` trains the agent and compares it with the model's own rule.
+``python -m simenv_marl.testing.templates.simpy`` trains the agent and compares it with the model's
+own rule.
 """
 
 import sys
@@ -11,7 +12,15 @@ import numpy as np
 import simpy
 from gymnasium.spaces import Box, Discrete
 
-from simenv_marl import TRUNCATED, SimulationInterface, Streams, difference, evaluate, make_step, single_env
+from simenv_marl import (
+    TRUNCATED,
+    SimulationInterface,
+    Streams,
+    difference,
+    evaluate,
+    make_step,
+    single_env,
+)
 
 # -- 1. The model: SimPy's processes, and a rule of its own ---------------------------------------
 
@@ -32,7 +41,8 @@ class MyModel:
 
     def receive_orders(self) -> Any:
         """Let jobs come in: one in four is urgent."""
-        arrivals, kinds = self.streams["arrivals"], self.streams["kinds of jobs"]  # independent of each other
+        # independent of each other
+        arrivals, kinds = self.streams["arrivals"], self.streams["kinds of jobs"]
         while True:
             due = self.clock.now + kinds.choice([20.0, 120.0, 120.0, 120.0])
             self.waiting.append(Job(kinds.choice([4.0, 8.0, 20.0]), due))
@@ -86,7 +96,10 @@ class MySimulation(SimulationInterface):
         self.model = MyModel(seed)
 
     def run(self) -> Any:
-        """Run SimPy's own loop. It is suspended at each decision; nothing here has to be stepped."""
+        """Run SimPy's own loop.
+
+        It is suspended at each decision; nothing here has to be stepped.
+        """
         self.model.clock.run(until=8 * 60)
         return TRUNCATED  # time is up, but the shop goes on: no end of the task
 
@@ -108,21 +121,38 @@ def env() -> Any:
 
 
 def policy_of(weights: Any) -> Any:
-    """Make a policy that gives points to each job, and takes the job with the most; for one observation or many."""
-    return lambda seen: np.where(seen[..., 0] > 0, seen[..., 1:] @ np.asarray(weights), -np.inf).argmax(-1)
+    """Make a policy that gives points to each job, and takes the job with the most.
+
+    For one observation or many.
+    """
+    return lambda seen: np.where(
+        seen[..., 0] > 0, seen[..., 1:] @ np.asarray(weights), -np.inf
+    ).argmax(-1)
 
 
 def train(candidates: int, days: int) -> Any:
     """Train by random search: all candidates meet the same days, and the best becomes the policy."""
-    policies = [policy_of(weights) for weights in np.random.default_rng(1).normal(size=(candidates, 2))]
-    contenders: dict[str, Any] = {str(number): {"dispatcher_0": policy} for number, policy in enumerate(policies)}
+    policies = [
+        policy_of(weights) for weights in np.random.default_rng(1).normal(size=(candidates, 2))
+    ]
+    contenders: dict[str, Any] = {
+        str(number): {"dispatcher_0": policy} for number, policy in enumerate(policies)
+    }
     found = evaluate(MySimulation, contenders, seeds=range(days), batched=True)
     return policies[int(found.summary()["mean"].idxmax())]
 
 
 if __name__ == "__main__":
     quick = "--quick" in sys.argv  # only to see that everything runs
-    policies: dict[str, Any] = {"rule": {}, "trained": {"dispatcher_0": train(*(5, 2) if quick else (40, 20))}}
+    policies: dict[str, Any] = {
+        "rule": {},
+        "trained": {"dispatcher_0": train(*(5, 2) if quick else (40, 20))},
+    }
     seeds = range(100_000, 100_010 if quick else 100_050)  # days that it was not trained on
     print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")
-    print(evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True).summary().round(1).to_string())
+    print(
+        evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
+        .summary()
+        .round(1)
+        .to_string()
+    )

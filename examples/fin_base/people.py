@@ -138,8 +138,8 @@ class Client(Entity):
     """
 
     __slots__ = (
-        "accrual", "accrued", "born", "caution", "company", "contract", "disposable", "extra", "premium", "status",
-        "wage",
+        "accrual", "accrued", "born", "caution", "company", "contract", "disposable", "extra",
+        "premium", "status", "wage",
     )  # fmt: skip
 
     kind = "client"

@@ -50,9 +50,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "Streams",
-    "aec_env", "branch", "clone", "difference", "evaluate", "generate_env", "joint_env", "make_step", "parallel_env",
-    "register_simulation", "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
+    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation",
+    "Streams", "aec_env", "branch", "clone", "difference", "evaluate", "generate_env", "joint_env",
+    "make_step", "parallel_env", "register_simulation", "reseed_generators", "simulate",
+    "simulate_many", "single_env", "vector_env",
 ]  # fmt: skip
 
 ROOMS = (

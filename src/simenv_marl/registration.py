@@ -65,7 +65,7 @@ def register_simulation(
     _RECIPES[recipe] = simulation, points, options
     named = [point for point in plan.active if point.agent or plan.one_agent]
     views: dict[str, dict[str, Any]] = {}
-    for title, point in zip(_titles([point.point.name for point in named]), named, strict=True):
+    for title, point in zip(_titles([point.hook.name for point in named]), named, strict=True):
         no_roster = {} if point.agent is None else {"possible_agents": None, "undeclared": "error"}
         views[title] = {"view": "single", "agent": point.agent or plan.one_agent, **no_roster}
     entry, vector_entry = f"{__name__}:make_view", f"{__name__}:make_vector_view"

@@ -133,7 +133,7 @@ def test_requests_contain_the_latest_decisions_of_the_agent():
     roles = [[message["role"][0] for message in request["messages"]] for request in requests[:4]]
     assert ["".join(own) for own in roles] == ["su", "suau", "suauau", "suauau"]
     assert [message["content"] for message in requests[3]["messages"] if message["role"] == "assistant"] == [
-        "half", "closed"
+        "half", "closed",
     ]  # fmt: skip
 
 

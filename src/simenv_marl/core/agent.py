@@ -66,10 +66,11 @@ class Agent:
     """
 
     __slots__ = (
-        "acted", "answered", "answered_at", "applying", "asked", "carried", "choices", "clock", "decided", "delegated",
-        "deliver", "ended", "entity", "fallbacks", "group", "handed_out", "info", "informs_rule_action", "kwargs",
-        "mask", "memory", "name", "notes", "now", "observation", "offered", "plugins", "point", "policy", "present",
-        "rate", "read_clock", "report", "rest", "reward", "rule_action", "update",
+        "acted", "answered", "answered_at", "applying", "asked", "carried", "choices", "clock",
+        "decided", "delegated", "deliver", "ended", "entity", "fallbacks", "group", "handed_out",
+        "info", "informs_rule_action", "kwargs", "mask", "memory", "name", "notes", "now",
+        "observation", "offered", "plugins", "point", "policy", "present", "rate", "read_clock",
+        "report", "rest", "reward", "rule_action", "update",
     )  # fmt: skip
 
     def __init__(self, name: str, point: Point, plan: Plan, clock: Any) -> None:
@@ -134,7 +135,7 @@ class Agent:
         if episode.ended:
             if self.ended:
                 raise AgentError(
-                    f"the agent {self.name!r} decides at {self.point.point.name} after its end;"
+                    f"the agent {self.name!r} decides at {self.point.hook.name} after its end;"
                     " agent= must name each entity differently, and removed_by= or end_agent()"
                     " must end an agent only when its entity is gone"
                 )
@@ -175,7 +176,7 @@ class Agent:
                 episode.consulted = None
         if len(episode.tape) < episode.tape_size:
             episode.tape.append(duplicate(action))
-        legal = action if action is RULE else self.point.checked(action, self.name, self.mask)
+        legal = action if action is RULE else self.point.validate(action, self.name, self.mask)
         return episode.answer(self, legal, False)
 
     def add_carried_reward(self, *, carry_on: bool) -> None:

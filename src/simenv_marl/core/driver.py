@@ -172,8 +172,8 @@ class Driver:
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_past", "_refused", "_stack", "caller",
-        "ended", "events", "forked", "given_up", "idle", "opened", "plugins",
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_past", "_refused",
+        "_stack", "caller", "ended", "events", "forked", "given_up", "idle", "opened", "plugins",
     )  # fmt: skip
 
     resume: Any

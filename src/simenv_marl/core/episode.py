@@ -101,8 +101,9 @@ class EpisodeState:
     """
 
     __slots__ = (
-        "agents", "clock", "consulted", "ended", "just_ended", "last_time", "others", "over", "pending", "plan",
-        "round", "seed", "skips", "terminated", "truncated", "turns", "unreported_end", "where",
+        "agents", "clock", "consulted", "ended", "just_ended", "last_time", "others", "over",
+        "pending", "plan", "round", "seed", "skips", "terminated", "truncated", "turns",
+        "unreported_end", "where",
     )  # fmt: skip
 
     def __init__(
@@ -181,8 +182,8 @@ class Episode(EpisodeState):
     """
 
     __slots__ = (
-        "_lock", "_rng", "driver", "entities", "failed_in_model", "items", "latest", "most_steps", "plain", "running",
-        "script", "session", "simulation", "tape", "tape_size",
+        "_lock", "_rng", "driver", "entities", "failed_in_model", "items", "latest", "most_steps",
+        "plain", "running", "script", "session", "simulation", "tape", "tape_size",
     )  # fmt: skip
 
     def __init__(
@@ -224,9 +225,9 @@ class Episode(EpisodeState):
         """The events that the simulation sends: an agent where it is the only one of a point, else the plan's event."""
         agents = self.agents
         return {
-            hook: agents.get(getattr(event, "agent", None), event)
+            hook: agents.get(getattr(event, "agent", None) or "", event)
             for hook, event in self.plan.events.items()
-        }  # type: ignore[arg-type]
+        }
 
     # -- steps ------------------------------------------------------------------------------------
 
@@ -287,7 +288,7 @@ class Episode(EpisodeState):
                 check = agent.point.check
                 legal = check(action)
                 if legal is ILLEGAL or agent.mask is not None:
-                    legal = agent.point.checked(action, agent.name, agent.mask)
+                    legal = agent.point.validate(action, agent.name, agent.mask)
                 action = legal
             self.advance(self.answer(agent, action))
         except BaseException as error:
@@ -413,7 +414,7 @@ class Episode(EpisodeState):
         """
         if not isinstance(name, str):
             raise AgentError(
-                f"agent= of {point.point.name} must return a string or None, not {short_repr(name)}"
+                f"agent= of {point.hook.name} must return a string or None, not {short_repr(name)}"
             )
         agent = self.others.get(name) or self.agents.get(name) or self.ended.get(name)
         if agent is None:
@@ -421,7 +422,7 @@ class Episode(EpisodeState):
             (self.others if agent.delegated else self.agents)[name] = agent
         elif agent.point is not point:
             raise AgentError(
-                f"the agent {name!r} decides at {agent.point.point.name} and at {point.point.name};"
+                f"the agent {name!r} decides at {agent.point.hook.name} and at {point.hook.name};"
                 " an agent has one decision point: give each point's agents names of their own"
             )
         return agent
@@ -440,7 +441,7 @@ class Episode(EpisodeState):
         """The live agents that ``expected_calls`` announces, with the bound arguments of the first call of each."""
         announced: dict[Agent, tuple[tuple[Any, ...], dict[str, Any]]] = {}
         for point in self.plan.active:
-            for call in expected_calls(point.point.name):
+            for call in expected_calls(point.hook.name):
                 for args, kwargs in point.decisions_of(call):
                     name = point.agent or point.name_agent(*args, **kwargs)
                     agent = None if name is None else self.agent_for(point, name)
@@ -519,10 +520,10 @@ class Episode(EpisodeState):
 
     def _without_decision(self) -> NoDecisionError:
         """Make the error for an episode that ended without a decision for the environment's user."""
-        expected = ", ".join(point.point.name for point in self.plan.active)
-        overriding = listed([name for point in self.plan.active for name in overrides(point.point)])
+        expected = ", ".join(point.hook.name for point in self.plan.active)
+        overriding = listed([name for point in self.plan.active for name in overrides(point.hook)])
         hints: list[str] = []
-        threads = {name for point in self.plan.active for name in point.point.threads} - {
+        threads = {name for point in self.plan.active for name in point.hook.threads} - {
             current_thread().name
         }
         if overriding:
@@ -555,7 +556,7 @@ class Episode(EpisodeState):
             number, when = self.turns + 1, "at"
             if self.failed_in_model:
                 number, when = self.turns, "in the model, after"
-            where = f"{when} decision {number}, of {agent.name!r} at {agent.point.point.name}"
+            where = f"{when} decision {number}, of {agent.name!r} at {agent.point.hook.name}"
         annotate(error, f"simenv_marl: {where}; seed {self.seed}")
 
     def fail(self, error: BaseException) -> None:

@@ -58,9 +58,9 @@ class Decision:
     memory: dict[Any, Any] = field(repr=False)
     _agent: Agent = field(repr=False)
 
-    def checked(self, action: Any) -> Any:
+    def validate(self, action: Any) -> Any:
         """Return an action in the form that the model's mapping gets, or raise an ``InvalidActionError``."""
-        return self._agent.point.checked(action, self.agent, self._agent.mask)
+        return self._agent.point.validate(action, self.agent, self._agent.mask)
 
     def count_fallback(self) -> None:
         """Note that a fallback answers: evaluations count these for each agent and seed."""
@@ -73,7 +73,7 @@ def decision_of(episode: Episode, agent: Agent) -> Decision:
     call = agent.arguments() or (), agent.kwargs
     return Decision(
         agent=agent.name,
-        point=point.point.name,
+        point=point.hook.name,
         seed=episode.seed,
         number=agent.answered + 1,
         time=agent.now,
@@ -84,7 +84,7 @@ def decision_of(episode: Episode, agent: Agent) -> Decision:
         action_labels=point.action_labels(choices, *call),
         observation_labels=point.observation_labels(*call),
         reward=agent.reward,
-        doc=point.point.function.__doc__,
+        doc=point.hook.function.__doc__,
         in_clone=episode.where > 0,
         memory=agent.memory,
         _agent=agent,

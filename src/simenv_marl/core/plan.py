@@ -252,7 +252,7 @@ class Plan:
         if len(points) > 1:
             raise AgentError(
                 f"the agent {short_repr(agent)} may decide at"
-                f" {', '.join(point.point.name for point in points)}; name its decision point in"
+                f" {', '.join(point.hook.name for point in points)}; name its decision point in"
                 " points=, or declare the agents of each with possible_agents="
             )
         self.active, self.roster, self.complete = points, {agent: points[0]}, True
@@ -260,12 +260,12 @@ class Plan:
     def _find_events(self) -> None:
         """Find the events that the simulation sends: decisions, and calls that end agents."""
         self.events: dict[Hook, Any] = {
-            point.point: point if point.definition.split is None else Split(point)
+            point.hook: point if point.definition.split is None else Split(point)
             for point in self.points
         }
         for point in self.points:
             for name, agent in (
-                *point.point.removed_by.items(),
+                *point.hook.removed_by.items(),
                 *point.definition.removed_by.items(),
             ):
                 remover = locate(name, self._own)
@@ -275,7 +275,7 @@ class Plan:
                         f"{name} is a decision point, so removed_by= cannot name it as a function"
                         " that ends an agent"
                     )
-                removal.of.append((point, agent, owner_class(point.point)))
+                removal.of.append((point, agent, owner_class(point.hook)))
         if self.points and self._ends_agents:
             ends = self.events.setdefault(locate(SimulationInterface.end_agent), Removal())
             ends.of.append((None, lambda simulation, name: name, None))
@@ -292,7 +292,7 @@ class Plan:
         if self.options.undeclared == "rule":
             return RULE
         raise AgentError(
-            f"the agent {agent!r}, which decides at {point.point.name}, is not declared in"
+            f"the agent {agent!r}, which decides at {point.hook.name}, is not declared in"
             " possible_agents; declare"
             ' it, or let its rule decide with undeclared="rule"'
         )
@@ -359,9 +359,7 @@ class Plan:
     def declared(self, roster: Mapping[str, Point]) -> Plan:
         """The same plan with a roster of agents that was found out."""
         names = {
-            point.point.name: [
-                agent for agent, other in roster.items() if other.point is point.point
-            ]
+            point.hook.name: [agent for agent, other in roster.items() if other.hook is point.hook]
             for point in self.active
             if point.agent is None
         }

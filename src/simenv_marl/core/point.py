@@ -73,13 +73,27 @@ class Point:
     """
 
     __slots__ = (
-        "agent", "applies", "cast", "check", "convert", "definition", "deliver", "informs_rule_action", "legal",
-        "masked_parts", "name_agent", "one_entity", "point", "policy", "report", "updates",
+        "agent",
+        "applies",
+        "cast",
+        "check",
+        "convert",
+        "definition",
+        "deliver",
+        "hook",
+        "informs_rule_action",
+        "legal",
+        "masked_parts",
+        "name_agent",
+        "one_entity",
+        "policy",
+        "report",
+        "updates",
     )  # fmt: skip
 
     def __init__(
         self,
-        point: DecisionPoint,
+        hook: DecisionPoint,
         definition: Definition,
         agent: str | None,
         policy: Any,
@@ -87,14 +101,14 @@ class Point:
         clips: bool,
     ) -> None:
         """Prepare a point whose decisions are recorded, including those of the rule, and whose actions are clipped."""
-        self.point, self.definition = point, definition
+        self.hook, self.definition = hook, definition
         self.agent, self.policy = agent, policy
         self.name_agent: Any = definition.agent if agent is None else None
         self.cast = spaces.observation_cast(definition.observation_space)
         self.check = actions.action_check(definition.action_space, clips=clips)
         self.convert: Any = definition.action_space_mapping or _same
-        self.deliver, self.applies = _delivery(definition, point), definition.apply is not None
-        self.legal = _legal(definition, point.name)
+        self.deliver, self.applies = _delivery(definition, hook), definition.apply is not None
+        self.legal = _legal(definition, hook.name)
         self.masked_parts = (
             [] if self.legal is None else _masked_parts(definition.observation_space)
         )
@@ -103,7 +117,7 @@ class Point:
         self.report = (
             RuleDecided(self) if self.informs_rule_action or (records and readable) else None
         )
-        self.one_entity = definition.agent is None and point.bound
+        self.one_entity = definition.agent is None and hook.bound
         self.updates: Any = None
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
@@ -123,7 +137,7 @@ class Point:
 
     def decisions_of(self, call: Any) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
         """Return the bound arguments of the decisions of a call: its own, or those of each of its items."""
-        args, kwargs = self.point.bind(call, BOUND) or (tuple(call), BOUND)
+        args, kwargs = self.hook.bind(call, BOUND) or (tuple(call), BOUND)
         split = self.definition.split
         return (
             [(args, kwargs)]
@@ -135,7 +149,7 @@ class Point:
         """Warn once that several objects decide under the name of one agent."""
         self.one_entity = False
         warn_user(
-            f"several objects decide at {self.point.name} as one agent, {agent!r}: their rewards"
+            f"several objects decide at {self.hook.name} as one agent, {agent!r}: their rewards"
             " and differences mix. Set agent= of its make_step to a callable that names an agent"
             " for each object, or to a string if one agent is meant"
         )
@@ -202,7 +216,7 @@ class Point:
         some = isinstance(given, Mapping) and isinstance(space, gym_spaces.Discrete)
         if not some and not fit_labels(space, given):
             raise DefinitionError(
-                f"the labels of {self.point.name} for a call are {short_repr(given)}, which are"
+                f"the labels of {self.hook.name} for a call are {short_repr(given)}, which are"
                 f" not texts for the parts of {short_repr(space)}"
             )
         return given
@@ -217,7 +231,7 @@ class Point:
         """Whether a mask allows an action that is in the space."""
         return actions.mask_allows(self.definition.action_space, mask, action)
 
-    def checked(self, action: Any, agent: str, mask: Any) -> Any:
+    def validate(self, action: Any, agent: str, mask: Any) -> Any:
         """Return an action of an agent in the form that ``convert`` takes, or raise an ``InvalidActionError``."""
         legal, space = self.check(action), self.definition.action_space
         if legal is ILLEGAL and inspect.isawaitable(action):
@@ -480,7 +494,7 @@ class RuleDecided:
         legal = None if action is None else point.check(action)
         if legal is ILLEGAL:
             raise InvalidActionError(
-                f"rule_action_mapping of {point.point.name} maps the rule's decision"
+                f"rule_action_mapping of {point.hook.name} maps the rule's decision"
                 f" {short_repr(decision)} to the action {short_repr(action)}, which is not in its"
                 f" action space {short_repr(point.definition.action_space)}"
             )

@@ -209,7 +209,7 @@ def resolve_roster(
     active: list[Point], declared: Any, known: Collection[str | None]
 ) -> tuple[dict[str, Point], bool]:
     """Find out which agents are known beforehand, and whether there can be no others."""
-    naming = [point.point for point in active if point.agent is None]
+    naming = [point.hook for point in active if point.agent is None]
     if declared is not None and not isinstance(declared, Mapping):
         others = [name for name in declared if name not in known]
         if len(naming) > 1 or (others and not naming):
@@ -229,7 +229,7 @@ def resolve_roster(
         names[named] = value
     roster: dict[str, Point] = {}
     for point in active:
-        for name in names.get(point.point, []) if point.agent is None else [point.agent]:
+        for name in names.get(point.hook, []) if point.agent is None else [point.agent]:
             if not isinstance(name, str) or name in roster:
                 raise AgentError(
                     f"possible_agents must be different strings, not {short_repr(name)}"

@@ -66,7 +66,7 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
         if option.name not in ("plugins", "policies")
         and getattr(plan.options, option.name) != option.default
     }
-    points = {point.point.name: point.agent for point in plan.active}
+    points = {point.hook.name: point.agent for point in plan.active}
     packages = sorted({dotted.partition(".")[0] for dotted in (name, *points)})
     return {
         "simulation": name,

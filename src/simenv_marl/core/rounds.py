@@ -104,7 +104,7 @@ class Round:
                 legal = check(action)
                 mask = agent.mask if agent is pending else None
                 if legal is ILLEGAL or mask is not None:
-                    legal = agent.point.checked(action, name, mask)
+                    legal = agent.point.validate(action, name, mask)
                 action = legal
                 self.given += 1
             checked[name] = action

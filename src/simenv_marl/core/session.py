@@ -48,8 +48,9 @@ class Session:
     """
 
     __slots__ = (
-        "__weakref__", "_close", "_driver", "_installed", "_np_random", "_reset", "_rng", "bound_plan", "episode",
-        "exclusive", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state", "where",
+        "__weakref__", "_close", "_driver", "_installed", "_np_random", "_reset", "_rng",
+        "bound_plan", "episode", "exclusive", "lock", "np_random_seed", "options", "plan", "seed",
+        "simulation", "state", "where",
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:

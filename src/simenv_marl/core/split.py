@@ -41,9 +41,9 @@ class Split:
         """On the simulation's side, turn the replies to the items into the value of the call."""
         items, replies = reply
         value: Any = self._gather(items, replies, args, kwargs)
-        if self.point.point.kind == "generator":
+        if self.point.hook.kind == "generator":
             return value
-        if self.point.point.kind == "coroutine":
+        if self.point.hook.kind == "coroutine":
             return _awaited(value)
         try:
             next(value)
@@ -58,7 +58,7 @@ class Split:
 
         The rule runs once, when it is first needed; waits as its function does.
         """
-        definition, hook, deliver = self.point.definition, self.point.point, self.point.deliver
+        definition, hook, deliver = self.point.definition, self.point.hook, self.point.deliver
         decisions: list[Any] = []
         results: list[Any] = []
         for place, (item, reply) in enumerate(zip(items, replies, strict=True)):

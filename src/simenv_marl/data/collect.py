@@ -127,7 +127,7 @@ def learners_plan(
         for point in plan.points if isinstance(policy, LeftToRule) else ():
             if point.report is None and is_answered_by(plan, point, place):
                 raise DefinitionError(
-                    f"the actions of the rule of {point.point.name} are not known; give its"
+                    f"the actions of the rule of {point.hook.name} are not known; give its"
                     " make_step a rule_action_mapping, which maps the rule's decision to an action"
                 )
     return plan

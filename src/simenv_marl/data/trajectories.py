@@ -219,7 +219,7 @@ class _DecisionLog:
         self.stack_observations: Stacker = np.array
         self.stack_actions: Stacker = np.array
         if point is not None:
-            self.name, definition = point.point.name, point.definition
+            self.name, definition = point.hook.name, point.definition
             self.observation_space, self.action_space = (
                 definition.observation_space,
                 definition.action_space,

@@ -17,8 +17,8 @@ from .single import SimulationEnv
 from .vector import SimulationVectorEnv
 
 __all__ = [
-    "SimulationAECEnv", "SimulationEnv", "SimulationJointEnv", "SimulationParallelEnv", "SimulationVectorEnv",
-    "pad_agents",
+    "SimulationAECEnv", "SimulationEnv", "SimulationJointEnv", "SimulationParallelEnv",
+    "SimulationVectorEnv", "pad_agents",
 ]  # fmt: skip
 
 VIEWS: Final[dict[str, Any]] = {
@@ -71,7 +71,7 @@ def generate_env(
 
     attributes = {
         "__init__": initialise,
-        "__doc__": f"A view of {plan.name}: {', '.join(point.point.name for point in plan.active)}.",
+        "__doc__": f"A view of {plan.name}: {', '.join(point.hook.name for point in plan.active)}.",
         "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
         "metadata": base._metadata_of(plan),
     }

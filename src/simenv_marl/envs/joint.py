@@ -140,7 +140,7 @@ class SimulationJointEnv(OneAgentView):
         if not self._plan.complete:
             if not hasattr(session.simulation, "expected_calls"):
                 points = ", ".join(
-                    point.point.name for point in self._plan.active if point.agent is None
+                    point.hook.name for point in self._plan.active if point.agent is None
                 )
                 raise ViewError(
                     "all agents must be known when the environment is made, and a callable names"

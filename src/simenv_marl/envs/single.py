@@ -42,7 +42,7 @@ class SimulationEnv(OneAgentView):
     def _adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and put the goals of its point, if it has any, into the observations."""
         if plan.one_agent is None:
-            points = ", ".join(point.point.name for point in plan.active)
+            points = ", ".join(point.hook.name for point in plan.active)
             raise ViewError(
                 "the single view needs one active decision point whose agent= is not a callable,"
                 f" or the name of one agent; active are {points}. Name the agent with agent=, name"
@@ -74,7 +74,7 @@ class SimulationEnv(OneAgentView):
             }
         )
         changed = replace(definition, observation_space=space, observation_space_mapping=observe)
-        return super()._adapt(plan).redefined(plan.active[0].point, changed)
+        return super()._adapt(plan).redefined(plan.active[0].hook, changed)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.

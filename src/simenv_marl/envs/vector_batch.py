@@ -137,7 +137,7 @@ class SimulationBatch:
         if pending is None:  # the step says why
             return action
         if self.joint is None:
-            return pending.point.checked(action, self._agent, pending.mask)
+            return pending.point.validate(action, self._agent, pending.mask)
         self.joint.check(session.episode, action)
         return action
 

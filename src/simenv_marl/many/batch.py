@@ -79,12 +79,12 @@ class BatchPolicy:
 
     def group(self, point: Point) -> Group:
         """Return the group of the decisions at a point."""
-        group = self.groups.get(point.point)
+        group = self.groups.get(point.hook)
         if group is None:
             group = next(
                 (known for known in self.groups.values() if known.takes(point)), None
             ) or Group(self, point)
-            self.groups[point.point] = group
+            self.groups[point.hook] = group
         return group
 
 
@@ -410,7 +410,7 @@ def _checked(episode: Episode, action: Any) -> Any:
     """Return the action of the pending agent, checked."""
     agent: Any = episode.pending
     try:
-        return action if action is RULE else agent.point.checked(action, agent.name, agent.mask)
+        return action if action is RULE else agent.point.validate(action, agent.name, agent.mask)
     except InvalidActionError as error:
         episode.annotate(error)
         raise

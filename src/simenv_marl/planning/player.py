@@ -108,7 +108,7 @@ class Player:
         if action is RULE:
             return
         if space == point.definition.action_space:
-            point.checked(action, self.agent, mask)
+            point.validate(action, self.agent, mask)
         elif action_check(space)(action) is ILLEGAL:
             raise InvalidActionError(
                 f"the action {short_repr(action)} of {self.agent!r} is not in {short_repr(space)}"

@@ -80,7 +80,7 @@ def parse(env_or_decision: Any, text: str) -> Any:
                 if legal
                 else _action(space, decision.action_labels, value)
             )
-            decision.checked(action)
+            decision.validate(action)
             return action
     words = "|".join(re.escape(label) for label in sorted(legal, key=len, reverse=True))
     named = set(re.findall(rf"(?<![\w.-])(?:{words})(?!\w|\.\d)", text)) if words else set()

@@ -105,7 +105,7 @@ class FallbackPolicy(PolicyWrapper):
                 if self.timeout is not None and monotonic() - began > self.timeout:
                     raise TimeoutError
                 if answer is not RULE:
-                    decision.checked(answer)
+                    decision.validate(answer)
                 return answer
             except OptionValueError:  # the policy was not written or set up well
                 raise
@@ -212,7 +212,7 @@ class RecordedPolicy(PolicyWrapper):
         recorded = None
         if answer is not RULE:
             try:
-                action = decision.checked(answer)
+                action = decision.validate(answer)
             except InvalidActionError:
                 return answer
             recorded = decision.action_space.to_jsonable([_in_form(decision.action_space, action)])

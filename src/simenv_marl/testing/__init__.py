@@ -169,7 +169,7 @@ def inspect_simulation(
         simulation=plan.name,
         points=tuple(
             {
-                "point": bound.point.name,
+                "point": bound.hook.name,
                 "agent": bound.agent or "named by each call",
                 "observations": str(bound.definition.observation_space),
                 "actions": str(bound.definition.action_space),

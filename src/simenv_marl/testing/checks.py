@@ -109,7 +109,7 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
             return
     if not any(run.calls for run in subject.plain.values()):
         report.add(
-            "no_decision", points=", ".join(bound.point.name for bound in subject.plan.active)
+            "no_decision", points=", ".join(bound.hook.name for bound in subject.plan.active)
         )
         return
     subject.views = fitting_views(subject.plan)
@@ -248,7 +248,7 @@ class PointRecord:
             ]
             for name, (number, low, total, high) in self.values.items()
         }
-        point, rewards = self.point.point.name, ranges.pop("reward", [None])[0]
+        point, rewards = self.point.hook.name, ranges.pop("reward", [None])[0]
         never: tuple[int, ...] = ()
         if isinstance(self.legal, np.ndarray):
             start = int(getattr(self.point.definition.action_space, "start", 0))
@@ -276,7 +276,7 @@ def _collect(
 ) -> None:
     """Record a step of an episode. Rewards count only for agents that have acted in it."""
     bound = env._point(agent)
-    record = records[bound.point.name, bound.agent]
+    record = records[bound.hook.name, bound.agent]
     observation, reward, terminated, truncated, info = step
     record.record("observation", observation)
     space = env.observation_space(agent)
@@ -296,7 +296,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
 
     Collect statistics; compare episodes of the same seed.
     """
-    records = {(bound.point.name, bound.agent): PointRecord(bound) for bound in subject.plan.active}
+    records = {(bound.hook.name, bound.agent): PointRecord(bound) for bound in subject.plan.active}
     first, failures = None, 0
     acted: dict[str, Any] = {}
     with report.opened(subject, max_steps=subject.max_steps) as env:

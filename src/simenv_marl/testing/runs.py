@@ -271,7 +271,7 @@ class Subject:
 
     def _record(self, run: Run, start: Callable[[], None], seed: int) -> Run:
         """Play a run in which the decisions of the rules are recorded."""
-        points = list(dict.fromkeys(bound.point for bound in self.plan.points))
+        points = list(dict.fromkeys(bound.hook for bound in self.plan.points))
         for point in points:
             point.replace_rule(self._recording_rule(run, point))
         try:

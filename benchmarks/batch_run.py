@@ -1,4 +1,4 @@
-"""A sweep of Mesa's wealth model, with Mesa's ``batch_run`` and with ``run_experiment``: lines of code, and seconds.
+"""A sweep of Mesa's wealth model with ``batch_run`` and ``run_experiment``: code lines and seconds.
 
 The sweep measures the final inequality, depending on the number of people and on the space: a mean
 with its interval for each combination. The same seeds give the same numbers. A user would write the
@@ -35,7 +35,7 @@ SEEDS = range(8)
 STEPS = 100
 
 ABLE = "n" in inspect.signature(BoltzmannWealth).parameters
-"""Whether ``batch_run`` can run this model: it cannot in Mesa 3.5, where the model takes a scenario."""
+"""Whether ``batch_run`` can run this model. It cannot in Mesa 3.5: the model takes a scenario."""
 
 
 def interval(values: Any) -> Any:
@@ -93,10 +93,10 @@ def lines(*functions: Any) -> int:
 
 
 def sweep(name: str, processes: int, *, start: bool = False) -> Contender:
-    """Make a contender: the seconds of a sweep, of the processor for one process, else of the wall clock.
+    """Make a contender that measures the seconds of a sweep.
 
-    With ``start``, joblib's workers of earlier sweeps are ended before, so that new ones have to
-    start.
+    The seconds are processor time for one process, and wall-clock time for several. With ``start``,
+    joblib's workers of earlier sweeps are ended before, so that new ones have to start.
     """
     clock = now if processes == 1 else time.perf_counter
 

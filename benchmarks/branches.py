@@ -1,4 +1,4 @@
-"""The cost of branches and clones beside the minimum for the same task, and the speed-up by two cores.
+"""The cost of branches and clones beside the minimum for the task, and the speed-up by two cores.
 
 Times are wall-clock times, as these are processes. On one core, branches run one after another.
 """
@@ -184,7 +184,7 @@ def echo() -> Callable[[int], None]:
 
 
 def memory_of_clones(number: int = 300) -> float:
-    """Measure by how much each clone of a greenhouse makes the memory of all processes grow, in MiB."""
+    """Measure the growth of the memory of all processes per clone of a greenhouse, in MiB."""
     env, own = make_greenhouse(), str(os.getpid())
     env.reset(seed=0)
 

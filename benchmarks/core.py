@@ -1,4 +1,4 @@
-"""The cost of a simulation that keeps its own loop: this library's views beside their alternatives, in one run.
+"""The cost of simulations with their own loop: this library's views and alternatives, in one run.
 
 Run it with ``make benchmark``. It keeps itself on one core, except for rows that need two. A
 section is a module whose function ``groups`` takes a number of decisions and yields its rows;

@@ -1,4 +1,4 @@
-"""The cost of a decision in the AEC and the single view, and of a decision function that no environment answers."""
+"""The cost of a decision in the AEC view, in the single view, and without an environment."""
 
 from __future__ import annotations
 

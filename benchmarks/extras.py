@@ -1,4 +1,4 @@
-"""The cost of a decision with a clock, with a plugin that is not called, and beside other objects in the process.
+"""The cost of a decision with a clock, with an uncalled plugin, and beside other objects.
 
 Each figure comes from a process of its own: a ``difference`` stays once it is made, and the
 features of one environment may slow down its neighbours. The processes take turns.

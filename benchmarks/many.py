@@ -1,4 +1,4 @@
-"""The speed-up by policies that answer many simulations at once, and by two processes that share the work."""
+"""The speed-up by policies that answer many simulations at once, and by two worker processes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ async def wait(observation: Any) -> int:
 
 
 def groups(number: int) -> Iterator[Group]:
-    """Yield the rows: as many simulations as there are decisions in a round, divided by 20, and at most a thousand."""
+    """Yield the rows, with one simulation for 20 decisions in a round, at most a thousand."""
     number = min(SIMULATIONS, number // 20)
     network = {Model.left: network_policy()}
     waiting = at_once(

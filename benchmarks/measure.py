@@ -1,4 +1,4 @@
-"""Measuring side by side: all contenders of a group in turn, many rounds, medians of the ratios within a round.
+"""Measure contenders side by side: in turn, in many rounds, by medians of the ratios in a round.
 
 A machine that is slow for a while is slow for all contenders of a round, so ratios are reliable
 where times are not. Times are processor times of all threads of this process, or wall-clock times
@@ -88,7 +88,7 @@ class MissingError(Exception):
 
 @dataclass(frozen=True)
 class Figure:
-    """What was measured for a row: medians over the rounds of the ratio, of the candidate and of the baseline."""
+    """The figures of a row: medians over rounds of the ratio, the candidate and the baseline."""
 
     row: Row
     ratio: float
@@ -124,7 +124,7 @@ class Figure:
 
 
 def measure(group: Group, rounds: int, *, warm_up: bool = True) -> list[Figure]:
-    """Run all contenders of a group in turn for a number of rounds, after one that does not count."""
+    """Run all contenders of a group in turn for a number of rounds, after a warm-up round."""
     pairs = [contender for row in group.rows for contender in (row.baseline, row.candidate)]
     values: dict[Contender, list[float]] = {
         contender: [] for contender in pairs if contender is not None
@@ -222,7 +222,10 @@ _cores: list[int] = []
 
 
 def pin(most: int) -> None:
-    """Keep this process and those that it starts on one core, and let some rows use more, where that is possible."""
+    """Keep this process and its children on one core, and let some rows use up to ``most`` cores.
+
+    The function has no effect on systems without processor affinity.
+    """
     if hasattr(os, "sched_getaffinity"):
         _cores[:] = sorted(os.sched_getaffinity(0))[:most]
         os.sched_setaffinity(0, _cores[:1])
@@ -248,7 +251,7 @@ def two_cores() -> Iterator[None]:
 
 
 class Table:
-    """The one table of all figures: lines on the terminal as they are found, then Markdown and JSON.
+    """The table of all figures: printed line by line, then written as Markdown and JSON.
 
     Attributes:
         figures: The figures of each section.

@@ -1,4 +1,4 @@
-"""No-op simulations, so that only the overhead remains, and contenders that run their environments."""
+"""No-op simulations, which leave only the overhead, and contenders that run their environments."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def single(env: Any, number: int) -> Contender:
 
 
 def parallel(env: Any, agents: int, number: int) -> Contender:
-    """Make a contender of steps of a parallel environment with actions of all agents: the time of each agent."""
+    """Make a contender of parallel steps with actions of all agents: the time per agent."""
     env.reset(seed=0)
     if len(env.agents) < agents:  # some agents have not appeared yet
         for _ in range(agents):

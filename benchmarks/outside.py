@@ -1,4 +1,4 @@
-"""The cost of a decision for a simulator in another process, beside the minimum for a pipe and JSON.
+"""The cost of a decision of a simulator in another process, beside the minimum for a pipe and JSON.
 
 Times are processor times of both processes, which alternate on one core; on two cores, they are
 wall-clock times.

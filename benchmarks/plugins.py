@@ -1,4 +1,4 @@
-"""The cost of handlers for functions without one, for functions with another environment's handler, and with one."""
+"""The cost of handlers for functions with none, with another environment's, and with their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cost of what is not a decision: a reset, an episode of three decisions, an environment for one reset."""
+"""The cost outside decisions: a reset, a three-decision episode, an environment for one reset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cost of a parallel step: every agent acts once, and then all of them are rewarded and observed."""
+"""The cost of a parallel step: every agent acts once, then all are rewarded and observed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from simenv_marl import aec_env, parallel_env
 SIZES = (2, 100, 1_000, 10_000)
 
 CONVERTIBLE = (2, 100, 1_000)
-"""The numbers of agents for ``aec_to_parallel``: its step is quadratic, and takes tens of seconds at 10,000."""
+"""The agents for ``aec_to_parallel``: its quadratic step takes tens of seconds for 10,000."""
 
 TURNS = 50
 """The number of steps of the turn-based converter.

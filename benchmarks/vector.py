@@ -1,4 +1,4 @@
-"""The cost of a step of many simulations, suspended side by side in one process, beside Gymnasium's vector views."""
+"""The cost of a step of many suspended simulations in one process, beside Gymnasium's vectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The speed of a third-party model in environments, relative to the plain run: Mesa's unmodified wolf-sheep model.
+"""The speed of Mesa's unmodified wolf-sheep model in environments, relative to the plain run.
 
 All actions are ``RULE``, so every run ends with the same animals in the same places and the same
 state of the generator.
@@ -60,7 +60,7 @@ class Meadow(SimulationInterface):
 
 
 def wolves_and_sheep(seed: int | None) -> tuple[Any, Any]:
-    """Make the model, and the object that runs its ticks: since Mesa 3.5 the model itself, before a simulator."""
+    """Make the model and the runner of its ticks: the model itself, before Mesa 3.5 a simulator."""
     if hasattr(wolf_sheep, "WolfSheepScenario"):
         model = wolf_sheep.WolfSheep(wolf_sheep.WolfSheepScenario(rng=seed))
         return model, model
@@ -104,7 +104,7 @@ POINTS = {name_of(kind): definition(word) for word, kind in KINDS.items()}
 
 
 def groups(number: int) -> Iterator[Group]:
-    """Yield the rows, with one episode of each contender in a round, whatever the number of decisions."""
+    """Yield the rows. Each contender runs one episode in a round; ``number`` has no effect."""
     run, outcome = plain()
     run()
     expected = outcome()

@@ -1,4 +1,4 @@
-"""Fixtures that let each page's examples import the models beside it, independently of other pages."""
+"""Fixtures: each page's examples import the models beside it, independently of other pages."""
 
 import sys
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""A hive whose bees are born and die, and its environments: learners with fixed rosters find such agents hardest.
+"""A hive whose bees are born and die, and its environments.
 
-The model has a loop, a clock and rules of its own. Some meadows have no nectar; action masks
-exclude these.
+Learners with fixed rosters find such agents hardest. The model has a loop, a clock and rules of its
+own. Some meadows have no nectar; action masks exclude these.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measures the intervals of ``evaluate``: how often they contain the truth, and how often equal contenders differ.
+"""Measure the intervals of ``evaluate``: their coverage, and how often equal contenders differ.
 
 From the repository's root:
 
@@ -32,7 +32,7 @@ CONFIDENCE = 0.95
 
 
 def measure(name: str, number: int, repetitions: int) -> tuple[float, float, float]:
-    """Return the coverage of the mean, the share of unknown intervals, and the share of false differences."""
+    """Return the coverage of the mean and the shares of unknown intervals and false differences."""
     generator, (mean, draw) = np.random.default_rng(number), DISTRIBUTIONS[name]
     covered, unknown, different, known = 0, 0, 0, 0
     for _ in range(repetitions):

@@ -99,7 +99,7 @@ class Measured:
         return list(dict.fromkeys(test for tests in found for test in self.ordered(tests)))
 
     def ordered(self, found: set[str]) -> list[str]:
-        """Sort tests into the order in which they should run: some quick ones of each file first."""
+        """Sort tests into their running order: some quick ones of each file first."""
         by_file: dict[str, list[str]] = {}
         for test in self.seconds:
             if test in found:
@@ -182,7 +182,7 @@ def modules() -> list[str]:
 
 
 def draw(number: int, seed: int, only: str = "", kind: str = "") -> list[Mutant]:
-    """Draw mutants: from each module in proportion to its candidates, at least one, and evenly from all kinds."""
+    """Draw mutants: by each module's number of candidates, at least one, evenly by kind."""
     found = {
         path: candidates(path, (ROOT / PACKAGE / path).read_text(encoding="utf-8"))
         for path in modules()
@@ -238,7 +238,7 @@ def environment(folder: Path, **more: Path) -> dict[str, str]:
 
 
 def measure(cache: Path) -> Measured:
-    """Run all tests and measure which lines they execute, unless the cache has the same sources and tests."""
+    """Measure the lines that each test executes, or load them for the same sources and tests."""
     digest = hashlib.sha256()
     for path in sorted([*ROOT.glob("src/**/*.py"), *ROOT.glob("tests/**/*.py")]):
         digest.update(path.read_bytes())
@@ -332,7 +332,7 @@ def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
 
 
 def covered(data: Path, folder: Path) -> Iterator[tuple[str, int, list[str]]]:
-    """Iterate over the modules and lines that a file of Coverage.py has, with the contexts of each."""
+    """Iterate over the modules and lines of a Coverage.py file, with the contexts of each line."""
     from coverage import CoverageData
 
     measured = CoverageData(str(data))
@@ -438,7 +438,7 @@ def outcome(mutant: Mutant, folder: Path, measured: Measured, most: float) -> di
 
 
 def write(path: Path, text: str) -> None:
-    """Write a module, and delete its compiled files, as timestamps do not show changes within a second."""
+    """Write a module and delete its compiled files: timestamps miss changes within a second."""
     for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
         compiled.unlink(missing_ok=True)
     path.write_text(text, encoding="utf-8")

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 COPIES = {"duplicate", "deepcopy", "copy", "list", "dict", "set", "array"}
 """Functions that copy their first argument."""
 CLEAN_UPS = {
-    "cancel", "clear", "close", "discard", "join", "kill", "pop", "popitem", "release", "remove", "shutdown",
-    "terminate", "unlink",
+    "cancel", "clear", "close", "discard", "join", "kill", "pop", "popitem", "release", "remove",
+    "shutdown", "terminate", "unlink",
 }  # fmt: skip
 """Methods that clean up."""
 COMPARISONS: dict[type[ast.cmpop], str] = {
-    ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
-    ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in",
+    ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==",
+    ast.Is: "is not", ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in",
 }  # fmt: skip
 SIMPLE = (
     ast.Assign,
@@ -144,7 +144,7 @@ class Drawer:
         lines: tuple[int, int],
         function: tuple[int, int],
     ) -> Iterator[Mutant]:
-        """Yield the mutants of a statement as a whole: it is dropped, or swapped with the next one."""
+        """Yield the mutants of a whole statement: it is dropped, or swapped with the next one."""
         kind = "clean-up" if puts_away(statement) else "dropped"
         yield Mutant(self.module, kind, self.span(statement), "pass", lines, function)
         if rest and isinstance(rest[0], SIMPLE) and counts(rest[0]) and depend(statement, rest[0]):
@@ -157,7 +157,7 @@ class Drawer:
             )
 
     def of_expressions(self, statement: ast.stmt) -> Iterator[tuple[str, tuple[int, int], str]]:
-        """Yield the mutants of a statement's own expressions, without those of the statements in it."""
+        """Yield the mutants of a statement's own expressions, without its inner statements."""
         if isinstance(statement, ast.If | ast.While) and not isinstance(
             statement.test, ast.Constant
         ):
@@ -200,7 +200,7 @@ class Drawer:
 
 
 def head(statement: ast.stmt) -> int:
-    """Return the last line of a statement's head, which is the whole statement if it contains no others."""
+    """Return the last line of a statement's head: of the whole statement without inner ones."""
     inner = [block[0].lineno for block in blocks(statement) if block]
     return (
         max(statement.lineno, min(inner) - 1) if inner else statement.end_lineno or statement.lineno
@@ -208,7 +208,10 @@ def head(statement: ast.stmt) -> int:
 
 
 def counts(statement: ast.stmt) -> bool:
-    """Tell whether a change of a statement can be a mistake, and does not concern names, types or texts alone."""
+    """Tell whether a change of a statement can be a mistake.
+
+    A change of names, types or texts alone cannot be one.
+    """
     if isinstance(
         statement, ast.Import | ast.ImportFrom | ast.Global | ast.Nonlocal | ast.Pass | ast.Assert
     ):

@@ -1,4 +1,4 @@
-"""A pytest plugin for ``tools.mutants``: it records the durations of tests, and runs chosen tests in a given order.
+"""A pytest plugin for ``tools.mutants``, which times tests and runs chosen tests in a given order.
 
 Three environment variables with the name of a file each control it. To ``MUTANTS_NOTE`` it writes
 each test's name, outcome and seconds. ``MUTANTS_TESTS`` is a JSON object that maps the names of the

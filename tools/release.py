@@ -1,6 +1,7 @@
-"""Checks what is released: the changelog, the citation and the built files name the version, which stands in one place.
+"""Check a release: the changelog, the citation and the built files name its version.
 
-``make release`` builds and tests the wheel and the source distribution, and then runs this.
+The version stands in one place. ``make release`` builds and tests the wheel and the source
+distribution, and then runs this.
 """
 
 from __future__ import annotations

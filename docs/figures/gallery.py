@@ -73,7 +73,7 @@ def room() -> Any:
 
 
 def follower() -> Any:
-    """Draw the follower's distance to its leader, by its rule, and when it drives at half the speed."""
+    """Draw the follower's distance to its leader: by its rule, and at half the speed."""
     from examples.ros_follower import env as ros
 
     def slower(observation: np.ndarray) -> list[float]:

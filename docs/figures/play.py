@@ -1,6 +1,6 @@
-"""Plays the greenhouse in two browsers, for the figures of docs/play.md. Run it from the repository's root.
+"""Play the greenhouse in two browsers, for the figures of docs/play.md.
 
-It needs Playwright, and Chromium at ``/usr/bin/chromium``.
+Run it from the repository's root. It needs Playwright, and Chromium at ``/usr/bin/chromium``.
 """
 
 import re

@@ -1,22 +1,21 @@
-"""A model of a pension company and its clients over decades, in monthly steps. It contains no reinforcement learning.
+"""A model of a pension company and its clients over decades, in monthly steps.
 
-People join, pay premiums, change jobs, retire, transfer their rights to another fund, and die. A
-right is an accrued yearly pension, paid for life. The *coverage* is the ratio of assets to
-*provisions*, the value of all rights.
+It contains no reinforcement learning. People join, pay premiums, change jobs, retire, transfer
+their rights to another fund, and die. A right is an accrued yearly pension, paid for life. The
+*coverage* is the ratio of assets to *provisions*, the value of all rights.
 
 **Decisions**, each of them a method with a plausible rule:
 
-========================= ====================
-===================================================================== ``Company.set_premium``    client, yearly       the premium, as a share of a client's wage
-``Company.choose_indexation``       yearly      the increase of all rights
-``Company.choose_cut``              yearly      the cut of all rights in a shortfall
-``Manager.choose_mix``              quarterly   the share of the assets in equities
-``Regulator.choose_demand``         yearly      the cut below which a recovery plan is denied
-``Client.choose_to_join``  once                 whether to become a client
-``Client.choose_extra``    yearly               the contribution beyond the standard
-``Client.choose_to_leave`` with a new job       whether to transfer the rights to another fund
-========================= ====================
-=====================================================================
+============================= ============== ==============================================
+``Company.set_premium``       client, yearly the premium, as a share of a client's wage
+``Company.choose_indexation`` yearly         the increase of all rights
+``Company.choose_cut``        yearly         the cut of all rights in a shortfall
+``Manager.choose_mix``        quarterly      the share of the assets in equities
+``Regulator.choose_demand``   yearly         the cut below which a recovery plan is denied
+``Client.choose_to_join``     once           whether to become a client
+``Client.choose_extra``       yearly         the contribution beyond the standard
+``Client.choose_to_leave``    with a new job whether to transfer the rights to another fund
+============================= ============== ==============================================
 
 ``python -m examples.fin_base.pension --clients 10000 --years 40`` prints the fund's results, and
 how fast it runs.
@@ -87,7 +86,7 @@ class Fund:
         calendar.every(12, self.company.conclude_year, start=12)
 
     def _populate(self) -> None:
-        """Create the first clients, with the age distribution of people who joined at 25 and died by the mortality."""
+        """Create the first clients: survivors, by the mortality, of people who joined at 25."""
         alive, weights = 1.0, []
         for age in range(25 * 12, 100 * 12):
             alive *= 1 - self._deaths[age]
@@ -211,7 +210,7 @@ class Fund:
         self.company.review(client)
 
     def run(self, months: int) -> None:
-        """Simulate months, and check at the end of each year and of the run that money is conserved."""
+        """Simulate months, and check conservation of money at the end of each year and the run."""
         for _ in range(months):
             self.advance()
             if self.world.month % 12 == 0:

@@ -142,7 +142,7 @@ CASE: Final = make_step(
 
 
 def named(definition: Definition) -> Definition:
-    """Change a definition to fixed actions, those of ``CHOICES``, with a mask of the lawful ones."""
+    """Change a definition to the fixed actions ``CHOICES``, with a mask of the lawful ones."""
     return replace(
         definition,
         choices=None,
@@ -217,7 +217,7 @@ class CollectionSim(SimulationInterface):
         return self.agency.world.month
 
     def reseed(self, seed: int) -> None:
-        """Draw another future, for the present debtors and, by the world's seed, for those to come."""
+        """Draw another future for the present debtors and, by the world's seed, for later ones."""
         self.agency.world.seed = seed
         reseed_generators(self, seed)
 
@@ -226,7 +226,10 @@ class CollectionSim(SimulationInterface):
         return [(self.agency, debtor, self.agency.lawful(debtor)) for debtor in self.agency.queue]
 
     def state(self) -> NDArray[np.float32]:
-        """Summarise all cases: what the agency knows, and the debtors' money and willingness, which it does not."""
+        """Summarise all cases, with the debtors' money and willingness.
+
+        The agency knows neither their money nor their willingness.
+        """
         agency = self.agency
         cases = list(agency.cases.values())
         statuses = [debtor.status for debtor in cases]

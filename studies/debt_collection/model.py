@@ -9,15 +9,14 @@ the ``World`` is one day here, not one month.
 working day. It returns one of the ``choices``, which ``Agency.lawful`` lists: what the law, today's
 staff and the agency's money allow.
 
-========= ====================================
-============================================================ choice    cost                                 the case is due again
-========= ====================================
-============================================================ "leave"   none                                 after a week
-"write"   ``POSTAGE``                          after two weeks
-"call"    ``CALL`` and one of the day's calls  after a week; without an answer, later on the same day
-"sue"     ``FEE``                              never: the court decides
-========= ====================================
-============================================================
+======= =================================== ======================================================
+choice  cost                                the case is due again
+======= =================================== ======================================================
+"leave" none                                after a week
+"write" ``POSTAGE``                         after two weeks
+"call"  ``CALL`` and one of the day's calls after a week; without an answer, later on the same day
+"sue"   ``FEE``                             never: the court decides
+======= =================================== ======================================================
 
 **Utility.** ``Agency.profit``: the money collected less all costs, when all cases are closed or
 after two years. The agency buys debts in the first half year only, so two years show how their
@@ -69,10 +68,10 @@ PAUSES: Final = {"leave": 7, "write": 14, "call": 7, "sue": 0}
 """The number of days until a case is due again, by choice."""
 
 CALL_LIMIT, QUIET, VALIDATION, LIMITATION = 7, 7, 37, 4 * 365
-"""The law: calls in ``QUIET`` days, days without calls after a conversation, the validation period, the limitation."""
+"""The law: calls in ``QUIET`` days, quiet after a conversation, validation and limitation."""
 
 VERIFICATION, KEPT, MONTH, HALF_LIFE = 21, 365, 30, 240
-"""Days: for a verification, until a write-off, between two wages, until the probability of a payment has halved."""
+"""Days: verification, until a write-off, between wages, half-life of a payment's probability."""
 
 ACTIVE: Final = ("open", "disputed", "plan", "court", "judged")
 """The states of a case that is not closed. The agency decides on cases that are "open"."""
@@ -201,7 +200,7 @@ class Debtor(Entity):
         return max(1, round(0.8 * (self.wage - self.living))) if self.employed else 1
 
     def live(self) -> None:
-        """Simulate a payday: keep or lose the job, earn, spend, become insolvent, or pay the debt voluntarily."""
+        """Simulate a payday: keep or lose the job, earn, spend, become insolvent, or pay."""
         if self.status not in ACTIVE:
             return
         draw, world, garnished = self.life, self.world, self.status == "judged"
@@ -220,7 +219,10 @@ class Debtor(Entity):
         self.respond(0.1)
 
     def receive(self) -> None:
-        """Read a letter: dispute the debt after the first letter, or respond, less likely to each further letter."""
+        """Read a letter: dispute the debt after the first letter, or respond.
+
+        A response is less likely to each further letter.
+        """
         if self.status == "open" and self.letters == 1 and self.draw.random() < 0.04:
             self.status = "disputed"
             self.world.calendar.at(self.world.month + VERIFICATION, self.verify)
@@ -320,7 +322,7 @@ class Agency(Entity):
             self.world.calendar.at(int(time), self.buy, time)
 
     def advance(self) -> None:
-        """Simulate one day: the agency's work, then the debtors' events, then the payments that are due."""
+        """Simulate one day: the agency's work, the debtors' events, and the payments due."""
         self.work()
         self.world.advance()
 

@@ -41,7 +41,9 @@ def prefer(*wanted: str) -> Any:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """A threshold policy: it calls about debts of enough worth, which is the amount, halved per ``HALF_LIFE`` of age.
+    """A threshold policy: it calls about debts of enough worth.
+
+    The worth is the amount, halved per ``HALF_LIFE`` of age.
 
     Attributes:
         letters: The number of letters after which it sends no more.

@@ -1,4 +1,4 @@
-"""Learning by evolution (CMA-ES), which several examples share: it needs only the returns of a policy's weights."""
+"""Evolution (CMA-ES) for several examples: it needs only the returns of a policy's weights."""
 
 from __future__ import annotations
 

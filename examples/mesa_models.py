@@ -1,4 +1,6 @@
-"""Mesa's own example models as environments: the models are unchanged, and each function below is all that one needs.
+"""Mesa's own example models, unchanged, as environments.
+
+Each function below contains the complete definition of one environment.
 
 ``python -m examples.mesa_models`` runs each model without an environment and as an AEC environment
 with ``RULE`` as every action, and compares the final states of the two models. It then plays random
@@ -233,7 +235,7 @@ def wolf_sheep() -> Example:
 
 
 def alliance_formation() -> Example:
-    """One agent decides for each pair whether it joins, as this model's own agents have no behaviour."""
+    """One agent decides for each pair whether it joins: the model's agents have no behaviour."""
     worth = MultiLevelAllianceModel.calculate_shapley_value  # the rule
     join = make_step(
         observation_space=Box(0, np.inf, (4,), np.float32),
@@ -245,7 +247,10 @@ def alliance_formation() -> Example:
         reward_mapping=difference(lambda model, pair: max(agent.power for agent in model.agents)),
         agent="matchmaker_0",
     )
-    name = "mesa.examples.advanced.alliance_formation.model.MultiLevelAllianceModel.calculate_shapley_value"
+    name = (
+        "mesa.examples.advanced.alliance_formation.model."
+        "MultiLevelAllianceModel.calculate_shapley_value"
+    )
     return MultiLevelAllianceModel, {name: join}, {}
 
 
@@ -256,8 +261,8 @@ Then only ``examples.wolf_sheep`` runs it.
 """
 
 EXAMPLES: Final = (
-    boltzmann_wealth, schelling, boid_flockers, conways_game_of_life, virus_on_network, epstein_civil_violence, pd_grid,
-    sugarscape, wolf_sheep, alliance_formation,
+    boltzmann_wealth, schelling, boid_flockers, conways_game_of_life, virus_on_network,
+    epstein_civil_violence, pd_grid, sugarscape, wolf_sheep, alliance_formation,
 )  # fmt: skip
 
 
@@ -299,12 +304,12 @@ def fingerprint(simulation: SteppedSimulation) -> str:
 
 
 def positions(agent: Any) -> Any:
-    """Return the position of an agent in a continuous space, which is not an attribute in its ``vars``."""
+    """Return the position of an agent in a continuous space, which its ``vars`` lack."""
     return plain(agent.position) if hasattr(agent, "space") else None
 
 
 def plain(value: Any) -> Any:
-    """Make a value comparable: objects that are neither numbers nor names count by their coordinate or their type."""
+    """Make a value comparable: numbers and names stay, objects become coordinates or types."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -315,7 +320,10 @@ def plain(value: Any) -> Any:
 
 
 def run_plainly(example: Example, seed: int) -> str:
-    """Run a model without an environment, after seeding the global generators, and return its final state."""
+    """Run a model without an environment, after seeding the global generators.
+
+    It returns the final state.
+    """
     simulation = stepped(example[0])
     random.seed(seed)
     np.random.seed(seed)

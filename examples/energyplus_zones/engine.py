@@ -107,7 +107,7 @@ class Engine:
         return len(self._actuators) - 1
 
     def at_begin_of_step(self, function: Callable[[], Any]) -> None:
-        """Register a function that runs before EnergyPlus predicts the heating loads of a time step."""
+        """Register a function that runs before EnergyPlus predicts a step's heating loads."""
         self._call_back("callbackBeginTimeStepBeforePredictor", function)
 
     def at_end_of_step(self, function: Callable[[], Any]) -> None:
@@ -201,7 +201,7 @@ class Engine:
         return hours
 
     def results(self) -> str:
-        """Read EnergyPlus's output of the run, without the line that contains the time of the run."""
+        """Read EnergyPlus's output of the run, without the first line, which has a timestamp."""
         return (self.folder / "eplusout.eso").read_text().partition("\n")[2]
 
     def close(self) -> None:

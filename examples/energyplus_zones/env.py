@@ -136,7 +136,9 @@ def raw_env(**options: Any) -> SimulationAECEnv:
 
 
 def env(**options: Any) -> OrderEnforcingWrapper[str, Any, Any]:
-    """Make the environment of both agents in PettingZoo's wrappers, which report wrong use and clip actions.
+    """Make the environment of both agents in PettingZoo's wrappers.
+
+    The wrappers report wrong use and clip actions.
 
     Args:
         **options: The options of ``simenv_marl.aec_env``.

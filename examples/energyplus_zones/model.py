@@ -1,4 +1,4 @@
-"""A model on top of EnergyPlus: two rooms, the people in them, and the cost of heating and discomfort.
+"""A model on top of EnergyPlus: two rooms, their occupants, the cost of heating and discomfort.
 
 It contains no reinforcement learning: ``python -m examples.energyplus_zones.model`` runs it by its
 own rule.

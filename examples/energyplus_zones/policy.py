@@ -1,6 +1,7 @@
-"""A presence-based policy: the colder the room is, the earlier it heats. A comparison with the model's time switch.
+"""A presence-based policy: the colder the room is, the earlier it heats.
 
-``python -m examples.energyplus_zones.policy`` compares both on the same days.
+The model's own policy is a time switch. ``python -m examples.energyplus_zones.policy`` compares
+both on the same days.
 """
 
 from __future__ import annotations

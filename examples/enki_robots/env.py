@@ -1,7 +1,7 @@
-"""Environments made from e-pucks that sweep an arena: each robot is an agent. The simulator is Enki, in C++.
+"""Environments made from e-pucks that sweep an arena: each robot is an agent.
 
-``robots.cpp`` is the model, which runs in a process of its own. Robots come in pairs and leave in
-mid-episode.
+The simulator is Enki, in C++. ``robots.cpp`` is the model, which runs in a process of its own.
+Robots come in pairs and leave in mid-episode.
 
 - ``robots``: the simulation.
 - ``raw_env`` and ``parallel_env``: the PettingZoo environments.
@@ -63,7 +63,10 @@ def program(folder: Path = HERE / "out") -> Path:
 
 
 def observe(call: Any) -> NDArray[np.float32]:
-    """Observe a robot: four sensors in thousands, two distances in metres, two angles in radians, the charge."""
+    """Observe a robot: four sensors, two distances, two angles and the charge.
+
+    Sensors are in thousands, distances in metres, and angles in radians.
+    """
     (other, to_other), (dirt, to_dirt) = call.other, call.dirt
     sensors = np.asarray(call.sensors) / 1000
     return np.array(

@@ -1,1 +1,1 @@
-"""Building blocks for models of financial entities, and two models built on them: a pension fund, a debt collector."""
+"""Building blocks for financial models, and two such models: a pension fund, a debt collector."""

@@ -1,4 +1,4 @@
-"""Building blocks for models of financial entities: entities, money, contracts, requests, a calendar.
+"""Building blocks for financial models: entities, money, contracts, requests, a calendar.
 
 Time is an integer number of months, and money an integer number of cents. ``World.advance``
 simulates one month.
@@ -31,7 +31,7 @@ class Shortage(ValueError):
 
 
 class World:
-    """The shared state of a model: the month, the ledger, the calendar, entities, and the contracts in force."""
+    """The shared state of a model: month, ledger, calendar, entities, contracts in force."""
 
     def __init__(self, seed: int | None = None) -> None:
         """Make an empty world; without a seed, a new one each time."""
@@ -47,7 +47,7 @@ class World:
         self.outside.may_owe = True
 
     def stream(self, name: str) -> Random:
-        """Make a generator for one purpose, which depends on the world's seed and the name of the purpose alone."""
+        """Make a generator for one purpose, from the world's seed and the purpose's name alone."""
         return Random(f"{self.seed}/{name}")
 
     def next_id(self, kind: str) -> int:
@@ -72,7 +72,7 @@ class World:
                 contract.perform()
 
     def check(self) -> None:
-        """Check that no cent has appeared or vanished, and that no entity but ``outside`` owes money."""
+        """Check that no cent has appeared or vanished, and that only ``outside`` owes money."""
         total = 0
         for entity in self.entities.values():
             cents = entity.cents
@@ -110,7 +110,7 @@ class Entity:
 
 
 class Ledger:
-    """The ledger, which moves money between entities: each cent that one entity receives, another one has paid.
+    """The ledger, which moves money between entities: each received cent is a paid cent.
 
     Attributes:
         flows: The cents moved so far, by reason.
@@ -142,7 +142,7 @@ class Ledger:
 
 
 def share(cents: int, weights: Sequence[int]) -> list[int]:
-    """Divide money in proportion to weights, by the largest remainder method: the parts sum to the whole."""
+    """Divide money in proportion to weights, by largest remainders: the parts sum to the whole."""
     total = sum(weights)
     if total <= 0 or cents < 0 or min(weights) < 0:
         raise ValueError(f"{cents} cents cannot be divided by weights that sum up to {total}")
@@ -156,7 +156,7 @@ def share(cents: int, weights: Sequence[int]) -> list[int]:
 
 @dataclass(slots=True, weakref_slot=True, eq=False)
 class Contract:
-    """A contract: one party pays another a fixed amount at regular intervals, from a start to an end."""
+    """A contract: one party pays another a fixed amount at regular intervals, from start to end."""
 
     debtor: Entity
     creditor: Entity

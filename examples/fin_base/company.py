@@ -40,7 +40,7 @@ class Manager(Entity):
         return self.equities if self.company.policy_coverage() < MINIMUM else 1.0
 
     def choose_mix(self) -> float:
-        """Choose the share of equities: 40 %, or 30 % while coverage is below 100 %, within what is lawful."""
+        """Choose the lawful share of equities: 40 %, or 30 % while coverage is below 100 %."""
         return min(
             0.4 if self.company.policy_coverage() >= TRANSFERABLE else 0.3, self.lawful_mix()
         )
@@ -56,7 +56,7 @@ class Regulator(Entity):
     kind = "regulator"
 
     def choose_demand(self, company: Company) -> float:
-        """Choose the cut of rights to demand: a tenth of the shortfall, if it is critical or has lasted too long."""
+        """Choose the cut of rights to demand: a tenth of a critical or long shortfall, or none."""
         due = company.policy_coverage() < CRITICAL or company.measured_short >= MEASUREMENTS
         return company.shortfall() / SPREAD if due else 0.0
 
@@ -96,7 +96,7 @@ class Company(Entity):
         return self._factors[OLDEST - 1 - age]
 
     def provisions(self) -> float:
-        """The value of all rights, in cents: a product of sums of rights, by month of birth, and factors."""
+        """The value of all rights, in cents: sums of rights by month of birth, times factors."""
         if self._provisions is None:
             youngest = self.world.month
             self._provisions = sum(
@@ -129,7 +129,7 @@ class Company(Entity):
         )
 
     def repair(self) -> float:
-        """The lawful growth of rights in addition to inflation: a fifth of the gap, if coverage is as required."""
+        """The lawful growth of rights beyond inflation: a fifth of the gap, at enough coverage."""
         behind = self.market.price_level / max(self.indexed, 1e-9) - 1
         return max(0.0, behind) / 5 if self.policy_coverage() >= REQUIRED else 0.0
 
@@ -142,18 +142,21 @@ class Company(Entity):
         )
 
     def set_premium(self, client: Client) -> float:
-        """Choose a premium, as a share of the wage: the accrual's cost, and 5 % (or 15 or -10 %) of it for solvency."""
+        """Choose a premium, as a share of the wage: the accrual's cost and a solvency surcharge.
+
+        The surcharge is 5 % of the cost, 15 % in a shortfall, and -10 % at a high coverage.
+        """
         coverage = self.policy_coverage()
         surcharge = 1.15 if coverage < MINIMUM else 0.9 if coverage > REQUIRED + 0.15 else 1.05
         return surcharge * self.cost_rate(client) * (1 + client.extra)
 
     def choose_indexation(self) -> float:
-        """Choose the indexation of rights: it rises linearly from zero at 110 % to the lawful maximum at 130 %."""
+        """Choose the indexation of rights: linear from 0 at 110 % to the legal maximum at 130 %."""
         step = (self.policy_coverage() - INDEXING) / 0.2
         return self.lawful_indexation() * min(max(step, 0.0), 1.0)
 
     def choose_cut(self) -> float:
-        """Choose the cut of rights in a shortfall: a tenth of the shortfall, from the third measurement on."""
+        """Choose the cut of rights: a tenth of the shortfall, from the third measurement on."""
         return self.shortfall() / SPREAD if self.measured_short >= 3 else 0.0
 
     def book_right(self, born: int, cents: int) -> None:

@@ -25,7 +25,7 @@ OLDEST = 120 * 12
 """The maximum age in months, which no person survives."""
 
 STEP = 0.0025
-"""The rounding of the yield at which provisions are valued: there is a table of annuity factors for each step."""
+"""The rounding of the yield that values provisions: each step has a table of annuity factors."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,10 @@ class Mortality:
 
 @lru_cache(maxsize=256)
 def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[float, ...]:
-    """Compute the value of a pension of 1 a year, paid monthly for life from retirement on, at a yield in ``STEP``.
+    """Compute the value of a lifelong pension of 1 a year, paid monthly from retirement on.
 
-    The values are by age in months, from ``OLDEST - 1`` *down to* 0, that is, in the order of
-    birth.
+    The yield is ``steps`` times ``STEP``. The values are by age in months, from ``OLDEST - 1``
+    *down to* 0, that is, in the order of birth.
     """
     discount = (1 + STEP * steps) ** (-1 / 12)
     value, values = 0.0, []
@@ -84,7 +84,7 @@ class Climate:
 
 
 class Market:
-    """The market in monthly steps: annual inflation and yield, the price level, and the returns of the last month."""
+    """The market in monthly steps: annual inflation and yield, price level, monthly returns."""
 
     DURATION = 12.0  # of bonds, in years
 
@@ -128,7 +128,7 @@ def _revert(value: float, mean: float, memory: float) -> float:
 
 
 def _monthly_sd(long_run: float, memory: float) -> float:
-    """Return the standard deviation of monthly shocks that gives the process this long-run standard deviation."""
+    """Return the standard deviation of monthly shocks, given the process's in the long run."""
     return long_run * sqrt(1 - memory ** (1 / 6))
 
 

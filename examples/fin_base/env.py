@@ -1,4 +1,4 @@
-"""Environments made from the pension fund: agents for its decisions, with observations, actions and rewards.
+"""Environments made from the pension fund: agents, observations, actions and rewards.
 
 The model itself does not refer to this module: the module names the model's methods as decision
 points.
@@ -101,7 +101,7 @@ def look_at(company: Company) -> tuple[float, ...]:
 
 
 def company_of(*call: Any) -> Company:
-    """Find the company in a single agent's call: the last argument itself, or that argument's company."""
+    """Find the company in a single agent's call: the last argument, or that argument's company."""
     last = call[-1]
     return last if isinstance(last, Company) else last.company
 
@@ -137,7 +137,10 @@ welfare: Final = difference(total_welfare)
 
 
 def premium_reward(company: Company, client: Client) -> float:
-    """Reward years without a shortfall less the premium: ten per cent of the wage cost a fifth of a sound year."""
+    """Reward years without a shortfall, less the premium.
+
+    Ten per cent of the wage cost a fifth of a sound year.
+    """
     coverage = company.policy_coverage()
     sound = 1.0 if coverage >= MINIMUM else 1.0 - 10 * (MINIMUM - coverage)
     return sound - 2 * client.premium
@@ -268,7 +271,7 @@ TEAM: Final[dict[Any, Definition]] = {
         "regulator_0", CUTS, apply=cut, rule_action_mapping=was_cut
     ),
 }
-"""Indexation in good years, cuts in a shortfall, the asset mix, and the regulator's demand in a shortfall."""
+"""Indexation in good years, cuts in a shortfall, the asset mix, and the regulator's demand."""
 
 
 # -- the simulation -------------------------------------------------------------------------------
@@ -327,7 +330,7 @@ class FundSim(SimulationInterface):
         fund.people.seed(f"{seed}/people")
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Return the calls to come at a decision point: those of the company, its manager and its regulator."""
+        """Return the calls to come at a point: of the company, its manager and its regulator."""
         company = self.fund.company
         callers = {
             "Company": (company,),

@@ -70,7 +70,7 @@ class Contribution(Request):
     extra: float
 
     def objection(self) -> str | None:
-        """Deny clients who do not work, and increases that are unlawful or that the client cannot afford."""
+        """Deny clients without work, and increases that are unlawful or exceed their means."""
         client = self.applicant
         if client.status != "working":
             return "not working"
@@ -90,7 +90,7 @@ class Transfer(Request):
     """A client's request to transfer the value of the accrued rights to another fund."""
 
     def objection(self) -> str | None:
-        """Deny pensioners, transfers while coverage is too low, and values that the company cannot pay."""
+        """Deny pensioners, transfers at low coverage, and values beyond the company's means."""
         client = self.applicant
         if client.status == "retired":
             return "retired"
@@ -108,7 +108,7 @@ class Transfer(Request):
 
 @dataclass
 class RecoveryPlan(Request):
-    """A company's proposal to the regulator, in a shortfall: by how much to cut rights this year."""
+    """A company's proposal to the regulator in a shortfall: this year's cut of rights."""
 
     cut: float
     demand: float
@@ -169,7 +169,7 @@ class Client(Entity):
         return self.world.month - self.born
 
     def choose_to_join(self) -> bool:
-        """Decide whether to become a client: yes, if coverage is high enough for the candidate's caution."""
+        """Decide whether to become a client: coverage must suffice for the candidate's caution."""
         return self.company.policy_coverage() >= 0.75 + 0.3 * self.caution
 
     def choose_extra(self) -> float:
@@ -189,7 +189,7 @@ class Client(Entity):
         return EXTRAS[step]
 
     def choose_to_leave(self) -> bool:
-        """Decide whether to transfer the rights: yes, if they are small, or coverage is too low for the caution."""
+        """Decide whether to transfer the rights: if small, or at low coverage for the caution."""
         little = self.accrued < 2 * ACCRUAL * self.wage
         return little or self.company.policy_coverage() < 0.85 + 0.3 * self.caution
 

@@ -1,4 +1,4 @@
-"""Train policies of the pension fund: one for the asset mix, and one for the indexation of pensions.
+"""Train policies of the pension fund: for the asset mix, and for the indexation of pensions.
 
 ``python -m examples.fin_base.train`` trains the pair by evolution (CMA-ES) in small funds, and
 compares it with the model's rules in funds that it has not been trained on, by the members'
@@ -48,7 +48,7 @@ def nearest_lawful(level: int, mask: NDArray[np.int8]) -> int:
 
 @dataclass(frozen=True)
 class Linear:
-    """A linear policy: the logistic function turns a weighted sum of the observations into a level."""
+    """A linear policy: the logistic function of a weighted sum of the observations is the level."""
 
     weights: tuple[float, ...]  # one for each observed number, in units of SPREAD, then a constant
 
@@ -84,7 +84,7 @@ Rate = Callable[[Iterable[Policies], Iterable[int]], NDArray[np.float64]]
 def rate(
     world: Any, points: Any, workers: int, contenders: Iterable[Policies], seeds: Iterable[int]
 ) -> Any:
-    """Compute the mean welfare of each of several policies of some decision points, on the same seeds."""
+    """Compute the mean welfare of several policies of some decision points, on the same seeds."""
     named = {str(number): policies for number, policies in enumerate(contenders)}
     found = evaluate(
         world, named, seeds=seeds, points=points, metric=FundSim.welfare, workers=workers

@@ -43,7 +43,7 @@ class Account:
         self._lived = 0.0
 
     def right(self) -> float:
-        """The purchasing power of a right that was 1 in the first month, in prices of that month."""
+        """The purchasing power of a right of 1 from the first month, in prices of that month."""
         return self.fund.company.indexed / self.fund.company.market.price_level
 
     def close_year(self) -> None:
@@ -61,7 +61,7 @@ class Account:
         self._lived += utility
 
     def close_for_ever(self, years: float) -> None:
-        """Account for years after the end of the fund, in which members live on the minimum income."""
+        """Account for years after the fund's end: members live on the minimum income."""
         self._lived += years * log(LEAST)
 
     def welfare(self) -> float:

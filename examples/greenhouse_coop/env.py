@@ -139,7 +139,7 @@ def from_litres(litres: float) -> list[float]:
 
 
 def exchange_air(action: Any, greenhouse: Greenhouse) -> None:
-    """Exchange the fraction of the air that the ventilator's action says, in place of the model's fixed 20 %."""
+    """Exchange the ventilator's fraction of the air, in place of the model's fixed 20 %."""
     fraction = to_fraction(action)
     greenhouse.humidity = (
         1 - fraction
@@ -147,7 +147,10 @@ def exchange_air(action: Any, greenhouse: Greenhouse) -> None:
 
 
 def usual_exchange(nothing: None, greenhouse: Greenhouse) -> list[float]:
-    """Return the action of the model's rule: a fixed 20 %, which the model's function applies and does not return."""
+    """Return the action of the model's rule: a fixed 20 %.
+
+    The model's function applies this action and does not return it.
+    """
     return [0.2]
 
 
@@ -259,12 +262,15 @@ def raw_env(**options: Any) -> SimulationAECEnv:
 
 
 def env(**options: Any) -> OrderEnforcingWrapper[str, Any, Any]:
-    """Make the environment of both agents in PettingZoo's wrappers, which report wrong use and clip actions."""
+    """Make the environment of both agents in PettingZoo's wrappers.
+
+    The wrappers report wrong use and clip actions.
+    """
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(raw_env(**options)))
 
 
 def parallel_env(**options: Any) -> SimulationParallelEnv:
-    """Make the parallel environment, in which both agents decide each day without seeing each other's decision."""
+    """Make the parallel environment: each day, both agents decide without seeing the other act."""
     return simenv_marl.parallel_env(GreenhouseSim, **options)
 
 
@@ -277,7 +283,7 @@ def joint_env(**options: Any) -> SimulationJointEnv:
 
 
 def _register() -> None:
-    """Register the environments with Gymnasium and PettingZoo, unless they are registered already."""
+    """Register the environments with Gymnasium and PettingZoo, unless they already are."""
     for name in ("Watering", "Ventilation", "Joint"):
         if f"greenhouse_coop/{name}-v0" not in gymnasium.registry:
             gymnasium.register(f"greenhouse_coop/{name}-v0", f"{__name__}:{name.lower()}_env")

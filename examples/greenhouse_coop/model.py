@@ -74,7 +74,7 @@ class Greenhouse:
         self.temp = min(max(temp, LOWEST_TEMPERATURE), HIGHEST_TEMPERATURE)
 
     def update_humidity(self) -> None:
-        """Let water evaporate from the pots into the air: the warmer and drier the air, the more."""
+        """Let water evaporate from the pots: the warmer and drier the air, the more."""
         portion = self.temp / 100 * (1 - self.humidity)
         vapour = 0.0
         # no min() or max() in the loop over plants, because they would take half of the run time

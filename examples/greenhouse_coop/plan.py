@@ -43,7 +43,10 @@ def days_left(env: Any) -> float:
 
 
 class CountingPlanner(RolloutPolicy):
-    """A planner that reports, as the extra ``days`` of each action, how many days its branches have simulated."""
+    """A planner that reports the number of days that its branches have simulated.
+
+    The number is the extra ``days`` of each action.
+    """
 
     def __init__(self, actions: Sequence[float], horizon: int, **options: Any) -> None:
         """Make a planner.

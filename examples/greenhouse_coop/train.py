@@ -203,7 +203,7 @@ ONE_TRAINED, BOTH_TRAINED = "watering trained", "both trained"
 """Titles of the teams that are trained."""
 
 Curves = dict[str, list[NDArray[np.float64]]]
-"""By the title of each team that was trained, the mean return of each candidate of each generation."""
+"""By the title of each trained team, the mean return of each candidate of each generation."""
 
 
 def compare(

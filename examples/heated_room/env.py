@@ -1,4 +1,4 @@
-"""An environment made from the heated room: the agent sets the power of the heater every quarter of an hour.
+"""An environment made from the heated room: the agent sets the heater's power each quarter hour.
 
 Observations and actions have the names of the unit's variables. The reward is minus the cost since
 the previous decision: of energy, which is half as expensive at night, and of each degree below 20

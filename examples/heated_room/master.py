@@ -68,10 +68,11 @@ def spaces_of(
     names: Collection[str],
     bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> spaces.Dict:
-    """Return the spaces of scalar variables by name, from the bounds of the variables or of their declared types.
+    """Return the spaces of scalar variables by name.
 
-    ``bounds`` contains the bounds of variables that have none, or others. A real variable has a
-    ``Box`` of shape ``(1,)``, in its unit, and any other one a ``Discrete``.
+    Bounds are those of the variables or of their declared types. ``bounds`` contains the bounds of
+    variables that have none, or others. A real variable has a ``Box`` of shape ``(1,)``, in its
+    unit, and any other one a ``Discrete``.
 
     Raises:
         ValueError: A variable does not exist, is not a scalar number, or has no bounds.

@@ -24,7 +24,7 @@ HELD_OUT: Final = 1_000_000
 
 @dataclass(frozen=True)
 class Linear:
-    """A policy: the power grows with a weighted sum of warmth, the temperature outside, and the time of day."""
+    """A policy: the power grows with a weighted sum of warmth, outside temperature, time of day."""
 
     weights: Sequence[float]
 

@@ -34,7 +34,10 @@ def java() -> tuple[str, str]:
     Raises:
         RuntimeError: A command is missing or too old.
     """
-    remedy = f"install a JDK of version {VERSION} or newer (Debian: apt-get install openjdk-17-jdk-headless)"
+    remedy = (
+        f"install a JDK of version {VERSION} or newer "
+        "(Debian: apt-get install openjdk-17-jdk-headless)"
+    )
     found = []
     for name in ("java", "javac"):
         command = shutil.which(name)

@@ -48,7 +48,7 @@ METRICS: Final[Mapping[str, Callable[[ProcessSimulation], float]]] = {
         np.std([wheat for _, _, wheat, _ in simulation.result["trace"]])
     ),
 }
-"""The metrics: loaves sold, farms and shops that gave up, and the standard deviation of the price of wheat."""
+"""The metrics: loaves sold, farms and shops that gave up, the deviation of the wheat price."""
 
 
 def compare(seeds: Sequence[int], weeks: int = WEEKS) -> Evaluation:

@@ -1,4 +1,4 @@
-"""Environments made from a market town in Java: farms decide how much to sow, shops decide on their price of bread.
+"""Environments made from a market town in Java: farms sow wheat, and shops price bread.
 
 The model, ``Market.java``, has its own main loop in its own JVM; farms and shops enter and leave
 the market. The client ``clients/java/SimEnv.java`` is its only connection to environments, and it
@@ -50,12 +50,12 @@ SOW, PRICE = "farm.sow", "shop.price"
 
 
 def farm_sees(c: Any) -> NDArray[np.float32]:
-    """Observe a farm's money and plots last time, the price of wheat, the granary's stock, and the number of farms."""
+    """Observe a farm's money and plots, the wheat price, the granary and the number of farms."""
     return np.array([c.money, c.plots, c.wheat_price, c.granary, c.farms], np.float32)
 
 
 def shop_sees(c: Any) -> NDArray[np.float32]:
-    """Observe a shop's money, last price, loaves baked and sold, the price of wheat, and the number of shops."""
+    """Observe a shop's money, price, loaves baked and sold, the wheat price, the shops' number."""
     return np.array([c.money, c.price, c.baked, c.sold, c.wheat_price, c.shops], np.float32)
 
 

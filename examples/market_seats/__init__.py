@@ -1,1 +1,1 @@
-"""A market for four people: a model without any environment, two conditions of an experiment, and their seats."""
+"""A market for four people: a model without an environment, two conditions, and their seats."""

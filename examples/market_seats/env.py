@@ -1,4 +1,4 @@
-"""Two conditions of the market, in which four agents, or four people, decide how many crates they bring.
+"""Two conditions of the market: four agents, or four people, decide how many crates to bring.
 
 ``python -m simenv_marl play examples.market_seats.env:Free --seat trader_0 trader_1 trader_2
 trader_3`` serves a page with a seat for each trader.

@@ -1,9 +1,9 @@
-"""A market: each round, four traders decide in turn how many crates to bring, and all crates sell at one price.
+"""A market: each round, four traders decide in turn how many crates to bring.
 
-A crate that is brought lowers the price of all others. So four traders who each do the best for
-themselves bring more than the number at which they together earn most: 8 crates each in place of 5.
-A levy on each crate can mend that; it is paid back to all traders, in equal parts. With a levy of
-20 each does best with 5 crates, if all others do so.
+All crates sell at one price. A crate that is brought lowers the price of all others. So four
+traders who each do the best for themselves bring more than the number at which they together earn
+most: 8 crates each in place of 5. A levy on each crate can mend that; it is paid back to all
+traders, in equal parts. With a levy of 20 each does best with 5 crates, if all others do so.
 
 ``python -m examples.market_seats.model`` runs the model without any environment.
 """
@@ -46,7 +46,7 @@ class Trader:
         self.crates, self.gain, self.profit = 0, 0.0, 0.0
 
     def crates_of_others(self) -> int:
-        """Return the crates of all others: those of this round, where they have decided, else of the round before."""
+        """Return the crates of all others: of this round if decided, else of the round before."""
         return sum(trader.crates for trader in self.market.traders if trader is not self)
 
     def choose_crates(self) -> int:

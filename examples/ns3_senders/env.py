@@ -1,8 +1,8 @@
-"""Environments made from senders in a simulated network: each sender is an agent. The simulator is ns-3, in C++.
+"""Environments made from senders in a simulated network: each sender is an agent.
 
-``senders.cpp`` is the model, which runs in a process of its own and does not depend on
-environments: at an acknowledgement or a timeout, a sender chooses its rate by a rule like TCP's.
-The model asks for decisions through the client ``clients/cpp/simenv.hpp``.
+The simulator is ns-3, in C++. ``senders.cpp`` is the model, which runs in a process of its own and
+does not depend on environments: at an acknowledgement or a timeout, a sender chooses its rate by a
+rule like TCP's. The model asks for decisions through the client ``clients/cpp/simenv.hpp``.
 
 - ``program``: the compiled model.
 - ``senders``: the simulation.

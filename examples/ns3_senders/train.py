@@ -34,7 +34,7 @@ HELD_OUT: Final = 1_000_000
 
 @dataclass(frozen=True)
 class Linear:
-    """A linear policy: the hyperbolic tangent turns a weighted sum of the observation into an action.
+    """A linear policy: the action is the hyperbolic tangent of a weighted sum of the observation.
 
     Attributes:
         weights: One weight for each number of the observation, then a constant.

@@ -1,1 +1,1 @@
-"""A SimPy queue with two kinds of jobs: decisions at irregular times, and learners that discount by time."""
+"""A SimPy queue with two kinds of jobs: irregular decisions, and learners that discount by time."""

@@ -39,7 +39,7 @@ AGENT: Final = "admission_0"
 
 
 def observation(decision: Decision) -> NDArray[np.float32]:
-    """Return the observation of a decision, which is the kind of the job and the state of the queue."""
+    """Return the observation of a decision: the kind of the job and the state of the queue."""
     kind, (a, b, serving) = decision
     return np.array([kind == 0, kind == 1, serving == 0, serving == 1, a, b], np.float32)
 

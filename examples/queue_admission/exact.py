@@ -1,4 +1,4 @@
-"""Exact values of the queue: all its times are exponential, so it is a Markov chain with few states.
+"""Exact values of the queue: with exponential times, it is a Markov chain with few states.
 
 A *state* is the number of waiting jobs of each kind, and the kind in service (None: the server is
 idle). A *decision* is the kind of an arriving job and the state that it finds. A *table* tells for
@@ -88,7 +88,7 @@ def values(
 
 
 def worth(table: Table) -> float:
-    """Return what a table is worth: the expected present value of an endless run that begins empty."""
+    """Return a table's worth: the expected present value of an endless run from an empty queue."""
     return values(table)[EMPTY]
 
 

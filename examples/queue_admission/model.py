@@ -1,4 +1,4 @@
-"""A queue in SimPy: jobs of two kinds arrive at random, wait for one server, and pay when they are done.
+"""A queue in SimPy: jobs of two kinds arrive at random, wait for one server, and pay when done.
 
 ``python -m examples.queue_admission.model`` runs the model without any environment.
 """
@@ -15,7 +15,7 @@ from numpy.random import SeedSequence, default_rng
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of jobs: the rates of arrivals and of services per unit of time, and what a finished job pays."""
+    """A kind of jobs: the rates of arrivals and services per unit of time, and a job's pay."""
 
     name: str
     arrivals: float
@@ -24,7 +24,7 @@ class Kind:
 
 
 KINDS: Final = (Kind("A", 0.4, 1.0, 1.0), Kind("B", 0.8, 0.1, 6.0))
-"""The kinds, in the order of their priority: A is quick, B pays more but holds the server ten times as long."""
+"""The kinds by priority: A is quick; B pays more but holds the server ten times as long."""
 
 PLACES: Final = 2
 """How many jobs can wait."""
@@ -71,7 +71,7 @@ class Queue:
         return users[0].priority if users else None
 
     def present_value(self) -> float:
-        """Return the rewards minus the holding costs so far, discounted to the beginning of the run."""
+        """Return the rewards minus the holding costs so far, discounted to the run's beginning."""
         cost = HOLDING_COST * self._jobs / INTEREST
         return self._earned - cost * (
             exp(-INTEREST * self._booked) - exp(-INTEREST * self.clock.now)

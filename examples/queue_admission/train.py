@@ -1,4 +1,4 @@
-"""Train the admission of jobs with DQN and PPO of Stable-Baselines3, discounting by time and by decision.
+"""Train job admission with Stable-Baselines3's DQN and PPO, discounted by time and by decision.
 
 ``python -m examples.queue_admission.train`` trains each learner three times by time, and DQN once
 for each discount by decision. It evaluates each trained table of decisions exactly, and by
@@ -89,7 +89,10 @@ class TimedRollout(RolloutBuffer):
 
 
 class Times(BaseCallback):
-    """Hand the discounts in the infos to the rollout buffer, and to PPO, whose gamma weighs the ends of episodes."""
+    """Hand the discounts in the infos to the rollout buffer and to PPO.
+
+    PPO's gamma weighs the ends of episodes.
+    """
 
     def _on_step(self) -> bool:
         buffer: Any = self.model.rollout_buffer
@@ -156,7 +159,10 @@ def table_of(learner: Any) -> Table:
 
 
 def simulated(policies: dict[str, Any], runs: int) -> Any:
-    """Return the mean present value of each policy over the same seeds, its interval, and its gain on the rule."""
+    """Return each policy's mean present value on the same seeds, its interval, and its gain.
+
+    The gain is the difference to the rule.
+    """
     found = evaluate(
         QueueSimulation,
         {"rule": {}, **{name: {AGENT: policy} for name, policy in policies.items()}},

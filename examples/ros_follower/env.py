@@ -1,4 +1,4 @@
-"""Environments made from a robot in ROS 1 that follows a leader: the agent chooses the robot's velocity.
+"""Environments made from a ROS 1 robot that follows a leader: the agent chooses its velocity.
 
 ``follower.py`` is the robot's controller, a ROS node, and ``world.py`` a simulated world on
 simulated time. Both are ordinary ROS nodes, in the system's Python.

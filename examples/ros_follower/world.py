@@ -1,7 +1,7 @@
-"""A ROS node that simulates a leader and the robot that follows it: it publishes what the robot sees, and the clock.
+"""A ROS node that simulates a leader and the robot that follows it.
 
-It waits for a command on ``cmd_vel`` before each step, so that the run does not depend on the speed
-of the nodes.
+It publishes the robot's measurements and the clock. It waits for a command on ``cmd_vel`` before
+each step, so that the run does not depend on the speed of the nodes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Environments made from Mesa's own model of wolves, sheep and grass: each sheep decides where to go.
+"""Environments made from Mesa's wolves, sheep and grass: each sheep decides where to go.
 
 The model is unchanged and undecorated. This module names ``Sheep.move`` as a decision point, and
 each sheep is an agent from its birth to its death. The wolves, and the rest of the sheep's
@@ -58,7 +58,10 @@ MOVE: Final = "mesa.examples.advanced.wolf_sheep.agents.Sheep.move"
 
 @cache
 def ways(sight: int) -> tuple[tuple[int, tuple[int, int]], ...]:
-    """List the paths to the visible cells: for each but the own one, the index of the previous cell, and a step."""
+    """List the paths to the visible cells, without the own cell.
+
+    A path is the index of the previous cell, and a step.
+    """
     found = [(0, 0)]
     steps = []
     # the list grows in the loop: a breadth-first search
@@ -73,7 +76,10 @@ def ways(sight: int) -> tuple[tuple[int, tuple[int, int]], ...]:
 
 @cache
 def cells(sight: int) -> tuple[tuple[int, int], ...]:
-    """List the visible cells as offsets, in the order of the observation: the own cell, then by distance."""
+    """List the visible cells as offsets, in the order of the observation.
+
+    The own cell comes first; the others follow by distance.
+    """
     found = [(0, 0)]
     for number, direction in ways(sight):
         found.append((found[number][0] + direction[0], found[number][1] + direction[1]))
@@ -81,7 +87,7 @@ def cells(sight: int) -> tuple[tuple[int, int], ...]:
 
 
 def look(sheep: Any, sight: int = SIGHT) -> NDArray[np.float32]:
-    """Observe the sheep's energy, then the grass of all ``cells``, then their wolves, then their other sheep."""
+    """Observe the sheep's energy, then the grass, wolves and other sheep of all ``cells``."""
     around = [sheep.cell]
     for number, direction in ways(sight):
         around.append(around[number].connections[direction])

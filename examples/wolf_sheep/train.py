@@ -1,9 +1,9 @@
-"""Train one shared policy for all sheep, by PPO with TorchRL's losses on the trajectories of ``collect_episodes``.
+"""Train one shared policy for all sheep, by PPO on the trajectories of ``collect_episodes``.
 
-``python -m examples.wolf_sheep.train`` trains it with several seeds, for sheep with the sight of
-the model's rule and for sheep that see one step farther. It writes the policies to ``out/`` beside
-this file and the learning curves to ``docs/figures/shared-policy-training.csv``. It needs TorchRL
-(the extra ``clients``).
+The losses are TorchRL's. ``python -m examples.wolf_sheep.train`` trains it with several seeds, for
+sheep with the sight of the model's rule and for sheep that see one step farther. It writes the
+policies to ``out/`` beside this file and the learning curves to
+``docs/figures/shared-policy-training.csv``. It needs TorchRL (the extra ``clients``).
 
 Hundreds of sheep, most of them born during the episode, need no more code than one: each call of
 the policy answers all waiting decisions, and each sheep's life is one trajectory. The same seed
@@ -56,7 +56,7 @@ MINIBATCH: Final = 2048
 
 
 class Compressed(nn.Module):
-    """A layer that compresses the range of the observations, as energies and flocks may be large."""
+    """A layer that compresses the range of the observations: energies and flocks may be large."""
 
     def forward(self, observations: Any) -> Any:
         """Compress the observations."""

@@ -1,4 +1,4 @@
-"""Credit assignment: the advantage of an agent's action, by branches and by returns less a learned baseline.
+"""Credit assignment: an action's advantage, by branches and by returns less a learned baseline.
 
 ``python -m studies.credit.estimators`` goes to decisions of the greenhouse's two agents and of the
 sheep on Mesa's meadow, and draws an action for each. The advantage of the action is the difference
@@ -70,7 +70,10 @@ class World:
 
 
 def worlds() -> Iterator[World]:
-    """Yield both agents of the greenhouse, with the best constants as base, and the sheep, with their rule."""
+    """Yield both agents of the greenhouse, with the best constants as base, and the sheep.
+
+    The base of the sheep is their rule.
+    """
     for agent in (WATERER, VENTILATOR):
         yield World(f"greenhouse, {agent}", GreenhouseSim, None, agent, BEST, 2)
     yield World("one of the sheep", lambda: Meadow(TICKS), sheep_points(), MOVE, RULE, 100)

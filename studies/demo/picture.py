@@ -1,4 +1,4 @@
-"""Pictures of the results of ``make demo`` and ``make plan``: returns of all policies, and how the days went by.
+"""Pictures of the results of ``make demo`` and ``make plan``: returns and daily developments.
 
 ``python -m studies.demo.picture FILE`` draws the results that ``examples.greenhouse_coop.train`` or
 ``examples.greenhouse_coop.plan`` has written to a file, as a picture beside it.
@@ -22,12 +22,14 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 COLOURS: Final = ("#8c8c8c", "#c9c9c9", "#e3b778", "#d1812c", "#7fb3d3", "#1b6f5f")
-"""In the order of the table: grey without a search, orange for searched constants, then the learned policies."""
+"""In the order of the table: grey without a search, orange for constants, then learned policies."""
 
 INK: Final = "#333333"
 
 TITLES: Final = {
-    "greenhouse": "Two agents learn to keep a greenhouse: one decides the water, the other the ventilation",
+    "greenhouse": (
+        "Two agents learn to keep a greenhouse: one decides the water, the other the ventilation"
+    ),
     "plan": "Plans keep a greenhouse: the waterer tries out amounts of water before it pours",
 }
 """The title of each picture, by the name of its file."""

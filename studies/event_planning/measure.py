@@ -1,7 +1,7 @@
-"""Is a planner worse than the rule? ``python -m studies.event_planning.measure`` compares them on the same seeds.
+"""Compare a planner with the rule on the same seeds: is it worse?
 
-It prints a table: the mean paired difference of costs, its standard error, and the share of
-decisions left to the rule.
+``python -m studies.event_planning.measure`` runs the comparison. It prints a table: the mean paired
+difference of costs, its standard error, and the share of decisions left to the rule.
 """
 
 from __future__ import annotations

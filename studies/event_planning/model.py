@@ -1,4 +1,4 @@
-"""Three models that are driven by events: a factory with one generator or one for each machine, and a queue network."""
+"""Three event-driven models: factories with one generator or one per machine, a queue network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Baselines for learning: the rule, random actions, the best constants, and the CMA-ES pair of ``make demo``.
+"""Baselines for learning: the rule, random actions, the best constants, ``make demo``'s CMA-ES.
 
 ``python -m studies.greenhouse_experiment.baselines``
 
@@ -47,7 +47,7 @@ SEARCHED_ON: Final = 8
 
 
 def constant_ventilation(seed: int) -> Verdict:
-    """Evaluate the best constant ventilation, where watering follows the rule: the baseline of question 2."""
+    """Evaluate the best constant ventilation, the baseline of question 2: watering by the rule."""
     seeds = draw_seeds(np.random.default_rng(seed), SEARCHED_ON)
     teams: list[Team] = [{VENTILATOR: Constant(fraction)} for fraction in EXCHANGES]
     best = max(teams, key=lambda team: judge(team, seeds).value)

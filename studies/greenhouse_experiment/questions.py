@@ -24,7 +24,7 @@ FINAL: Final = range(HELD_OUT, HELD_OUT + 32)
 """The seeds of the greenhouses for the final evaluation: those of ``make demo``."""
 
 BEST_WATERING: Final = {WATERER: Constant(0.06)}
-"""The best constant watering that ``make demo`` finds where ventilation follows its rule: 60 litres."""
+"""The best constant watering by ``make demo`` where ventilation follows its rule: 60 litres."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ QUESTIONS: Final = {
 # -- policies -------------------------------------------------------------------------------------
 
 Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""A trained policy: maps an observation, float32 ``(6,)``, to actions, float32 ``(number of learners,)``."""
+"""A trained policy: from an observation, float32 ``(6,)``, to actions, float32 ``(learners,)``."""
 
 
 def in_turns(agent: str, act: Act) -> Team:

@@ -104,7 +104,7 @@ def gather(runs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _baselines(searches: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Select rows: CMA-ES for each number of episodes, all other baselines from the longest searches alone."""
+    """Select rows: CMA-ES for each number of episodes, others from the longest searches alone."""
     most = max((search["episodes"] for search in searches), default=0)
     rows: list[dict[str, Any]] = []
     for search in searches:
@@ -180,7 +180,7 @@ def table(finals: pd.DataFrame) -> str:
 
 
 def _place(library: str, question: str, median: float) -> tuple[bool, str | float, str]:
-    """Return a sort key: baselines first, from the worst to the best, then the questions in their order."""
+    """Return a sort key: baselines from the worst to the best, then the questions in order."""
     return (False, median, "") if library == "baselines" else (True, question, library)
 
 
@@ -239,7 +239,7 @@ def _draw_lines(axes: Axes, curves: pd.DataFrame) -> None:
 
 
 def draw_finals(finals: pd.DataFrame, path: Path) -> None:
-    """Draw the final results: a dot for each seed, a line for the median, and a bar between the quartiles."""
+    """Draw the final results: a dot per seed, a line for the median, a bar between quartiles."""
     groups = list(finals.groupby(["library", "question"], sort=False))
     groups.sort(
         key=lambda group: _place(group[0][0], group[0][1], group[1].value.median()), reverse=True

@@ -153,7 +153,9 @@ def start() -> None:
 
 
 def act(modules: Sequence[RLModule], observation: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Compute the modules' actions without exploration. At the beginning of a day, both agents observe the same.
+    """Compute the modules' actions without exploration.
+
+    At the beginning of a day, both agents observe the same.
 
     Args:
         modules: The waterer's module and the ventilator's.

@@ -162,7 +162,7 @@ class Greenhouses:
         return self._look(environment, observations)
 
     def _look(self, environment: SimulationParallelEnv, observations: dict[str, Any]) -> Any:
-        """Return the agents' observations, ``(2, 6)``, and the state, ``(36,)``, or an empty array in its place."""
+        """Return the agents' observations, ``(2, 6)``, and the state, ``(36,)`` or empty."""
         state = environment.state() if self._central else np.zeros(0, np.float32)
         return np.stack([observations[agent] for agent in BOTH]), state
 

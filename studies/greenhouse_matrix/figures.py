@@ -1,4 +1,7 @@
-"""Figures and tables of the matrix, made from one tidy table with pandas, seaborn, statsmodels and the library."""
+"""Figures and tables of the matrix, from one tidy table.
+
+They are made with pandas, seaborn, statsmodels and the library.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ def averaged(table: Any) -> Any:
 
 
 def compared(means: Any) -> str:
-    """Tabulate each contender's results by number of plants, and the difference to those who learned at home.
+    """Tabulate results by number of plants, and differences to the learners trained at home.
 
     The comparison is of means over all climates and exchanges, seed by seed: intervals are over
     seeds.
@@ -75,7 +78,7 @@ def _between(found: Any, name: str, form: str) -> str:
 
 
 def moved(means: Any) -> str:
-    """Tabulate, for each contender and factor, the range of its mean returns over the levels of the factor."""
+    """Tabulate the range of mean returns over each factor's levels, for each contender."""
     rows = []
     for name in dict.fromkeys(means.contender):
         levels = effects(means, contender=name).main["mean"].groupby("factor", sort=False)
@@ -84,7 +87,7 @@ def moved(means: Any) -> str:
 
 
 def learners(table: Any) -> str:
-    """Tabulate each learner's mean return, in the greenhouse of the paper and with each number of plants."""
+    """Tabulate each learner's mean return in the paper's greenhouse and per number of plants."""
     team = table[(table.agent == "team") & table.contender.str.startswith(tuple(SCHOOLS))]
     home = (
         team[(team[list(HOME)] == list(HOME.values())).all(axis=1)]
@@ -118,10 +121,11 @@ def shares(means: Any) -> str:
 
 
 def draw_returns(means: Any, table: Any) -> Any:
-    """Draw the whole matrix: a panel for each climate and exchange, with a thin line for each learner."""
+    """Draw the whole matrix: a panel per climate and exchange, a thin line per learner."""
     grid = seaborn.catplot(
-        means, x="plants", y="return", hue="contender", row="climate", col="exchange", kind="point", palette=COLOURS,
-        height=2.1, aspect=1.35, margin_titles=True, markersize=5, linewidth=1.6, err_kws={"linewidth": 1.2}, seed=0,
+        means, x="plants", y="return", hue="contender", row="climate", col="exchange", kind="point",
+        palette=COLOURS, height=2.1, aspect=1.35, margin_titles=True, markersize=5, linewidth=1.6,
+        err_kws={"linewidth": 1.2}, seed=0,
     )  # fmt: skip
     grid.set_titles(row_template="{row_name}", col_template="exchange: {col_name}")
     grid.set_axis_labels("plants", "return")
@@ -132,8 +136,8 @@ def draw_returns(means: Any, table: Any) -> Any:
             (table.climate == climate) & (table.exchange == exchange) & table.contender.isin(names)
         ]
         seaborn.pointplot(
-            own, x="plants", y="return", hue="contender", palette=colours, errorbar=None, markers="", linewidth=0.8,
-            alpha=0.6, legend=False, ax=axes,
+            own, x="plants", y="return", hue="contender", palette=colours, errorbar=None,
+            markers="", linewidth=0.8, alpha=0.6, legend=False, ax=axes,
         )  # fmt: skip
         axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
     place = sorted(set(means.plants)).index(HOME["plants"])
@@ -148,7 +152,7 @@ def draw_returns(means: Any, table: Any) -> Any:
 
 
 def draw_behind(means: Any) -> Any:
-    """Draw how far learners are behind the planner on the same seeds, in each row, with intervals."""
+    """Draw the learners' distance to the planner on the same seeds, per row, with intervals."""
     rows = []
     for levels, own in means.groupby(list(FACTORS), sort=False):
         summary = Evaluation(own, "planned", 0.95).summary()
@@ -168,8 +172,8 @@ def draw_behind(means: Any) -> Any:
         )
         names = [", ".join(pair) for pair in cells.index]
         seaborn.heatmap(
-            cells["apart"], annot=cells["said"], fmt="", vmin=-60, vmax=0, cmap="YlOrBr_r", linewidths=1.5, ax=axes,
-            annot_kws={"fontsize": 8}, yticklabels=names, cbar=False,
+            cells["apart"], annot=cells["said"], fmt="", vmin=-60, vmax=0, cmap="YlOrBr_r",
+            linewidths=1.5, ax=axes, annot_kws={"fontsize": 8}, yticklabels=names, cbar=False,
         )  # fmt: skip
         axes.set_title(f"{name}, less planned", fontsize=10)
         axes.set_ylabel("")
@@ -178,21 +182,21 @@ def draw_behind(means: Any) -> Any:
 
 
 def draw_factors(means: Any) -> Any:
-    """Draw the effect of each factor on each contender: means over the other factors, seed by seed."""
+    """Draw each factor's effect on each contender: means over the other factors, seed by seed."""
     figure = new_figure(9.5, 3.2)
     for axes, factor in zip(figure.subplots(1, len(FACTORS), sharey=True), FACTORS, strict=True):
         by_seed = means.groupby([factor, "contender", "seed"], sort=False, as_index=False)[
             "return"
         ].mean()
         seaborn.pointplot(
-            by_seed, x=factor, y="return", hue="contender", palette=COLOURS, markersize=5, linewidth=1.6,
-            err_kws={"linewidth": 1.2}, seed=0, legend=False, ax=axes,
+            by_seed, x=factor, y="return", hue="contender", palette=COLOURS, markersize=5,
+            linewidth=1.6, err_kws={"linewidth": 1.2}, seed=0, legend=False, ax=axes,
         )  # fmt: skip
         axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
         axes.spines[["top", "right"]].set_visible(False)
     figure.legend(
-        [Line2D([], [], color=colour, marker="o", markersize=5) for colour in COLOURS.values()], list(COLOURS),
-        loc="outside upper center", ncols=len(COLOURS), frameon=False,
+        [Line2D([], [], color=colour, marker="o", markersize=5) for colour in COLOURS.values()],
+        list(COLOURS), loc="outside upper center", ncols=len(COLOURS), frameon=False,
     )  # fmt: skip
     return figure
 

@@ -1,4 +1,4 @@
-"""The paper's matrix of experiments: policies that water, over numbers of plants, climates and plugins.
+"""The paper's matrix of experiments: waterers, over numbers of plants, climates and plugins.
 
 ``python -m studies.greenhouse_matrix.matrix`` (or ``make matrix``) trains waterers. They, the
 model's rule and a planner then run the same greenhouses in every combination of the factors, which
@@ -119,7 +119,7 @@ PORTIONS: Final = tuple(tenths / 10 for tenths in range(7))
 
 @dataclass(frozen=True)
 class PortionPlanner:
-    """A waterer that plans for any number of pots: it tries out portions per pot, for one day, in one future.
+    """A waterer that plans for any number of pots: portions per pot, for one day, in one future.
 
     The terminal value after that day is ``days_left``, so the portion itself is the only decision
     in a branch.

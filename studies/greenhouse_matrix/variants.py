@@ -126,7 +126,7 @@ class House(GreenhouseSim):
         self.plants, self.outside_humidity = plants, outside_humidity
 
     def reset(self, seed: int | None = None) -> None:
-        """Create a new greenhouse: with the model's own plants, fewer of them, or additional ones."""
+        """Create a new greenhouse: with the model's plants, fewer of them, or additional ones."""
         super().reset(seed)
         greenhouse = self.greenhouse
         del greenhouse.pots[self.plants :]
@@ -172,7 +172,7 @@ def greenhouse(plants: int, climate: str, exchange: str) -> Variant:
 
 
 def main() -> None:
-    """Print the plants' numbers in each variant with its rules, and the provenance of the last one."""
+    """Print the plants' numbers in each variant with its rules, and the last one's provenance."""
     for variant in (BASE, WARM_EXCHANGE, VENTILATED):
         print(f"{variant.name:15}", simulate(variant, seed=1).render("ansi"))
     print(json.dumps(provenance(VENTILATED, seed=1), indent=2))

@@ -1,4 +1,4 @@
-"""Expert iteration: a network learns from a planner, and the planner uses the network as its base policy.
+"""Expert iteration: a network learns from a planner, and serves it as the base policy.
 
 ``python -m studies.imitation.plans`` does so in rounds (Anthony, Tian and Barber, 2017) until a
 budget of simulated days is spent. Then the network runs the greenhouses of ``make demo`` without
@@ -66,8 +66,11 @@ DRAWN: Final = 0.1
 """The share of decisions in which a random amount replaces the network's."""
 
 TAUGHT, KEPT = 4, 2
-"""The number of networks trained per round, each from another initialisation, and the number of those with the lowest
-loss, whose mean decides. Some networks collapse to a constant amount and stay there."""
+"""The numbers of networks that a round trains, each from another initialisation, and keeps.
+
+The networks with the lowest loss are kept, and their mean decides. Some networks collapse to a
+constant amount and stay there.
+"""
 
 FIRST: Final = Constant(LITRES[len(LITRES) // 2] / MOST_WATER)
 """The waterer before any learning: the middle candidate."""
@@ -78,10 +81,10 @@ FIRST: Final = Constant(LITRES[len(LITRES) // 2] / MOST_WATER)
 
 @dataclass(frozen=True)
 class Network:
-    """A network that pours the expected amount, for one observation or a batch, without the library that trained it.
+    """A network that pours the expected amount, for one observation or a batch.
 
-    Branches use it as the base policy, and forks are slow in a process that has imported a large
-    library.
+    It does without the library that trained it. Branches use it as the base policy, and forks are
+    slow in a process that has imported a large library.
 
     Attributes:
         layers: For each network, the weights and biases of each layer.

@@ -1,4 +1,4 @@
-"""Behaviour cloning: a network learns the model's own ventilation rule, and ventilates greenhouses in its place.
+"""Behaviour cloning: a network learns the model's ventilation rule, and ventilates in its place.
 
 ``python -m studies.imitation.rule`` lets the rule ventilate some greenhouses, records its decisions
 as a Minari data set, and clones its behaviour with TorchRL. It then compares rule and clone in
@@ -68,7 +68,7 @@ TOLERANCE: Final = 0.01
     agent="ventilator_0",
 )
 def choose_air_exchange(greenhouse: Greenhouse) -> float:
-    """Choose the fraction of air to replace: more at higher temperatures (paper, section 4, step 3)."""
+    """Choose the fraction of air to replace, by the temperature (paper, section 4, step 3)."""
     return (greenhouse.temp - 15) / 20
 
 

@@ -1,4 +1,6 @@
-"""Hyperparameters as factors: a sweep that resumes, and a search with Optuna over the same hyperparameters.
+"""Hyperparameters as factors: a sweep that resumes, and a search with Optuna.
+
+Both cover the same hyperparameters.
 
 A training run is a simulation like any other: its factors are the learner's hyperparameters, its
 seed is the seed of the training, and a metric evaluates it after its end. So ``run_experiment`` can

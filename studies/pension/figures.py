@@ -1,4 +1,4 @@
-"""Figures and tables of the pension study, made from its tables of runs and its trained policies."""
+"""Figures and tables of the pension study, from its tables of runs and its trained policies."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ DRAWN: Final = 64
 
 
 def compared(table: Any) -> str:
-    """Tabulate each contender's welfare in one world, the difference to the rule, and the outcomes of the funds."""
+    """Tabulate contenders' welfare in one world, their gain on the rule, the funds' outcomes."""
     summary = _against_rule(table).summary("welfare")
     others = table.groupby("contender")[["right", "coverage", "premium", "short", "cuts"]].mean()
     rows = []
@@ -92,7 +92,7 @@ def moved(table: Any) -> str:
 
 
 def sizes(at_home: Any, large: Any) -> str:
-    """Tabulate how much better than the rule contenders are in small and in large funds, on the same seeds."""
+    """Tabulate the contenders' gain on the rule in small and large funds, on the same seeds."""
     few = at_home[at_home.seed.isin(set(large.seed)) & at_home.contender.isin(set(large.contender))]
     small, big = (_against_rule(own).summary("welfare") for own in (few, large))
     rows = [
@@ -122,7 +122,7 @@ def _difference(found: Any, form: str) -> str:
 
 
 def draw_worlds(worlds: Mapping[str, Any]) -> Figure:
-    """Draw how much better than the rule each contender is in each world of ``in_worlds``, with intervals."""
+    """Draw each contender's gain on the rule in each world of ``in_worlds``, with intervals."""
     without_rule = {levels: summary.drop("rule") for levels, summary in worlds.items()}
     better = DataFrame({levels: own["difference"] for levels, own in without_rule.items()}).T
     told = DataFrame(
@@ -135,8 +135,8 @@ def draw_worlds(worlds: Mapping[str, Any]) -> Figure:
     axes = figure.subplots()
     most = float(np.nanmax(abs(better.to_numpy())))
     seaborn.heatmap(
-        better, annot=told, fmt="", vmin=-most, vmax=most, cmap="BrBG", linewidths=1.5, ax=axes, cbar=False,
-        annot_kws={"fontsize": 8},
+        better, annot=told, fmt="", vmin=-most, vmax=most, cmap="BrBG", linewidths=1.5, ax=axes,
+        cbar=False, annot_kws={"fontsize": 8},
     )  # fmt: skip
     axes.set(
         xlabel="",
@@ -148,7 +148,7 @@ def draw_worlds(worlds: Mapping[str, Any]) -> Figure:
 
 
 def draw_learned(found: Mapping[str, Policies]) -> Figure:
-    """Draw the decisions of the trained policies beside the model's rules, with all other observations typical."""
+    """Draw the trained policies' decisions and the rules', with other observations typical."""
     figure = new_figure(11, 3.4)
     mix, by, premium = figure.subplots(1, 3)
     coverage = np.linspace(0.8, 1.8, 101)
@@ -200,7 +200,7 @@ def _surcharge(policy: Any, age: int, coverage: float) -> float:
 
 
 def draw_years(found: Mapping[str, Policies], home: Callable[[], Any], seeds: int) -> Figure:
-    """Draw rights and coverage over the years: medians, and the range from the 10 % to the 90 % quantile."""
+    """Draw rights and coverage over the years: the median, and the 10 % to 90 % quantiles."""
     figure = new_figure(9.5, 3.4)
     rights, coverages = figure.subplots(1, 2)
     for name, policies in (("rule", {}), ("trained pair", found["trained pair"])):

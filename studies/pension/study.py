@@ -167,7 +167,7 @@ def learned(
 
 
 def planned() -> dict[str, RolloutPolicy]:
-    """Make a planner: the indexer simulates each indexation for a year, in two futures, before it decides."""
+    """Make a planner: the indexer simulates each indexation for a year, in two futures."""
     return {INDEXER: RolloutPolicy(base=RULE, futures=2, horizon=1, horizon_by="time")}
 
 

@@ -1,4 +1,4 @@
-"""One network for the two agents that decide on rights in the pension fund, trained with TorchRL's PPO.
+"""One network for the pension fund's two agents for rights, trained with TorchRL's PPO.
 
 ``python -m studies.pension.torchrl`` needs the extra ``clients``. It trains for 7,000 years, and
 compares the network with the model's rule on seeds that the training has not seen.

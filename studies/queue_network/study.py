@@ -1,4 +1,4 @@
-"""Two queues in a row: who admits jobs to each learns by itself, from the times between its own decisions.
+"""Two queues in a row: the admission to each learns alone, from the times between decisions.
 
 ``python -m studies.queue_network.study`` trains both by semi-Markov Q-learning with a table, in one
 AEC environment, and compares them with the rule, which admits all.
@@ -99,9 +99,10 @@ class Learner:
         self._before: tuple[bytes, int] | None = None
 
     def decide(self, observation: Any, reward: float, discount: float, over: bool) -> int | None:
-        """Learn from the interval since the previous decision, and decide, or None at the end of an episode.
+        """Learn from the interval since the previous decision, and decide.
 
-        Episodes are truncated, so that their last observation still has a value.
+        The decision is None at the end of an episode. Episodes are truncated, so that their last
+        observation still has a value.
         """
         seen = observation.tobytes()
         if self._before is not None:

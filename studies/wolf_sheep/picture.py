@@ -29,7 +29,7 @@ STYLES: Final[dict[str, dict[str, Any]]] = {
     "trained, one step of sight": {"color": "#6aa5cf", "linestyle": "-"},
     "trained, two steps of sight": {"color": "#1b6f5f", "linestyle": "-"},
 }
-"""The line style of each policy: grey for the rule and random moves, green and blue for trained policies."""
+"""The line style of each policy: grey for rule and random moves, green and blue for trained."""
 
 LEARNERS: Final = {1: "trained, one step of sight", 2: "trained, two steps of sight"}
 
@@ -90,7 +90,7 @@ def _draw_course(axes: Axes, course: Sequence[Mapping[str, str]], what: str, nam
 
 
 def draw_results(results: Mapping[str, Any], path: Path) -> None:
-    """Draw the numbers of sheep and wolves under each policy, and the lengths of the sheep's lives."""
+    """Draw the numbers of sheep and wolves, and the lengths of sheep's lives, by policy."""
     figure = new_figure(11, 6.4)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
     sheep = figure.add_subplot(grid[0, 0])

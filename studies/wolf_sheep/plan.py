@@ -1,4 +1,4 @@
-"""One sheep of a herd plans over the model's own rule: how long does it live, compared with the others?
+"""One sheep of a herd plans over the model's own rule: does it live longer than the others?
 
 ``python -m studies.wolf_sheep.plan`` lets one sheep in each of many herds try out the four
 directions at each turn, in branches of a few turns in which all animals follow the rule and all
@@ -44,7 +44,7 @@ class Lives:
 
 
 def lives(seed: int, planner: Any, ticks: int) -> tuple[int, int, float]:
-    """Measure the lives of a sheep that plans, of the same sheep under the rule, and of the others of its herd.
+    """Measure the lives of a planning sheep, of the same sheep by the rule, of the others.
 
     Args:
         seed: The seed of the meadow; it also selects the sheep.
@@ -113,7 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> Lives:
     options = parser.parse_args(arguments)
     found = watch(
         range(options.herds),
-        horizon=options.horizon, futures=options.futures, ticks=options.ticks, workers=options.workers,
+        horizon=options.horizon, futures=options.futures,
+        ticks=options.ticks, workers=options.workers,
     )  # fmt: skip
     for title, turns in (
         ("plans", found.own),

@@ -90,7 +90,7 @@ def play(policy: Policy, sight: int, seeds: Sequence[int], **parameters: Any) ->
 def lives(
     lengths: NDArray[np.int64], died: NDArray[np.bool_], turns: int = LIVES
 ) -> NDArray[np.float64]:
-    """Estimate the survival curve of sheep by Kaplan and Meier's method, as some lives are censored.
+    """Estimate the survival curve of sheep by Kaplan and Meier's method: some lives are censored.
 
     Args:
         lengths: The number of turns of each sheep.

@@ -37,7 +37,11 @@ class State:
 class TemplateAECEnv(AECEnv[str, Any, Any]):
     """A no-op environment with the bookkeeping of PettingZoo's template."""
 
-    metadata = {"name": "template_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012 - as the template has it
+    metadata = {  # noqa: RUF012 - as in the template
+        "name": "template_v0",
+        "render_modes": [],
+        "is_parallelizable": True,
+    }
     render_mode = None
 
     def __init__(self, agents: int = 2, rounds: int = 10**12) -> None:

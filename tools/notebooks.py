@@ -48,7 +48,8 @@ def write_notebooks(docs: Path, pages: tuple[str, ...] = PAGES) -> None:
     folder = docs / "_notebooks"
     folder.mkdir(exist_ok=True)
     for page in pages:
-        nbformat.write(executed(notebook(docs, page)), folder / f"{page}.ipynb")  # type: ignore[no-untyped-call]
+        book = executed(notebook(docs, page))
+        nbformat.write(book, folder / f"{page}.ipynb")  # type: ignore[no-untyped-call]
 
 
 def executed(made: Any) -> Any:

@@ -221,7 +221,8 @@ def compare(
     Returns:
         By the title of each team, the outcome for each seed; and the course of learning.
     """
-    from tqdm import tqdm  # type: ignore[import-untyped]  # imported here, as for all that slows down forks
+    # Large libraries slow down forks, so they are imported where they are used.
+    from tqdm import tqdm  # type: ignore[import-untyped]
 
     curves: Curves = {ONE_TRAINED: [], BOTH_TRAINED: []}
     rng = np.random.default_rng(seed)

@@ -11,9 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def python(*arguments: object, **environment: str) -> str:
-    """Let another Python run something, with more variables in its environment; return what it has
-    printed.
-    """
+    """Run another Python with additional environment variables, and return its output."""
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
         cwd=ROOT,

@@ -11,9 +11,7 @@ torch = pytest.importorskip("torch")
 
 
 def pytest_configure(config) -> None:
-    """Learners warn of much that is theirs; what this library warns of, and what nobody could
-    catch, is an error.
-    """
+    """Allow the learners' warnings; this library's, and lost exceptions, are errors."""
     for line in (
         "default",
         "error:::simenv_marl",

@@ -1,6 +1,4 @@
-"""The code of the page on clients, ready to be run as its reader would run it: one block after the
-other.
-"""
+"""The code of the page on clients, for a run in a reader's order: block after block."""
 
 from __future__ import annotations
 
@@ -16,9 +14,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def blocks(name: str, section: str | None = None) -> list[CodeType]:
-    """Compile all python blocks of a file in ``docs``, or of a section or a tab of it, in their
-    order.
-    """
+    """Compile all python blocks of a file in ``docs``, or of its section or tab, in order."""
     text = (DOCS / name).read_text(encoding="utf-8")
     tab = f"{{tab-item}} {section}\n"
     if tab in text:
@@ -36,9 +32,7 @@ def blocks(name: str, section: str | None = None) -> list[CodeType]:
 
 
 def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
-    """Run the python blocks of a section of ``docs/clients.md``; after each, yield the names that
-    it has left.
-    """
+    """Run the python blocks of a section of ``docs/clients.md``, and yield the names after each."""
     monkeypatch.syspath_prepend(DOCS)
     names: dict[str, Any] = {"__name__": "__main__"}
     with models_of_pages_forgotten():

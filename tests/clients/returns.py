@@ -18,9 +18,7 @@ def mean_return(
     seeds: Iterable[int] = range(10_000, 10_030),
     **options: Any,
 ) -> float:
-    """The mean of what all agents together gain when ``act`` decides by agent, observation and
-    info.
-    """
+    """The mean sum of all agents' returns; ``act`` decides by agent, observation and info."""
     env = parallel_env(simulation, points, **options)
     returns = []
     for seed in seeds:

@@ -1,6 +1,4 @@
-"""The experiment: every script from its command line to its files, with a budget that teaches
-nobody anything.
-"""
+"""The experiment: every script from its command line to its files, with a tiny budget."""
 
 import json
 import shutil
@@ -22,9 +20,7 @@ QUESTIONS = {"sb3": ["1", "2", "3", "5a", "5b", "5c"], "torchrl": ["4a", "4b"], 
 
 
 def carry_out(library, out, *, questions, seeds, hashes):
-    """In a process of its own, as ``make experiment`` does; by ``hashes`` its sets of strings are
-    in another order.
-    """
+    """Run in a new process, as ``make experiment`` does; ``hashes`` orders its sets of strings."""
     options = [
         "--questions",
         *questions,

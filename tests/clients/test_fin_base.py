@@ -1,6 +1,4 @@
-"""Stable-Baselines3 and TorchRL on the pension fund, as its page shows them: both gain over the
-rule.
-"""
+"""Stable-Baselines3 and TorchRL on the pension fund, as on its page: both gain over the rule."""
 
 import torch
 from studies.pension import torchrl as together
@@ -9,9 +7,7 @@ from .page import blocks
 
 
 def check(found, untrained):
-    """A trained learner does better than the rule, seed by seed with the interval above 0, and
-    than before training.
-    """
+    """A trained learner surpasses the rule, with an interval above 0, and the untrained learner."""
     trained, before = (each.summary("metric").loc["trained"] for each in (found, untrained))
     assert trained["difference_low"] > 0
     assert trained["difference"] > before["difference"]

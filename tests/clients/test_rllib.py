@@ -1,6 +1,4 @@
-"""RLlib's new API stack: its own wrappers, its own checker, its own training, and its modules in
-our loop.
-"""
+"""RLlib's new API stack: its wrappers, its checker, its training, and its modules in our loop."""
 
 import os
 import random
@@ -50,9 +48,7 @@ def _also_without_torch():
 
 @pytest.mark.parametrize("view", HIVES)
 def test_its_checker_finds_nothing_and_its_episodes_end_when_ours_do(view):
-    """A death and a time limit in the same step are neither ``terminated`` nor ``truncated`` for
-    all, unless padded.
-    """
+    """Without padding, a death and a time limit in one step set neither flag of ``__all__``."""
     env = hive(view)
     check_multiagent_environments(env)
     assert set(env.possible_agents) == set(BEES)

@@ -1,6 +1,4 @@
-"""TorchRL: one policy for all sheep of Mesa's model, learnt from the episodes that
-``collect_episodes`` returns.
-"""
+"""TorchRL: one policy for all sheep of Mesa's model, learnt from ``collect_episodes``."""
 
 from functools import partial
 
@@ -28,9 +26,7 @@ def test_a_seed_determines_everything():
 
 
 def test_sheep_learn_to_live_longer():
-    """Of the default meadow, on seeds that nobody was trained on: more turns for each sheep than
-    before.
-    """
+    """On held-out seeds of the default meadow, each sheep has more turns than before."""
 
     def turns(policy):
         meadow, seeds = (

@@ -1,6 +1,4 @@
-"""SuperSuit, whose wrappers people bring along: around our views they do what they do around those
-written by hand.
-"""
+"""SuperSuit: its wrappers act on our views as on environments written by hand."""
 
 import copy
 import importlib
@@ -30,7 +28,11 @@ HANDS = ["hand_0"]
 class HandEnv(pettingzoo.ParallelEnv):
     """What was written by hand, for one agent."""
 
-    metadata = {"name": "hand_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012 - PettingZoo's way
+    metadata = {  # noqa: RUF012 - PettingZoo's way
+        "name": "hand_v0",
+        "render_modes": [],
+        "is_parallelizable": True,
+    }
     render_mode = None
     np_random = np.random.default_rng(0)
     possible_agents = HANDS

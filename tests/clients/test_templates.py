@@ -1,6 +1,4 @@
-"""The template of a plain loop, with Stable-Baselines3: it trains where it was written, in half a
-minute, and gains.
-"""
+"""The template of a plain loop, with Stable-Baselines3: it trains in place, briefly, and gains."""
 
 from simenv_marl.testing.templates import write_template
 

@@ -1,8 +1,7 @@
-"""Spread many simulations over a local cluster, and compare with this process alone. Run by ``make
-test-clusters``.
+"""Spread many simulations over a local cluster, and compare with this process alone.
 
-``python -m tests.clusters.check dask`` or ``... ray``, each in an environment of its own, because
-of what it pins. Everything listens on the loopback address alone.
+``make test-clusters`` runs ``python -m tests.clusters.check dask`` and ``... ray``, each in an
+environment of its own, because their pins differ. All sockets listen on the loopback address alone.
 """
 
 import argparse
@@ -123,8 +122,9 @@ def check_experiment():
     with tempfile.TemporaryDirectory() as folder:
         tables = [
             run_experiment(
-                Model, {"bonus": [0, 3, 5]}, contenders=policies, seeds=range(9), points=[Model.decide], batched=True,
-                metric=lambda model: model.level, store=Path(folder) / str(workers), workers=workers,
+                Model, {"bonus": [0, 3, 5]}, contenders=policies, seeds=range(9),
+                points=[Model.decide], batched=True, metric=lambda model: model.level,
+                store=Path(folder) / str(workers), workers=workers,
             )
             for workers in (0, 2)
         ]  # fmt: skip

@@ -1,6 +1,4 @@
-"""Mappings get the call's arguments bound to the function's signature, however the model writes
-the call.
-"""
+"""Mappings get the call's arguments bound to the function's signature, in any form of the call."""
 
 import pytest
 

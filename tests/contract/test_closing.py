@@ -1,6 +1,4 @@
-"""The simulation's ``close``: once for each reset that has succeeded, after the last
-observations.
-"""
+"""The simulation's ``close``: once for each successful reset, after the last observations."""
 
 import threading
 from contextlib import nullcontext
@@ -28,9 +26,7 @@ LOG = []
 
 
 class Shop:
-    """Keeps books, which the last observation reads; only the thread that has opened them may
-    close them.
-    """
+    """Keeps books, which the last observation reads; only the opening thread may close them."""
 
     fails = False
 

@@ -1,6 +1,4 @@
-"""Sections 5.8 and 11 of the contract: the library's own errors, and who may catch those of a
-model.
-"""
+"""Sections 5.8 and 11 of the contract: the library's errors, and the handling of a model's."""
 
 import gc
 import inspect

@@ -1,6 +1,4 @@
-"""Whatever fails, wherever: it surfaces as itself, nothing hangs or stays behind, and the next
-episode is as ever.
-"""
+"""Every failure surfaces as itself, leaves nothing behind, and does not affect the next episode."""
 
 import gc
 import os
@@ -249,7 +247,8 @@ def interrupt_at(number, function, *args):
         left -= 1
         if left == 0:
             sys.setprofile(None)
-            where = f"{os.path.basename(frame.f_code.co_filename)}:{frame.f_lineno} {event} {frame.f_code.co_name}"
+            file = os.path.basename(frame.f_code.co_filename)
+            where = f"{file}:{frame.f_lineno} {event} {frame.f_code.co_name}"
             raise KeyboardInterrupt
 
     before = sys.getprofile()

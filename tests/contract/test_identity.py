@@ -1,6 +1,4 @@
-"""An environment never changes what it is made of: random models of processes, in random use, in
-all views.
-"""
+"""An environment never changes its model: random process models, in random use, in all views."""
 
 import gc
 
@@ -34,8 +32,9 @@ def seeing(machine_or_yard, *args, **kwargs):
 PLUGINS = [
     (seeing, f"{HERE}.{target}", position)
     for target, position in (
-        ("Yard.note", "before"), ("Yard.plan", "before"), ("Yard.plan", "after"), ("Machine.load", "after"),
-        ("Machine.pace", "before"), ("Machine.work", "before_next"), ("Yard.manage", "after_next"),
+        ("Yard.note", "before"), ("Yard.plan", "before"), ("Yard.plan", "after"),
+        ("Machine.load", "after"), ("Machine.pace", "before"), ("Machine.work", "before_next"),
+        ("Yard.manage", "after_next"),
     )
 ]  # fmt: skip
 OPTIONS = st.sampled_from(
@@ -132,9 +131,7 @@ class Player:
             self.env.step(RULE)
 
     def check(self):
-        """Everything is as in an environment of its own, where nobody looks and nothing else
-        happens.
-        """
+        """The episode equals one in a separate environment, without observers or clones."""
         if self.seed is None:
             return
         other = Player(*self.given)

@@ -406,9 +406,7 @@ def test_a_revived_agent_or_its_namesake_is_an_error_that_ends_the_episode(
 
 @pytest.mark.parametrize("view", [aec_env, parallel_env, single_env])
 def test_several_entities_under_one_name_are_warned_of_once(view):
-    """Nothing was said of agents, and so they are taken to be one, whose rewards and differences
-    mix.
-    """
+    """Without ``agent=``, the entities count as one agent, whose rewards and differences mix."""
 
     def main(simulation):
         simulation.crowd = [Being(number) for number in range(simulation.seed)]

@@ -1,6 +1,4 @@
-"""What mappings are given: the simulation, where they ask for it; a chosen answer, where there are
-choices.
-"""
+"""The arguments of mappings: the simulation on request, and a chosen answer among choices."""
 
 import gc
 import pickle

@@ -1,5 +1,4 @@
-"""Mesa's own model of wolves and sheep, unmodified: births and deaths in the hundreds, addressed
-by names from outside.
+"""Mesa's unmodified wolves and sheep: hundreds of births and deaths, and names from outside.
 
 Its other example models are tested in ``tests/examples/test_mesa_models.py``.
 """
@@ -13,9 +12,7 @@ from tests.worlds.models import follow_the_rule
 
 
 class Pasture:
-    """The model for some ticks, in which wolves decide as well; it does not say who is going to
-    decide.
-    """
+    """The model for some ticks, in which wolves decide as well; it announces no decisions."""
 
     ticks, size = 25, {}
 

@@ -119,9 +119,7 @@ NAMED = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(
 
 
 def episode(env):
-    """Play an episode of a Gymnasium environment; what each step has returned but for the info,
-    and the offers.
-    """
+    """Play an episode of a Gymnasium environment; return its steps without infos, and offers."""
     observation, info = env.reset(seed=3)
     steps, offers = [], [int(info["action_mask"].sum())]
     while True:
@@ -366,9 +364,7 @@ CAR = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 
 
 
 def flown(make, space, action, *, clip_actions=True):
-    """What reaches the mapping of an agent called ``pilot``, of the last one where there are
-    several.
-    """
+    """The argument of the mapping of agent ``pilot``, or of the last one among several."""
     taken = []
     fly = decision(agent="pilot", action_space=space, action_space_mapping=taken.append)
     env = make(calling(fly), fly, clip_actions=clip_actions)

@@ -389,9 +389,7 @@ def test_rounds_are_as_the_contract_has_it(program, seed, max_steps, data):
 
 
 def played(env, seed, in_turns):
-    """Play a colony in rounds; returns the totals, the fortune at which everybody joined, and the
-    ends.
-    """
+    """Play a colony in rounds; return the totals, the fortune at each agent's start, the ends."""
     _, infos = env.reset(seed=seed)
     used, totals, joined, ended = Counter(), Counter(), {}, {}
     for _ in range(2000):

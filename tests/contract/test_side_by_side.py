@@ -1,6 +1,4 @@
-"""Section 5.10 of the contract, and models that switch stacks of their own: SimPy, generators,
-greenlets, asyncio.
-"""
+"""Section 5.10 of the contract, and models with stacks: SimPy, generators, greenlets, asyncio."""
 
 import asyncio
 import gc

@@ -62,9 +62,7 @@ going = {Going.decide: define(agent="going_0")}
 @given(worlds.designs(), some_seeds, sizes)
 @settings(max_examples=60)
 def test_worlds_are_what_they_are_one_by_one(design, seeds, size):
-    """Whatever the decision points are like: nested, generators, with choices, of entities, named
-    now and then.
-    """
+    """All kinds of decision points: nested, generators, with choices, of entities, named late."""
 
     def source():
         return worlds.World(design, points)
@@ -428,9 +426,7 @@ def test_missing_packages_are_named_with_their_extra(monkeypatch, missing, wante
 
 
 def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch):
-    """Few at first, which stay in the processor's caches; never more than asked for, and the same
-    comes of it.
-    """
+    """Few simulations run at first, for the processor's caches; the results are always the same."""
     monkeypatch.setattr("simenv_marl.many.batch.CROWD", 4)
     clock = [0.0]  # stands still while simulations run
     monkeypatch.setattr("simenv_marl.many.batch.perf_counter", lambda: clock[0])

@@ -1,6 +1,4 @@
-"""Section 2, and 5.1 of the contract: what a simulation is, how it is made, reset, seeded and
-ended.
-"""
+"""Sections 2 and 5.1 of the contract: how a simulation is made, reset, seeded and ended."""
 
 import threading
 from typing import Any

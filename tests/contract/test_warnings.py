@@ -1,6 +1,4 @@
-"""What a user is warned of at run time: shared generators, agents that never come, rounds that
-stand still.
-"""
+"""Warnings at run time: shared generators, agents that never come, rounds that stand still."""
 
 import random
 import sys
@@ -34,9 +32,7 @@ def heard():
 
 @pytest.fixture
 def heard_alone(heard, monkeypatch):
-    """As if no threads of other tests were left, beside which the driver of threads can blame no
-    simulation.
-    """
+    """Hide the threads of other tests: beside them, the thread driver can blame no simulation."""
     monkeypatch.setattr(rng, "enumerate_threads", lambda: [threading.current_thread()])
     return heard
 
@@ -47,9 +43,7 @@ decide = decision(agent="chooser")
 
 
 def gambler(draw, *, in_reset=False):
-    """A class of simulations that draw from what the process shares, in the reset or before the
-    first decision.
-    """
+    """A class of simulations that use a shared generator, in the reset or before a decision."""
 
     class Gambler:
         def reset(self):
@@ -93,7 +87,9 @@ def test_a_simulation_that_draws_is_warned_of_once(heard_alone, draw, name, in_r
 
 @pytest.mark.parametrize("run", [
     lambda kind: simulate(kind, {decide: lambda observation: 1}),
-    lambda kind: simulate_many(kind, {decide: lambda observations: np.ones(len(observations), np.int64)}, seeds=[1, 2]),
+    lambda kind: simulate_many(
+        kind, {decide: lambda observations: np.ones(len(observations), np.int64)}, seeds=[1, 2]
+    ),
     lambda kind: vector_env(kind, decide, num_envs=3).reset(seed=1),
 ])  # fmt: skip
 def test_all_runners_warn(heard_alone, run) -> None:

@@ -1,6 +1,4 @@
-"""What no driver may do differently: stacks, nesting, threads that models start, forks, ends of
-the process.
-"""
+"""All drivers agree on stacks, nesting, threads of models, forks and ends of the process."""
 
 import asyncio
 import contextvars

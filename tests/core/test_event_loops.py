@@ -1,6 +1,4 @@
-"""What event loops set for a whole thread is the model's while it runs, and its user's between the
-steps.
-"""
+"""The settings of an event loop are the model's while it runs, and the user's between steps."""
 
 import asyncio
 import gc
@@ -61,9 +59,7 @@ def told(caplog):
 
 
 def tracking(decide):
-    """A model that notes what is set around it, before and after each of its decisions within a
-    loop.
-    """
+    """A model that notes the settings around it, before and after each decision within a loop."""
 
     async def work(simulation):
         simulation.log.append(around())
@@ -292,9 +288,7 @@ async def stay(log, cleanup):
 
 
 async def office(simulation, decide, cleanup):
-    """Decide while tasks and asynchronous generators of the model are left, of which some decide
-    in their cleanup.
-    """
+    """Decide beside tasks and asynchronous generators, of which some decide in their clean-up."""
 
     def quietly():
         cleanup.append("decides")
@@ -386,9 +380,7 @@ def test_models_of_trio_run_on_one_greenlet_or_side_by_side_in_threads(driver, n
     "ignore:coroutine .* was never awaited", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
 def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations() -> None:
-    """A loop that outlives its episodes keeps their tasks, which pass their exit on when it runs
-    again.
-    """
+    """A loop that outlives its episodes keeps their tasks and passes on their exit later."""
     decide, raised = decision(), None
     env = single_env(lambda: Lasting(partial(gathered, clerk_of(decide))), decide)
     for _ in range(10):

@@ -1,6 +1,4 @@
-"""Processes that a simulation forks have no user to ask: what they decide is refused, and the
-environment goes on.
-"""
+"""Processes forked by a simulation have no user: their decisions are refused."""
 
 import sys
 
@@ -39,7 +37,8 @@ PREAMBLE = """
 
     class Pool:
         def __init__(self):
-            self.pool = context.Pool(1, maxtasksperchild=1)  # all but the first are forked in a thread of the pool
+            # A thread of the pool forks all workers but the first.
+            self.pool = context.Pool(1, maxtasksperchild=1)
         def ask(self):
             told = {self.pool.apply_async(ask_twice, [0]).get(20) for _ in range(3)}
             self.pool.close()
@@ -102,7 +101,8 @@ def test_a_forked_worker_uses_environments_of_its_own(driver):
     run(
         """
         def play_own(queue):
-            env = single_env(script(lambda simulation: simulation.log.append(decide())), decide, driver=driver)
+            model = script(lambda simulation: simulation.log.append(decide()))
+            env = single_env(model, decide, driver=driver)
             env.reset()
             queue.put((env.step(7)[2], env.simulation.log, ask()[0]))
             env.close()

@@ -1,6 +1,4 @@
-"""Models that wait in gevent's hub, which serves all greenlets of a thread: their own, and those
-of their user.
-"""
+"""Models that wait in gevent's hub, which serves their own greenlets and those of their user."""
 
 import pytest
 
@@ -68,7 +66,8 @@ def test_a_decision_of_the_users_while_the_model_waits_in_a_hub_runs_the_rule(wh
                 env.reset()
                 asking = [gevent.spawn(ask) for _ in range(2)]
                 assert not env.step(1)[2]
-                asking += [gevent.spawn_later(0.005, ask), gevent.spawn(lambda: gevent.spawn(ask).join())]
+                asking.append(gevent.spawn_later(0.005, ask))
+                asking.append(gevent.spawn(lambda: gevent.spawn(ask).join()))
                 assert not env.step(2)[2]
                 gevent.joinall(asking, timeout=10, raise_error=True)
                 assert told.count("rule") == told.count("not active") == 4 == len(told) / 2

@@ -1,6 +1,4 @@
-"""``global_rng=True``: global generators of its own for each environment, and untouched ones for
-everybody else.
-"""
+"""``global_rng=True``: each environment has global generators of its own; others stay untouched."""
 
 import random
 import threading

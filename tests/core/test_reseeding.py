@@ -1,6 +1,4 @@
-"""``reseed_generators``: the generators that a simulation holds are found and seeded in place;
-``Streams`` by name.
-"""
+"""``reseed_generators`` finds and seeds a simulation's generators in place, ``Streams`` by name."""
 
 import copy
 import functools

@@ -1,6 +1,4 @@
-"""What goes through a space: observations are cast to it, actions and masks are checked against
-it.
-"""
+"""Spaces: observations are cast to them, and actions and masks are checked against them."""
 
 import copy
 

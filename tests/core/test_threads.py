@@ -1,6 +1,4 @@
-"""driver="thread": simulations in threads of their own, and environments that are used from
-changing threads.
-"""
+"""driver="thread": simulations in their own threads, and environments in changing threads."""
 
 import gc
 import signal

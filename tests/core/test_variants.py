@@ -1,6 +1,4 @@
-"""Variants: a model with all that an experiment changes, under one name; and what environments say
-they are made of.
-"""
+"""Variants: a model with all changes of an experiment under one name, and its provenance."""
 
 import json
 import pickle
@@ -174,13 +172,15 @@ def test_values_that_are_no_json_are_named():
     ant = decision(agent="ant_0")
     parameters = {
         "a": np.arange(2), "b": {1.5}, "c": Farm, "d": {1: {Farm: 2, (3, None): 4}},
-        "e": [np.datetime64("2020-01-01"), np.complex64(1)], "f": np.array([1, 2j], object), "g": np.longdouble(1),
+        "e": [np.datetime64("2020-01-01"), np.complex64(1)], "f": np.array([1, 2j], object),
+        "g": np.longdouble(1),
     }  # fmt: skip
     variant = Variant("odd", lambda **parameters: Farm(), parameters=parameters, points=ant)
     said = json.loads(json.dumps(provenance(variant)))
     assert isinstance(said["parameters"].pop("g"), (str, float))  # it has no counterpart everywhere
     assert said["parameters"] == {
-        "a": [0, 1], "b": ["1.5"], "c": f"{__name__}.Farm", "d": {"1": {f"{__name__}.Farm": 2, "[3, None]": 4}},
+        "a": [0, 1], "b": ["1.5"], "c": f"{__name__}.Farm",
+        "d": {"1": {f"{__name__}.Farm": 2, "[3, None]": 4}},
         "e": ["datetime.date(2020, 1, 1)", "(1+0j)"], "f": [1, "2j"],
     }  # fmt: skip
     assert "<lambda>" in said["simulation"]

@@ -1,5 +1,4 @@
-"""A simulator that sends as little as it may, and what is none of the wire's besides: ``python
-bare.py POINT ...``.
+"""A simulator that sends only required frames, and other text: ``python bare.py POINT ...``.
 
 It has six decisions in an episode, the third and the sixth at its last point, the others at its
 first.

@@ -97,14 +97,19 @@ VARIETY: dict[str, tuple[Any, Any]] = {
     )),
     "rows": (Counter, definition(
         observation_space=spaces.Box(-100, 100, (2, 3), np.float64),
-        # Laid out column by column, and of nobody else.
-        observation_space_mapping=lambda self: np.full((2, 3), [self.count, self.goal, 7.0], order="F"),
+        # A new array with a column-major layout.
+        observation_space_mapping=lambda self: np.full(
+            (2, 3), [self.count, self.goal, 7.0], order="F"
+        ),
     )),
     "box": (Counter, definition(
-        action_space=spaces.Box(0, 3, (2,), np.float32), action_space_mapping=lambda a: 1 + int(a.sum())
+        action_space=spaces.Box(0, 3, (2,), np.float32),
+        action_space_mapping=lambda a: 1 + int(a.sum()),
     )),
     "dict action": (Counter, definition(
-        action_space=spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Box(0, 1, (2,), np.float64)}),
+        action_space=spaces.Dict(
+            {"a": spaces.Discrete(3), "b": spaces.Box(0, 1, (2,), np.float64)}
+        ),
         action_space_mapping=lambda action: 1 + int(action["a"]),
     )),
     "multi": (Counter, definition(
@@ -188,9 +193,7 @@ def agree(ours: Any, theirs: Any, steps: int, rng: np.random.Generator) -> None:
 def made(
     design: Any, number: int, mode: AutoresetMode, *, sync: bool = False, **options: Any
 ) -> Any:
-    """A vector environment of worlds of a design, ours or Gymnasium's; None where there is no
-    such.
-    """
+    """A vector environment of worlds of a design, ours or Gymnasium's; None if it is impossible."""
     points = points_of(design)
     policies = {points[point]: advised for point in design.policies} | {
         points[point]: RULE for point in design.rules

@@ -83,7 +83,7 @@ class DialSim:
 class DialEnv(gymnasium.Env[Any, Any]):
     """The same, written by hand."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012 - as Gymnasium has it
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 200}  # noqa: RUF012 - Gymnasium's way
     action_space = ACTIONS
     episodes = 0
 

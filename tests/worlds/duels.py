@@ -1,6 +1,4 @@
-"""A simulation to be planned in, and what its futures must be worth, computed without the
-library.
-"""
+"""A simulation for planning, and the values of its futures, computed without the library."""
 
 from __future__ import annotations
 

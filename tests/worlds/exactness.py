@@ -22,9 +22,7 @@ from tests.worlds.trips import move
 
 
 def tree_of_archive(chance: random.Random) -> list[bool]:
-    """Which branches and clones in a tree become what their archive becomes: files, and global
-    generators.
-    """
+    """Whether branches and clones in a tree have their archive's outcome: files, generators."""
 
     def step(env: Any) -> tuple[Any, bool]:
         told = env.step(3)
@@ -35,9 +33,7 @@ def tree_of_archive(chance: random.Random) -> list[bool]:
 
 
 def tree_of_yard(chance: random.Random) -> list[bool]:
-    """Which branches and clones in a tree become what their yard becomes: births, deaths, stacks
-    in stacks.
-    """
+    """Whether branches and clones in a tree have their yard's outcome: births, deaths, stacks."""
     design = Design(
         machines=chance.randint(1, 4),
         jobs=chance.randint(1, 3),
@@ -59,8 +55,7 @@ def of_tree(
     come: Any,
     methods: list[str],
 ) -> list[bool]:
-    """Which clones of an environment, which of its clones, and which branches of all these become
-    what it becomes.
+    """Whether an environment's clones, their clones and all branches have its outcome.
 
     All move in a random order. A ``step`` returns what is told, and whether it was the last one.
     ``come`` returns what has come of a simulation.

@@ -1,6 +1,4 @@
-"""A simulation in which anything may happen anywhere: in the model, its mappings, policies and
-handlers.
-"""
+"""A simulation with faults anywhere: in the model, its mappings, policies and handlers."""
 
 from __future__ import annotations
 
@@ -169,8 +167,8 @@ OF_ONE = (single_env, vector)
 """Views of one agent, which is the planner."""
 IN_THE_MODEL = ("run", "rule", "apply", "before", "after", "instead")
 PLACES = (
-    *IN_THE_MODEL, "reset", "finally", "stop", "close", "observation", "reward", "mask", "agent", "removed_by",
-    "choices", "action", "policy", "time", "expected_calls", "render",
+    *IN_THE_MODEL, "reset", "finally", "stop", "close", "observation", "reward", "mask", "agent",
+    "removed_by", "choices", "action", "policy", "time", "expected_calls", "render",
 )  # fmt: skip
 ONCE = ("reset", "finally", "stop", "close", "removed_by", "apply", "action")
 """What an episode does not come by three times."""
@@ -182,9 +180,7 @@ def comes_by(view: Any, place: str) -> bool:
 
 
 def farm_env(view: Any, place: str | None = None, **options: Any) -> Any:
-    """An environment of a farm, which comes by that place, and its farm, for a vector the first
-    one.
-    """
+    """An environment of a farm that comes by ``place``, and its farm (a vector's first one)."""
 
     def policy(observation: Any) -> int:
         farms[0].come_by("policy")
@@ -240,9 +236,7 @@ def run(env: Any, seed: int = 11) -> str:
 
 
 def cut_short(env: Any) -> None:
-    """Begin an episode, go on a little, and close the environment, or reset it if it would be of
-    no use after that.
-    """
+    """Begin an episode, take a step, and close the environment, or reset a vector."""
     env.reset(seed=11)
     take(env, RULE)
     env.reset() if isinstance(env, VectorEnv) else env.close()

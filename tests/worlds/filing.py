@@ -1,6 +1,4 @@
-"""A simulation that keeps files and draws from the global generators, which a fork must not
-disturb.
-"""
+"""A simulation with files and global generators, which a fork must not disturb."""
 
 from __future__ import annotations
 
@@ -20,9 +18,7 @@ choose = decision()
 
 
 class Archive:
-    """Between two decisions it does something with a file, drawn at random; all that it reads is
-    in its log.
-    """
+    """Does something random with a file between decisions; its log holds all that it reads."""
 
     def __init__(self, days: int = 12) -> None:
         self.days = days
@@ -66,7 +62,7 @@ class Archive:
     def open(self) -> None:
         path = Path(self.folder, str(self.chance.randrange(3)))
         mode = self.chance.choice(["r+", "a+", "w+", "a", "r"])
-        self.files.append(open(path, mode if path.exists() else "w+"))  # noqa: SIM115 - closed at the end
+        self.files.append(open(path, mode if path.exists() else "w+"))  # noqa: SIM115 - closed later
 
     def open_nameless(self) -> None:
         self.files.append(tempfile.TemporaryFile("w+"))  # noqa: SIM115

@@ -18,9 +18,7 @@ from simenv_marl import RULE, Definition, make_step
 
 
 def plainly(value: Any) -> str:
-    """What a test with that value is called: the same in every process, whatever lies where in
-    memory.
-    """
+    """The name of a test with that value: the same in every process, without memory addresses."""
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
@@ -28,9 +26,7 @@ PAIR = spaces.Box(-1e6, 1e6, (2,), np.float64)
 
 
 def define(**changes: Any) -> Definition:
-    """A definition that returns the action itself, observes (1, 2) and rewards nothing, but for
-    what is changed.
-    """
+    """A definition that returns the action, observes (1, 2) and rewards 0, but for ``changes``."""
     given: dict[str, Any] = {
         "observation_space": PAIR,
         "observation_space_mapping": lambda *args, **kwargs: [1.0, 2.0],
@@ -174,9 +170,7 @@ def decisions(turns: list[Turn]) -> list[str]:
 
 
 def rewards_of(turns: list[Turn], agent: str) -> list[float]:
-    """An agent's rewards for its actions, in their order (what it had before its first one left
-    out).
-    """
+    """An agent's rewards for its actions, in order, without the reward before the first one."""
     return [turn.reward for turn in turns if turn.agent == agent][1:]
 
 
@@ -195,16 +189,13 @@ def culprits(error: BaseException) -> list[str]:
 
 
 def alive(kind: type) -> int:
-    """How many objects of a type there are since the file of tests began, once the collector has
-    run.
-    """
+    """The number of objects of a type since the file of tests began, after a collection."""
     gc.collect()
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
 def stacks(before: WeakSet[Any] | None = None) -> WeakSet[Any]:
-    """The greenlets since the file of tests began, but for those that are a thread's own, which
-    have no parent.
+    """The greenlets since the file of tests began, without each thread's own (which has no parent).
 
     Those that were there ``before`` are left out. Of environments that hold others one goes at a
     time.
@@ -226,7 +217,5 @@ _unattended = decision()
 
 
 def nobody_is_asked() -> bool:
-    """Whether no simulation is taken to run in this thread: then decision functions are their
-    rules.
-    """
+    """Whether no simulation counts as running in this thread: decision functions are rules."""
     return bool(_unattended() == "rule")

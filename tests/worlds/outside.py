@@ -1,5 +1,4 @@
-"""A model of its own process, which speaks the wire: reservoirs that are filled, leak, are given
-up and come anew.
+"""A process of its own that speaks the wire: reservoirs are filled, leak, are given up, and return.
 
 ``python outside.py [EPISODES] [tells]`` plays it to an environment, which it tells or not what its
 rule decides. ``python outside.py SEED`` plays it by its own rule. It needs nothing but Python, and
@@ -35,9 +34,7 @@ class Reservoirs:
     def run(
         self, decide: Callable[..., Any], remove: Callable[..., None], update: Callable[..., None]
     ) -> None:
-        """The main loop: decides by ``decide``, says what is gone by ``remove``, and what has
-        changed by ``update``.
-        """
+        """The main loop: decisions by ``decide``, removals by ``remove``, changes by ``update``."""
         for hour in range(self.hours):
             if self.words:
                 print("hm" * self.words, file=sys.stderr)
@@ -175,9 +172,7 @@ POINTS = ["reservoir.inflow", "broker.price"]
 
 
 def main() -> None:
-    """Play to an environment, or by the model's own rule: the result stands on the standard output
-    then.
-    """
+    """Play to an environment, or by the model's rule, with the result on the standard output."""
     numbers = [int(word) for word in sys.argv[1:] if word.isdecimal()]
     if "SIMENV_MARL_FDS" in os.environ:
         Wire().play(Reservoirs, POINTS, *numbers)

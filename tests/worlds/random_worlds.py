@@ -1,5 +1,4 @@
-"""Random models of processes in continuous time, whose machines decide while they hold what others
-wait for.
+"""Random models of continuous-time processes: machines decide while they hold shared resources.
 
 A ``Yard`` is made of SimPy processes, nested generators, births and deaths. What comes of it is all
 in its ``trace`` and its generator, and depends on every decision and on their order.
@@ -30,8 +29,7 @@ ROSTER = {
 
 @dataclass(frozen=True)
 class Design:
-    """What a yard is like: machines at first, jobs of each, machines that may load at once
-    (``cranes``).
+    """A yard: initial machines, jobs of each, and ``cranes``, the machines that may load at once.
 
     It decides itself every ``plans`` units of time. One of ``luck`` cases brings a birth or a
     death.
@@ -182,9 +180,7 @@ PLAN = {f"{HERE}.Yard.plan": POINTS[f"{HERE}.Yard.plan"]}
 
 
 def advised(observation: Any) -> Any:
-    """What everybody answers who makes that observation of a machine or of the yard: an action, or
-    the rule.
-    """
+    """The answer to an observation of a machine or of the yard: an action, or the rule."""
     number, decided, _, seed = (int(value) for value in observation)
     return random.Random(f"{seed} {number} {decided}").choice([1, 2, 3, 4, RULE])
 

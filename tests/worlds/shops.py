@@ -1,6 +1,4 @@
-"""A small shop whose keeper and helper decide, for experiments: its returns are known without the
-library.
-"""
+"""A small shop for experiments: a keeper and a helper decide; its returns are known in advance."""
 
 import time
 from dataclasses import replace
@@ -58,9 +56,7 @@ NEAR = {
     point: replace(definition, reward_mapping=lambda shop: -abs(shop.level))
     for point, definition in POINTS.items()
 }
-"""Points at which both are to keep the level near to nothing, so that chance matters to those who
-plan.
-"""
+"""Points at which both should keep the level near zero, so that chance matters to planners."""
 
 
 def much(observation):

@@ -1,6 +1,4 @@
-"""A trip has all that a clone must continue, and is undertaken in all views; its diary is a file
-of all processes.
-"""
+"""A trip has all state that a clone must continue, in all views; processes share its diary file."""
 
 import os
 import random
@@ -91,10 +89,12 @@ PLACE = {
 }
 POINTS = {
     f"{__name__}.Trip.walk": define(
-        agent="walker_0", observation_space_mapping=Trip.state, action_space_mapping=lambda action: action - 1,
+        agent="walker_0", observation_space_mapping=Trip.state,
+        action_space_mapping=lambda action: action - 1,
         action_mask_mapping=lambda trip: [1, 1, trip.free or trip.day % 2],
         reward_mapping=difference(lambda trip: trip.place), goal_space=PLACE["observation_space"],
-        achieved_goal_mapping=lambda trip: [trip.day, trip.place], desired_goal_mapping=lambda trip: [trip.place, 1],
+        achieved_goal_mapping=lambda trip: [trip.day, trip.place],
+        desired_goal_mapping=lambda trip: [trip.place, 1],
         compute_reward=lambda achieved, desired, info: achieved[0], **PLACE,
     ),
     f"{__name__}.Trip.lead": define(
@@ -105,10 +105,13 @@ POINTS = {
 
 single, limited = partial(single_env, agent="walker_0"), partial(TimeLimit, max_episode_steps=4)
 VIEWS = {
-    "aec": (aec_env, None), "aec, ordered": (aec_env, OrderEnforcingWrapper), "aec, padded": (aec_env, pad_agents),
+    "aec": (aec_env, None), "aec, ordered": (aec_env, OrderEnforcingWrapper),
+    "aec, padded": (aec_env, pad_agents),
     "parallel": (parallel_env, None), "parallel, padded": (parallel_env, pad_agents),
     "parallel to aec": (parallel_env, parallel_to_aec),
-    "parallel to aec to parallel": (parallel_env, lambda env: aec_to_parallel(parallel_to_aec(env))),
+    "parallel to aec to parallel": (
+        parallel_env, lambda env: aec_to_parallel(parallel_to_aec(env))
+    ),
     "single": (single, None), "single, limited": (single, limited),
     "joint": (joint_env, None), "joint, limited": (joint_env, limited),
 }  # fmt: skip
@@ -125,9 +128,7 @@ def trip(view="single", simulation=Trip, *, taken=1, seed=3, **options):
 
 
 def move(env):
-    """Take the step that the generators of the spaces draw, in any view; return all that is told,
-    and if it is over.
-    """
+    """Take a step that the spaces' generators draw, in any view; return its results and the end."""
     view = env.unwrapped
 
     def drawn(name, space):

@@ -68,9 +68,7 @@ def fail():
 
 
 def threaded():
-    """Decide in a thread whose errors nobody sees, as in callbacks that a library catches; never
-    end by itself.
-    """
+    """Decide in a thread that hides errors, as a library's callbacks do; never end by itself."""
 
     def callback():
         try:

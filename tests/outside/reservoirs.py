@@ -1,6 +1,4 @@
-"""The reservoirs of ``tests/worlds/outside.py`` as a simulation: in a process of its own, and in
-this one.
-"""
+"""The reservoirs of ``tests/worlds/outside.py`` as a simulation, in a process or in this one."""
 
 import sys
 from collections import defaultdict

@@ -1,6 +1,4 @@
-"""The clients in C++, Java and Python: programs that play what they are told to; the other side is
-the test's.
-"""
+"""The clients in C++, Java and Python: programs follow a script, and the test is the other side."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Whatever a simulator does wrong is told as what it is, in time, and the next episode begins in a
-new process.
-"""
+"""A simulator's faults are reported precisely and in time; the next episode has a new process."""
 
 import multiprocessing
 import os
@@ -270,7 +268,8 @@ def test_a_process_that_computes_ends_with_its_parent_though_that_is_killed():
 import signal, threading
 from simenv_marl.remote.child import Child
 children = []
-thread = threading.Thread(target=lambda: children.append(Child({[sys.executable, "-c", BUSY]}, 60.0)))
+command = {[sys.executable, "-c", BUSY]}
+thread = threading.Thread(target=lambda: children.append(Child(command, 60.0)))
 thread.start()
 thread.join()
 print(children[0].pid, children[0].hello["descendant"], flush=True)

@@ -1,6 +1,4 @@
-"""Co-simulation units (FMI 2 and 3): the master decides in this process, and the units run below
-it.
-"""
+"""Co-simulation units (FMI 2 and 3): the master decides in this process, the units run below it."""
 
 import random
 import shutil
@@ -135,8 +133,10 @@ def test_variables_that_are_not_real_have_discrete_spaces():
     description = ModelDescription(modelVariables=variables)
     found = spaces_of(description, ["open", "level", "count"])
     assert dict(found) == {
-        "open": spaces.Discrete(2), "level": spaces.Discrete(2, start=1), "count": spaces.Discrete(5, start=-1)
-    }  # fmt: skip
+        "open": spaces.Discrete(2),
+        "level": spaces.Discrete(2, start=1),
+        "count": spaces.Discrete(5, start=-1),
+    }
     for name in ("text", "row"):
         with pytest.raises(ValueError, match=f"{name} is not a scalar number"):
             spaces_of(description, [name], {name: (0, 1)})

@@ -1,6 +1,4 @@
-"""Models outside Python: a town in Java, a network in ns-3, robots in Enki, and what the pages on
-clients show.
-"""
+"""Models outside Python: a Java town, an ns-3 network, Enki robots, and the pages on clients."""
 
 from __future__ import annotations
 

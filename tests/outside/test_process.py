@@ -1,6 +1,4 @@
-"""A simulator in another process is a simulation like any other: every view, and all that is built
-on simulations.
-"""
+"""A simulator in another process is like any other simulation, in every view and application."""
 
 import copy
 import gc

@@ -1,6 +1,4 @@
-"""The frames of simulators in other processes: invalid ones, the decisions of their rules, and
-births.
-"""
+"""The frames of simulators in other processes: invalid ones, their rules' decisions, births."""
 
 import json
 import sys

@@ -1,6 +1,4 @@
-"""The wire: what is sent arrives, what is no frame is refused; and the check that authors of
-clients make of them.
-"""
+"""The wire: frames arrive, other bytes are refused; and the check for authors of clients."""
 
 import json
 import re

@@ -132,9 +132,7 @@ class Child:
         return calls, frame
 
     def ended(self) -> tuple[int, str, str]:
-        """Wait until the process has ended: its status, and what it has written on stdout and
-        stderr.
-        """
+        """Wait until the process has ended; return its status, its stdout and its stderr."""
         output, errors = self.process.communicate()
         return self.process.returncode, output.decode(), errors.decode()
 

@@ -61,9 +61,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def endpoint(answers):
-    """Serve answers, one for each request, and the last one for all others; a number of seconds is
-    a late one.
-    """
+    """Serve one answer per request, and repeat the last one; a number of seconds is a delay."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), _Handler)
     server.daemon_threads = True
     server.answers, server.requests = [*answers], []

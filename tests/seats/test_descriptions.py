@@ -176,7 +176,12 @@ def test_labels_may_be_made_for_each_call():
 
 SPACES = {
     "number": (spaces.Box(0, 2, (1,)), None, ["1.5", "[1.5]", '{"action": 1.5}'], [1.5]),
-    "numbers": (spaces.Box(0, 2, (2,)), ["in", "out"], ['{"in": 1, "out": 0.5}', "[1, 0.5]", "1, 0.5"], [1, 0.5]),
+    "numbers": (
+        spaces.Box(0, 2, (2,)),
+        ["in", "out"],
+        ['{"in": 1, "out": 0.5}', "[1, 0.5]", "1, 0.5"],
+        [1, 0.5],
+    ),
     "counts": (spaces.MultiDiscrete([3, 4]), ["a", "b"], ['{"a": 2, "b": 3}', "[2, 3]"], [2, 3]),
     "switches": (spaces.MultiBinary(2), None, ["[1, 0]", '{"0": 1, "1": 0}'], [1, 0]),
     "parts": (
@@ -185,8 +190,13 @@ SPACES = {
         ['{"Kind": 2, "Size in m": 4}', '{"kind": 2, "size": 4}'],
         {"kind": 2, "size": [4]},
     ),
-    "pair": (spaces.Tuple([spaces.Discrete(3), spaces.Discrete(2)]), None, ["[2, 1]", '{"0": 2, "1": 1}'], (2, 1)),
-}  # fmt: skip
+    "pair": (
+        spaces.Tuple([spaces.Discrete(3), spaces.Discrete(2)]),
+        None,
+        ["[2, 1]", '{"0": 2, "1": 1}'],
+        (2, 1),
+    ),
+}
 
 
 @pytest.mark.parametrize("kind", SPACES)

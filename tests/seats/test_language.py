@@ -1,6 +1,4 @@
-"""A language model decides: over an endpoint that answers right, wrong, late, with garbage, or not
-at all.
-"""
+"""A language model decides: its endpoint answers rightly, wrongly, late, with garbage, or never."""
 
 import asyncio
 import json
@@ -132,9 +130,9 @@ def test_requests_contain_the_latest_decisions_of_the_agent():
         played(model(address, history=2))
     roles = [[message["role"][0] for message in request["messages"]] for request in requests[:4]]
     assert ["".join(own) for own in roles] == ["su", "suau", "suauau", "suauau"]
-    assert [message["content"] for message in requests[3]["messages"] if message["role"] == "assistant"] == [
-        "half", "closed",
-    ]  # fmt: skip
+    messages = requests[3]["messages"]
+    answers = [message["content"] for message in messages if message["role"] == "assistant"]
+    assert answers == ["half", "closed"]
 
 
 def test_episodes_of_one_seed_have_a_history_each():

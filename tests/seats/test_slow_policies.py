@@ -81,7 +81,9 @@ def test_a_coroutine_function_answers_as_a_function_does(run, plain):
 
 @pytest.mark.parametrize("run", [
     lambda policy: levels(policy, concurrency=4),
-    lambda policy: evaluate(Tank, {"it": {"filler": policy}}, seeds=range(6), points=POINTS, concurrency=4),
+    lambda policy: evaluate(
+        Tank, {"it": {"filler": policy}}, seeds=range(6), points=POINTS, concurrency=4
+    ),
 ])  # fmt: skip
 def test_as_many_decisions_wait_at_once_as_concurrency_says(run):
     waiting, most = 0, 0

@@ -60,8 +60,8 @@ def two(observation):
 
 @pytest.mark.parametrize("retries", [0, 2])
 @pytest.mark.parametrize(("policy", "kind"), [
-    (raises, "failed"), (raises_later, "failed"), (late, "late"), (never, "late"), (illegal, "illegal"),
-    (illegal_later, "illegal"),
+    (raises, "failed"), (raises_later, "failed"), (late, "late"), (never, "late"),
+    (illegal, "illegal"), (illegal_later, "illegal"),
 ])  # fmt: skip
 def test_the_fallback_answers_after_the_retries_and_is_counted(policy, kind, retries):
     timeout = 0.002 if kind == "late" else None  # others may be late, too, on a busy machine
@@ -123,7 +123,8 @@ def test_an_illegal_answer_of_the_fallback_is_an_error():
 
 
 @pytest.mark.parametrize("arguments", [
-    {"policy": 3}, {"fallback": 3}, {"timeout": 0}, {"timeout": "1"}, {"retries": -1}, {"retries": True},
+    {"policy": 3}, {"fallback": 3}, {"timeout": 0}, {"timeout": "1"},
+    {"retries": -1}, {"retries": True},
 ])  # fmt: skip
 def test_what_cannot_be_used_is_refused_at_once(arguments, tmp_path):
     with pytest.raises(OptionValueError, match=next(iter(arguments))):

@@ -1,6 +1,4 @@
-"""The command and its server: links, keys, hosts, limits of messages and connections, and the
-end.
-"""
+"""The command and its server: links, keys, hosts, limits of messages and connections, the end."""
 
 import asyncio
 import json
@@ -48,8 +46,8 @@ class Server:
             *arguments,
         ]
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT,
-            start_new_session=True,
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env=environment, cwd=ROOT, start_new_session=True,
         )  # fmt: skip
         self.base = re.search(r"http://\S+", self.process.stdout.readline())[0]
         self.host = self.base.split("/")[2]
@@ -325,7 +323,10 @@ def test_a_missing_extra_is_told(monkeypatch, capsys):
 
 def test_the_command_line_imports_the_server_only_to_play():
     names = ("starlette", "uvicorn", "websockets")
-    code = f"import simenv_marl.__main__, sys; print([name for name in {names} if name in sys.modules])"
+    code = (
+        "import simenv_marl.__main__, sys; "
+        f"print([name for name in {names} if name in sys.modules])"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "src"
     )

@@ -99,9 +99,7 @@ def pytest_runtest_protocol(item, nextitem):
 
 @pytest.fixture
 def _collected():
-    """For tests in whose midst no finalizer may run, as at the end of the stack: it would swallow
-    an error.
-    """
+    """Disable finalizers during a test: at the end of the stack, one would swallow an error."""
     gc.collect()
     gc.disable()
     yield

@@ -15,8 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def alone(function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function of a test file in a process of its own, where no other test has left
-    anything open.
+    """Call a function of a test file in a fresh process, without open resources of other tests.
 
     Environments have the driver of the test that calls. The arguments are strings and numbers.
     """
@@ -81,9 +80,7 @@ def runs(number: int) -> bool:
 
 
 def gone(number: int) -> bool:
-    """Whether a process ends, within a time that is long enough on a machine that is busy with
-    other things.
-    """
+    """Whether a process ends within a generous time, for busy machines."""
     until = time.monotonic() + 60
     while runs(number) and time.monotonic() < until:
         time.sleep(0.01)

@@ -1,6 +1,4 @@
-"""The benchmark: its sections run, its page explains its rows, and its two sweeps of Mesa's model
-find the same.
-"""
+"""The benchmark: its sections run, its page explains its rows, and its two sweeps of Mesa agree."""
 
 import json
 import multiprocessing

@@ -1,5 +1,4 @@
-"""Branches: what functions return from them, what forks share, and the chance ahead that
-``seeds=`` draws anew.
+"""Branches: returns of functions, sharing between forks, and the chance that ``seeds=`` redraws.
 
 That branches do what the environment would have done is asserted beside the same of clones, in
 ``test_clone.py``.
@@ -287,9 +286,7 @@ def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
 
 
 def test_actions_are_replayed_as_they_were_given():
-    """Also if the user, a policy or the mapping changes them later; and nobody is asked again for
-    what he has said.
-    """
+    """Later changes by the user, a policy or the mapping do not count; no policy is asked twice."""
     walk, buffer, asked = next(iter(POINTS)), np.zeros(1, np.float32), []
     amount = define(
         agent="walker_0",

@@ -1,6 +1,4 @@
-"""Clones: what they do, what they leave alone, and how they end; and that branches do what clones
-do.
-"""
+"""Clones: their behaviour, their isolation and their ends; and that branches behave like clones."""
 
 import errno
 import gc

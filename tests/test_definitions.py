@@ -276,9 +276,7 @@ async def apply_later(action, good):
 
 
 def finished(made):
-    """What a generator or coroutine yields, where each yield is answered by 100, and what it
-    returns.
-    """
+    """The yields of a generator or coroutine, each answered by 100, and its return value."""
     yields = []
     try:
         yields.append(made.send(None))

@@ -30,9 +30,7 @@ def lines_of(path):
 
 
 def room_of(path):
-    """The room that a file's lines count for: the one with the longest prefix of the file's
-    path.
-    """
+    """The room of a file's lines: the one with the longest prefix of the file's path."""
     name = path.relative_to(PACKAGE).as_posix()
     prefixes = [
         (prefix, room) for room, given in BUDGETS["rooms"].items() for prefix in given["files"]

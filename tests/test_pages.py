@@ -1,6 +1,4 @@
-"""Pages: their code runs and needs only what can be got as they say, and what they quote is what
-the library says.
-"""
+"""Pages: their code runs with the packages they name, and their quotations are the library's."""
 
 import builtins
 import random
@@ -143,9 +141,7 @@ def texts():
 
 @cache
 def programs_of_tests():
-    """The modules that tests run as programs, and our commands; a star stands for what a test
-    fills in.
-    """
+    """The modules that tests run as programs, and our commands; a star is a placeholder."""
     found = set()
     for path in ROOT.glob("tests/**/*.py"):
         text = re.sub(r"\{.+?\}", "*", texts()[path])
@@ -167,9 +163,7 @@ def programs_of_tests():
 
 
 def commands_of(text):
-    """The commands of a page, in its blocks and lines, without the blocks that it marks as not
-    run.
-    """
+    """The commands of a page, in its blocks and lines, without the blocks marked as not run."""
     yield from re.findall(r"`((?:make|python -m) [^`<]+)`", text)
     blocks = re.findall(
         r"^(<!-- not run: .+ -->\n\n?)?( *)```(sh|console)\n(.*?)^ *```$",
@@ -187,9 +181,7 @@ def commands_of(text):
 
 
 def untested(command, written):
-    """What a command runs or installs, and no test; ``written`` are the modules that a command
-    before it writes.
-    """
+    """The untested parts of a command; earlier commands write the modules ``written``."""
     if command.startswith("make "):
         dry_run = [*shlex.split(command), "--dry-run"]
         recipe = subprocess.run(
@@ -293,7 +285,8 @@ def test_the_page_quotes_what_the_library_says_and_names_errors_that_there_are()
 TERMS = (
     "parameter sharing", "centralised training", "CTDE", "self-play", "black death",
     "discrete-event simulation", "agent-based model", "semi-MDP", "callback", "hook",
-    "DAgger", "action mask", "PPO", "wrapper", "seed", "pickle", "AEC", "turn-based", "MARL", "behavior cloning",
+    "DAgger", "action mask", "PPO", "wrapper", "seed", "pickle", "AEC", "turn-based", "MARL",
+    "behavior cloning",
 )  # fmt: skip
 
 

@@ -1,6 +1,4 @@
-"""Mistakes of users that are told when the environment is made, or with the remedy; and what
-``help`` tells them.
-"""
+"""Mistakes of users: reported when an environment is made, or with a remedy; and ``help``."""
 
 import pydoc
 from dataclasses import fields

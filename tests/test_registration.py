@@ -146,9 +146,7 @@ def test_entities_have_no_single_view_and_are_in_that_of_another_point(register)
 
 @pytest.mark.parametrize("flatten", [False, True])
 def test_flatten_is_an_option_of_the_joint_view_alone(register, flatten):
-    """It may be one of the variant, of the registration and of the one who makes it, who comes
-    first.
-    """
+    """The option of ``make`` comes before the registration's, and that before the variant's."""
     ids = register(Variant("flat", Voyage, options={"flatten": True}), flatten=flatten)
     for options, expected in (({}, flatten), ({"flatten": not flatten}, not flatten)):
         env = made("flat/Joint-v0", **options)
@@ -162,9 +160,7 @@ def test_flatten_is_an_option_of_the_joint_view_alone(register, flatten):
 
 
 def test_names_of_points_become_camel_case_and_stay_distinct(register):
-    """The id of the joint view is taken, names may differ in how they are written alone, and
-    classes share names.
-    """
+    """The joint view's id is taken, names differ in spelling alone, and classes share names."""
     named = [
         "Robot.joint",
         "Robot.choose_2nd_route",
@@ -221,9 +217,7 @@ def test_a_refused_registration_leaves_the_registries_unchanged(register, change
 
 
 def test_in_another_process_by_module_and_id_or_by_a_spec_that_was_written_down():
-    """And in vectors: where processes are spawned, as on all systems but Linux, they know no more
-    than the spec.
-    """
+    """In vectors too: spawned processes, the default outside Linux, know only the spec."""
     env = gymnasium.make(f"tests.worlds.many_registered:{SINGLES[0]}", max_steps=2)
     code = f"""
 import gymnasium, pettingzoo

@@ -1,6 +1,4 @@
-"""Templates: what the command line writes runs where it stands, and what it cannot write it
-says.
-"""
+"""Templates: the files of the command line run in place, and impossible ones are refused."""
 
 import ast
 import os

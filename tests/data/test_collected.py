@@ -1,6 +1,4 @@
-"""Whole episodes of all agents as arrays: ``collect_episodes``, beside an AEC environment that is
-played alike.
-"""
+"""Whole episodes of all agents as arrays: ``collect_episodes``, beside a like AEC environment."""
 
 from collections import defaultdict
 
@@ -65,9 +63,7 @@ def played(env, policies, seed):
 
 
 def check(found, episodes, chosen):
-    """Compare what was collected under one key with what was ``played`` by the agents that belong
-    to it.
-    """
+    """Compare the collection under one key with the ``played`` turns of its agents."""
     trajectory = row = 0
     following = found.next_observations
     for number, (agents, last) in enumerate(episodes):

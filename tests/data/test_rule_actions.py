@@ -126,7 +126,8 @@ def test_with_apply_it_is_asked_when_the_rule_has_decided_in_place():
     fill = decision(
         pour, apply=lambda action: None, rule_action_mapping=lambda nothing: tank["level"]
     )
-    last = lambda: tank.update(level=5)  # noqa: E731  # what comes after the decision is not looked at
+    # Changes after the decision do not count.
+    last = lambda: tank.update(level=5)  # noqa: E731
     env = begun(calling(fill, fill, fill, last), fill)
     assert [env.step(RULE)[4]["rule_action"] for _ in range(3)] == [3, 6, 9]
 

@@ -112,9 +112,7 @@ def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 @COPIES
 def test_a_copy_has_all_options(copied, driver):
-    """Points that nobody has decorated, policies, plugins, variants, rosters and all other
-    options.
-    """
+    """Undecorated points, policies, plugins, variants, rosters and all other options."""
     points = {f"{Walk.__module__}.Walk.drift": define(agent="wind_0"), Walk.choose: None}
     variant = Variant(
         "long", Walk, parameters={"length": 7}, plugins=[(blow, Walk.drift, "instead")]
@@ -158,11 +156,10 @@ def run(code, given=None):
 
 
 def test_cloudpickle_takes_a_model_of_the_main_module_to_another_process():
-    """A model in ``__main__``, decorated and not, with differences, lambdas and policies, as in a
-    notebook.
-    """
+    """A model in ``__main__``, with and without decorators, with lambdas, as in a notebook."""
     code = """
-points = {Model.one: None, Model.two: define(agent="two_0", action_space_mapping=lambda action: action)}
+two = define(agent="two_0", action_space_mapping=lambda action: action)
+points = {Model.one: None, Model.two: two}
 env = aec_env(Model, points, policies={"two_0": lambda observation: 5})
 env.reset()
 env.close()
@@ -179,9 +176,7 @@ print([turn.reward for turn in play(env, 2, seed=1)], env.simulation.total, env.
 
 
 def test_copies_of_a_model_of_the_main_module_leave_its_class_as_it_stands():
-    """As in a script that gives its environments to processes which it has forked, or keeps them
-    in a file.
-    """
+    """As in a script that gives its environments to forked processes, or keeps them in a file."""
     code = """
 two = Model.two
 for env in (

@@ -1,6 +1,4 @@
-"""Padded rosters: everybody who may ever be there is there, from the reset to the end of the
-episode.
-"""
+"""Padded rosters: every possible agent is present, from the reset to the end of the episode."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Simulations spread over processes tell what they tell in one, and nothing hangs or stays
-behind.
-"""
+"""Simulations in several processes give the results of one process, and leave nothing behind."""
 
 from __future__ import annotations
 
@@ -46,9 +44,7 @@ def _nothing_is_left():
 
 
 class Failing(Counter):
-    """Counts for ever, and calls what the options of its reset have for its seed, after decisions
-    and unwinding.
-    """
+    """Counts for ever; calls its reset's option for its seed after decisions and in unwinding."""
 
     def __init__(self) -> None:
         self.process = os.getpid()

@@ -17,9 +17,7 @@ from tests.worlds.dials import DialEnv, dial_env
 
 
 class Case(NamedTuple):
-    """How a wrapper is made: its arguments, what it wants to be seen, and the packages that it
-    needs.
-    """
+    """The making of a wrapper: its arguments, its required observations, its required packages."""
 
     arguments: dict[str, Any] = {}  # noqa: RUF012 - it is never changed
     seen: str = "numbers"

@@ -1,6 +1,4 @@
-"""The library's check, which runs those of PettingZoo and Gymnasium, on the environments of all
-examples.
-"""
+"""The library's check, with PettingZoo's and Gymnasium's, on the environments of all examples."""
 
 import pickle
 from functools import partial

@@ -1,6 +1,4 @@
-"""The greenhouse: the model on its own, the ends of its episodes, its registration, and what a
-training is worth.
-"""
+"""The greenhouse: the model alone, the ends of episodes, registration, and the gain by training."""
 
 import re
 

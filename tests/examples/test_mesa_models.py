@@ -1,6 +1,4 @@
-"""Mesa's example models as environments: with RULE throughout the plain run, with actions another
-one.
-"""
+"""Mesa's example models as environments: with RULE as in the plain run, with actions otherwise."""
 
 import re
 from pathlib import Path

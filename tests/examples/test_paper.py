@@ -1,6 +1,4 @@
-"""The paper's showcase (its supplements S1 and S2, and step 4) runs as it is printed, but for its
-import lines.
-"""
+"""The paper's showcase (supplements S1 and S2, step 4) runs as printed, except for its imports."""
 
 import re
 import subprocess
@@ -14,8 +12,12 @@ PAPER = Path(__file__).parents[3] / "shared" / "paper" / "sim-env.tex"
 CHANGES = {
     "from gym import spaces": "from gymnasium import spaces",
     "from gym_fin.envs.sim_env import make_step": "from simenv_marl import make_step",
-    "from gym_fin.envs.sim_interface import SimulationInterface": "from simenv_marl import SimulationInterface",
-    "from gym.envs.registration import register": "from gymnasium.envs.registration import register",
+    "from gym_fin.envs.sim_interface import SimulationInterface": (
+        "from simenv_marl import SimulationInterface"
+    ),
+    "from gym.envs.registration import register": (
+        "from gymnasium.envs.registration import register"
+    ),
     "from gym_fin.envs.sim_env import generate_env": "from simenv_marl import generate_env",
     "import gym": "import gymnasium as gym",
     "obs0 = env.reset()": "obs0, info = env.reset()",

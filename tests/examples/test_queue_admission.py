@@ -1,6 +1,4 @@
-"""Admission to a queue: its exact values, and those of the model; its training is in
-``tests/clients``.
-"""
+"""Admission to a queue: exact values, and the model's; ``tests/clients`` tests the training."""
 
 import math
 

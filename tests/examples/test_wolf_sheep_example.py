@@ -1,6 +1,4 @@
-"""The lives of sheep in Mesa's unmodified model; how one policy for all is trained is tested in
-``tests/clients``.
-"""
+"""The lives of sheep in Mesa's unmodified model; ``tests/clients`` tests the shared policy."""
 
 import numpy as np
 from examples.wolf_sheep.env import MOVE, Meadow, numbers, sheep_points

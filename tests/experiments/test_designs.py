@@ -25,8 +25,12 @@ ranges = st.one_of(
         lambda pair: (pair[0], pair[0] + pair[1])
     ),
 )
-levels = st.lists(st.one_of(st.integers(), st.booleans(), st.none(), st.text(max_size=3)), min_size=1, max_size=4,
-                  unique_by=lambda level: (type(level), level))  # fmt: skip
+levels = st.lists(
+    st.one_of(st.integers(), st.booleans(), st.none(), st.text(max_size=3)),
+    min_size=1,
+    max_size=4,
+    unique_by=lambda level: (type(level), level),
+)
 factors = st.dictionaries(
     st.text(min_size=1, max_size=3), st.one_of(ranges, levels), min_size=1, max_size=4
 )

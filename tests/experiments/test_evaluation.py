@@ -40,7 +40,10 @@ def of_teams(**returns):
 
 def returns_by_hand(policies, seed, make=Shop, points=POINTS, **options):
     found = Counter()
-    decide = lambda agent, env: policies[agent](env.observe(agent)) if agent in policies else RULE  # noqa: E731
+
+    def decide(agent, env):
+        return policies[agent](env.observe(agent)) if agent in policies else RULE
+
     for turn in play(aec_env(make, points, **options), decide, seed=seed):
         found[turn.agent] += turn.reward
     return found
@@ -261,7 +264,7 @@ def test_the_number_of_seeds_is_that_of_the_paired_t_test(size, power, confidenc
     assert found.seeds_needed(size * apart.std(ddof=1), power=power)["b"] == np.ceil(expected)
 
 
-def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_wrong_ones_are_refused():
+def test_differences_that_are_far_too_large_or_small_have_a_number_of_seeds_and_wrong_ones_are_refused():  # noqa: E501
     returns = of_teams(a=[0, 0, 0], b=[1, 2, 3], same=[0, 0, 0])
     found = Evaluation(returns, "a", 0.95)
     for difference, number in ((1e3, 2), (1e15, 2), (1e-12, np.inf)):

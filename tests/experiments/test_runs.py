@@ -477,7 +477,10 @@ def visits(days=2):
 def test_a_name_that_no_agent_has_is_an_error_of_its_contender(arguments, tmp_path):
     policy = much_of_many if arguments.get("batched") else much
     given = {"seeds": range(3), "points": beings(), **arguments}
-    told = "'wrong' has a policy for 'beeing_1', but no agent .*decided: being_0, being_1; did you mean being_1"
+    told = (
+        "'wrong' has a policy for 'beeing_1', but no agent "
+        ".*decided: being_0, being_1; did you mean being_1"
+    )
     contenders = {"right": {"being_1": policy}, "wrong": {"being_1": policy, "beeing_1": policy}}
     with pytest.raises(AgentError, match=told):
         evaluate(visits, contenders, **given)
@@ -580,20 +583,27 @@ SCRIPT = """
             return 3
 
         def run(self):
-            if most and sum(path.read_bytes().count(b"\\n") for path in Path(store).glob("*.jsonl")) >= most:
+            files = Path(store).glob("*.jsonl")
+            if most and sum(path.read_bytes().count(b"\\n") for path in files) >= most:
                 os.killpg(0, signal.SIGKILL)
             super().run()
 
     store, workers, most = sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
     if __name__ == "__main__":
-        undecided = run_experiment(Own, {"days": [1]}, seeds=[1], store=f"{store}.undecided", workers=workers,
-                                   metric=lambda shop: shop.days)
-        assert undecided[["agent", "return", "length", "metric"]].values.tolist() == [["team", 0.0, 0, 1]]
+        undecided = run_experiment(
+            Own, {"days": [1]}, seeds=[1], store=f"{store}.undecided", workers=workers,
+            metric=lambda shop: shop.days,
+        )
+        columns = ["agent", "return", "length", "metric"]
+        assert undecided[columns].values.tolist() == [["team", 0.0, 0, 1]]
         order, sell = POINTS.values()
-        design = pd.DataFrame({"days": range(1, 7), "price": 0.5, "kind": ["plain"] * 5 + ["faulty"]})
-        frame = run_experiment(Own, design, contenders={"some": {"__main__.Own.order": some}}, seeds=range(4),
-                               points={"__main__.Own.order": order, Shop.sell: sell}, metric=level, store=store,
-                               workers=workers)
+        kinds = ["plain"] * 5 + ["faulty"]
+        design = pd.DataFrame({"days": range(1, 7), "price": 0.5, "kind": kinds})
+        frame = run_experiment(
+            Own, design, contenders={"some": {"__main__.Own.order": some}}, seeds=range(4),
+            points={"__main__.Own.order": order, Shop.sell: sell}, metric=level, store=store,
+            workers=workers,
+        )
         frame.to_pickle(f"{store}.table")
 """
 """Workers find what a script defines, and a model need not decide."""

@@ -1,6 +1,4 @@
-"""What handlers are attached to, and what is decided by points: functions of all forms, which
-nobody has decorated.
-"""
+"""Targets of handlers and points: undecorated functions of all forms."""
 
 import asyncio
 import statistics

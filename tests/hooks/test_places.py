@@ -1,6 +1,4 @@
-"""Wrappers of a model's functions: who takes part in their calls, where they are found, set, and
-put back.
-"""
+"""Wrappers of a model's functions: their users, and how they are found, set and removed."""
 
 import gc
 import pickle

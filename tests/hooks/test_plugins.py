@@ -1,6 +1,4 @@
-"""Section 8: handlers before, after and instead of a model's functions, of the whole process and
-of one environment.
-"""
+"""Section 8: handlers before, after and instead of functions, per process and per environment."""
 
 import asyncio
 import collections.abc
@@ -156,7 +154,7 @@ def test_whatever_is_importable_can_be_extended(name, call, result, how, with_ha
 
 
 @EVERYWHERE
-def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and_their_changes_chain(
+def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and_their_changes_chain(  # noqa: E501
     with_handlers,
 ):
     function, seen = local(), []

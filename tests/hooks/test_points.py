@@ -1,6 +1,4 @@
-"""Sections 3 and 4: what ``points=`` names, and what that does to models which nobody has
-decorated.
-"""
+"""Sections 3 and 4: the names in ``points=``, and their effect on undecorated models."""
 
 import gc
 import sys

@@ -90,9 +90,7 @@ def test_collected_episodes_are_the_same():
 
 
 def test_functions_that_are_defined_anywhere_reach_the_workers():
-    """Decision functions that nobody can import ask there as here: those of local classes,
-    differences, handlers.
-    """
+    """Functions without an importable name work in workers: local, differences, handlers."""
 
     class Model:
         @expose_to_plugins
@@ -193,9 +191,7 @@ def test_errors_surface_as_themselves():
 
 
 def test_an_interrupt_cancels_the_remaining_work(monkeypatch):
-    """An interrupt while results arrive: the rest is given up, and nothing is in the way of the
-    next call.
-    """
+    """After an interrupt between results, the rest is cancelled, and the next call works."""
 
     def interrupted(parcel):
         raise KeyboardInterrupt

@@ -1,6 +1,4 @@
-"""What candidate actions are worth: the same as by a reference that goes through the model by
-itself.
-"""
+"""The values of candidate actions are those of a reference that runs the model by itself."""
 
 import copy
 import random
@@ -202,9 +200,7 @@ def test_policies_of_the_environment_stay():
 
 
 class Herd:
-    """Two beings that count up together, each in its turn; the other one joins when it first
-    decides.
-    """
+    """Two beings count up together, in turns; the other one joins at its first decision."""
 
     def reset(self, seed=None):
         self.sum, self.moves = 0, 0

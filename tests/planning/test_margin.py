@@ -1,6 +1,4 @@
-"""No candidate is taken that is not better than the rule; what is warned of where futures tell
-little.
-"""
+"""The margin over the rule: worse candidates are not taken, and uninformative futures warn."""
 
 import random
 

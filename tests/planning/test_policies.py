@@ -1,6 +1,4 @@
-"""Policies that plan: how they spend their branches, all places where they serve, and what shows
-its worth later.
-"""
+"""Policies that plan: their use of branches, all places for them, and delayed effects."""
 
 import copy
 import pickle
@@ -41,9 +39,7 @@ def planner(**given):
 
 
 def tame(**changes):
-    """Points at which the one on the left is to come near to three, so that it matters what it
-    does.
-    """
+    """Points at which the left one's aim is to come near to three, so its actions matter."""
     given = {
         "reward_mapping": lambda duel: -abs(duel.value - 3),
         "rule_action_mapping": lambda decision: decision,
@@ -58,9 +54,7 @@ def known(answers):
 
 @cache
 def by_hand(seed=5, down=False):
-    """What a planner does in a single view whose user asks it: its actions, and what the model has
-    come to.
-    """
+    """A planner in a single view, called by its user: its actions, and the model's final value."""
     policies = {"right": lambda observation: 2} if down else None
     env = begun(single_env(Duel, tame(), agent="left", policies=policies), seed)
     actions, over = [], False
@@ -269,9 +263,7 @@ def test_entities_plan_each_for_itself():
 
 @METHODS
 def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
-    """In a branch of the one the other is left to its base, or to its rule; else there were a
-    branch of each branch.
-    """
+    """In a branch of one agent, the other follows its base or its rule: branches do not nest."""
     calls, seen, plans = [], [], []
 
     def branches(observation, info, *, _environment):

@@ -1,6 +1,4 @@
-"""Each study runs from its command line to its figures, in a small way; those of learners are in
-``tests/clients``.
-"""
+"""Each study runs from command line to figures, in small; ``tests/clients`` has the learners'."""
 
 import json
 import re
@@ -150,9 +148,7 @@ def test_debt_collection_learns_and_compares(capsys):
 
 
 def test_pages_state_the_figures_of_the_finals():
-    """The table of the greenhouse's experiment is made of the runs that are under version
-    control.
-    """
+    """The table of the greenhouse experiment agrees with the runs under version control."""
     pytest.importorskip("pandas")
     import pandas as pd
     from studies.greenhouse_experiment import results

@@ -197,9 +197,7 @@ FOUND = []
 
 
 def found(severity, words, *told, changes=None, **options):
-    """Makes a model a row of the table of those of which that is found; an error is all that is
-    wrong with it.
-    """
+    """Add a model to the table with its expected finding; an error is its only finding."""
 
     def add(model):
         FOUND.append(

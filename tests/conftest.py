@@ -8,7 +8,7 @@ import signal
 import pytest
 from hypothesis import HealthCheck, settings
 
-from simenv_marl.core.options import Options
+from simenv_marl.core.plans.options import Options
 
 # Hypothesis draws the same examples at every run, keeps no files, and does not look at the clock.
 settings.register_profile(

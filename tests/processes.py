@@ -9,7 +9,7 @@ from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
-from simenv_marl.core.options import Options
+from simenv_marl.core.plans.options import Options
 
 ROOT = Path(__file__).parents[1]
 
@@ -21,7 +21,7 @@ def alone(function: Callable[..., None], *arguments: Any) -> None:
     """
     code = f"""
 import gc
-from simenv_marl.core.options import Options
+from simenv_marl.core.plans.options import Options
 from {function.__module__} import {function.__name__}
 gc.collect()
 gc.freeze()  # so that the function's own collections look at what it makes

@@ -24,8 +24,8 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import RULE, branch, clone, single_env
-from simenv_marl.core import episode as run
-from simenv_marl.core.separation import loops_on
+from simenv_marl.core.episodes import episode as run
+from simenv_marl.core.copies.separation import loops_on
 from simenv_marl.errors import (
     BranchError,
     ClosedError,

@@ -19,7 +19,7 @@ import pytest
 from gymnasium.wrappers import TimeLimit
 
 from simenv_marl import branch, clone
-from simenv_marl.core.forks import Fork
+from simenv_marl.core.copies.forks import Fork
 from simenv_marl.errors import (
     BranchError,
     EpisodeOverError,

@@ -9,7 +9,7 @@ import pytest
 
 import simenv_marl
 from simenv_marl import SimulationInterface, aec_env, parallel_env, single_env
-from simenv_marl.core.options import CheckOptions, EpisodeOptions, Options, ViewOptions
+from simenv_marl.core.plans.options import CheckOptions, EpisodeOptions, Options, ViewOptions
 from simenv_marl.errors import DefinitionError, NoDecisionError, did_you_mean
 from tests.worlds.copied import Walk
 from tests.worlds.models import define

@@ -37,14 +37,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .core.clone import branch, clone
-    from .core.rng import Streams, reseed_generators
+    from .core.copies.clone import branch, clone
+    from .core.switching.generators import Streams, reseed_generators
     from .decision import Definition, difference, make_step
     from .envs import aec_env, generate_env, joint_env, parallel_env, single_env, vector_env
     from .errors import SimEnvError
     from .experiments.evaluation import evaluate
-    from .many.simulate import simulate, simulate_many
     from .registration import register_simulation
+    from .runs import simulate, simulate_many
     from .simulation import RULE, TRUNCATED, SimulationInterface, SteppedSimulation
 
 __version__ = "0.1.0"
@@ -70,13 +70,13 @@ ROOMS = (
 """The modules in which all other public names are."""
 
 _MODULES = {
-    "core.clone": ("branch", "clone"),
-    "core.rng": ("Streams", "reseed_generators"),
+    "core.copies.clone": ("branch", "clone"),
+    "core.switching.generators": ("Streams", "reseed_generators"),
     "decision": ("Definition", "difference", "make_step"),
     "envs": ("aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "vector_env"),
     "errors": ("SimEnvError",),
     "experiments.evaluation": ("evaluate",),
-    "many.simulate": ("simulate", "simulate_many"),
+    "runs": ("simulate", "simulate_many"),
     "registration": ("register_simulation",),
     "simulation": ("RULE", "TRUNCATED", "SimulationInterface", "SteppedSimulation"),
 }

@@ -9,10 +9,9 @@ import gymnasium
 import pettingzoo
 from gymnasium.wrappers import HumanRendering
 
-from .core.options import ViewOptions
-from .core.plan import Plan
-from .core.points import Points
+from .core import Points, ViewOptions
 from .envs import vector_env, view_class
+from .envs.single import plan_of
 from .errors import OptionValueError, UnknownPointError, short_repr
 
 _RECIPES: dict[str, tuple[Any, Any, Any]] = {}
@@ -60,7 +59,7 @@ def register_simulation(
         )
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
-    plan = Plan(simulation, points, options)
+    plan = plan_of(simulation, points, options)
     recipe = f"{name}-v{version}"
     _RECIPES[recipe] = simulation, points, options
     named = [point for point in plan.active if point.agent or plan.one_agent]
@@ -112,8 +111,8 @@ def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
     simulation without the mode "human".
     """
     simulation, points, options = _recall(recipe, module, view, options)
-    plan = Plan(simulation, points, {**options, "render_mode": None})
-    mode, modes = options.get("render_mode"), plan.render_modes
+    plan = plan_of(simulation, points, {**options, "render_mode": None})
+    mode, modes = options.get("render_mode"), plan.subject.render_modes
     if (
         view in ("single", "joint")
         and mode == "human"

@@ -22,7 +22,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.core import threads
+from simenv_marl.core.switching import threads
 from simenv_marl.errors import NotResetError, ReentrancyError, ResetNeededError
 from simenv_marl.hooks.stacks import EVALUATING
 from tests.core.test_threads import in_a_thread

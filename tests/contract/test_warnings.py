@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, aec_env, parallel_env, simulate, simulate_many, single_env, vector_env
-from simenv_marl.core import rng
+from simenv_marl.core.switching import generators as rng
 from simenv_marl.errors import UnknownPointError
 from tests.worlds.models import calling, decision
 from tests.worlds.models import play as play_in_turns

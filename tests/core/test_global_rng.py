@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
-from simenv_marl.core import context
+from simenv_marl.core.switching import context
 from simenv_marl.errors import OptionValueError, WrongThreadError
 from tests.worlds.models import define, play
 

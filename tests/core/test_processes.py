@@ -10,7 +10,7 @@ from types import GetSetDescriptorType, MemberDescriptorType
 import numpy as np
 import pytest
 
-from simenv_marl.core.packing import RemoteTraceback, pack_error, unpack_error
+from simenv_marl.core.copies.packing import RemoteTraceback, pack_error, unpack_error
 from simenv_marl.errors import WorkerError, error_text
 
 

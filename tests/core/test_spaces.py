@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl.core.actions import ILLEGAL, action_check, mask_allows, mask_cast, open_mask
-from simenv_marl.core.spaces import blank, duplicate, observation_cast, same
+from simenv_marl.core.values.actions import ILLEGAL, action_check, mask_allows, mask_cast, open_mask
+from simenv_marl.core.values.spaces import blank, duplicate, observation_cast, same
 from simenv_marl.errors import MaskError, ObservationError
 
 BOX = spaces.Box(-1.0, 3.0, (2,), np.float32)

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 import pytest
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
-from simenv_marl.core import threads
+from simenv_marl.core.switching import threads
 from simenv_marl.errors import ReentrancyError
 from tests.worlds import farms
 from tests.worlds.models import calling, decision, notes, script, step

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, aec_env, generate_env, simulate, single_env
-from simenv_marl.core import packing
-from simenv_marl.core.packing import pack, pack_plainly, unpack
-from simenv_marl.core.points import find_point, portable
+from simenv_marl.core.copies import packing
+from simenv_marl.core.copies.packing import pack, pack_plainly, unpack
+from simenv_marl.core.plans.points import find_point, portable
 from simenv_marl.decision import point_of
 from simenv_marl.errors import (
     AgentError,

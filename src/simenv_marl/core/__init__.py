@@ -1,23 +1,83 @@
-"""The life cycle of episodes: plans, drivers, sessions, episodes and agents.
+"""The life cycle of a decision, without any view.
 
-Each module imports only from those below it::
+Five folders, each of which imports only from those below it::
 
-    clone                       copies of an environment in mid-episode, and exact continuations
-    mirror, host                a clone, as its view sees it, and in its process
-    provenance                  the record of what an environment was made of
-    session                     the simulation of one environment, over all its episodes
-    episode, plan               one episode, and the life cycle of a decision; the checked description of an environment
-    rounds                      the rounds of parallel and joint views
-    agent                       one agent of an episode
-    split                       calls that hold many decisions
-    point                       decision points and other events
-    greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
-    driver                      the switch between a simulation's stack and its user's; what a simulation has opened
-    context, points             the user's side, with its global generators; points, agents and policies by their names
-    policies                    policies that are asked one decision at a time
-    actions, pending            checks of actions; a pending decision, as policies and people get it
-    awaiting                    the thread in which coroutines of policies run
-    spaces, stacking            casts and checks of single values; stacks of many
-    rng, options, packing       seeds of generators; options; pickles for other processes
-    forks, separation           forked processes, which end with the first one; what separates them from it
+    copies      copies of an environment in mid-episode, in other processes or by replays
+    episodes    sessions, episodes and agents; ``episodes/episode.py`` tells what happens when
+    plans       what an environment is made of: decision points, policies, options
+    switching   how control switches between a simulation's stack and its user's
+    values      casts and checks of observations and actions
+
+This module lists the interface of the core. The rooms of the package use nothing else of it.
 """
+
+from ..simulation import Action, Model, Observation
+from .copies.clone import branch, clone, pending_view
+from .copies.mirror import Mirror, RemoteSession
+from .copies.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
+from .copies.peer import Peer, PeerLostError, serve
+from .episodes.agent import Agent
+from .episodes.clock import Clock
+from .episodes.decision import Decision
+from .episodes.episode import Episode
+from .episodes.round import Round, checked_actions
+from .episodes.session import BaseSession, Session, checked_seed, close_all
+from .episodes.state import EpisodeState, Outcome, State, UnmatchedNames
+from .plans.mappings import adapt
+from .plans.options import CheckOptions, EpisodeOptions, Options, ViewOptions, explain_arguments
+from .plans.plan import Mode, Plan, Source, make_plan, source_name
+from .plans.point import Labels, Mask, Point, Policy, Space
+from .plans.points import Points, declared_agents, portable
+from .plans.policies import (
+    COUNTS,
+    AskingPolicy,
+    Caller,
+    DeferredPolicy,
+    EpisodePolicy,
+    Info,
+    PolicyWrapper,
+    Where,
+    count,
+    has_fallback,
+    is_asked_alone,
+    is_planner,
+    policy_for,
+    two_arguments,
+    waits,
+    when_answered,
+)
+from .plans.provenance import as_json, describe, provenance
+from .switching.awaiting import Answer, Answers
+from .switching.context import GlobalRandom, environment_context
+from .switching.driver import WAIT, Driver
+from .switching.exits import LoopExit
+from .switching.generators import Streams, generators_of, is_seed, reseed_generators
+from .switching.resources import acquire, release, reuse_resources
+from .values.actions import ILLEGAL, MASK, action_check
+from .values.spaces import blank, duplicate, observation_cast, same
+from .values.stacking import Stacker, joined, rows, stack_masks, stacker, taken
+
+__all__ = [
+    # What an environment is made of, and what happens in it.
+    "Agent", "BaseSession", "Clock", "Decision", "Driver", "Episode", "EpisodeState", "Mode",
+    "Options", "Outcome", "Plan", "Point", "RemoteSession", "Mirror", "Round", "Session", "State",
+    "UnmatchedNames", "Where", "checked_actions", "checked_seed", "close_all", "describe",
+    "make_plan", "provenance",
+    # Types: the first three are the aliases of values of the user.
+    "Observation", "Action", "Model", "Info", "Labels", "Mask", "Points", "Policy", "Source",
+    "Space", "Stacker", "CheckOptions", "EpisodeOptions", "ViewOptions",
+    # Policies.
+    "COUNTS", "Answer", "Answers", "AskingPolicy", "Caller", "DeferredPolicy", "EpisodePolicy",
+    "PolicyWrapper", "count", "has_fallback", "is_asked_alone", "is_planner", "policy_for",
+    "two_arguments", "waits", "when_answered",
+    # Copies and other processes.
+    "Peer", "PeerLostError", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
+    "pending_view", "portable", "release", "reuse_resources", "serve", "unpack", "unpack_outcome",
+    # Values.
+    "ILLEGAL", "MASK", "WAIT", "action_check", "adapt", "as_json", "blank", "declared_agents",
+    "duplicate", "explain_arguments", "joined", "observation_cast", "rows", "same", "source_name",
+    "stack_masks", "stacker", "taken",
+    # Chance, and the user's side.
+    "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "is_seed",
+    "reseed_generators",
+]  # fmt: skip

@@ -9,16 +9,23 @@ from typing import Any, Final, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.options import EpisodeOptions
-from ..core.plan import Plan
-from ..core.points import Points
-from ..core.policies import PolicyWrapper, is_asked_alone, when_answered
-from ..core.spaces import same
-from ..core.stacking import stacker, taken
+from ..core import (
+    EpisodeOptions,
+    Mode,
+    Plan,
+    Points,
+    PolicyWrapper,
+    is_asked_alone,
+    same,
+    stacker,
+    taken,
+    when_answered,
+)
+from ..envs.single import plan_of
 from ..errors import DefinitionError, OptionValueError, short_repr
 from ..many.batch import BatchPolicy, PolicyKey, policy_keys, read_answers, run
 from ..many.parallel import progress_bar, spread
-from ..many.simulate import check_options, checked_policies, checked_seeds
+from ..runs import check_options, checked_policies, checked_seeds
 from ..simulation import RULE
 from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by, leaves
 
@@ -122,10 +129,10 @@ def learners_plan(
     others = (
         PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone)) if all_points else None
     )
-    plan = Plan(simulation, points, options, unattended=True, rewarded=True, others=others)
+    plan = plan_of(simulation, points, options, mode=Mode.COLLECT, default_policy=others)
     for place, policy in enumerate(policies.values()):
         for point in plan.points if isinstance(policy, LeftToRule) else ():
-            if point.report is None and is_answered_by(plan, point, place):
+            if not point.reports_rule and is_answered_by(plan, point, place):
                 raise DefinitionError(
                     f"the actions of the rule of {point.hook.name} are not known; give its"
                     " make_step a rule_action_mapping, which maps the rule's decision to an action"

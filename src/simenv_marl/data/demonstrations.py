@@ -13,10 +13,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.options import EpisodeOptions
-from ..core.points import Points
-from ..core.provenance import provenance
-from ..core.stacking import joined, taken
+from ..core import EpisodeOptions, Points, joined, provenance, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
 from .collect import LeftToRule, check_known, collect_episodes, follows_rule, policy_name
 from .trajectories import Trajectories

@@ -15,12 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.agent import Agent
-from ..core.episode import Episode
-from ..core.plan import Plan
-from ..core.point import Point
-from ..core.spaces import blank
-from ..core.stacking import Stacker, joined, stack_masks, stacker, taken
+from ..core import Agent, Episode, Plan, Point, Stacker, blank, joined, stack_masks, stacker, taken
 from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Answers, Group, PolicyKey
 from ..simulation import RULE
@@ -305,6 +300,7 @@ class Recorder:
     def __init__(self, first_episode: int) -> None:
         self._first_episode = first_episode
         self._logs: dict[Group, _DecisionLog] = {}
+        self._trajectories: dict[Agent, _TrajectoryLog] = {}  # of agents that have not ended
 
     def record(
         self,
@@ -322,11 +318,10 @@ class Recorder:
         row, turns = len(log.rewards), log.turns
         agents = [episode.pending for episode in waiting]
         for place, episode, agent in zip(places, waiting, agents, strict=True):
-            trajectory = agent.notes
+            trajectory = self._trajectories.get(agent)
             if trajectory is None:
-                trajectory = agent.notes = _TrajectoryLog(
-                    log, self._first_episode + place, agent.name
-                )
+                trajectory = _TrajectoryLog(log, self._first_episode + place, agent.name)
+                self._trajectories[agent] = trajectory
                 log.trajectories.setdefault(agent.policy.place, []).append(trajectory)
             trajectory.rows.append(row)
             turns.append(episode.turns)
@@ -359,21 +354,32 @@ class Recorder:
     def pay(self, episode: Episode) -> None:
         """Record the rewards: see ``Watcher``."""
         if episode.pending is not None:
-            _reward(episode.pending)
+            self._reward(episode.pending)
         if not (episode.over or episode.just_ended):
             return
-        ended = [(agent, True, False) for agent in episode.just_ended]
-        episode.just_ended = []
+        ended = [(agent, True, False) for agent in episode.take_ended()]
         if episode.over:
             ended += [
                 (agent, episode.terminated, episode.truncated) for agent in episode.agents.values()
             ]
         for agent, terminated, truncated in ended:
-            _reward(agent)
-            trajectory: _TrajectoryLog | None = agent.notes
+            self._reward(agent)
+            trajectory = self._trajectories.pop(agent, None)
             if trajectory is not None:
                 trajectory.last_observation, trajectory.last_turn = agent.observation, episode.turns
                 trajectory.terminated, trajectory.truncated = terminated, truncated
+
+    def _reward(self, agent: Agent) -> None:
+        """Record the reward of the agent's latest action, if it has decided before."""
+        trajectory = self._trajectories.get(agent)
+        if trajectory is None:
+            return
+        log, row = trajectory.decisions, trajectory.rows[-1]
+        log.rewards[row] = agent.reward
+        log.elapsed[row] = agent.info.get("elapsed", nan)
+        rule_action = agent.take_rule_action()
+        if rule_action is not None:
+            log.rule_actions[row] = rule_action
 
     def records(self, plan: Plan, keys: Iterable[Any]) -> list[Records]:
         """Return the records of each policy, in the order of the policies, which have these keys."""
@@ -399,18 +405,6 @@ def is_answered_by(plan: Plan, point: Point, place: int) -> bool:
     """Return whether it is known beforehand that the policy at this place answers at a decision point."""
     policy = point.policy if point.agent is None else plan.policies.get(point.agent, point.policy)
     return isinstance(policy, PolicyKey) and policy.place == place
-
-
-def _reward(agent: Agent) -> None:
-    """Record the reward of the agent's latest action, if it has decided before."""
-    trajectory: _TrajectoryLog | None = agent.notes
-    if trajectory is None:
-        return
-    log, row = trajectory.decisions, trajectory.rows[-1]
-    log.rewards[row] = agent.reward
-    log.elapsed[row] = agent.info.get("elapsed", nan)
-    if agent.rule_action is not None:
-        log.rule_actions[row], agent.rule_action = agent.rule_action, None
 
 
 def _check_extras(batches: Sequence[Mapping[str, Any]]) -> None:

@@ -5,15 +5,13 @@ from typing import Any, Final, Unpack
 
 from gymnasium.vector import AutoresetMode
 
-from ..core.options import ViewOptions, explain_arguments
-from ..core.plan import Plan
-from ..core.points import Points
+from ..core import Plan, Points, ViewOptions, explain_arguments
 from ..errors import OptionValueError, did_you_mean, short_repr
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
 from .padding import pad_agents
 from .parallel import SimulationParallelEnv
-from .single import SimulationEnv
+from .single import SimulationEnv, plan_of
 from .vector import SimulationVectorEnv
 
 __all__ = [
@@ -61,12 +59,12 @@ def generate_env(
             ``agent=`` names one agent; else AEC.
         {options}
     """
-    plan = Plan(simulation, points, options)
+    plan = plan_of(simulation, points, options)
     base = view_class(plan, view)
     base._adapt(plan)  # raises errors at once
 
     def initialise(self: Any, **changes: Any) -> None:
-        current = Plan(simulation, points, options) if plan.stale else plan
+        current = plan_of(simulation, points, options) if plan.is_stale else plan
         base.__init__(self, current.amended(changes))
 
     attributes = {
@@ -87,7 +85,7 @@ def aec_env(
     {arguments}
         {options}
     """
-    return SimulationAECEnv(Plan(simulation, points, options))
+    return SimulationAECEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments
@@ -99,7 +97,7 @@ def parallel_env(
     {arguments}
         {options}
     """
-    return SimulationParallelEnv(Plan(simulation, points, options))
+    return SimulationParallelEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments
@@ -114,7 +112,7 @@ def single_env(
     {arguments}
         {options}
     """
-    return SimulationEnv(Plan(simulation, points, options))
+    return SimulationEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments
@@ -129,7 +127,7 @@ def joint_env(
     {arguments}
         {options}
     """
-    return SimulationJointEnv(Plan(simulation, points, options))
+    return SimulationJointEnv(plan_of(simulation, points, options))
 
 
 @explain_arguments

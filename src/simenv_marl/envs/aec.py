@@ -5,9 +5,7 @@ from typing import Any
 from numpy import ndarray
 from pettingzoo import AECEnv
 
-from ..core.agent import Agent
-from ..core.episode import Episode
-from ..core.spaces import duplicate
+from ..core import Agent, EpisodeState, duplicate
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
 from .base import AgentsView
@@ -58,7 +56,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        session = self._session
+        session = self.session
         episode = session.episode
         if episode is None or (session.lock is not None and not session.lock.held):
             self._step_alone(SimulationAECEnv.step, action)
@@ -93,11 +91,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         Raises:
             ResetNeededError: There is no episode, or all agents have taken their final step.
         """
-        episode, observation = self._session.episode, None
+        episode, observation = self.session.episode, None
         if self._leaving:
             observation = self.observe(self.agent_selection) if observe else None
         elif episode is None or episode.pending is None:
-            raise self._session.refusal()
+            raise self.session.refusal()
         elif observe:
             observation = episode.pending.observation
             observation = (
@@ -140,11 +138,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.truncations: dict[str, bool] = {}
         self.infos: dict[str, dict[str, Any]] = {}
 
-    def _begin(self, episode: Episode) -> None:
+    def _begin(self, episode: EpisodeState) -> None:
         for agent in episode.agents.values():
             self._join(agent)
         self._record(episode)
-        episode.unreported_end = False  # the books report it
+        episode.mark_reported()
 
     def _join(self, agent: Agent) -> None:
         name = agent.name
@@ -154,11 +152,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.terminations[name] = self.truncations[name] = False
         self.infos[name] = agent.info
 
-    def _record(self, episode: Episode) -> None:
+    def _record(self, episode: EpisodeState) -> None:
         """Record the ends and the pending decision of a reset or a step."""
         pending = episode.pending
         if pending is None or episode.just_ended:
-            ended = [(agent, True, False) for agent in episode.just_ended]
+            ended = [(agent, True, False) for agent in episode.take_ended()]
             if episode.over:
                 # Those that have never decided come last.
                 others = sorted(episode.agents.values(), key=lambda agent: not agent.decided)
@@ -173,7 +171,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                 self.terminations[name], self.truncations[name] = terminated, truncated
                 self._rewarded.append(name)
             self._leaving = self._rewarded[::-1]
-            episode.just_ended = []
         if pending is not None:
             name = pending.name
             if name not in self.rewards:
@@ -191,7 +188,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             self.rewards[name] = 0.0
         self._rewarded = []
 
-    def _dead_step(self, episode: Episode, action: Any) -> None:
+    def _dead_step(self, episode: EpisodeState, action: Any) -> None:
         if action is not None and action is not RULE:
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is"

@@ -16,14 +16,19 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.agent import Agent
-from ..core.episode import Episode
-from ..core.packing import pack, unpack
-from ..core.plan import Plan
-from ..core.point import Point
-from ..core.provenance import describe
-from ..core.session import Session, checked_seed
-from ..core.spaces import observation_cast
+from ..core import (
+    Agent,
+    BaseSession,
+    EpisodeState,
+    Plan,
+    Point,
+    Session,
+    checked_seed,
+    describe,
+    observation_cast,
+    pack,
+    unpack,
+)
 from ..errors import (
     UnknownAgentError,
     UnknownOptionError,
@@ -35,17 +40,7 @@ from ..errors import (
 from ..plugins import Entry
 
 _OWN = frozenset(
-    (
-        "_definition",
-        "_finalizer",
-        "_outermost",
-        "_own",
-        "_plan",
-        "_roster",
-        "_session",
-        "joint",
-        "metadata",
-    )
+    ("_definition", "_finalizer", "_own", "_plan", "_roster", "joint", "metadata", "session")
 )
 """The attributes that no copy takes over."""
 
@@ -62,31 +57,29 @@ class View:
     render_mode: str | None
     _option: ClassVar[str | None] = None  # the option that only this view takes
     _in_rounds: ClassVar[bool] = False  # whether all agents are updated when a step returns
-    _solo: ClassVar[bool] = False  # whether its branches wait for one agent only
+    waits_for_one: ClassVar[bool] = False  # whether its branches wait for one agent only
     _finalizer: Any = None
-    # the wrapper with which it was cloned
-    _outermost: Callable[[], Any] = staticmethod(lambda: None)
-    _set_up: Callable[[], None]  # completes what is made
+    set_up: Callable[[], None]  # completes what is made
     # makes the records of a new episode, and returns the results of its reset
-    _begin: Callable[[Episode], Any]
+    _begin: Callable[[EpisodeState], Any]
 
-    def __init__(self, plan: Plan, session: Session | None = None) -> None:
+    def __init__(self, plan: Plan, session: BaseSession | None = None) -> None:
         """Make the view of a plan, of a session that its owner closes, or else of a new session."""
         super().__init__()
         self._plan = plan
-        self._session = Session(self._adapt(plan)) if session is None else session
+        self.session: BaseSession = session or Session(self._adapt(plan))
         if session is None:
-            self._finalizer = weakref.finalize(self, self._session.abandon)
+            self._finalizer = weakref.finalize(self, self.session.abandon)
         self.metadata = self._metadata_of(plan)
         self.render_mode = plan.options.render_mode
         self._picture_mode, self._shows = plan.options.picture_mode, plan.options.shows
         self._frames: list[Any] = []
         # of agents that are known beforehand
-        self._roster: Mapping[str, Point] = self._session.plan.roster
+        self._roster: Mapping[str, Point] = self.session.plan.roster
         # of observations and of actions, by agent
         self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}
         self._clear()
-        self._set_up()
+        self.set_up()
 
     @classmethod
     def _adapt(cls, plan: Plan) -> Plan:
@@ -99,17 +92,19 @@ class View:
     @classmethod
     def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
-        modes = list(dict.fromkeys(filter(None, [*plan.render_modes, plan.options.render_mode])))
+        modes = list(
+            dict.fromkeys(filter(None, [*plan.subject.render_modes, plan.options.render_mode]))
+        )
         return {
             "name": f"{plan.name.lower()}_v0",
             "render_modes": modes,
-            "render_fps": plan.render_fps,
+            "render_fps": plan.subject.render_fps,
         }
 
     @property
     def simulation(self) -> Any:
         """The simulation that this environment runs."""
-        return self._session.simulation
+        return self.session.simulation
 
     @property
     def driver(self) -> str:
@@ -123,23 +118,23 @@ class View:
 
     def provenance(self) -> dict[str, Any]:
         """Return what ``simenv_marl.experiments.provenance`` describes, with the seed of the latest episode."""
-        return describe(self._plan, self._session.seed)
+        return describe(self._plan, self.session.seed)
 
     @property
     def np_random(self) -> np.random.Generator:
         """The generator that was seeded with the last given seed, and from which other seeds are drawn."""
-        return self._session.np_random
+        return self.session.np_random
 
     @np_random.setter
     def np_random(self, generator: np.random.Generator) -> None:
-        self._session.np_random = generator
+        self.session.np_random = generator
 
     @property
     def np_random_seed(self) -> int:
         """The seed of the generator; -1 if the generator was set."""
-        if self._session.np_random_seed is None:
-            _ = self._session.np_random  # draws a seed
-        return self._session.np_random_seed  # type: ignore[return-value]
+        if self.session.np_random_seed is None:
+            _ = self.session.np_random  # draws a seed
+        return self.session.np_random_seed  # type: ignore[return-value]
 
     # -- the state --------------------------------------------------------------------------------
 
@@ -178,7 +173,7 @@ class View:
                 parts.append(spaces.flatten(agent.point.definition.observation_space, seen))
             value: Any = np.concatenate(parts)
         else:
-            value = self._session.ask("state")
+            value = self.session.ask("state")
         return (
             np.array(value)
             if self.state_space is None
@@ -188,14 +183,14 @@ class View:
     # -- episodes ---------------------------------------------------------------------------------
 
     @property
-    def episode(self) -> Episode:
+    def episode(self) -> EpisodeState:
         """The running episode, or the one that has just ended.
 
         Raise ``ResetNeededError`` if there is none.
         """
-        episode = self._session.episode
+        episode = self.session.episode
         if episode is None:
-            raise self._session.refusal()
+            raise self.session.refusal()
         return episode
 
     def _agents(self) -> list[Agent]:
@@ -213,13 +208,13 @@ class View:
         if self.render_mode is None:
             warn_user(
                 "render() shows nothing without a render_mode; the simulation's render modes are"
-                f" {self._plan.render_modes}"
+                f" {self._plan.subject.render_modes}"
             )
             return None
         if self._picture_mode != self.render_mode:
             frames, self._frames = self._frames, []
             return frames
-        return self._session.ask("render", self._picture_mode)
+        return self.session.ask("render", self._picture_mode)
 
     def _show(self, *, begins: bool = False) -> None:
         """Render after a step, or after the reset with which an episode ``begins``."""
@@ -228,7 +223,7 @@ class View:
         if self._picture_mode == self.render_mode:
             self.render()
             return
-        self._frames.append(self._session.ask("render", self._picture_mode))
+        self._frames.append(self.session.ask("render", self._picture_mode))
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.
@@ -236,15 +231,15 @@ class View:
         Raises:
             BaseException: Any exception of the simulation while it unwinds.
         """
-        with self._session.exclusive:
-            self._end(self._session.close)
+        with self.session.exclusive:
+            self._end(self.session.close)
 
     def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
         """Begin another episode, which ends if the environment is abandoned.
 
         Return the results of the reset.
         """
-        session = self._session
+        session = self.session
         with session.exclusive:
             seed = checked_seed(seed)
             self._end(session.end)
@@ -264,9 +259,9 @@ class View:
 
         Refuse it if there is no episode.
         """
-        if self._session.episode is None:
-            raise self._session.refusal()
-        with self._session.lock or nullcontext():
+        if self.session.episode is None:
+            raise self.session.refusal()
+        with self.session.lock or nullcontext():
             return step(self, action)
 
     def _end(self, end: Callable[[], None]) -> None:
@@ -274,10 +269,10 @@ class View:
         try:
             end()
         finally:
-            episode = self._session.episode
+            episode = self.session.episode
             if episode is None or episode.over:
                 self._clear()
-            if self._finalizer is not None and self._session.idle:
+            if self._finalizer is not None and self.session.idle:
                 # It would keep the session alive, and with it an environment that its own parts
                 # refer to.
                 self._finalizer.detach()
@@ -290,8 +285,8 @@ class View:
         made = self._spaces[agent] = copy.deepcopy(
             (definition.observation_space, definition.action_space)
         )
-        given = self._session.np_random_seed if self._plan.complete else -1
-        self._seed_spaces(agent, self._session.seed if given == -1 else given)
+        given = self.session.np_random_seed if self._plan.complete else -1
+        self._seed_spaces(agent, self.session.seed if given == -1 else given)
         return made
 
     def _seed_spaces(self, agent: str, seed: int | None) -> None:
@@ -331,41 +326,41 @@ class View:
 
     def _recipe(self) -> dict[str, Any]:
         """Return what a copy is made of."""
-        return self._state() | {"_plan": self._plan, "session": self._session.snapshot()}
+        return self._state() | {"_plan": self._plan, "session": self.session.snapshot()}
 
     def __setstate__(self, recipe: dict[str, Any]) -> None:
         """Make this environment like the one with a recipe."""
         View.__init__(self, recipe.pop("_plan"))
-        self._session.restore(recipe.pop("session"))
+        self.session.restore(recipe.pop("session"))
         vars(self).update(recipe)
         self._clear()
 
-    def _check_pending(self) -> None:
+    def check_pending(self) -> None:
         """Check that a decision is pending, or raise ``ResetNeededError`` or ``ReentrancyError``."""
         if self.episode.pending is None:
-            raise self._session.refusal()
+            raise self.session.refusal()
 
-    def _cloned(self, session: Session) -> Any:
+    def cloned(self, session: BaseSession) -> Any:
         """Make an environment in the same state in mid-episode, with a session that stands at the same decision."""
         made = type(self).__new__(type(self))
         View.__init__(made, self._plan, session)
         vars(made).update(copy.deepcopy(self._state()))
         made._finalizer = weakref.finalize(made, session.abandon)
-        made._set_up()
+        made.set_up()
         return made
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
         """Return ``function(environment, *args)``.
 
-        For a clone from its process, with the wrappers that were cloned.
+        For a clone from its process, with its unwrapped view there.
 
         Raises:
             BaseException: Any exception of the function; a ``BranchError`` if the clone's process
                 has ended.
         """
-        return self._session.call(self._outermost() or self, function, args)
+        return self.session.call(self, function, args)
 
-    def _begin_branch(self) -> None:
+    def begin_branch(self) -> None:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
 
 
@@ -401,7 +396,7 @@ class AgentsView(View):
     agents: list[str]
     possible_agents: Any = _Undeclared()
 
-    def _set_up(self) -> None:
+    def set_up(self) -> None:
         if self._plan.possible_agents is not None:
             self.possible_agents = self._plan.possible_agents
         elif isinstance(self._plan.options.state_space, str):
@@ -451,7 +446,7 @@ class AgentsView(View):
 
     def _point(self, agent: str) -> Point:
         """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
-        episode = self._session.episode
+        episode = self.session.episode
         found = None if episode is None else episode.agent(agent)
         point = self._roster.get(agent) if found is None else found.point
         if point is None:

@@ -2,16 +2,12 @@
 
 from collections.abc import Collection, Mapping
 from copy import deepcopy
-from math import exp
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from ..core.agent import Agent
-from ..core.episode import Episode
-from ..core.point import Point
-from ..core.spaces import duplicate
+from ..core import Agent, EpisodeState, Point, checked_actions, duplicate
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE
 from .base import OneAgentView
@@ -39,7 +35,7 @@ class Joint:
                 self._places[name] = slice(begin, begin + length) if space.shape else begin
                 begin += length
 
-    def actions(self, episode: Episode, action: Any) -> dict[str, Any]:
+    def actions(self, episode: EpisodeState, action: Any) -> dict[str, Any]:
         """Return the actions of the live agents, or raise ``InvalidActionError`` if one is missing."""
         actions = action
         if action is RULE:
@@ -59,16 +55,16 @@ class Joint:
             )
         return {name: actions[name] for name in self.roster if name in episode.agents}
 
-    def check(self, episode: Episode, action: Any) -> None:
+    def check(self, episode: EpisodeState, action: Any) -> None:
         """Check the joint action of a vector environment, as far as possible before the simulation moves."""
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
             raise InvalidActionError(
                 "RULE is not an action in vector environments; use joint_env, or policies="
             )
-        episode.round.check(episode, actions)  # type: ignore[union-attr]
+        checked_actions(episode, actions)
 
-    def observe(self, episode: Episode) -> Any:
+    def observe(self, episode: EpisodeState) -> Any:
         """Return the observations of all agents.
 
         An agent that has ended keeps its last observation.
@@ -83,19 +79,19 @@ class Joint:
             return np.concatenate(list(observations.values())).astype(self.observation_space.dtype)
         return observations
 
-    def reward(self, episode: Episode) -> float:
+    def reward(self, episode: EpisodeState) -> float:
         """Return the sum of the rewards of a step."""
         reward = 0.0
         for agent in (*episode.just_ended, *episode.agents.values()):
             reward += agent.reward
         return reward
 
-    def agents(self, episode: Episode) -> dict[str, Agent]:
+    def agents(self, episode: EpisodeState) -> dict[str, Agent]:
         """The agents of an episode, live or ended, in the order of the roster."""
         return {name: episode.agents.get(name) or episode.ended[name] for name in self.roster}
 
-    def inform(self, episode: Episode) -> dict[str, Any]:
-        """Return the info of a step or a reset, with the time since the previous one."""
+    def inform(self, episode: EpisodeState, before: float | None) -> dict[str, Any]:
+        """Return the info of a step or a reset. ``before``: the time of the previous one."""
         agents = self.agents(episode)
         info: dict[str, Any] = {
             "deciding": episode.pending.name if episode.pending is not None else "",
@@ -107,12 +103,7 @@ class Joint:
         if masks:
             info["action_mask"] = masks
         if episode.clock is not None:
-            before, now = episode.last_time, float(episode.clock())
-            episode.last_time = info["time"] = now
-            info["elapsed"] = 0.0 if before is None else now - before
-            rate = episode.plan.options.discount_rate
-            if rate is not None:
-                info["discount"] = exp(-rate * info["elapsed"])
+            info |= episode.clock.read(before)
         return info
 
 
@@ -134,9 +125,10 @@ class SimulationJointEnv(OneAgentView):
     _option = "flatten"
     _in_rounds = True
     _agent = "joint"
+    _last_time: float | None = None  # the time of the previous reset or step
 
-    def _set_up(self) -> None:
-        session = self._session
+    def set_up(self) -> None:
+        session = self.session
         if not self._plan.complete:
             if not hasattr(session.simulation, "expected_calls"):
                 points = ", ".join(
@@ -150,9 +142,8 @@ class SimulationJointEnv(OneAgentView):
                 )
             agents = session.start(0, None, in_rounds=True).agents
             roster = {name: agent.point for name, agent in agents.items()}
-            session.close()
-            session.seed = session.np_random_seed = session.bound_plan = None
-            self._plan = session.plan = self._plan.declared(roster)
+            self._plan = self._plan.declared(roster)
+            session.declare(self._plan)
         self._roster = self._plan.roster
         self.joint = self._definition = Joint(self._roster, flatten=self._plan.options.flatten)
 
@@ -176,7 +167,7 @@ class SimulationJointEnv(OneAgentView):
                 change.
             BaseException: Any other error of ``SimulationAECEnv.step``.
         """
-        session = self._session
+        session = self.session
         episode = session.episode
         if episode is None or (session.lock is not None and not session.lock.held):
             return self._step_alone(SimulationJointEnv.step, action)  # type: ignore[no-any-return]
@@ -184,7 +175,7 @@ class SimulationJointEnv(OneAgentView):
         episode.step(joint.actions(episode, action))
         if self._shows:
             self._show()
-        info = joint.inform(episode)
+        info = self._inform(episode)
         return (
             joint.observe(episode),
             joint.reward(episode),
@@ -193,8 +184,14 @@ class SimulationJointEnv(OneAgentView):
             info,
         )
 
-    def _begin(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
-        return self.joint.observe(episode), self.joint.inform(episode)
+    def _begin(self, episode: EpisodeState) -> tuple[Any, dict[str, Any]]:
+        self._last_time = None
+        return self.joint.observe(episode), self._inform(episode)
+
+    def _inform(self, episode: EpisodeState) -> dict[str, Any]:
+        info = self.joint.inform(episode, self._last_time)
+        self._last_time = info.get("time")
+        return info
 
 
 def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> spaces.Space[Any]:

@@ -47,7 +47,7 @@ def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any]) -> 
             info = infos[name]
         else:
             agent.clear_observation()
-            agent.observation = None  # so that ``observe`` and ``state`` have blanks
+            agent.take_observation()  # so that ``observe`` and ``state`` have blanks
             info = agent.info | (
                 {"deciding": False, "acted": agent.acted} if view._in_rounds else {}
             )
@@ -65,7 +65,7 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
     @property
     def agents(self) -> list[str]:
         """All possible agents while there is an episode."""
-        episode = self.unwrapped._session.episode
+        episode = self.unwrapped.session.episode
         return [] if episode is None or episode.over else list(self.possible_agents)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:

@@ -5,8 +5,7 @@ from typing import Any
 
 from pettingzoo import ParallelEnv
 
-from ..core.episode import Episode
-from ..core.spaces import duplicate
+from ..core import Agent, EpisodeState, Info, Observation, duplicate
 from ..errors import warn_user
 from ..simulation import Sentinel
 from .base import AgentsView
@@ -65,7 +64,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 not change.
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
-        session = self._session
+        session = self.session
         episode = session.episode
         if episode is None or (session.lock is not None and not session.lock.held):
             return self._step_alone(SimulationParallelEnv.step, actions)  # type: ignore[no-any-return]
@@ -94,30 +93,39 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             self._show()
         return results
 
-    def _begin(self, episode: Episode) -> Results:
+    def _begin(self, episode: EpisodeState) -> Results:
         """Return the results of a reset or a step, by agent."""
-        agents, ended, pending = episode.agents, episode.just_ended, episode.pending
+        agents = episode.agents
+        ended = episode.just_ended
+        pending = episode.pending
         if ended:
             agents = {agent.name: agent for agent in ended} | agents
-        terminations, truncations = (
-            dict.fromkeys(agents, episode.terminated),
-            dict.fromkeys(agents, episode.truncated),
-        )
-        results: Results = {}, {}, terminations, truncations, {}
-        observations, rewards, _, _, infos = results
+        terminations = dict.fromkeys(agents, episode.terminated)
+        truncations = dict.fromkeys(agents, episode.truncated)
+        observations: dict[str, Observation] = {}
+        rewards: dict[str, float] = {}
+        infos: dict[str, Info] = {}
         for name, agent in agents.items():
-            observation = agent.observation
-            # it could not be observed anew, or was never observed
-            if observation is agent.handed_out:
-                observation = agent.point.blank() if observation is None else duplicate(observation)
-            else:
-                agent.handed_out = observation  # the caller may change it
-            observations[name], rewards[name] = observation, agent.reward
+            observations[name] = self._hand_out(agent)
+            rewards[name] = agent.reward
             infos[name] = info = agent.info
-            info["deciding"], info["acted"] = agent is pending, agent.acted
+            info["deciding"] = agent is pending
+            info["acted"] = agent.acted
         for agent in ended:
-            terminations[agent.name], truncations[agent.name] = True, False
-        return results
+            terminations[agent.name] = True
+            truncations[agent.name] = False
+        return observations, rewards, terminations, truncations, infos
+
+    def _hand_out(self, agent: Agent) -> Observation:
+        """Return an observation that the caller may change."""
+        observation = agent.observation
+        if observation is None:
+            return agent.point.blank()
+        if observation is self._handed_out.get(agent.name):  # it could not be observed anew
+            return duplicate(observation)
+        self._handed_out[agent.name] = observation
+        return observation
 
     def _clear(self) -> None:
         self.agents = []
+        self._handed_out: dict[str, Observation] = {}

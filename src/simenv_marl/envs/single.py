@@ -5,7 +5,7 @@ A planner gets it for the agent for which it decides.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NoReturn
 
@@ -13,14 +13,19 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.agent import Agent
-from ..core.episode import Episode
-from ..core.plan import Plan
+from ..core import EpisodeState, Outcome, Plan, Points, Session, Source, make_plan
 from ..errors import CopyError, ReentrancyError, ViewError
 from ..simulation import asks_for
 from .base import OneAgentView
 
 _REFUSAL = "a policy cannot move the environment that it is given: it must return an action; branch tries actions out"
+
+
+def plan_of(
+    simulation: Source, points: Points, options: Mapping[str, Any], **settings: Any
+) -> Plan:
+    """Make a plan, as ``make_plan`` does. Its planners get the view of their agent."""
+    return make_plan(simulation, points, options, planner_view=PlannerEnv.of_session, **settings)
 
 
 class SimulationEnv(OneAgentView):
@@ -32,11 +37,11 @@ class SimulationEnv(OneAgentView):
     _option = "agent"
     _own: Any = None  # its agent during an episode
 
-    def _set_up(self) -> None:
+    def set_up(self) -> None:
         self._agent = str(self._plan.one_agent)
-        self._definition = self._session.plan.active[0].definition
-        if self._session.episode is not None:
-            self._begin(self._session.episode)
+        self._definition = self.session.plan.active[0].definition
+        if self.session.episode is not None:
+            self._begin(self.session.episode)
 
     @classmethod
     def _adapt(cls, plan: Plan) -> Plan:
@@ -85,17 +90,19 @@ class SimulationEnv(OneAgentView):
         Raises:
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
-        session = self._session
+        session = self.session
         episode = session.episode
         if episode is None or (session.lock is not None and not session.lock.held):
             return self._step_alone(SimulationEnv.step, action)  # type: ignore[no-any-return]
         episode.step(action)
         if self._shows:
             self._show()
-        own: Agent = self._own
+        own = self._own
         if own.ended:
             return own.observation, own.reward, True, False, own.info
-        return own.observation, own.reward, episode.terminated, episode.truncated, own.info
+        outcome = episode.outcome  # its properties would each take as long as a comparison
+        terminated = outcome is Outcome.TERMINATED
+        return own.observation, own.reward, terminated, outcome is Outcome.TRUNCATED, own.info
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], float | NDArray[np.float64]]:
@@ -123,7 +130,7 @@ class SimulationEnv(OneAgentView):
 
         return compute_reward
 
-    def _begin(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
+    def _begin(self, episode: EpisodeState) -> tuple[Any, dict[str, Any]]:
         self._own = episode.agent(self._agent)
         return self._own.observation, self._own.info
 
@@ -138,11 +145,16 @@ class PlannerEnv(SimulationEnv):
     of the agent, which can be stepped; policies or rules answer for all other agents.
     """
 
-    _solo = True
+    waits_for_one = True
     _branched = False  # whether it is a branch, or a clone
 
-    def _set_up(self) -> None:
-        episode: Any = self._session.episode
+    @classmethod
+    def of_session(cls, session: Session) -> PlannerEnv:
+        """Make the view of the agent whose planner a session is asking."""
+        return cls(session.plan, session)
+
+    def set_up(self) -> None:
+        episode: Any = self.session.episode
         if episode is not None:  # otherwise the session is going to replay one
             self._own = episode.deciding
             self._agent, self._definition = self._own.name, self._own.point.definition
@@ -154,14 +166,14 @@ class PlannerEnv(SimulationEnv):
         """Allow every plan: the agent is the one whose planner is being asked."""
         return plan
 
-    def _begin_branch(self) -> None:
+    def begin_branch(self) -> None:
         """Turn this environment into a branch that waits for the agent only."""
         if not self._branched:
             self._branched = True
-            self._session.step_out()
+            self.session.leave_caller()
             self.episode.single_out(self._own)
 
-    def _check_pending(self) -> None:
+    def check_pending(self) -> None:
         """Refuse a branch after the planner has returned its action."""
         episode = self.episode
         if episode.deciding is not self._own:

@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from numpy.typing import NDArray
 
-from ..core.session import checked_seed
-from ..core.spaces import duplicate
+from ..core import checked_seed, duplicate
 from ..errors import (
     ClosedError,
     CopyError,

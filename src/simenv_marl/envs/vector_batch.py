@@ -12,15 +12,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
-from ..core.plan import Plan
-from ..core.session import Session, close_all
-from ..core.stacking import stacker
+from ..core import Episode, Session, UnmatchedNames, close_all, stacker
 from ..decision import decision_points
 from ..errors import InvalidActionError, OptionValueError, annotate, short_repr
 from ..many.batch import step_all
 from .base import OneAgentView
 from .joint import Joint, SimulationJointEnv
-from .single import SimulationEnv
+from .single import SimulationEnv, plan_of
 
 Infos = list[tuple[int, dict[str, Any]]]
 """Infos, each with the number of its sub-environment, in the order in which they must be merged."""
@@ -52,8 +50,9 @@ class SimulationBatch:
 
         ``part`` has the numbers of the sub-environments in the vector environment.
         """
-        plan = Plan(simulation, points, options)
-        if points is None and [point.name for point in plan._named] == decision_points():
+        plan = plan_of(simulation, points, options)
+        names = [point.name for point in plan.subject.named]
+        if points is None and names == decision_points():
             points = decision_points()
         if view is None:
             view = "joint" if plan.one_agent is None else "single"
@@ -88,9 +87,13 @@ class SimulationBatch:
         self._first: int | None = None  # the sub-environment that moves first in a reset or a step
         self.failed = False
         self.sessions: list[Session] = []
+        unmatched = UnmatchedNames(self.plan.named_agents)
+        self._times: list[float | None] = [None] * len(
+            part
+        )  # of the previous steps, in joint views
         try:
             while len(self.sessions) < len(part):
-                self.sessions.append(Session(self.plan))
+                self.sessions.append(Session(self.plan, unmatched))
         except BaseException as error:
             annotate(error, f"simenv_marl: in sub-environment {part.start + len(self.sessions)}")
             self.abandon()
@@ -166,7 +169,7 @@ class SimulationBatch:
         if self.joint is not None:
             own = list(map(self.joint.actions, waiting, own))
         step_all(waiting, own, lambda place, error: self._fail(moving[place], error))
-        self._observed, earned, news = self._read(episodes)
+        self._observed, earned, news = self._read(episodes, range(len(episodes)))
         rewards = np.array(earned, np.float64)
         if begun:
             rewards[begun] = 0.0
@@ -205,20 +208,28 @@ class SimulationBatch:
             episode = session.start(seed, options, in_rounds=self.joint is not None)
             if self._shows:
                 self.views[number]._show(begins=True)
-            (self._observed[number],), _, (info,) = self._read([episode])
+            self._times[number] = None
+            (self._observed[number],), _, (info,) = self._read([episode], [number])
         except BaseException as error:
             self._fail(number, error)
             raise
         return info
 
-    def _read(self, episodes: list[Any]) -> tuple[list[Any], list[float], list[dict[str, Any]]]:
+    def _inform(self, joint: Joint, number: int, episode: Episode) -> dict[str, Any]:
+        info = joint.inform(episode, self._times[number])
+        self._times[number] = info.get("time")
+        return info
+
+    def _read(
+        self, episodes: list[Any], numbers: Sequence[int]
+    ) -> tuple[list[Any], list[float], list[dict[str, Any]]]:
         """Read the observations, the rewards and the infos of episodes."""
         joint = self.joint
         if joint is not None:
             return (
                 [joint.observe(episode) for episode in episodes],
                 [joint.reward(episode) for episode in episodes],
-                [joint.inform(episode) for episode in episodes],
+                [self._inform(joint, *pair) for pair in zip(numbers, episodes, strict=True)],
             )
         if episodes != self._episodes:
             self._episodes, self._agents = (

@@ -1,6 +1,6 @@
 """Experiments: policies compared on the same seeds, designs, resumable experiments, effects, variants of a model."""
 
-from ..core.provenance import provenance
+from ..core import provenance
 from .designs import design
 from .effects import Effects, effects, sobol_indices
 from .evaluation import Evaluation, evaluate

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.rng import is_seed
+from ..core import is_seed
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
 from .runner import dtype_of

@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.context import reuse_resources
-from ..core.options import EpisodeOptions
-from ..core.packing import pack
-from ..core.plan import Plan
-from ..core.points import Points
+from ..core import EpisodeOptions, Plan, Points, pack, reuse_resources
 from ..data.plots import interval, is_proportion
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread

@@ -10,11 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from ..core.agent import Agent
-from ..core.episode import Episode
-from ..core.plan import Plan
-from ..core.points import declared_agents
-from ..core.policies import has_fallback, waits
+from ..core import Agent, Episode, Plan, declared_agents, has_fallback, waits
 from ..data.collect import learners_plan
 from ..decision import decision_points
 from ..errors import (
@@ -28,7 +24,7 @@ from ..errors import (
 )  # fmt: skip
 from ..many.batch import Group, run, takes_identities
 from ..many.parallel import import_extra
-from ..many.simulate import check_options, checked_seeds
+from ..runs import check_options, checked_seeds
 from ..simulation import RULE
 
 if TYPE_CHECKING:
@@ -284,14 +280,14 @@ class Tally:
     def __init__(self) -> None:
         # by place and agent: return, length, fallbacks
         self._accounts: dict[int, dict[str, list[Any]]] = {}
+        self._of_agents: dict[Agent, list[Any]] = {}  # the same, of agents that have not ended
 
     def count(self, place: int, agent: Agent) -> None:
         """Count a decision of an agent."""
-        account = agent.notes
+        account = self._of_agents.get(agent)
         if account is None:
-            account = agent.notes = self._accounts.setdefault(place, {}).setdefault(
-                agent.name, [0.0, 0, 0]
-            )
+            accounts = self._accounts.setdefault(place, {})
+            account = self._of_agents[agent] = accounts.setdefault(agent.name, [0.0, 0, 0])
         account[1] += 1
 
     def record(self, group: Group, places: list[int], waiting: list[Any], *_: Any) -> None:
@@ -301,14 +297,17 @@ class Tally:
 
     def pay(self, episode: Episode) -> None:
         """Add the rewards: see ``Watcher``."""
-        paid = [*episode.just_ended, *(episode.agents.values() if episode.over else ())]
-        episode.just_ended = []
-        if episode.pending is not None:
-            paid.append(episode.pending)
-        for agent in paid:
-            if agent.notes is not None:
-                agent.notes[0] += agent.reward
-                agent.notes[2] = agent.fallbacks
+        ended = [*episode.take_ended(), *(episode.agents.values() if episode.over else ())]
+        for agent in ended:
+            self._pay(agent, self._of_agents.pop(agent, None))
+        pending = episode.pending
+        if pending is not None:
+            self._pay(pending, self._of_agents.get(pending))
+
+    def _pay(self, agent: Agent, account: list[Any] | None) -> None:
+        if account is not None:
+            account[0] += agent.reward
+            account[2] = agent.fallbacks
 
     def outcome(
         self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]

@@ -21,12 +21,17 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Unpack
 from uuid import uuid4
 
-from ..core.context import reuse_resources
-from ..core.options import EpisodeOptions
-from ..core.packing import pack
-from ..core.plan import Plan, source_name
-from ..core.points import Points, portable
-from ..core.provenance import as_json, describe
+from ..core import (
+    EpisodeOptions,
+    Plan,
+    Points,
+    as_json,
+    describe,
+    pack,
+    portable,
+    reuse_resources,
+    source_name,
+)
 from ..errors import (
     OptionValueError,
     SimEnvError,

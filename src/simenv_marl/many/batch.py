@@ -24,16 +24,24 @@ from typing import Any, Final, Protocol
 import numpy as np
 from greenlet import getcurrent
 
-from ..core.awaiting import Answers as Awaited
-from ..core.context import reuse_resources
-from ..core.driver import WAIT
-from ..core.episode import Episode
-from ..core.plan import Plan
-from ..core.point import Point
-from ..core.policies import AskingPolicy, DeferredPolicy, is_asked_alone, two_arguments, waits
-from ..core.session import Session, close_all
-from ..core.spaces import duplicate
-from ..core.stacking import rows, stacker
+from ..core import Answers as Awaited
+from ..core import (
+    AskingPolicy,
+    DeferredPolicy,
+    Episode,
+    Plan,
+    Point,
+    Session,
+    UnmatchedNames,
+    close_all,
+    duplicate,
+    is_asked_alone,
+    reuse_resources,
+    rows,
+    stacker,
+    two_arguments,
+    waits,
+)
 from ..decision import DecisionPoint
 from ..errors import InvalidActionError, annotate, short_repr
 from ..hooks.stacks import EVALUATING, outside_simulation
@@ -176,8 +184,7 @@ class Group:
         asked = self.asked
         infos: list[Any] = []
         for agent in agents if asked.informed else ():
-            infos.append(agent.info)
-            agent.info = {}  # a policy may change its info; the next decision gets a new one
+            infos.append(agent.take_info())
         try:
             identities = (
                 [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
@@ -291,6 +298,7 @@ class _Simulations:
         self.next = 0
         self.sessions: dict[int, Session] = {}  # by the place of their seed
         self.groups: dict[Group, None] = {}
+        self.unmatched = UnmatchedNames(self.plan.named_agents)
 
     def proceed(self) -> None:
         """Have decisions answered, and run their simulations to their next decisions."""
@@ -346,7 +354,7 @@ class _Simulations:
         action = _checked(episode, answer)
         if self.watcher is not None:
             extras = {name: np.asarray(value)[None] for name, value in extras.items()}
-            group = agent.group = agent.group or agent.policy.asked.group(agent.point)
+            group = agent.policy.asked.group(agent.point)
             self.watcher.record(group, [place], [episode], [agent.observation], ([action], extras))
         episode.step(action)
 
@@ -356,7 +364,7 @@ class _Simulations:
             place, seed = self.next, self.seeds[self.next]
             self.next += 1
             try:
-                session = Session(self.plan)
+                session = Session(self.plan, self.unmatched)
             except BaseException as error:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
@@ -367,7 +375,7 @@ class _Simulations:
         """Queue an episode that waits at a decision, or end it if it is over."""
         if self.watcher is not None:
             self.watcher.pay(episode)
-        agent = episode.pending
+        agent: Any = episode.pending
         while agent is not None and agent.policy.asked.alone and not agent.policy.waits:
             self.step(place, episode, partial(_ask_now, episode))
             if self.watcher is not None:
@@ -380,17 +388,14 @@ class _Simulations:
             self.crowd = min(self.size, max(self.crowd, self.concurrency))
             self.backlog.append((place, episode))
             return
-        group = agent.group
-        if group is None:
-            group = agent.group = agent.policy.asked.group(agent.point)
-            self.groups[group] = None
+        group = agent.policy.asked.group(agent.point)
+        self.groups[group] = None
         group.waiting.append(episode)
         group.places.append(place)
         # Kept outside the episodes: reading them from many suspended episodes would miss the
         # processor's caches.
-        group.observations.append(agent.observation)
-        if self.watcher is None:
-            agent.observation = None
+        is_watched = self.watcher is not None
+        group.observations.append(agent.observation if is_watched else agent.take_observation())
 
     def _end(self, place: int) -> None:
         session = self.sessions[place]
@@ -417,11 +422,9 @@ def _checked(episode: Episode, action: Any) -> Any:
 
 
 def _seen(episode: Episode) -> tuple[Any, ...]:
-    """Return what a policy of one decision is asked with: the episode, the agent, its observation and its info."""
+    """Return the arguments of a policy of one decision."""
     agent: Any = episode.pending
-    # a policy may change its info; the next decision gets a new one
-    info, agent.info = agent.info, {}
-    return episode, agent, duplicate(agent.observation), info
+    return episode, agent, duplicate(agent.observation), agent.take_info()
 
 
 def _ask_now(episode: Episode) -> Any:
@@ -462,26 +465,25 @@ def step_all(
             return
         replies: list[Any] = []
         for number, episode in enumerate(episodes):
-            replies.append(episode.answer(agents[number], actions[number]))
+            replies.append(episode.answer_turn(agents[number], actions[number]))
         for number, episode in enumerate(episodes):
-            resume = episode.driver.resume
-            events.append(resume(replies[number]))
+            events.append(episode.resume(replies[number]))
         del replies
         # popped one by one, so that the list keeps nothing alive that a model frees
         events.reverse()
-        for number, episode in enumerate(episodes):  # noqa: B007 - the handler below needs the number
+        for number, episode in enumerate(episodes):  # noqa: B007 - the handler below needs it
             event, args, kwargs = events.pop()
             reply = event.handle(episode, args, kwargs)
-            if reply is not WAIT:
-                event = args = kwargs = None
+            event = args = kwargs = None
+            if not episode.has_to_wait(reply):
                 episode.advance(reply)
     except BaseException as error:
         # so that the error's traceback does not keep them alive
-        events = event = args = kwargs = resume = None
+        events = event = args = kwargs = None
         culprit = episodes[number]
         for episode in episodes:
-            if episode.pending is None and not episode.over and episode is not culprit:
-                episode.pending = episode.latest  # so that it can be closed
+            if episode is not culprit:
+                episode.restore_pending()
         if culprit.pending is None and not culprit.over:
             culprit.fail(error)
         elif together:  # otherwise the episode has already done this

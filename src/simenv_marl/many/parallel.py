@@ -24,8 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
-from ..core.policies import COUNTS, count
+from ..core import COUNTS, count, pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from ..errors import (
     MissingExtraError,
     OptionValueError,

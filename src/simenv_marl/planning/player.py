@@ -21,11 +21,18 @@ from zlib import crc32
 import numpy as np
 from gymnasium import spaces
 
-from ..core.actions import ILLEGAL, action_check
-from ..core.agent import Agent
-from ..core.clone import pending_view
-from ..core.policies import AskingPolicy, Where, policy_for, two_arguments
-from ..core.rng import is_seed
+from ..core import (
+    ILLEGAL,
+    Agent,
+    AskingPolicy,
+    Where,
+    action_check,
+    checked_actions,
+    is_seed,
+    pending_view,
+    policy_for,
+    two_arguments,
+)
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
 from ..errors import (
     EpisodeOverError,
@@ -139,7 +146,7 @@ class Player:
 
     def now(self) -> float:
         """Return the simulation's time."""
-        return float(self.episode.clock())
+        return float(self.episode.clock.time())
 
     def step(self, action: Any) -> float:
         """Take an action, continue to the agent's next decision or its end, and return the reward."""
@@ -233,7 +240,7 @@ class JointPlayer(Player):
 
     def _check(self, action: Any, mask: Any) -> None:
         if self._space_of(self.agent) == self.view.action_space:
-            self.episode.round.check(self.episode, self.view.joint.actions(self.episode, action))
+            checked_actions(self.episode, self.view.joint.actions(self.episode, action))
         elif isinstance(action, Mapping):
             super()._check(
                 {
@@ -390,7 +397,7 @@ def rollout_from(
     a ``RolloutPolicy``.
     """
     began = perf_counter()
-    env.unwrapped._session.move_to(Where.PLAN)
+    env.unwrapped.session.move_to(Where.PLAN)
     try:
         player = player_of(env, policy.base)
         player.start(progress.seen)

@@ -14,9 +14,7 @@ from zlib import crc32
 
 import numpy as np
 
-from ..core.clone import branch, pending_view
-from ..core.policies import AskingPolicy, Where
-from ..core.session import checked_seed
+from ..core import AskingPolicy, Where, branch, checked_seed, pending_view
 from ..errors import BranchError, OptionValueError, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE
@@ -161,7 +159,7 @@ class Rollouts:
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
         self._name = player.view._plan.name
         try:
-            player.view._session.check_reseed()
+            player.view.session.check_reseed()
             self.reseeds = True
         except BranchError:
             self.reseeds = False

@@ -12,7 +12,7 @@ from threading import Lock
 from time import perf_counter
 from typing import Any, Final
 
-from ..core.clone import branch, clone
+from ..core import branch, clone
 from ..errors import BranchError, OptionValueError
 from .player import Progress, is_count, is_number, rollout_from, try_out
 from .rollouts import Plan, RolloutPolicy, Rollouts

@@ -13,7 +13,7 @@ from subprocess import DEVNULL, PIPE, TimeoutExpired, run
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
-from ..core.rng import is_seed
+from ..core import is_seed
 from ..errors import (
     OptionValueError,
     ProcessDiedError,

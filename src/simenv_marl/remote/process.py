@@ -8,7 +8,7 @@ from weakref import finalize
 
 import numpy as np
 
-from ..core.context import acquire, release
+from ..core import acquire, release
 from ..decision import BY_NAME, Definition
 from ..errors import (
     BranchError,

@@ -5,7 +5,7 @@ that are slow or fail are wrapped: ``FallbackPolicy`` answers for them, and ``Re
 repeats their answers.
 """
 
-from ..core.pending import Decision
+from ..core import Decision
 from .descriptions import describe, parse
 from .language import LanguageModelPolicy
 from .policies import FallbackPolicy, RecordedPolicy

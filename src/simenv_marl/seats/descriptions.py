@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from ..core.clone import pending_view
-from ..core.pending import Decision, decision_of
+from ..core import Decision, pending_view
 from ..errors import InvalidActionError, ViewError, short_repr
 
 MOST: int = 200
@@ -143,7 +142,7 @@ def _normal(text: str) -> str | float:
 def pending(env: Any) -> Decision:
     """Return the pending decision of an environment of this process."""
     episode = env.unwrapped.episode
-    return decision_of(episode, episode.deciding)
+    return episode.decision_of(episode.deciding)
 
 
 def _describe_pending(env: Any, as_json: bool) -> Any:

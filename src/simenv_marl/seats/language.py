@@ -14,9 +14,7 @@ from typing import Any, Final
 from uuid import uuid4
 from weakref import finalize
 
-from ..core.awaiting import Answer
-from ..core.pending import Decision
-from ..core.policies import COUNTS, count
+from ..core import COUNTS, Answer, Decision, count
 from ..errors import (
     InvalidActionError,
     LanguageModelError,

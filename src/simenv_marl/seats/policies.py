@@ -16,8 +16,7 @@ from uuid import uuid4
 import numpy as np
 from gymnasium import spaces
 
-from ..core.pending import Decision
-from ..core.policies import COUNTS, Caller, PolicyWrapper, count, waits, when_answered
+from ..core import COUNTS, Caller, Decision, PolicyWrapper, count, waits, when_answered
 from ..errors import InvalidActionError, OptionValueError, describe_error, short_repr, warn_user
 from ..simulation import RULE
 

@@ -16,10 +16,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, Unpack
 
-from ..core.options import CheckOptions
-from ..core.plan import Plan
-from ..core.points import Points
-from ..core.rng import is_seed
+from ..core import CheckOptions, Points, is_seed
+from ..envs.single import plan_of
 from ..errors import OptionValueError, SimEnvError, short_repr
 from ..simulation import TRUNCATED
 from .checks import CHECKS, Report, fitting_views, make_environment
@@ -92,7 +90,7 @@ def check_simulation(
     report, calls = Report(), ""
     with quietly() as caught:
         try:
-            plan = Plan(simulation, points, options)
+            plan = plan_of(simulation, points, options)
             make_environment(plan, "aec")
             subject = Subject(
                 plan=plan,
@@ -152,7 +150,7 @@ def inspect_simulation(
     if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
     with quietly():
-        plan = Plan(simulation, points, options)
+        plan = plan_of(simulation, points, options)
         subject = Subject(
             plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None
         )

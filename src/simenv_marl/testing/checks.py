@@ -16,9 +16,7 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
-from ..core.actions import MASK
-from ..core.plan import Plan
-from ..core.rng import Streams, generators_of
+from ..core import MASK, Plan, Streams, generators_of
 from ..envs import VIEWS, view_class
 from ..errors import AgentError, InvalidActionError, error_text, short_repr
 from ..simulation import RULE, make_simulation, takes
@@ -98,7 +96,7 @@ class Report:
 
 def check_plain_runs(subject: Subject, report: Report) -> None:
     """Check that the simulation runs without an environment, and decides something."""
-    if not takes(make_simulation(subject.plan.source).reset, "seed"):
+    if not takes(make_simulation(subject.plan.subject.source).reset, "seed"):
         report.add("unseeded_reset")
     for seed in subject.seeds:
         run = subject.plain[seed] = subject.run_plainly(seed)

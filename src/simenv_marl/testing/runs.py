@@ -30,10 +30,7 @@ from typing import Any, Final
 import numpy as np
 from greenlet import getcurrent
 
-from ..core.actions import MASK
-from ..core.context import GlobalRandom, environment_context
-from ..core.driver import LoopExit
-from ..core.plan import Plan
+from ..core import MASK, GlobalRandom, LoopExit, Plan, environment_context
 from ..decision import DecisionPoint
 from ..errors import describe_error, error_notes
 from ..hooks.handlers import Installation
@@ -234,7 +231,7 @@ class Subject:
             installation = Installation(self.plan.patches)
             try:
                 with environment_context(self.plan.plugins, rng):
-                    run.simulation = make_simulation(self.plan.source)
+                    run.simulation = make_simulation(self.plan.subject.source)
                     if rng is not None:
                         rng.begin(seed)
                     resetter(run.simulation)(seed, None)

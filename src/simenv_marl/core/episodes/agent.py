@@ -1,0 +1,476 @@
+"""One agent of an episode: its reward, observation, mask and info."""
+
+from __future__ import annotations
+
+from math import isfinite
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from greenlet import getcurrent
+
+from ...errors import AgentError, MaskError, RewardError, short_repr
+from ...hooks.stacks import DIFFERENCES, EVALUATING
+from ...plugins import Plugins
+from ...simulation import RULE, Action, Model, Observation
+from ..plans.point import Args, Kwargs, Mask, Policy
+from ..plans.policies import AskingPolicy, DeferredPolicy, EpisodePolicy, Info, Where
+from ..switching.driver import WAIT, AnyHandler
+from ..values.actions import MASK, only_choice
+from ..values.spaces import duplicate
+from .arguments import Arguments, Recalled, weaken
+from .clock import Clock
+from .decision import Decision, decision_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .episode import Episode
+    from .events import PointHandler
+
+
+class Agent:
+    """One agent of an episode.
+
+    It handles the decisions at its point if the point has no other agent.
+
+    Attributes:
+        name: The name.
+        handler: The handler of the decisions at its point.
+        point: The decision point.
+        policy: The policy that answers its decisions. None: the environment's user answers them.
+        delegated: Whether its decisions do not wait for the user, because a policy answers them or
+            because the agent has ended.
+        arguments: The arguments of its latest decision.
+        clock: The clock of the episode. None if the simulation has no time.
+        plugins: The handlers that take part in its mappings.
+        memory: Values of this agent in this episode: of differences, and of policies.
+        reward: The reward of its previous action, as of its latest decision or its end.
+        observation: The latest observation, cast to its space. None before the first one.
+        info: The latest info.
+        mask: The mask of the pending decision. None if all actions are legal.
+        choices: The choices of the pending decision. None without ``choices=``.
+        offered: The choices of the latest answered decision, held weakly, until the rule has chosen.
+        rule_action: The action that corresponds to the rule's latest decision. None if unknown.
+        decided: Whether the reward mapping was called in this episode. Its first value is dropped.
+        acted: Whether the latest round used an action that the user gave for the agent.
+        ended: Whether its episode has ended before the simulation's.
+        present: Whether the latest info comes from an observation.
+        asked: Whether anybody was asked for an action. Used where forced moves are skipped.
+        answered: The number of its decisions that were answered.
+        answered_at: The time of the latest answered decision.
+        now: The time of the latest decision.
+        fallbacks: The number of its decisions that a fallback has answered.
+    """
+
+    __slots__ = (
+        "_applying", "_carried", "_has_rule_action", "_is_quick", "acted", "answered",
+        "answered_at", "arguments", "asked", "choices", "clock", "decided", "delegated", "ended",
+        "fallbacks", "handler", "info", "mask", "memory", "name", "now", "observation", "offered",
+        "plugins", "point", "policy", "present", "reward", "rule_action",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        name: str,
+        handler: PointHandler,
+        policy: Policy,
+        delegated: bool,
+        clock: Clock | None,
+        plugins: Plugins | None,
+    ) -> None:
+        self.name = name
+        self.handler = handler
+        self.point = point = handler.point
+        self.policy = policy
+        self.delegated = delegated
+        self.arguments = Arguments(point)
+        self.clock = clock
+        self.plugins = plugins
+        self.memory: dict[Any, Any] = {}
+        self.reward = 0.0
+        self._carried = 0.0  # the sum of the rewards of forced moves
+        self.observation: Observation = None
+        self.info: Info = {}
+        self.mask: Mask | None = None
+        self.choices: list[Model] | None = None
+        self.offered: list[Model] | None = None
+        self.rule_action: Action = None
+        self._has_rule_action = False  # which the next info contains
+        self.decided = False
+        self._is_quick = False  # an update needs no more than an observation and a reward
+        self.acted = False
+        self.ended = False
+        self.present = False
+        self.asked = False
+        self.answered = 0
+        self.answered_at: float | None = None
+        self.now: float | None = None
+        self.fallbacks = 0
+        self._applying = 0
+
+    # -- decisions --------------------------------------------------------------------------------
+
+    @property
+    def deliver(self) -> Callable[..., Model] | None:
+        """Turns a reply into the value of a call, on the simulation's side."""
+        return self.point.deliver
+
+    @property
+    def report(self) -> AnyHandler | None:
+        """Handles the decisions of the rule."""
+        return self.handler.report
+
+    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+        """Handle a decision. Return this agent if it waits for the user, else the reply."""
+        if self._applying:
+            return RULE
+        if self.delegated:
+            return self.ask_policy(episode, args, kwargs)
+        arguments = self.arguments
+        if not (arguments.is_single and args and arguments.first() is args[0]):
+            self.keep(episode, args, kwargs)
+        if not episode.is_plain:
+            return episode.decide(self, args, kwargs)
+        try:
+            self.update(args, kwargs)
+        except BaseException:
+            episode.blame(self)
+            raise
+        return self
+
+    def ask_policy(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+        """Let the policy answer a decision. Return the reply, or ``WAIT`` for a deferred policy."""
+        if episode.ended:
+            if self.ended:
+                raise AgentError(
+                    f"the agent {self.name!r} decides at {self.point.hook.name} after its end;"
+                    " agent= must name each entity differently, and removed_by= or end_agent()"
+                    " must end an agent only when its entity is gone"
+                )
+            if episode.plan.one_agent in episode.ended:  # else it might run for ever without a user
+                episode.finish(truncated=False)
+                return WAIT
+        policy = self.policy
+        if policy is RULE:
+            return RULE
+        episode.blame(self)
+        is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
+        self.update_fully(args, kwargs, reward=is_rewarded)
+        if episode.skips:
+            forced = self.only_action()
+            if is_rewarded:
+                self.carry_reward(forced is not None or not self.asked)
+            if forced is not None:
+                return episode.answer_forced(self, forced)
+        self.asked = True
+        if isinstance(policy, AskingPolicy):
+            self.keep(episode, args, kwargs)
+        if isinstance(policy, DeferredPolicy) and not episode.is_branch:
+            return self
+        action = episode.consult(self, policy)
+        if action is WAIT:
+            return WAIT
+        return episode.answer(self, action if action is RULE else self.validate(action))
+
+    def answer_by_policy(self, episode: Episode) -> Action:
+        """Ask the policy itself for an action."""
+        policy = self.policy
+        if isinstance(policy, EpisodePolicy):
+            return policy.answer(episode, self, self.observation, self.info)
+        return policy(self.observation, self.info)
+
+    def validate(self, action: Action) -> Action:
+        """Validate an action for the pending decision: see ``Point.validate``."""
+        return self.point.validate(action, self.name, self.mask)
+
+    def only_action(self) -> Action:
+        """Return the only legal action of the pending decision. None if there are several."""
+        return only_choice(self.point.definition.action_space, self.mask)
+
+    def mark_answered(self, *, forced: bool = False) -> None:
+        """Note that the pending decision is answered. Forced moves leave the time as it is."""
+        if not forced or self.answered_at is None:
+            self.answered_at = self.now
+        self.answered += 1
+
+    def take_choice(self, action: Action) -> Model:
+        """Return the choice of an action in a list, and forget the others."""
+        choices, self.choices = self.choices, None
+        if self.point.reports_rule and choices is not None:
+            self.offered = [weaken(choice) for choice in choices]
+        return [choices[action]] if action is not RULE and choices is not None else action
+
+    def mark_acted(self, acted: bool) -> None:
+        """Note whether a round has used an action for the agent."""
+        self.acted = acted
+
+    def mark_asked(self) -> None:
+        """Note that somebody is asked for an action."""
+        self.asked = True
+
+    def begin_apply(self) -> None:
+        """Let the agent's calls run the rule, on the simulation's side."""
+        self._applying += 1
+
+    def end_apply(self) -> None:
+        """Undo ``begin_apply``."""
+        self._applying -= 1
+
+    def count_fallback(self) -> None:
+        """Count a decision that a fallback has answered."""
+        self.fallbacks += 1
+
+    # -- who answers ------------------------------------------------------------------------------
+
+    def delegate(self, policy: Policy) -> None:
+        """Let a policy answer from now on."""
+        self.policy = policy
+        self.delegated = True
+
+    def take_over(self) -> None:
+        """Let the environment's user answer from now on."""
+        self.policy = None
+        self.delegated = False
+        self.asked = True
+
+    def describe(self, seed: int, where: Where) -> Decision:
+        """Describe the decision of the agent."""
+        return decision_of(self, seed, where)
+
+    # -- arguments --------------------------------------------------------------------------------
+
+    def keep(self, episode: Episode, args: Args, kwargs: Kwargs) -> None:
+        """Hold the arguments of a decision."""
+        arguments = self.arguments
+        point = self.point
+        if point.expects_one and args:
+            before = arguments.first()
+            if before is not None and before is not args[0]:
+                self.handler.warn_of_several(self.name)
+        arguments.store(args, kwargs)
+        if point.agent is None and args:
+            episode.note_entity(self, args[0])
+
+    def is_entity(self, entity: Model) -> bool:
+        """Return whether an object was the first argument of the latest decision."""
+        return self.arguments.first() is entity
+
+    # -- rewards and observations -----------------------------------------------------------------
+
+    def update(self, args: Args, kwargs: Kwargs) -> None:
+        """Reward and observe the agent for the arguments of a call."""
+        if not self._is_quick or DIFFERENCES:
+            self.update_fully(args, kwargs)
+            return
+        point = self.point
+        reward = point.reward_mapping(*args, **kwargs) if kwargs else point.reward_mapping(*args)
+        if type(reward) is not float or reward - reward != 0.0:  # spares nearly all rewards a call
+            reward = checked_reward(self.name, reward)
+        self.reward = reward
+        if self.clock is None:
+            self.info = {}
+        else:
+            self.read_clock()
+        observe = point.observation_mapping
+        self.observation = point.cast(observe(*args, **kwargs) if kwargs else observe(*args))
+
+    def update_fully(
+        self,
+        args: Args,
+        kwargs: Kwargs,
+        *,
+        reward: bool = True,
+        observe: bool = True,
+        last: bool = False,
+    ) -> None:
+        """Reward and observe the agent for the arguments of a call.
+
+        Args:
+            args: The positional arguments.
+            kwargs: The keyword arguments.
+            reward: Whether to reward the agent.
+            observe: Whether to observe it.
+            last: Whether its episode ends here.
+        """
+        if not DIFFERENCES:
+            self._update(args, kwargs, reward, observe, last)
+            return
+        here = getcurrent()
+        before = EVALUATING.get(here)
+        EVALUATING[here] = self
+        try:
+            self._update(args, kwargs, reward, observe, last)
+        finally:
+            if before is None:  # without a function call, which fails at the recursion limit
+                del EVALUATING[here]
+            else:
+                EVALUATING[here] = before
+
+    def _update(self, args: Args, kwargs: Kwargs, reward: bool, observe: bool, last: bool) -> None:
+        point = self.point
+        if reward and self.decided:
+            self.reward = checked_reward(self.name, point.reward_mapping(*args, **kwargs))
+        elif reward and not last:  # the agent has not acted yet, so this value rewards nothing
+            point.reward_mapping(*args, **kwargs)
+            self.decided = True
+            self._is_quick = point.is_plain
+        if not observe:
+            return
+        self.present = True
+        if point.legal is not None:
+            self._restrict(args, kwargs, last)
+        self._inform()
+        if point.masked_parts and self.mask is not None:
+            self.observation = point.observe(args, kwargs, self.mask)
+        else:
+            self.observation = point.cast(point.observation_mapping(*args, **kwargs))
+
+    def _restrict(self, args: Args, kwargs: Kwargs, last: bool) -> None:
+        """Set the mask and the choices. An agent that has ended will not be asked again."""
+        legal: Any = self.point.legal
+        try:
+            self.mask, self.choices = legal(args, kwargs)
+        except MaskError:
+            if not last:
+                raise
+            self.mask = self.point.open_mask()
+            self.choices = None
+
+    def observe_again(self, args: Args, kwargs: Kwargs) -> None:
+        """Set the mask, the choices and the time at a decision in a round, and nothing else."""
+        if self.point.legal is not None:
+            self._restrict(args, kwargs, last=False)
+        if self.clock is not None:
+            self.now = self.clock.read(None)["time"]
+
+    def forget_choices(self) -> None:
+        """Forget the choices of an agent that was observed before its decision."""
+        self.choices = None
+
+    def refresh(self, *, reward: bool = True, last: bool = False) -> None:
+        """Reward and observe the agent for the arguments of its latest decision, at any later time.
+
+        Where the model has freed an argument that a mapping takes, the reward is 0.0, and the last
+        observation stays.
+        """
+        arguments = self.arguments
+        if arguments.is_empty:
+            self.clear_observation()
+            return
+        call = arguments.recall()
+        if call.is_whole:
+            if reward and not last:
+                self.update(call.args, call.kwargs)
+            else:
+                self.update_fully(call.args, call.kwargs, reward=reward, last=last)
+            return
+        self._refresh_in_part(call, reward, last)
+
+    def _refresh_in_part(self, call: Recalled, reward: bool, last: bool) -> None:
+        point = self.point
+        observes = not any(
+            mapping.takes_any(call.places, call.keys) for mapping in point.takes_for_observation
+        )
+        pays = not point.takes_for_reward.takes_any(call.places, call.keys)
+        if not observes:
+            self.clear_observation()
+        self.reward = 0.0
+        if reward and not pays and self.decided:
+            self.handler.warn_of_gone(call, "the reward is 0.0")
+        elif not observes and self.decided:
+            self.handler.warn_of_gone(call, "the last observation stays")
+        if pays or observes:
+            self.update_fully(
+                call.args, call.kwargs, reward=reward and pays, observe=observes, last=last
+            )
+
+    def conclude(self) -> None:
+        """End the agent's episode: give it its last reward and observation."""
+        self.refresh(last=True)
+        self.carry_reward(False)
+        self.arguments.clear()
+        self.answered_at = None
+
+    def end(self) -> None:
+        """Note that its episode has ended before the simulation's."""
+        self.ended = True
+        self.delegated = True
+
+    def carry_reward(self, carry_on: bool) -> None:
+        """Add the rewards of forced moves. Carry the sum on where no reward is returned."""
+        total = self.reward + self._carried
+        self.reward = 0.0 if carry_on else total
+        self._carried = total if carry_on else 0.0
+
+    # -- infos ------------------------------------------------------------------------------------
+
+    def read_clock(self) -> None:
+        """Note the time, in the info, too."""
+        clock: Any = self.clock
+        self.info = info = clock.read(self.answered_at)
+        self.now = info["time"]
+
+    def _inform(self) -> None:
+        """Make the info of an observation: the time, the action mask and the rule's action."""
+        if self.clock is None:
+            self.info = {}
+        else:
+            self.read_clock()
+        mask = self.mask
+        if mask is not None:
+            self.info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
+        if self._has_rule_action:
+            self.info["rule_action"] = self.rule_action
+            self._has_rule_action = False
+
+    def note_rule_action(self, action: Action, informs: bool) -> None:
+        """Note the action that corresponds to the rule's decision."""
+        self.rule_action = action
+        self._has_rule_action = informs
+        self.offered = None
+
+    def take_rule_action(self) -> Action:
+        """Return the action that corresponds to the rule's latest decision, and forget it."""
+        action, self.rule_action = self.rule_action, None
+        return action
+
+    def clear_observation(self) -> None:
+        """Set the reward to 0.0, and the info to one without an observation."""
+        self.reward = 0.0
+        self.present = False
+        if self.clock is None:
+            self.info = {}
+        else:
+            self.read_clock()
+        if self.point.legal is not None:
+            self.info[MASK] = self.point.open_mask()
+
+    def load(self, fields: dict[str, Any]) -> None:
+        """Take over fields of the agent in the process of a clone."""
+        for name, value in fields.items():
+            setattr(self, name, value)
+
+    def take_info(self) -> Info:
+        """Return the info, which a policy may change, and forget it."""
+        info, self.info = self.info, {}
+        return info
+
+    def take_observation(self) -> Observation:
+        """Return the observation, and forget it."""
+        observation, self.observation = self.observation, None
+        return observation
+
+
+def checked_reward(name: str, reward: Model) -> float:
+    """Return a reward as a float. Raise a ``RewardError`` if it is not one finite number."""
+    value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
+    if not isinstance(value, (Real, np.bool_)):
+        raise RewardError(f"the reward {short_repr(reward)} is not one number")
+    try:
+        number = float(value)
+    except OverflowError:
+        raise RewardError(f"the reward {short_repr(reward)} is too large for a float") from None
+    if not isfinite(number):
+        raise RewardError(f"the reward of {name!r} is {number}, which is not finite")
+    return number

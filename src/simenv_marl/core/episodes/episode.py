@@ -1,0 +1,697 @@
+"""One episode of one simulation. This module determines what happens when.
+
+An episode::
+
+    MOVING <--------> PENDING --------> OVER
+    the simulation    a decision waits  terminated, truncated,
+    runs, or          for the user      failed or closed
+    mappings and
+    policies do
+
+A decision::
+
+    simulation                     episode, on its user's stack
+    ----------                     ----------------------------
+    calls a decision function
+      suspended          ------>   ``handle``: find the agent; if the rule decides, back to the
+                                     simulation
+                                   ``Agent.update``: reward of the previous action (the first of an
+                                     episode is dropped), legal actions, info, observation
+                                   if a policy answers (``Agent.ask_policy``), back to the
+                                     simulation with its action
+                                   else PENDING, until the user answers
+                                   ``answer``: map the checked action to the reply
+      returns            <------   ``advance``
+    returns from ``run``
+      ended              ------>   ``finish``: last reward and observation of each agent; OVER
+
+In AEC, single and turn views an episode is played in turns: each agent is updated when its decision
+arises. In parallel and joint views it is played in rounds: all live agents are updated when a step
+returns. Where policies answer all agents (``simulate``, ``simulate_many``), agents are observed
+when a policy is asked, and not rewarded. While an episode is MOVING on the user's side, decision
+functions run their rule.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from math import inf
+from threading import current_thread
+from typing import TYPE_CHECKING, Final, NoReturn
+from weakref import ref
+
+from greenlet import getcurrent
+
+from ...errors import (
+    AgentError,
+    NoDecisionError,
+    annotate,
+    clear_frames,
+    listed,
+    short_repr,
+    warn_user,
+)
+from ...hooks.hook import Hook
+from ...hooks.stacks import EVALUATING
+from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel
+from ..plans.point import Policy
+from ..plans.points import overrides
+from ..plans.policies import Where, policy_for, two_arguments
+from ..switching.context import environment_context
+from ..switching.driver import WAIT, AnyHandler, Driver, Event
+from ..values.actions import ILLEGAL
+from ..values.spaces import duplicate
+from .agent import Agent
+from .arguments import restore, weaken
+from .decision import Decision, decision_of
+from .round import Round, checked_actions
+from .state import EpisodeState, Outcome
+
+if TYPE_CHECKING:
+    from ..plans.point import Args, Kwargs
+    from .events import PointHandler
+    from .session import Session
+    from .split import SplitCall
+
+LONGEST_TAPE: Final = 200_000
+"""The number of answers that are kept for a replay. It limits the memory of endless simulations."""
+
+
+class Replay:
+    """A policy that repeats the answers of another episode, in place of all other policies."""
+
+    def __init__(self, answers: Iterable[Action]) -> None:
+        self.answers = deque(answers)
+
+    def answer(self) -> Action:
+        """Return the next answer. ``WAIT`` where the other episode stands."""
+        return self.answers.popleft() if self.answers else WAIT
+
+
+class Episode(EpisodeState):
+    """One run of a simulation, from its reset to its end. It does not refer to the environment.
+
+    Attributes:
+        session: Returns the session. None if that is gone.
+        simulation: The simulation.
+        driver: The driver of its stack.
+        latest: The agent that decided last, for the notes of errors.
+        running: Whether the simulation's ``run`` has not ended yet.
+        is_plain: Whether a decision of the user's agents is just updated, and waits.
+        tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
+        replay: The policy that repeats another episode. None in ordinary episodes.
+    """
+
+    __slots__ = (
+        "_context", "_entities", "_failed_in_model", "_handlers", "_items", "_most_steps",
+        "_plugins", "_split", "_tape_size", "driver", "is_plain", "latest", "replay", "running",
+        "session", "simulation", "tape",
+    )  # fmt: skip
+
+    def __init__(
+        self, session: Session, driver: Driver, seed: int, replay: Replay | None, *, in_rounds: bool
+    ) -> None:
+        """Prepare the run of a simulation that has been reset. The next ``resume`` begins it."""
+        plan = session.plan
+        super().__init__(plan, seed, session.make_clock(), session.where, in_rounds=in_rounds)
+        self.session: Callable[[], Session | None] = ref(session)
+        self.simulation = session.simulation
+        self.driver = driver
+        self._context = session.context
+        self._handlers = session.handlers
+        self._plugins = plan.plugins
+        self.latest: Agent | None = None
+        self.running = True
+        self._failed_in_model = False
+        self._entities: dict[tuple[PointHandler, int], Agent] = {}  # by the id of the entity
+        self._most_steps: float = plan.options.max_steps or inf
+        self.is_plain = not (in_rounds or self.skips)
+        self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
+        self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
+        self.replay = replay
+        self._split: SplitCall | None = None
+        self._items: list[Model] = []
+        for name, point in plan.roster.items():
+            self.agents[name] = self._make_agent(name, self._handlers.by_point[point])
+
+    def context(self) -> environment_context:
+        """Return the context in which the environment's code must run."""
+        return self._context(self.driver)
+
+    def handlers_by_hook(self) -> dict[Hook, AnyHandler]:
+        """Return the handlers of events: the agent itself where a point has only one."""
+        handlers = dict(self._handlers.by_hook)
+        for agent in self.agents.values():
+            point = agent.point
+            if point.agent is not None and point.split is None:
+                handlers[point.hook] = agent
+        return handlers
+
+    # -- steps ------------------------------------------------------------------------------------
+
+    def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
+        """Run the simulation to its first decision. Call a function when it has sent an event.
+
+        Raises:
+            NoDecisionError: There is no decision for the environment's user.
+        """
+        with self.context():
+            try:
+                handler, args, kwargs = self.driver.resume(None)
+                if at_first_event is not None:
+                    at_first_event()
+                reply = handler.handle(self, args, kwargs)
+                del handler, args, kwargs
+                if not self.has_to_wait(reply):
+                    self.advance(reply)
+                if not self.over and self.consulted is None and self.agents:
+                    self.update_all()
+            except BaseException as error:
+                self.fail(error)
+                raise
+        self.unreported_end = self.over or (self.in_rounds and bool(self.just_ended))
+        if self.pending is None and self.plan.has_user and not self._has_only_forced_moves():
+            raise self._without_decision()
+
+    def step(self, action: Action, entered: bool = False) -> None:
+        """Answer the pending decision, and run to the user's next decision, or to the end.
+
+        Args:
+            action: An action or ``RULE``. In rounds, a dict of these by agent.
+            entered: Whether the environment's context is already entered.
+
+        Raises:
+            InvalidActionError: The action is not legal. Nothing has moved.
+            EpisodeOverError, ReentrancyError: No decision is pending.
+        """
+        agent = self.pending
+        if agent is None:
+            self.report_end()
+            return
+        if not entered and (
+            getcurrent() is not self.driver.caller or EVALUATING or self._plugins is not None
+        ):
+            self._enter_and_step(action)
+            return
+        if self.round is not None:
+            self._play(self.round, agent, action)
+            return
+        try:
+            if action is not RULE:
+                legal = agent.point.check(action)
+                if legal is ILLEGAL or agent.mask is not None:
+                    legal = agent.validate(action)
+                action = legal
+            self.advance(self.answer_turn(agent, action))
+        except BaseException as error:
+            if self.pending is None:
+                self.fail(error)
+            else:
+                self.annotate(error)
+            raise
+
+    def _enter_and_step(self, action: Action) -> None:
+        """Take a step in the environment's context."""
+        # The greenlet is in no variable: tracebacks keep variables, and a root must not outlive
+        # its thread.
+        if getcurrent() is not self.driver.caller or EVALUATING:
+            with self.context():
+                self.step(action, True)
+            return
+        # This does what the context does where only plugins need it, in a fifth of the time.
+        EVALUATING[getcurrent()] = self._plugins
+        try:
+            self.step(action, True)
+        finally:
+            del EVALUATING[getcurrent()]
+
+    def _play(self, played: Round, pending: Agent, actions: Mapping[str, Action]) -> None:
+        """Play a round with an action, or ``RULE``, for each agent's name."""
+        checked = checked_actions(self, actions)
+        self.pending = None
+        try:
+            self.record({name: _copied(action) for name, action in checked.items()})
+            self.turns += bool(checked)
+            is_last = bool(checked) and self.turns == self._most_steps
+            played.begin(checked)
+            for agent in (*self.agents.values(), *self.just_ended):
+                agent.mark_acted(False)
+            if self.unreported_end:
+                self.unreported_end = False
+            else:
+                self.just_ended = []
+            reply = self._use_action(played, pending)
+            moved = not self.has_to_wait(reply)
+            if moved:
+                self.advance(reply)
+            played.count_unused(self.skips)
+            if not self.over and self.consulted is None:  # it is set where a replay ends
+                self.update_all(truncated=is_last)
+        except BaseException as error:
+            self.fail(error)
+            raise
+        played.warn_if_stalled(pending, moved)
+
+    def advance(self, reply: Model) -> None:
+        """Resume the simulation with a reply, and run to the user's next decision, or to the end.
+
+        If the model, a mapping or a policy raises, the caller must call ``fail``.
+        """
+        while True:
+            if self._split is None:
+                handler, args, kwargs = self.driver.resume(reply)
+            else:
+                handler, args, kwargs = self._next_item(self._split, reply)
+            reply = handler.handle(self, args, kwargs)
+            if type(reply) is Agent:
+                self.latest = self.pending = reply
+                return
+            if reply is WAIT:
+                return
+            del handler, args, kwargs  # they must keep nothing alive that the model frees
+
+    def resume(self, reply: Model) -> Event:
+        """Resume the simulation with a reply; return its next event, or that of the next item."""
+        if self._split is None:
+            return self.driver.resume(reply)
+        return self._next_item(self._split, reply)
+
+    def has_to_wait(self, reply: Model) -> bool:
+        """Return whether the episode waits for an answer, or is over. If it waits, note the agent."""
+        if type(reply) is Agent:
+            self.latest = self.pending = reply
+            return True
+        return reply is WAIT
+
+    # -- decisions --------------------------------------------------------------------------------
+
+    def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
+        """Handle a decision where more than an update is due. Return the agent or the reply."""
+        self.latest = agent
+        if self.round is not None:
+            agent.observe_again(args, kwargs)
+            return self._use_action(self.round, agent)
+        if self.turns >= self._most_steps:  # the user has taken the last step
+            self.finish(truncated=True)
+            return WAIT
+        agent.update(args, kwargs)
+        if self.skips:
+            forced = agent.only_action()
+            agent.carry_reward(forced is not None or not agent.asked)
+            if forced is not None:
+                return self.answer_forced(agent, forced)
+            agent.mark_asked()
+        return agent
+
+    def _use_action(self, played: Round, agent: Agent) -> Model:
+        """Answer a decision with the agent's action of this round. Return the agent if it has none."""
+        forced = agent.only_action() if self.skips else None
+        action = played.take(agent) if forced is None else forced
+        if action is WAIT:
+            return agent
+        if forced is None:
+            agent.mark_acted(True)
+        self.latest = agent
+        if not agent.decided:  # it acts before it was ever updated
+            call = agent.arguments.recall()
+            agent.update_fully(call.args, call.kwargs, observe=False)
+        return self.answer(agent, action)
+
+    def answer_turn(self, agent: Agent, action: Action) -> Model:
+        """Turn the user's checked action, or ``RULE``, into the reply to the pending decision.
+
+        If a mapping raises, the decision stays pending.
+        """
+        self.pending = None  # so that an action from inside a mapping is refused
+        recorded = _copied(action)  # before a mapping can change it
+        try:
+            reply = self.answer(agent, action)
+        except BaseException:
+            self.pending = agent
+            raise
+        self.turns = turns = self.turns + 1
+        if len(self.tape) < self._tape_size:
+            self.tape.append(recorded)
+        if turns == self._most_steps:
+            self.is_plain = False
+        return reply
+
+    def answer_forced(self, agent: Agent, action: Action) -> Model:
+        """Answer with the only legal action. Elapsed times add up to the next decision asked."""
+        return self.answer(agent, action, forced=True)
+
+    def answer(self, agent: Agent, action: Action, *, forced: bool = False) -> Model:
+        """Turn the checked action of an agent, or ``RULE``, into the reply for ``resume``."""
+        point = agent.point
+        reply: Model = action
+        if agent.choices is not None:
+            reply = agent.take_choice(action)
+        elif action is not RULE:
+            reply = point.convert(action)
+        agent.mark_answered(forced=forced)
+        return (agent, reply) if point.applies and reply is not RULE else reply
+
+    def consult(self, agent: Agent, policy: Policy) -> Action:
+        """Ask the policy of an agent. ``WAIT`` where a replay ends."""
+        if self.replay is not None:
+            action = self.replay.answer()
+            if action is WAIT:
+                self.consulted = self.pending = agent
+                return WAIT
+        else:
+            self.consulted = agent
+            try:
+                action = agent.answer_by_policy(self)
+            finally:
+                self.consulted = None
+        self.record(_copied(action))
+        return action
+
+    def record(self, action: Action) -> None:
+        """Keep an answer for replays."""
+        if len(self.tape) < self._tape_size:
+            self.tape.append(action)
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether all answers of the episode are on its tape."""
+        return len(self.tape) < self._tape_size
+
+    def end_replay(self) -> None:
+        """Go on as an ordinary episode, whose ends another view has reported."""
+        self.replay = None
+        self.just_ended = []
+
+    def decision_of(self, agent: Agent) -> Decision:
+        """Describe the decision of an agent."""
+        return decision_of(agent, self.seed, self.where)
+
+    def planner_view(self) -> object:
+        """Make the environment that a planner gets."""
+        return self.plan.planner_view(self.session())
+
+    # -- calls that are split -----------------------------------------------------------------------
+
+    def begin_split(self, call: SplitCall) -> None:
+        """Decide the items of a call, before the simulation moves."""
+        self._split = call
+
+    def _next_item(self, call: SplitCall, reply: Model) -> Event:
+        """Return the event of the next item of a call. After the last one, resume the simulation."""
+        event = call.next_event(reply)
+        if event is not None:
+            return event
+        self._split = None
+        if call.handler.report is not None:
+            self._items = [weaken(item) for item in call.items]
+        return self.driver.resume(call.reply())
+
+    def take_items(self) -> list[Model]:
+        """Return the items of the latest call that was split, for the decision of its rule."""
+        items, self._items = self._items, []
+        return [restore(item) for item in items]
+
+    # -- agents -----------------------------------------------------------------------------------
+
+    def _make_agent(self, name: str, handler: PointHandler) -> Agent:
+        policy = self.plan.policy_of(name, handler.point)
+        delegated = self.plan.is_delegated(policy)
+        return Agent(name, handler, policy, delegated, self.clock, self._plugins)
+
+    def agent_for(self, handler: PointHandler, name: Model) -> Agent:
+        """Return the agent with a name that decides at a point. Let a new one join.
+
+        Raises:
+            AgentError: The name is no string, or its agent decides at another point.
+        """
+        here = handler.point.hook.name
+        if not isinstance(name, str):
+            raise AgentError(
+                f"agent= of {here} must return a string or None, not {short_repr(name)}"
+            )
+        agent = self.others.get(name) or self.agents.get(name) or self.ended.get(name)
+        if agent is None:
+            agent = self._make_agent(name, handler)
+            (self.others if agent.delegated else self.agents)[name] = agent
+        elif agent.handler is not handler:
+            raise AgentError(
+                f"the agent {name!r} decides at {agent.point.hook.name} and at {here}; an agent has"
+                " one decision point: give each point's agents names of their own"
+            )
+        return agent
+
+    def note_entity(self, agent: Agent, entity: Model) -> None:
+        """Note the object as which an agent decides."""
+        self._entities[agent.handler, id(entity)] = agent
+
+    def named_before(self, handler: PointHandler, entity: Model) -> str | None:
+        """Return the name of the agent as which an entity last decided. None if it was none."""
+        agent = self._entities.get((handler, id(entity)))
+        if agent is None or not agent.is_entity(entity):  # a freed object may have had the same id
+            return None
+        return agent.name
+
+    def blame(self, agent: Agent) -> None:
+        """Note the agent that notes of errors name."""
+        self.latest = agent
+
+    def restore_pending(self) -> None:
+        """Let the decision wait again that was answered last, so that the episode can be closed."""
+        if self.pending is None and not self.over:
+            self.pending = self.latest
+
+    def update_all(self, *, truncated: bool = False) -> None:
+        """Reward and observe the live agents when a reset or a round returns.
+
+        In turns, only agents that have not decided yet are observed, and none is rewarded.
+        ``truncated``: the episode ends here.
+        """
+        pending, self.pending = self.pending, None  # so that an action from a mapping is refused
+        in_rounds = self.in_rounds
+        for agent, (args, kwargs) in self._announced().items():
+            if agent is not pending and (in_rounds or not agent.decided):
+                agent.keep(self, args, kwargs)
+        if truncated:
+            self.finish(truncated=True)
+            return
+        for agent in self.agents.values():
+            if agent.decided and not in_rounds:
+                continue
+            if not agent.arguments.is_empty:
+                self.latest = agent
+            agent.refresh(reward=in_rounds)
+            if in_rounds and self.skips and agent.present:
+                agent.carry_reward(not self.turns)
+            if agent is not pending:
+                agent.forget_choices()  # ``legal`` returns them again when it decides
+        self.pending = pending
+
+    def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
+        """Return the agents that ``expected_calls`` announces, with the arguments of their call."""
+        expected_calls = getattr(self.simulation, "expected_calls", None)
+        announced: dict[Agent, tuple[Args, Kwargs]] = {}
+        if expected_calls is None:
+            return announced
+        for plan_point in self.plan.active:
+            handler = self._handlers.by_point[plan_point]
+            point = handler.point
+            for call in expected_calls(point.hook.name):
+                for args, kwargs in point.decisions_of(call):
+                    name = point.agent or point.name_agent(*args, **kwargs)
+                    agent = None if name is None else self.agent_for(handler, name)
+                    if agent is not None and not agent.delegated:
+                        announced.setdefault(agent, (args, kwargs))
+        return announced
+
+    def end_agent(self, agent: Agent) -> None:
+        """End the episode of one agent while the simulation's goes on."""
+        latest = self.latest
+        self.latest = agent
+        agent.conclude()
+        agent.end()
+        self.latest = latest  # the model continues after the decision of this agent
+        self.ended[agent.name] = self.agents.pop(agent.name)
+        self.just_ended.append(agent)
+
+    # -- branches that wait for one agent -----------------------------------------------------------
+
+    def single_out(self, agent: Agent) -> None:
+        """In a branch, wait for one agent alone. Policies answer for the others, else the rule."""
+        self.plan = self.plan.for_one(agent.name)
+        self.move_to(Where.BRANCH)
+        self.tape = []  # it cannot be replayed, because this is not on the tape
+        self._tape_size = 0
+        for name, other in self.agents.items():
+            if other is not agent:
+                self._most_steps = inf  # ``max_steps`` counts the steps of other agents
+                other.delegate(self.plan.policy_of(name, other.point))
+                self.others[name] = other
+        self.agents = {agent.name: agent}
+        self.just_ended = []
+        agent.take_over()
+        self.round = None  # it is played in turns from now on
+        self.is_plain = not self.skips
+        if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
+            call = agent.arguments.recall()
+            with self.context():
+                agent.update_fully(call.args, call.kwargs, observe=False)
+        self.consulted = None
+        self.pending = agent
+
+    def delegate(self, policies: Mapping[str, Policy]) -> None:
+        """In a branch, let policies answer for agents that neither the user nor a policy answers."""
+        substitutes: dict[str, Policy] = {}
+        for name in policies.keys() - self.agents.keys():
+            policy = policy_for(policies, name, self.where)
+            if policy is not RULE:
+                substitutes[name] = two_arguments(policy)
+        self.plan = self.plan.with_policies(substitutes)
+        for name, agent in self.others.items():
+            if name in substitutes and agent.policy is RULE:
+                agent.delegate(substitutes[name])
+
+    # -- ends -------------------------------------------------------------------------------------
+
+    def receive_end(self) -> Sentinel:
+        """Handle the end of ``run``: end the episode of all agents, or raise the error of ``run``."""
+        self.running = False
+        self._failed_in_model = self.driver.failed
+        result = self.driver.take_outcome()
+        self.finish(truncated=result is TRUNCATED)
+        return WAIT
+
+    def receive_refusal(self) -> NoReturn:
+        """Raise the error of a decision that the driver has refused."""
+        self._failed_in_model = True
+        raise self.driver.refusal()
+
+    def finish(self, *, truncated: bool) -> None:
+        """End the episode of all live agents."""
+        self.pending = None
+        for agent in self.agents.values():
+            self.latest = agent
+            agent.conclude()
+        self.outcome = Outcome.TRUNCATED if truncated else Outcome.TERMINATED
+        session = self.session()
+        if session is not None and self.plan.named_agents:
+            session.unmatched_names.check(self)
+
+    def _has_only_forced_moves(self) -> bool:
+        agents = (*self.agents.values(), *self.just_ended)
+        return self.skips and any(agent.decided for agent in agents)
+
+    def _without_decision(self) -> NoDecisionError:
+        """Make the error for an episode that ended without a decision for the environment's user."""
+        hooks = [point.hook for point in self.plan.active]
+        expected = ", ".join(hook.name for hook in hooks)
+        overriding = listed([name for hook in hooks for name in overrides(hook)])
+        threads = {name for hook in hooks for name in hook.threads} - {current_thread().name}
+        hints: list[str] = []
+        if overriding:
+            hints.append(
+                f"these override it and are called instead: {overriding}; name them as decision"
+                " points"
+            )
+        if threads:
+            hints.append(
+                "the rule has decided in threads that are not the simulation's:"
+                f" {listed(sorted(threads))}; call it where run() runs, and pass the decision on"
+            )
+        if self.others:
+            if self.plan.one_agent:
+                expected = f"{self.plan.one_agent!r} at {expected}"
+            hints = [f"these have decided: {listed(self.others)}"]
+        hint = "; ".join(hints) or (
+            "does the simulation call its decision functions as attributes of class or module?"
+        )
+        return NoDecisionError(
+            f"{type(self.simulation).__name__}.run() ended without a decision of {expected}; {hint}"
+        )
+
+    # -- errors, and the end by a close -----------------------------------------------------------
+
+    def annotate(self, error: BaseException) -> None:
+        """Add a note to an error: at which decision of which agent it arose."""
+        agent = self.latest
+        if agent is None:
+            where = "before the first decision"
+        elif self._failed_in_model:
+            where = f"in the model, after decision {self.turns}, {_at(agent)}"
+        else:
+            where = f"at decision {self.turns + 1}, {_at(agent)}"
+        annotate(error, f"simenv_marl: {where}; seed {self.seed}")
+
+    def fail(self, error: BaseException) -> None:
+        """End the episode because of an error, and note in the error where it arose."""
+        self.stop()  # first, because the next call may come to the end of the stack
+        self.annotate(error)
+        try:
+            problems = self._unwind()
+        except Warning as warning:  # warnings may be errors; this one must not replace the error
+            problems = [warning]
+        for problem in problems:
+            annotate(
+                error,
+                f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well",
+            )
+        clear_frames(error)
+
+    def stop(self) -> None:
+        """Note that nothing happens any more."""
+        self.pending = None
+        if self.outcome is Outcome.RUNNING:
+            self.outcome = Outcome.STOPPED
+
+    def close(self) -> None:
+        """Unwind the simulation if it is suspended, without answering its decisions.
+
+        Raises:
+            ReentrancyError, WrongThreadError: The simulation is moving, or suspended in another
+                thread.
+        """
+        if self.running and (self.driver.lost or self.driver.given_up is not None):
+            self.running = False
+            self.stop()
+        if self.pending is None and not self.over:
+            raise self.refusal()
+        if self.running:
+            with self.context():
+                for problem in self._unwind():
+                    self.annotate(problem)
+                    raise problem
+        self.stop()
+
+    def _unwind(self) -> list[BaseException]:
+        """Unwind the simulation if it is suspended. Return the errors that it raised."""
+        if self.driver.given_up is not None:  # a fork has inherited it
+            self.running = False
+        if not self.running:
+            self.stop()
+            return []
+        before = self.outcome
+        self.pending = None
+        self.outcome = Outcome.RUNNING  # it moves until it is unwound
+        problems: list[BaseException] = []
+        try:
+            stop = getattr(self.simulation, "stop", None)
+            try:
+                if stop is not None:
+                    stop()
+            except BaseException as error:
+                problems.append(error)
+            problems += self.driver.unwind()
+            self.running = False
+        finally:
+            self.outcome = Outcome.STOPPED if before is Outcome.RUNNING else before
+        if self.driver.given_up is not None:
+            warn_user(f"{type(self.simulation).__name__} {self.driver.given_up}.", ResourceWarning)
+        return problems
+
+
+def _copied(action: Action) -> Action:
+    return action if type(action) is int or action is RULE else duplicate(action)
+
+
+def _at(agent: Agent) -> str:
+    return f"of {agent.name!r} at {agent.point.hook.name}"

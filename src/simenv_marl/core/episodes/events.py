@@ -1,0 +1,261 @@
+"""The handlers of the events that a simulation sends: decisions, ends of agents, rules' decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+from weakref import WeakKeyDictionary
+
+from ...decision import inverse
+from ...errors import InvalidActionError, short_repr, warn_user
+from ...hooks.hook import Hook
+from ...simulation import RULE, Action, Model
+from ..plans.mappings import adapt
+from ..plans.plan import Plan, Remover
+from ..plans.point import Args, Kwargs, Point, warn_of_several
+from ..switching.driver import AnyHandler
+from ..values.actions import ILLEGAL
+from .arguments import Recalled, restore
+from .split import SplitHandler, part_of
+
+if TYPE_CHECKING:
+    from .agent import Agent
+    from .episode import Episode
+
+Namer = Callable[["Episode", Args, Kwargs], Model]
+"""Returns the name of the agent that a call ends."""
+
+
+class PointHandler:
+    """Handles the decisions at a point.
+
+    Attributes:
+        point: The decision point.
+        report: Handles the decisions of the rule. None if they are not reported.
+    """
+
+    def __init__(self, point: Point) -> None:
+        self.point = point
+        self.report: AnyHandler | None = RuleHandler(point) if point.reports_rule else None
+        self._warnings: set[str] = set()
+
+    @property
+    def deliver(self) -> Callable[..., Model] | None:
+        """Turns a reply into the value of a call, on the simulation's side."""
+        return self.point.deliver
+
+    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+        """Find the agent that decides, or let it join; then handle its decision."""
+        point = self.point
+        name: Model = point.agent
+        if name is None:
+            name_agent = point.name_agent
+            name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
+            if name is None:
+                return RULE
+        agent = None
+        if type(name) is str:
+            agent = episode.agents.get(name) or episode.others.get(name)
+        if agent is None or agent.handler is not self:
+            agent = episode.agent_for(self, name)
+        return agent.handle(episode, args, kwargs)
+
+    def warn_of_several(self, agent: str) -> None:
+        """Warn once that several objects decide under the name of one agent."""
+        if "several" not in self._warnings:
+            self._warnings.add("several")
+            warn_of_several(self.point.hook.name, agent)
+
+    def warn_of_gone(self, call: Recalled, effect: str) -> None:
+        """Warn once that the model has freed an argument that mappings take."""
+        if "gone" in self._warnings:
+            return
+        self._warnings.add("gone")
+        signature = self.point.hook.signature
+        known = [] if signature is None else list(signature.parameters)
+        skipped = int(self.point.split is not None)  # the item comes before the parameters
+        names = [
+            known[place - skipped] if 0 <= place - skipped < len(known) else f"argument {place}"
+            for place in sorted(call.places)
+        ]
+        names += sorted(call.keys)
+        warn_user(
+            f"the model has freed {', '.join(names)} of the latest call of"
+            f" {self.point.hook.name}, which its mappings take, so {effect} where an agent has"
+            " ended or a round has returned. Name the function that removes it in removed_by=, let"
+            " the mapping take _simulation instead, or keep the object in the simulation"
+        )
+
+
+class RemovalHandler:
+    """Handles calls that end agents. It changes nothing in the simulation: the function runs."""
+
+    deliver = None
+    report = None
+
+    def __init__(self) -> None:
+        self._removals: list[tuple[PointHandler | None, Namer]] = []
+
+    def add(self, handler: PointHandler | None, remover: Remover) -> None:
+        """Let calls end agents of a point. None: any agents."""
+        if handler is None:
+            self._removals.append((None, _name_of_end_agent))
+            return
+        name_agent = handler.point.removed_by[remover.name]
+        namer: Namer = partial(_name_of_entity, handler, remover.owner)
+        if name_agent is not None:
+            call = adapt(name_agent, "removed_by", remover.hook).call
+            namer = partial(_name_of_call, call)
+        self._removals.append((handler, namer))
+
+    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+        """Give the agents their last rewards and observations; then let the function run."""
+        # All names come first, because the end of an agent may change them.
+        named = [(handler, name(episode, args, kwargs)) for handler, name in self._removals]
+        for handler, name in named:
+            agent = episode.agents.get(name)
+            if agent is not None and handler in (None, agent.handler):
+                episode.end_agent(agent)
+        return RULE
+
+
+def _name_of_end_agent(episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+    """Return the name that ``SimulationInterface.end_agent`` gets after the simulation."""
+    return args[1]
+
+
+def _name_of_call(
+    name_agent: Callable[..., Model], episode: Episode, args: Args, kwargs: Kwargs
+) -> Model:
+    return name_agent(*args, **kwargs)
+
+
+def _name_of_entity(
+    handler: PointHandler, owner: type | None, episode: Episode, args: Args, kwargs: Kwargs
+) -> Model:
+    """Return the name of the agent that is the first argument of a call. None if it is none."""
+    point = handler.point
+    if not args or (owner is not None and not isinstance(args[0], owner)):
+        return None
+    if point.agent is not None:
+        return point.agent
+    name = point.name_agent(args[0])
+    return episode.named_before(handler, args[0]) if name is None else name
+
+
+class RuleHandler:
+    """Handles the decisions that the rule of a point has made."""
+
+    deliver = None
+    report = None
+
+    def __init__(self, point: Point) -> None:
+        self._point = point
+        self._inverse = inverse(point.definition) or {}
+
+    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> None:
+        """Note the action for a decision. ``args``: the decision, and its call's arguments."""
+        decision, call_args, call_kwargs = args
+        point = self._point
+        if point.split is None:
+            self._note(episode, decision, call_args, call_kwargs)
+            return
+        for place, item in enumerate(episode.take_items()):
+            piece = part_of(point.part, decision, item, place, call_args, call_kwargs)
+            self._note(episode, piece, (item, *call_args), call_kwargs)
+
+    def _note(self, episode: Episode, decision: Model, args: Args, kwargs: Kwargs) -> None:
+        point = self._point
+        name = point.agent or point.name_agent(*args, **kwargs)
+        agent = None
+        if type(name) is str:
+            agent = episode.agents.get(name) or episode.others.get(name)
+        if agent is None or agent.point is not point:
+            return
+        episode.blame(agent)
+        action = self._action(decision, args, kwargs, agent)
+        agent.note_rule_action(action, point.informs_rule_action and action is not None)
+
+    def _action(self, decision: Model, args: Args, kwargs: Kwargs, agent: Agent) -> Action:
+        """Return the action that corresponds to a decision. None if no action does."""
+        point = self._point
+        mapping = point.definition.rule_action_mapping
+        if mapping is None:
+            return self._default_action(decision, agent)
+        if isinstance(mapping, Mapping):
+            try:
+                action = mapping[decision]
+            except (KeyError, TypeError):
+                raise InvalidActionError(
+                    "the dict rule_action_mapping has no action for the rule's decision"
+                    f" {short_repr(decision)}; add one, or pass a callable that returns None where"
+                    " no action corresponds"
+                ) from None
+        elif point.rule_action_mapping is not None:
+            action = point.rule_action_mapping(decision, *args, **kwargs)
+        legal = None if action is None else point.check(action)
+        if legal is ILLEGAL:
+            raise InvalidActionError(
+                f"rule_action_mapping of {point.hook.name} maps the rule's decision"
+                f" {short_repr(decision)} to the action {short_repr(action)}, which is not in its"
+                f" action space {short_repr(point.definition.action_space)}"
+            )
+        return legal
+
+    def _default_action(self, decision: Model, agent: Agent) -> Action:
+        """Look a decision up among the choices, or among the values of actions."""
+        for place, held in enumerate(agent.offered or ()):
+            choice = restore(held)
+            if choice is decision or choice == decision:
+                return place
+        with suppress(TypeError):  # the decision is not hashable
+            return self._inverse.get(decision)
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Handlers:
+    """The handlers of the events of a simulation.
+
+    Attributes:
+        by_point: The handler of the decisions at each point of the plan.
+        by_hook: The handler of the events of each hook.
+    """
+
+    by_point: Mapping[Point, PointHandler]
+    by_hook: Mapping[Hook, AnyHandler]
+
+
+_HANDLERS: Final[WeakKeyDictionary[Plan, Handlers]] = WeakKeyDictionary()
+"""The handlers that all simulations of a plan share."""
+
+
+def handlers_of(plan: Plan, simulation: Model) -> Handlers:
+    """Return the handlers of a simulation's events.
+
+    All simulations of a plan share them, unless mappings ask for the simulation.
+    """
+    if plan.needs_simulation:
+        return _make_handlers(plan, simulation)
+    handlers = _HANDLERS.get(plan)
+    if handlers is None:
+        handlers = _HANDLERS[plan] = _make_handlers(plan, simulation)
+    return handlers
+
+
+def _make_handlers(plan: Plan, simulation: Model) -> Handlers:
+    by_point = {point: PointHandler(point.bind(simulation)) for point in plan.points}
+    by_hook: dict[Hook, AnyHandler] = {}
+    for handler in by_point.values():
+        by_hook[handler.point.hook] = handler
+        if handler.point.split is not None:
+            by_hook[handler.point.hook] = SplitHandler(handler)
+    removals: dict[Hook, RemovalHandler] = {}
+    for remover in plan.removers:
+        removal = removals.setdefault(remover.hook, RemovalHandler())
+        removal.add(None if remover.point is None else by_point[remover.point], remover)
+    by_hook.update(removals)
+    return Handlers(by_point, by_hook)

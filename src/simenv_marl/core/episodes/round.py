@@ -1,0 +1,95 @@
+"""Rounds: in parallel and joint views, a step has an action for each agent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from ...errors import InvalidActionError, UnknownAgentError, listed, short_repr, warn_user
+from ...simulation import RULE, Action
+from ..switching.driver import WAIT
+from ..values.actions import ILLEGAL
+
+if TYPE_CHECKING:
+    from .agent import Agent
+    from .state import EpisodeState
+
+MANY_ROUNDS: Final = 100
+"""The number of rounds in a row without an action for the pending agent after which the user is warned."""
+
+
+class Round:
+    """The present round of an episode. It uses each action once, up to a decision without one.
+
+    Attributes:
+        given: The number of actions in the episode, other than ``RULE``.
+        unused: The number of these that no decision has used.
+    """
+
+    __slots__ = ("_actions", "_stalled", "given", "unused")
+
+    def __init__(self) -> None:
+        self._actions: dict[str, Action] = {}
+        self._stalled = 0  # rounds without an action for the pending agent
+        self.given = 0
+        self.unused = 0
+
+    def begin(self, actions: dict[str, Action]) -> None:
+        """Begin a round with checked actions."""
+        self._actions = actions
+        self.given += sum(action is not RULE for action in actions.values())
+
+    def take(self, agent: Agent) -> Action:
+        """Return the action for a decision. ``WAIT`` if there is none, or if it is illegal by now."""
+        action = self._actions.pop(agent.name, WAIT)
+        if action is WAIT or action is RULE or agent.mask is None:
+            return action
+        return action if agent.point.allows(agent.mask, action) else WAIT
+
+    def count_unused(self, skips: bool) -> None:
+        """Count the actions that the round has not used, unless forced moves were not asked for."""
+        if not skips:
+            self.unused += sum(action is not RULE for action in self._actions.values())
+
+    def warn_if_stalled(self, pending: Agent, moved: bool) -> None:
+        """Warn if the simulation has not moved for many rounds."""
+        self._stalled = 0 if moved else self._stalled + 1
+        if self._stalled == MANY_ROUNDS:
+            warn_user(
+                f"the simulation stands still: {short_repr(pending.name)} must decide, but"
+                f" {MANY_ROUNDS} rounds in a row had no action for it; the info of the agent that"
+                ' must decide has "deciding": True'
+            )
+
+
+def checked_actions(episode: EpisodeState, actions: Mapping[str, Action]) -> dict[str, Action]:
+    """Check the actions of a round; return them in the form that mappings take.
+
+    Raises:
+        InvalidActionError: An action is not legal, or the actions are no dict.
+        UnknownAgentError: An action is for an agent that is not live.
+    """
+    if type(actions) is not dict and not isinstance(actions, Mapping):
+        raise InvalidActionError(
+            f"a round takes a dict of actions by agent, not {short_repr(actions)}"
+        )
+    pending = episode.pending
+    agents = episode.agents
+    checked: dict[str, Action] = {}
+    for name, action in actions.items():
+        agent = agents.get(name)
+        if agent is None:
+            if episode.unreported_end and name in episode.ended:
+                continue
+            raise UnknownAgentError(
+                f"there is an action for {short_repr(name)}, which is not a live agent; live"
+                f" agents: {listed(agents)}"
+            )
+        if action is not RULE:
+            legal = agent.point.check(action)
+            mask = agent.mask if agent is pending else None
+            if legal is ILLEGAL or mask is not None:
+                legal = agent.point.validate(action, name, mask)
+            action = legal
+        checked[name] = action
+    return checked

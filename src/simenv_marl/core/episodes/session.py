@@ -1,0 +1,585 @@
+"""The simulation of one environment over all its episodes: made once, reset for each episode.
+
+A session does not refer to its environment. So an environment that is dropped in mid-episode is
+freed at once, together with its session.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from contextvars import Context, copy_context
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.utils import seeding
+
+from ...errors import (
+    BranchError,
+    OptionValueError,
+    ReentrancyError,
+    SimEnvError,
+    annotate,
+    short_repr,
+    warn_user,
+)
+from ...hooks.handlers import Installation
+from ...simulation import Action, Model, Observation, closer, make_simulation, resetter
+from ..plans.plan import DRIVERS, Plan
+from ..plans.point import Mask
+from ..plans.policies import Where
+from ..switching.context import ExclusiveLock, GlobalRandom, environment_context
+from ..switching.driver import Driver
+from ..switching.generators import ENVIRONMENT, draws_check, is_seed, seed_globals
+from ..switching.resources import reuse_resources
+from ..values.spaces import same
+from .clock import Clock
+from .episode import LONGEST_TAPE, Episode, Replay
+from .events import Handlers, handlers_of
+from .state import EpisodeState, State, UnmatchedNames
+
+ResetOptions = dict[str, Any] | None
+"""The options of a ``reset``."""
+
+
+class Snapshot(NamedTuple):
+    """What a copy of a session takes over.
+
+    Attributes:
+        state: Its state.
+        seed: The seed of the latest episode.
+        np_random_seed: The seed of the generator.
+        np_random: The generator.
+    """
+
+    state: State
+    seed: int | None
+    np_random_seed: int | None
+    np_random: np.random.Generator | None
+
+
+class PendingDecision(NamedTuple):
+    """What a pending decision looks like, to compare a replay with its original."""
+
+    agent: str
+    agents: list[str]
+    observation: Observation
+    mask: Mask | None
+
+
+class Recording(NamedTuple):
+    """What a replay of an episode needs."""
+
+    seed: int
+    options: ResetOptions
+    in_rounds: bool
+    tape: list[Action]
+    decision: PendingDecision | None
+
+
+class BaseSession(ABC):
+    """What views know of a session, whose simulation may be in another process.
+
+    Attributes:
+        plan: The plan.
+        where: Whether it belongs to the user, a clone or a branch.
+        seed: The seed of the latest episode.
+        options: The options of the latest reset.
+        np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
+        exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
+        lock: The same lock, if steps need it, too. None if only the thread that began an episode
+            can step it.
+    """
+
+    __slots__ = (
+        "__weakref__", "_np_random", "_state", "exclusive", "lock", "np_random_seed", "options",
+        "plan", "seed", "where",
+    )  # fmt: skip
+
+    def __init__(self, plan: Plan, where: Where) -> None:
+        self.plan = plan
+        self.where = where
+        self._state = State.NEW
+        self.seed: int | None = None
+        self.options: ResetOptions = None
+        self.np_random_seed: int | None = None
+        self._np_random: np.random.Generator | None = None
+        self.exclusive = ExclusiveLock()
+        self.lock: ExclusiveLock | None = None
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator that was seeded with the last given seed. It draws all other seeds."""
+        if self._np_random is None:
+            self._np_random, self.np_random_seed = seeding.np_random(self.np_random_seed)
+        return self._np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self._np_random = generator
+        self.np_random_seed = -1
+
+    def seed_for(self, seed: int | None) -> int:
+        """Return the seed of an episode, and seed the generator with it. None: draw one."""
+        if seed is None:
+            return int(self.np_random.integers(2**31))
+        self._np_random = None  # made when a seed must be drawn
+        self.np_random_seed = seed
+        return seed
+
+    def snapshot(self) -> Snapshot:
+        """Return what a copy takes over."""
+        has_decision = self.episode is not None and self.episode.pending is not None
+        state = State.COPIED if has_decision else State.NEW
+        return Snapshot(state, self.seed, self.np_random_seed, self._np_random)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Take over what ``snapshot`` has returned."""
+        self._state, self.seed, self.np_random_seed, self._np_random = snapshot
+
+    def refusal(self) -> SimEnvError:
+        """Make the error that says why no action can be taken now."""
+        episode = self.episode
+        return self._state.refusal() if episode is None else episode.refusal()
+
+    def move_to(self, where: Where) -> None:
+        """Note that its episodes are played in a clone or a branch from now on."""
+        self.where = max(self.where, where)
+        if self.episode is not None:
+            self.episode.move_to(where)
+
+    @property
+    @abstractmethod
+    def episode(self) -> EpisodeState | None:
+        """The current or latest episode."""
+
+    @property
+    @abstractmethod
+    def simulation(self) -> Model:
+        """The simulation."""
+
+    @property
+    @abstractmethod
+    def idle(self) -> bool:
+        """Whether there is nothing to end."""
+
+    @abstractmethod
+    def start(
+        self, seed: int | None, options: ResetOptions, *, in_rounds: bool = False
+    ) -> EpisodeState:
+        """End the current episode, reset the simulation, and run it to its first decision.
+
+        Args:
+            seed: The seed. None: one is drawn.
+            options: The options of the reset.
+            in_rounds: Whether all agents are updated when a step returns.
+
+        Returns:
+            The episode.
+        """
+
+    @abstractmethod
+    def end(self) -> None:
+        """End the current episode, or raise a ``ReentrancyError`` if that is not possible here."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the current episode, and close the simulation."""
+
+    @abstractmethod
+    def abandon(self) -> None:
+        """Close it from a finalizer. Warn of errors instead of raising them."""
+
+    @abstractmethod
+    def ask(self, name: str, *args: Any) -> Model:
+        """Call a method of the simulation, or raise ``NotImplementedError`` if it has none."""
+
+    def declare(self, plan: Plan) -> None:
+        """Forget the episode that has shown the agents, and take over a plan that declares them."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def call(self, view: Model, function: Callable[..., Model], args: tuple[Any, ...]) -> Model:
+        """Call a function with the view, where the simulation is."""
+
+    @abstractmethod
+    def check_reseed(self) -> None:
+        """Raise a ``BranchError`` unless the simulation's future chance can be drawn anew."""
+
+    @abstractmethod
+    def reseed(self, seed: int) -> None:
+        """Draw the simulation's future chance anew."""
+
+    @abstractmethod
+    def recording(self) -> Recording:
+        """Return what a replay of the episode needs."""
+
+    @abstractmethod
+    def leave_caller(self) -> None:
+        """In a branch that was forked from inside a policy, leave the step that has asked it."""
+
+
+class Session(BaseSession):
+    """A session whose simulation is in this process.
+
+    Attributes:
+        handlers: The handlers of the simulation's events.
+        context: Makes the context in which the environment's code must run.
+        unmatched_names: The agents that options name, and that no episode has had yet.
+    """
+
+    __slots__ = (
+        "_close", "_driver", "_installed", "_reset", "_rng", "_simulation", "context", "episode",
+        "handlers", "unmatched_names",
+    )  # fmt: skip
+
+    episode: Episode | None
+    handlers: Handlers
+    _driver: Driver
+
+    def __init__(self, plan: Plan, unmatched_names: UnmatchedNames | None = None) -> None:
+        """Make the simulation, and set the plan's decision functions in the model.
+
+        ``unmatched_names``: those of many sessions that run side by side.
+        """
+        super().__init__(plan, Where.USER)
+        self.episode = None
+        self.unmatched_names = unmatched_names or UnmatchedNames(plan.named_agents)
+        if plan.options.driver == "thread":
+            self.lock = self.exclusive
+        self._rng = GlobalRandom() if plan.options.global_rng else None
+        self.context: Callable[..., environment_context] = partial(
+            environment_context, plan.plugins, self._rng, self.lock
+        )
+        # Closes the simulation, if it was reset since the last time.
+        self._close: Callable[[bool], None] | None = None
+        self._installed: Installation | None = Installation(plan.patches)
+        prototype = plan.claim_prototype()
+        if prototype is not None:
+            self._driver, simulation = prototype
+            self._take_simulation(simulation)
+            return
+        self._driver = DRIVERS[plan.options.driver](plan.plugins)
+        try:
+            self._make_simulation()
+        except BaseException:
+            self._put_away()
+            raise
+
+    @property
+    def simulation(self) -> Model:
+        """The simulation."""
+        return self._simulation
+
+    # -- the simulation's stack -------------------------------------------------------------------
+
+    def _make_simulation(self) -> None:
+        self._take_simulation(self._run(partial(make_simulation, self.plan.subject.source)))
+
+    def _take_simulation(self, simulation: Model) -> None:
+        self._simulation = simulation
+        self._reset = resetter(simulation)
+        self.handlers = handlers_of(self.plan, simulation)
+
+    def _run(self, job: Callable[[], Model], context: Context | None = None) -> Model:
+        """Run a job on the simulation's stack. A stack that cannot run it is replaced."""
+        self._driver = self._driver.ready()
+        with self.context():
+            return self._driver.run(job, context)
+
+    def _close_simulation(self, *, last: bool) -> None:
+        """Close the simulation, once for each reset. ``last``: no reset follows."""
+        close, self._close = self._close, None
+        if close is not None:
+            self._run(partial(close, last))
+
+    def _put_away(self) -> None:
+        """End the stack and remove the patches."""
+        self._driver.end()
+        if self._installed is not None:
+            self._installed.uninstall()
+            self._installed = None
+
+    # -- episodes ---------------------------------------------------------------------------------
+
+    def start(
+        self,
+        seed: int | None,
+        options: ResetOptions,
+        *,
+        in_rounds: bool = False,
+        replay: Replay | None = None,
+    ) -> Episode:
+        """Begin another episode: see ``BaseSession``. ``replay`` repeats one of another session."""
+        self.end()
+        self._state = State.MOVING
+        try:
+            self._close_simulation(last=False)
+            if self._installed is None or not self._installed.complete:
+                self._installed = Installation(self.plan.patches)
+            self.options = options
+            self.seed = seed = self.seed_for(seed)
+            self._driver = self._driver.ready()
+            if self._driver.stale:  # code that still uses it must not meet another episode
+                self._make_simulation()
+                self._driver.renew()
+            return self._begin(seed, in_rounds, replay)
+        finally:
+            self._state = State.NEW if self.episode is None else State.OVER
+
+    def _begin(self, seed: int, in_rounds: bool, replay: Replay | None) -> Episode:
+        """Reset the simulation, and run it to its first decision."""
+        context = copy_context()
+        check = None
+        if self._rng is None:
+            check = draws_check(self._simulation, in_thread=self.lock is not None)
+        try:
+            if self._rng is not None:
+                with self.context():
+                    self._rng.begin(seed)
+            self._run(partial(self._reset, seed, self.options), context)
+        except BaseException as error:
+            annotate(error, f"simenv_marl: while the simulation was reset; seed {seed}")
+            raise
+        self._close = closer(self._simulation)
+        episode = Episode(self, self._driver, seed, replay, in_rounds=in_rounds)
+        self._driver.begin(self._simulation.run, episode.handlers_by_hook(), context)
+        try:
+            self.episode = episode  # from now on it will be ended, even after an interrupt
+            episode.begin(check)
+        except BaseException:
+            episode.stop()  # an interrupt may have come before
+            if not episode.running:
+                self.episode = None
+            raise
+        return episode
+
+    def make_clock(self) -> Clock | None:
+        """Make the clock of an episode. None if the simulation has no time."""
+        options = self.plan.options
+        time = getattr(self._simulation, "time", None)
+        if time is not None:
+            if self.plan.plugins is not None or self._rng is not None:
+                time = _within(self.context, time)  # because views read the clock, too
+            return Clock(time, options.discount_rate)
+        if options.discount_rate is not None:
+            raise OptionValueError(
+                f"discount_rate needs the times of decisions, but {short_repr(self._simulation)}"
+                " has no method time(); add one that returns its clock, or leave out discount_rate"
+            )
+        return None
+
+    def end(self) -> None:
+        """End the current episode, or raise a ``ReentrancyError`` if that is not possible here."""
+        if self._state is State.MOVING:
+            raise self._state.refusal()
+        episode = self.episode
+        if episode is None:
+            return
+        try:
+            episode.close()
+        finally:
+            if episode.over and not episode.running:
+                self.episode = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is no episode to end and no patch to remove."""
+        return self.episode is None and self._installed is None
+
+    def close(self) -> None:
+        """Unwind the simulation, close it, and remove the patches. For errors, see ``end``."""
+        try:
+            self.end()
+        finally:
+            if self.episode is None and self._state is not State.MOVING:
+                self._state = State.MOVING
+                try:
+                    self._close_simulation(last=True)
+                finally:
+                    self._state = State.CLOSED
+                    self._put_away()
+
+    def abandon(self) -> None:
+        """Close it from a finalizer. Warn of errors instead of raising them."""
+        episode = self.episode
+        try:
+            if episode is None or not episode.running or self._driver.reachable:
+                self.close()  # else the simulation's thread unwinds it at its next switch
+        except ReentrancyError:
+            pass  # the process exits, and the thread in which the simulation moves ends with it
+        except Exception as error:
+            warn_user(
+                f"a simulation that was abandoned raised {short_repr(error)}", ResourceWarning
+            )
+        finally:
+            self._put_away()
+
+    def ask(self, name: str, *args: Any) -> Model:
+        """Call a method of the simulation, or raise ``NotImplementedError`` if it has none."""
+        method = getattr(self._simulation, name, None)
+        if not callable(method):
+            raise NotImplementedError(f"{type(self._simulation).__name__} has no method {name}()")
+        with self.context():
+            return method(*args)
+
+    def call(self, view: Model, function: Callable[..., Model], args: tuple[Any, ...]) -> Model:
+        """Call a function with the view."""
+        return function(view, *args)
+
+    def declare(self, plan: Plan) -> None:
+        """Forget the episode, and take over a plan: see ``BaseSession``."""
+        self.close()
+        self.plan = plan
+        self.handlers = handlers_of(plan, self._simulation)
+        self.seed = None
+        self.np_random_seed = None
+
+    # -- replays ----------------------------------------------------------------------------------
+
+    def recording(self) -> Recording:
+        """Return what a replay of the episode needs."""
+        episode = self.episode
+        if episode is None:
+            raise self.refusal()
+        if not episode.is_recorded:
+            raise BranchError(
+                f"the episode has more than {LONGEST_TAPE:,} decisions, or already is a branch of"
+                " the environment that a policy is given, so its actions were not kept; use"
+                ' method="fork"'
+            )
+        return Recording(
+            episode.seed, self.options, episode.in_rounds, episode.tape, _pending_decision(episode)
+        )
+
+    def replay(self, original: BaseSession) -> None:
+        """Bring the simulation to the current decision of another session with the same plan.
+
+        Raises:
+            BranchError: The simulation does not repeat its decisions.
+        """
+        self.move_to(max(original.where, Where.CLONE))
+        recording = original.recording()
+        replay = Replay(recording.tape)
+        episode = self.start(
+            recording.seed, recording.options, in_rounds=recording.in_rounds, replay=replay
+        )
+        while replay.answers:
+            answer = replay.answer()
+            if isinstance(answer, _Reseeded):
+                self.reseed(answer.seed)
+            else:
+                episode.step(answer)
+        episode.end_replay()
+        if not same(_pending_decision(episode), recording.decision):
+            raise BranchError(
+                f"{type(self._simulation).__name__} does not repeat its decisions with the same"
+                " seed and the same actions: some of its random numbers do not follow from the"
+                ' seed. Use method="fork", or global_rng=True if it draws from random or'
+                " numpy.random"
+            )
+        state = self._state
+        self.restore(copy.deepcopy(original.snapshot())._replace(state=state))
+
+    # -- branches ---------------------------------------------------------------------------------
+
+    def leave_parent(self) -> None:
+        """In a forked process, never unwind or close the simulation in which it was forked."""
+        self.move_to(Where.CLONE)
+        self._driver.give_up("belongs to the environment that was cloned")
+        self._close = None
+
+    def leave_caller(self) -> None:
+        """In a branch that was forked from inside a policy, leave the step that has asked it."""
+        self._state = State.OVER  # a reset that has come to its first decision is still moving
+        if self._rng is not None:
+            self._rng.leave_all()
+
+    def check_reseed(self) -> None:
+        """Raise a ``BranchError`` unless the simulation's future chance can be drawn anew."""
+        if self._rng is None and not callable(getattr(self._simulation, "reseed", None)):
+            raise BranchError(
+                f"seeds= needs a way to reseed {type(self._simulation).__name__}: give it a method"
+                " reseed(seed), which may call simenv_marl.reseed_generators(self, seed), or make"
+                " the environment with global_rng=True if it draws from random or numpy.random"
+            )
+
+    def reseed(self, seed: int) -> None:
+        """Draw the simulation's future chance anew, and its own global generators."""
+        reseed = getattr(self._simulation, "reseed", None)
+        with self.context():
+            if self._rng is not None:
+                seed_globals(seed, ENVIRONMENT)
+            if callable(reseed):
+                try:
+                    reseed(seed)
+                except BaseException as error:
+                    annotate(error, f"simenv_marl: while the simulation was reseeded; seed {seed}")
+                    raise
+        if self.episode is not None:
+            self.episode.record(_Reseeded(seed))
+
+
+def _within(
+    context: Callable[[], environment_context], function: Callable[[], float]
+) -> Callable[[], float]:
+    def call() -> float:
+        with context():
+            return function()
+
+    return call
+
+
+@dataclass(frozen=True)
+class _Reseeded:
+    """On the tape of an episode: here the simulation was reseeded."""
+
+    seed: int
+
+
+def _pending_decision(episode: EpisodeState) -> PendingDecision | None:
+    agent = episode.deciding
+    if agent is None:
+        return None
+    return PendingDecision(agent.name, list(episode.agents), agent.observation, agent.mask)
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Return the seed of a ``reset`` as a Python integer, or None. Refuse all other values."""
+    if seed is None:
+        return None
+    if not is_seed(seed):
+        raise OptionValueError(
+            f"seed must be a non-negative integer or None, not {short_repr(seed)}"
+        )
+    return int(seed)
+
+
+def close_all(
+    sessions: Iterable[tuple[str, BaseSession]], error: BaseException | None = None
+) -> BaseException | None:
+    """Close sessions, given with their names.
+
+    Args:
+        sessions: The sessions.
+        error: An error that was raised before.
+
+    Returns:
+        The first error, with notes of all others. None without any.
+    """
+    with reuse_resources():  # it waits for all processes of simulations together
+        for name, session in sessions:
+            try:
+                session.close()
+            except BaseException as problem:
+                if error is None:
+                    error = problem
+                    annotate(error, f"simenv_marl: in {name}")
+                else:
+                    annotate(
+                        error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well"
+                    )
+    return error

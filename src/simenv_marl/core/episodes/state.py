@@ -1,0 +1,237 @@
+"""What views and clones read of an episode."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from ...errors import (
+    ClosedError,
+    EpisodeOverError,
+    NotResetError,
+    ReentrancyError,
+    SimEnvError,
+    listed,
+    warn_user,
+)
+from ...simulation import Action
+from ..plans.points import declared_agents
+from ..plans.policies import Where
+from .round import Round
+
+if TYPE_CHECKING:
+    from ..plans.plan import Plan
+    from .agent import Agent
+    from .clock import Clock
+
+
+class Outcome(Enum):
+    """How an episode has ended."""
+
+    RUNNING = "running"
+    """It has not ended."""
+
+    TERMINATED = "terminated"
+    """The simulation's ``run`` has returned."""
+
+    TRUNCATED = "truncated"
+    """The simulation, or ``max_steps``, has reached a limit of time."""
+
+    STOPPED = "stopped"
+    """An error has ended it, or it was closed."""
+
+
+class State(Enum):
+    """The states of an episode, and of a session without an episode."""
+
+    NEW = "new"
+    """There was no episode yet."""
+
+    COPIED = "copied"
+    """This is a copy of an environment that had an episode."""
+
+    MOVING = "moving"
+    """The simulation, a mapping or a policy runs."""
+
+    PENDING = "pending"
+    """A decision waits for the user."""
+
+    OVER = "over"
+    """Nothing happens any more."""
+
+    CLOSED = "closed"
+    """The environment is closed."""
+
+    def refusal(self) -> SimEnvError:
+        """Make the error that says why no action can be taken in this state."""
+        if self is State.NEW:
+            return NotResetError("there is no episode yet; call reset() first")
+        if self is State.COPIED:
+            return NotResetError(
+                "this is a copy of an environment, and has no episode yet; call reset() first, or"
+                " use clone() to go on from where the original stands"
+            )
+        if self is State.OVER:
+            return EpisodeOverError("the episode is over; call reset() to begin the next one")
+        if self is State.CLOSED:
+            return ClosedError("the environment is closed; call reset() to use it again")
+        return ReentrancyError(
+            "the environment was used from inside its own reset, simulation or mappings, or while"
+            " another thread was using it"
+        )
+
+
+class UnmatchedNames:
+    """The agents that options name and no episode of an environment has had yet."""
+
+    def __init__(self, names: frozenset[str]) -> None:
+        self._names = set(names)
+
+    def check(self, episode: EpisodeState) -> None:
+        """Warn once of each name that does not appear in an episode that has ended."""
+        if not self._names:
+            return
+        present = [
+            name
+            for name, agent in episode.agents.items()
+            if agent.decided or agent.observation is not None
+        ]
+        present += [*episode.others, *episode.ended]
+        absent = self._names.difference(present)
+        if absent:
+            self._names -= absent
+            warn_user(
+                "policies= or possible_agents= name agents that did not appear in the episode:"
+                f" {listed(sorted(absent))}; these did: {listed(present)}"
+            )
+
+
+class EpisodeState:
+    """What views read of an episode. A clone has no more of it; the rest is in its process.
+
+    Attributes:
+        plan: The plan.
+        seed: The seed.
+        clock: The clock. None if the simulation has no time.
+        agents: The live agents of the environment, by name, in the order in which they joined.
+        others: The agents for which policies answer, by name.
+        ended: The agents of the environment whose episodes ended before the simulation's, by name.
+        just_ended: The ended agents that no view has reported yet.
+        pending: The agent whose decision waits for an answer. None in all states but PENDING.
+        consulted: The agent whose policy is being asked. In a replay, the one at whose decision
+            the replay ends.
+        outcome: How it has ended.
+        unreported_end: Whether agents ended during the reset, which the first step reports.
+        turns: The number of actions that the environment's user has given.
+        round: The present round. None if the episode is played in turns.
+        skips: Whether a decision with one legal action is answered with it.
+        where: Where it is played, which determines the policies that are asked.
+    """
+
+    __slots__ = (
+        "agents", "clock", "consulted", "ended", "just_ended", "others", "outcome", "pending",
+        "plan", "round", "seed", "skips", "turns", "unreported_end", "where",
+    )  # fmt: skip
+
+    def __init__(
+        self, plan: Plan, seed: int, clock: Clock | None, where: Where, *, in_rounds: bool
+    ) -> None:
+        self.plan = plan
+        self.seed = seed
+        self.clock = clock
+        self.round = Round() if in_rounds else None
+        self.skips = plan.options.skip_forced
+        self.where = where
+        self.agents: dict[str, Agent] = {}
+        self.others: dict[str, Agent] = {}
+        self.ended: dict[str, Agent] = {}
+        self.just_ended: list[Agent] = []
+        self.pending: Agent | None = None
+        self.consulted: Agent | None = None
+        self.outcome = Outcome.RUNNING
+        self.unreported_end = False
+        self.turns = 0
+
+    @property
+    def state(self) -> State:
+        """The state."""
+        if self.pending is not None:
+            return State.PENDING
+        return State.OVER if self.over else State.MOVING
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing happens any more."""
+        return self.outcome is not Outcome.RUNNING
+
+    @property
+    def terminated(self) -> bool:
+        """Whether the simulation's ``run`` has returned."""
+        return self.outcome is Outcome.TERMINATED
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the episode has reached a limit of time."""
+        return self.outcome is Outcome.TRUNCATED
+
+    @property
+    def in_rounds(self) -> bool:
+        """Whether all agents are updated when a step returns."""
+        return self.round is not None
+
+    @property
+    def is_branch(self) -> bool:
+        """Whether it is a branch that a policy has made of its environment."""
+        return self.where >= Where.BRANCH
+
+    @property
+    def deciding(self) -> Agent | None:
+        """The agent whose decision waits for the user, or for its policy."""
+        return self.pending or self.consulted
+
+    def agent(self, name: str) -> Agent | None:
+        """Return an agent of the environment, live or ended. None if there is no such agent."""
+        return self.agents.get(name) or self.ended.get(name)
+
+    def may_have(self, name: object) -> bool:
+        """Return whether there is an agent with that name, or could be one later."""
+        plan = self.plan
+        declared = plan.options.possible_agents
+        groups = (self.agents, self.others, plan.roster, plan.policies, declared_agents(declared))
+        if any(name in names for names in groups):
+            return True
+        is_open = declared is None and any(point.agent is None for point in plan.points)
+        return is_open and isinstance(name, str)
+
+    def move_to(self, where: Where) -> None:
+        """Note that it is played in a clone or a branch from now on."""
+        self.where = max(self.where, where)
+
+    def step(self, action: Action) -> None:
+        """Answer the pending decision: see ``Episode.step``."""
+        raise NotImplementedError
+
+    def single_out(self, agent: Agent) -> None:
+        """In a branch, wait for one agent alone: see ``Episode.single_out``."""
+        raise NotImplementedError
+
+    # -- what views report ------------------------------------------------------------------------
+
+    def take_ended(self) -> list[Agent]:
+        """Return the ended agents that no view has reported yet, and forget them."""
+        ended, self.just_ended = self.just_ended, []
+        return ended
+
+    def mark_reported(self) -> None:
+        """Note that the view has reported the ends during the reset."""
+        self.unreported_end = False
+
+    def refusal(self) -> SimEnvError:
+        """Make the error that says why no action can be taken now."""
+        return self.state.refusal()
+
+    def report_end(self) -> None:
+        """Handle a step without a pending decision: report an end during the reset, or refuse."""
+        if not (self.over and self.unreported_end):
+            raise self.refusal()
+        self.unreported_end = False

@@ -1,0 +1,556 @@
+"""The plan of an environment: a complete description that is checked before anything runs.
+
+A plan names the decision points of an environment, the names of their agents, the policies and the
+options. It is a value: it has no state of any environment, so that one plan serves any number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import partial
+from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias
+from weakref import finalize
+
+from ...decision import BY_NAME, DecisionPoint, Definition
+from ...errors import (
+    AgentError,
+    DefinitionError,
+    OptionValueError,
+    UnknownOptionError,
+    UnknownPointError,
+    ViewError,
+    did_you_mean,
+    short_repr,
+    warn_user,
+)
+from ...hooks.handlers import Handler
+from ...hooks.hook import Hook
+from ...hooks.stacks import outside_simulation
+from ...plugins import Plugins
+from ...simulation import RULE, Model, SimulationInterface, make_simulation
+from ..switching.driver import Driver
+from ..switching.greenlets import GreenletDriver
+from ..switching.threads import ThreadDriver
+from .options import Options
+from .point import Point, Policy
+from .points import (
+    Definitions,
+    Points,
+    agent_names,
+    declared_agents,
+    find_points,
+    locate,
+    own_points,
+    owner_class,
+    portable,
+    resolve_policies,
+    resolve_roster,
+)
+from .policies import AskingPolicy, DeferredPolicy
+
+DRIVERS: Final[Mapping[str, type[Driver]]] = {
+    "greenlet": GreenletDriver,
+    "thread": ThreadDriver,
+}
+
+Source: TypeAlias = "Model | type | Callable[[], Model]"
+"""A simulation, its class, a zero-argument factory, or a ``Variant``."""
+
+PlannerView: TypeAlias = "Callable[[Any], object]"
+"""Makes, from a session, the environment that a planner gets."""
+
+
+def no_view(session: object) -> NoReturn:
+    """Refuse to make the environment of a planner, in plans that run no episodes."""
+    raise ViewError("this plan has no environment for planners")
+
+
+class Mode(Enum):
+    """What the episodes of a plan are played for."""
+
+    ENVIRONMENT = "environment"
+    """A user answers the agents without a policy."""
+
+    SIMULATE = "simulate"
+    """The rule decides for the agents without a policy."""
+
+    COLLECT = "collect"
+    """As SIMULATE, but agents with deferred policies have rewards and ends, which are recorded."""
+
+
+class Variant(Protocol):
+    """A variant of a simulation, which replaces the arguments of an environment."""
+
+    name: str
+    parameters: Mapping[str, object]
+
+    def environment_arguments(
+        self, points: Points, options: Mapping[str, Any]
+    ) -> tuple[Source, Points, Mapping[str, Any]]:
+        """Return the source, the points and the options of the environment."""
+
+
+def source_name(source: Source) -> str:
+    """Return the dotted name of a class or factory, or of the class of an object."""
+    while isinstance(source, partial):
+        source = source.func
+    named = source if hasattr(source, "__qualname__") else type(source)
+    return f"{named.__module__}.{named.__qualname__}"
+
+
+class Prototype:
+    """A simulation that was made to be inspected, on a stack that ends with this object.
+
+    The first session of a plan claims both.
+    """
+
+    def __init__(self, source: Source, driver: str) -> None:
+        """Make a simulation on a stack of the driver with that name."""
+        made = DRIVERS[driver]()
+        self._end = finalize(self, made.end)
+        try:
+            with outside_simulation():
+                simulation = made.run(partial(make_simulation, source))
+        except BaseException:
+            self._end()
+            raise
+        self._unclaimed: list[tuple[Driver, Model]] = [(made, simulation)]
+
+    @property
+    def simulation(self) -> Model:
+        """The simulation, before it is claimed."""
+        return self._unclaimed[0][1]
+
+    def claim(self, driver: str) -> tuple[Driver, Model] | None:
+        """Hand over both. None if the driver is of another kind, or they are claimed already."""
+        with suppress(IndexError):  # because another thread may have claimed them
+            claimed = self._unclaimed.pop()
+            if type(claimed[0]) is DRIVERS[driver]:
+                self._end.detach()
+                return claimed
+        return None
+
+
+class Remover(NamedTuple):
+    """A function of the model whose calls end agents.
+
+    Attributes:
+        hook: The function.
+        point: The decision point of the agents. None: any.
+        name: The name under which ``removed_by`` has the function.
+        owner: The class whose instances are such agents. None if it is not known.
+    """
+
+    hook: Hook
+    point: Point | None
+    name: str
+    owner: type | None
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What a plan is about: the source of its simulations, and what one of them shows.
+
+    Attributes:
+        source: The source of its simulations.
+        variant: The variant that gave the source, if there is one.
+        named: The decision points that are named, with their definitions.
+        own: The definitions of the simulation itself.
+        render_modes: The render modes of the simulation.
+        render_fps: The number of images per second of a video.
+        ends_agents: Whether the simulation has ``end_agent``.
+        prototype: A simulation that was made to be inspected, if there is one.
+    """
+
+    source: Source
+    variant: Variant | None
+    named: Definitions
+    own: Definitions
+    render_modes: Collection[str]
+    render_fps: float
+    ends_agents: bool
+    prototype: Prototype | None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The plan of an environment.
+
+    Attributes:
+        subject: What it is about.
+        options: The options.
+        mode: What its episodes are played for.
+        default_policy: The policy of all agents without one. None: the user or the rule.
+        planner_view: Makes the environment that a planner gets.
+        points: The decision points that do not run their rule.
+        active: The decision points that the environment's user answers.
+        policies: The policies of agents, by name.
+        has_planner: Whether a policy asks for the environment, and so may branch it.
+        needs_simulation: Whether a mapping asks for the simulation.
+        named_agents: The agents that ``policies`` and ``possible_agents`` name.
+        one_agent: The only agent that the environment's user answers for. None if there may be
+            several.
+        roster: The decision points of the agents that are known beforehand, by agent, in the order
+            of the points.
+        complete: Whether ``roster`` contains all possible agents.
+        removers: The functions whose calls end agents.
+        plugins: The handlers for this environment's simulation only. None if there are none.
+        patches: The hooks, and the handlers with their hooks, that must be set while an environment
+            is in use.
+    """
+
+    subject: Subject
+    options: Options
+    mode: Mode
+    default_policy: Policy
+    planner_view: PlannerView
+    points: tuple[Point, ...]
+    active: tuple[Point, ...]
+    policies: Mapping[str, Policy]
+    has_planner: bool
+    needs_simulation: bool
+    named_agents: frozenset[str]
+    one_agent: str | None
+    roster: Mapping[str, Point]
+    complete: bool
+    removers: tuple[Remover, ...]
+    plugins: Plugins | None
+    patches: tuple[tuple[Hook, Handler | None], ...]
+
+    @property
+    def has_user(self) -> bool:
+        """Whether a user answers the agents without a policy."""
+        return self.mode is Mode.ENVIRONMENT
+
+    @property
+    def possible_agents(self) -> list[str] | None:
+        """The names of all possible agents. None if an agent joins when it first decides."""
+        return list(self.roster) if self.complete else None
+
+    @property
+    def name(self) -> str:
+        """The name of the simulation's class or factory."""
+        return source_name(self.subject.source).rpartition(".")[2]
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether other code has replaced a function that the plan patches."""
+        return any(hook.stale for hook, _ in self.patches)
+
+    def policy_of(self, agent: str, point: Point) -> Policy:
+        """Return the policy that answers for an agent. None if the environment's user answers."""
+        policy = self.policies.get(agent) or point.policy
+        if policy is not None:
+            return policy
+        if not self.has_user or (self.one_agent is not None and agent != self.one_agent):
+            return RULE
+        if not self.complete or agent in self.roster:
+            return None
+        if self.options.undeclared == "rule":
+            return RULE
+        raise AgentError(
+            f"the agent {agent!r}, which decides at {point.hook.name}, is not declared in"
+            " possible_agents; declare it, or let its rule decide with"
+            ' undeclared="rule"'
+        )
+
+    def is_delegated(self, policy: Policy) -> bool:
+        """Return whether agents with a policy are no agents of the environment."""
+        if policy is None:
+            return False
+        return self.mode is not Mode.COLLECT or not isinstance(policy, DeferredPolicy)
+
+    def claim_prototype(self) -> tuple[Driver, Model] | None:
+        """Hand over the simulation that was made to be inspected, and its driver, or None."""
+        prototype = self.subject.prototype
+        if prototype is None or self.plugins or self.options.global_rng:  # it was made without them
+            return None
+        return prototype.claim(self.options.driver)
+
+    # -- other plans ------------------------------------------------------------------------------
+
+    def amended(self, options: Mapping[str, Any]) -> Plan:
+        """Return the same plan with other values of some options."""
+        if not options:
+            return self
+        return self._resolved(self.subject, self.options.amended(options))
+
+    def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
+        """Return the same plan with another definition of a point."""
+        named = {**self.subject.named, point: definition}
+        return self._resolved(replace(self.subject, named=named), self.options)
+
+    def declared(self, roster: Mapping[str, Point]) -> Plan:
+        """Return the same plan with a roster that an episode has shown."""
+        names: dict[str, list[str]] = {
+            point.hook.name: [] for point in self.active if point.agent is None
+        }
+        for agent, point in roster.items():
+            if point.hook.name in names:
+                names[point.hook.name].append(agent)
+        made = self.amended({"possible_agents": names})
+        return replace(made, named_agents=self.named_agents)  # the user has named no others
+
+    def for_one(self, agent: str) -> Plan:
+        """Return the plan of a branch that waits for one agent only."""
+        nothing = frozenset[str]()
+        return replace(self, mode=Mode.SIMULATE, one_agent=agent, named_agents=nothing)
+
+    def with_policies(self, policies: Mapping[str, Policy]) -> Plan:
+        """Return the plan of a branch in which policies answer for agents that have none."""
+        return replace(self, policies={**policies, **self.policies})
+
+    def _resolved(self, subject: Subject, options: Options) -> Plan:
+        return _resolve(subject, options, self.mode, self.default_policy, self.planner_view)
+
+    def __deepcopy__(self, memory: object) -> Plan:
+        return self  # because nothing changes it
+
+    def __reduce__(self) -> tuple[Callable[..., Plan], tuple[object, ...]]:
+        subject = self.subject
+        points: dict[object, Definition | None] = {}
+        for point, definition in subject.named.items():
+            is_own = definition is point.definition
+            points[portable(point.function, point.name)] = None if is_own else definition
+        options = dict(vars(self.options))
+        options["plugins"] = [] if self.plugins is None else self.plugins.portable
+        for name in ("policies", "possible_agents"):
+            if isinstance(options[name], Mapping):
+                options[name] = {portable(key): value for key, value in options[name].items()}
+        return _remake, (
+            subject.source,
+            points,
+            options,
+            self.mode,
+            self.planner_view,
+            subject.variant,
+        )
+
+
+def make_plan(
+    source: Source,
+    points: Points,
+    options: Mapping[str, Any],
+    *,
+    mode: Mode = Mode.ENVIRONMENT,
+    default_policy: Policy = None,
+    planner_view: PlannerView = no_view,
+) -> Plan:
+    """Make a plan from the arguments of ``generate_env``, and check them.
+
+    Args:
+        source: The simulation, its class, a factory, or a ``Variant``.
+        points: The decision points.
+        options: The options.
+        mode: What the episodes are played for.
+        default_policy: The policy of all agents without one. With it, ``points=None`` means all
+            decision points.
+        planner_view: Makes the environment that a planner gets.
+
+    Raises:
+        SimEnvError: An argument is invalid. The message says which.
+    """
+    variant: Variant | None = None
+    if hasattr(source, "environment_arguments"):
+        variant = source  # type: ignore[assignment]
+    if variant is not None:
+        source, points, options = variant.environment_arguments(points, options)
+    checked = Options().amended(options)
+    if mode is not Mode.ENVIRONMENT and checked.agent is not None:
+        raise UnknownOptionError(
+            "agent is an option of single views only, as single_env makes them"
+        )
+    prototype: Prototype | None = None
+    inspected = source
+    has_no_points = points is None and getattr(source, "points", None) is None
+    if not isinstance(source, type) or has_no_points:
+        prototype = Prototype(source, checked.driver)
+        inspected = prototype.simulation
+    if points is None:
+        points = getattr(inspected, "points", None)
+    if mode is not Mode.ENVIRONMENT and points is None and default_policy is None:
+        policies = checked.policies or {}
+        names_agents = any(isinstance(key, str) and "." not in key for key in policies)
+        if not names_agents:
+            points = ()  # those that ``policies`` names are enough
+    own = own_points(inspected)
+    kind = inspected if isinstance(inspected, type) else type(inspected)
+    modes = getattr(inspected, "render_modes", ("ansi", "human", "rgb_array"))
+    subject = Subject(
+        source,
+        variant,
+        find_points(points, own, empty=mode is not Mode.ENVIRONMENT),
+        own,
+        modes if hasattr(inspected, "render") else [],
+        getattr(inspected, "render_fps", 4),
+        issubclass(kind, SimulationInterface),
+        prototype,
+    )
+    return _resolve(subject, checked, mode, default_policy, planner_view)
+
+
+def _remake(
+    source: Source,
+    points: Points,
+    options: Mapping[str, Any],
+    mode: Mode,
+    planner_view: PlannerView,
+    variant: Variant | None,
+) -> Plan:
+    """Make an unpickled plan."""
+    plan = make_plan(source, points, options, mode=mode, planner_view=planner_view)
+    return replace(plan, subject=replace(plan.subject, variant=variant))
+
+
+# -- who decides where ----------------------------------------------------------------------------
+
+
+def _resolve(
+    subject: Subject,
+    options: Options,
+    mode: Mode,
+    default_policy: Policy,
+    planner_view: PlannerView,
+) -> Plan:
+    """Check the options against the simulation and its points, and find out who decides where."""
+    options = _checked_render_mode(subject, options)
+    by_point, by_agent, definitions = resolve_policies(
+        options.policies or {}, subject.named, subject.own
+    )
+    agents = agent_names(definitions)
+    known = [agents[point] for point in subject.named]
+    only = options.agent if options.agent in known else None
+    points: list[Point] = []
+    active: list[Point] = []
+    for hook, definition in definitions.items():
+        agent = agents[hook]
+        policy = by_point.get(hook, default_policy)
+        if options.agent is not None and agent != only:
+            policy = policy or RULE
+        if agent is None:
+            policies = [policy, *by_agent.values()]
+        else:
+            policies = [by_agent.get(agent, policy)]
+        if policy is RULE and policies == [RULE]:
+            continue
+        point = Point(
+            hook,
+            definition,
+            agent,
+            policy,
+            records=mode is Mode.COLLECT,
+            clips=options.clip_actions,
+        )
+        points.append(point)
+        is_active = policies[0] is None
+        if mode is Mode.COLLECT:
+            is_active = any(isinstance(policy, DeferredPolicy) for policy in policies)
+        if is_active:
+            active.append(point)
+    declared = options.possible_agents if mode is Mode.ENVIRONMENT else None
+    roster, complete = resolve_roster(active, declared, agents.values())
+    if mode is Mode.ENVIRONMENT:
+        roster = {name: point for name, point in roster.items() if name not in by_agent}
+    if options.agent is not None and (active or None not in known):
+        active, roster = _choose_one(options.agent, known, active, roster, complete, by_agent)
+        complete = True
+    if not active and mode is Mode.ENVIRONMENT:
+        raise UnknownPointError(
+            "no decision point is left to the environment: policies answer all of them"
+        )
+    one_agent = active[0].agent or options.agent if len(active) == 1 else None
+    own_hooks = {hook.name: hook for hook in subject.own if hasattr(hook.function, BY_NAME)}
+    plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
+    removers = _removers(points, subject)
+    handlers = [] if plugins is None else plugins.handlers
+    hooks = dict.fromkeys((*definitions, *(remover.hook for remover in removers)))
+    ruled = {agents[hook] for hook in definitions} - {point.agent for point in points}
+    return Plan(
+        subject=subject,
+        options=options,
+        mode=mode,
+        default_policy=default_policy,
+        planner_view=planner_view,
+        points=tuple(points),
+        active=tuple(active),
+        policies=by_agent,
+        has_planner=any(
+            isinstance(policy, AskingPolicy) and policy.plans
+            for policy in (*by_point.values(), *by_agent.values())
+        ),
+        needs_simulation=any(point.needs_simulation for point in points),
+        named_agents=frozenset({*by_agent, *declared_agents(options.possible_agents)} - ruled),
+        one_agent=one_agent,
+        roster=roster,
+        complete=complete,
+        removers=removers,
+        plugins=plugins,
+        patches=(
+            *((hook, None) for hook in hooks),
+            *((handler.target, handler) for handler in handlers),
+        ),
+    )
+
+
+def _checked_render_mode(subject: Subject, options: Options) -> Options:
+    """Warn of a render mode that the simulation does not have, and leave it out."""
+    mode = options.render_mode
+    modes = subject.render_modes
+    if mode is None or options.picture_mode in modes:
+        return options
+    warn_user(
+        f"render_mode {mode!r} is not one of the simulation's"
+        f" ({', '.join(modes) or 'it has none'}), and is ignored{did_you_mean(mode, modes)}"
+    )
+    return replace(options, render_mode=None)
+
+
+def _choose_one(
+    agent: str,
+    known: Collection[str | None],
+    active: list[Point],
+    roster: Mapping[str, Point],
+    complete: bool,
+    by_agent: Mapping[str, Policy],
+) -> tuple[list[Point], dict[str, Point]]:
+    """Return the one active point, and the roster, of a view of one agent."""
+    if agent in by_agent or (agent in known and agent not in roster):
+        raise OptionValueError(
+            f"agent={short_repr(agent)} is answered by policies, and no decision is left to the"
+            " environment"
+        )
+    if complete and agent not in roster:
+        names = [name for name in dict.fromkeys((*known, *roster)) if name is not None]
+        raise AgentError(
+            f"agent={short_repr(agent)} names no agent of the environment; its agents are"
+            f" {', '.join(names)}{did_you_mean(agent, names)}"
+        )
+    points = [roster[agent]] if complete else active
+    if len(points) > 1:
+        raise AgentError(
+            f"the agent {short_repr(agent)} may decide at"
+            f" {', '.join(point.hook.name for point in points)}; name its decision point in"
+            " points=, or declare the agents of each with possible_agents="
+        )
+    return points, {agent: points[0]}
+
+
+def _removers(points: Collection[Point], subject: Subject) -> tuple[Remover, ...]:
+    """Find the functions whose calls end agents."""
+    decisions = {point.hook for point in points}
+    found: list[Remover] = []
+    for point in points:
+        for name in dict.fromkeys((*point.hook.removed_by, *point.definition.removed_by)):
+            hook = locate(name, subject.own)
+            if hook in decisions:
+                raise DefinitionError(
+                    f"{name} is a decision point, so removed_by= cannot name it as a function that"
+                    " ends an agent"
+                )
+            found.append(Remover(hook, point, name, owner_class(point.hook)))
+    if points and subject.ends_agents:
+        found.append(Remover(locate(SimulationInterface.end_agent), None, "end_agent", None))
+    return tuple(found)

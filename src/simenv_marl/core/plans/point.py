@@ -1,0 +1,451 @@
+"""Decision points under the definition of one environment: what agents there observe and may do."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from types import coroutine
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+from gymnasium import spaces as gym_spaces
+from numpy.typing import NDArray
+
+from ...decision import DecisionPoint, Definition, fit_labels, inverse
+from ...errors import (
+    DefinitionError,
+    InvalidActionError,
+    MaskError,
+    OptionValueError,
+    short_repr,
+    warn_user,
+)
+from ...hooks.hook import BOUND
+from ...simulation import Action, Model, Observation, asks_for
+from ..values import actions, spaces
+from ..values.actions import ILLEGAL, MASK
+from .mappings import Mapped, adapt, number_of_places, union_of_keys
+
+Space: TypeAlias = gym_spaces.Space[Any]
+Args = tuple[Model, ...]
+Kwargs = dict[str, Model]
+Mask: TypeAlias = "NDArray[np.int8] | tuple[NDArray[np.int8], ...]"
+
+Labels = Mapping[Any, str] | Sequence[str] | None
+"""Texts: for a ``Discrete`` or ``Dict`` a dict, for a one-dimensional space a sequence."""
+
+Policy: TypeAlias = "Callable[..., Action] | Model"
+"""A policy, as a plan has it: a callable, or ``RULE``."""
+
+_WITHOUT_ITEM = ("split", "gather", "part")
+"""The callables of a definition that do not get an item of a split call first."""
+
+
+class Applier(Protocol):
+    """An agent whose action is applied on the simulation's side."""
+
+    def begin_apply(self) -> None:
+        """Let the agent's calls run the rule."""
+
+    def end_apply(self) -> None:
+        """Undo ``begin_apply``."""
+
+
+class Point:
+    """A decision point under the definition of one environment. It has no state of any episode.
+
+    Attributes:
+        hook: The decision function.
+        definition: Its definition in this environment.
+        agent: The name of the agent. None if ``name_agent`` names it.
+        name_agent: A callable of the call's arguments that names the agent.
+        policy: The policy that answers all decisions of the point. None: the agents' own policies
+            answer them, or the environment's user does.
+        observation_mapping, reward_mapping: The mappings, callable with all arguments.
+        takes_for_observation: The mappings of which an observation consists: also that of the mask.
+        takes_for_reward: The reward mapping, with the arguments that it takes.
+        taken_places: How many positional arguments mappings take after the decision. None: all.
+        taken_keys: The keyword arguments that they take. None: all.
+        cast: Casts an observation to the observation space.
+        check: Checks an action against the action space. Returns it in the form that ``convert``
+            takes, or ``ILLEGAL``.
+        convert: Turns a checked action into the reply to the simulation.
+        applies: Whether an ``apply`` gets the action, on the simulation's side.
+        legal: Returns the mask of a call, and its choices if it has any. None if all actions are
+            always legal.
+        deliver: Turns the reply, on the simulation's side, into the value of the call. None if the
+            reply is that value.
+        split, gather, part: The callables for calls that decide for several items; None without.
+        removed_by: The callables that name the agents that other functions end, by the functions'
+            names. None in place of a callable: the agent of the call's first argument.
+        rule_action_mapping: Returns the action for a decision of the rule. None without.
+        masked_parts: The keys of the parts of the observation space that contain the mask; "" for
+            the whole space.
+        informs_rule_action: Whether infos contain the action of the rule.
+        reports_rule: Whether the decisions of the rule are reported.
+        is_plain: Whether an observation and a reward are all that a decision needs.
+        expects_one: Whether one object makes all decisions, because the definition names no agents.
+        needs_simulation: Whether a mapping asks for the simulation.
+    """
+
+    __slots__ = (
+        "__weakref__", "_labels", "_settings", "agent", "applies", "cast", "check", "convert",
+        "definition", "deliver", "expects_one", "gather", "hook", "informs_rule_action",
+        "is_plain", "legal", "masked_parts", "name_agent", "needs_simulation",
+        "observation_mapping", "part", "policy", "removed_by", "reports_rule", "reward_mapping",
+        "rule_action_mapping", "split", "taken_keys", "taken_places", "takes_for_observation",
+        "takes_for_reward",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        hook: DecisionPoint,
+        definition: Definition,
+        agent: str | None,
+        policy: Policy,
+        *,
+        records: bool,
+        clips: bool,
+    ) -> None:
+        """Prepare a point.
+
+        Args:
+            hook: The decision function.
+            definition: Its definition.
+            agent: The name of its agent. None if the definition has a callable that names it.
+            policy: The policy of all its decisions, if there is one.
+            records: Whether the actions of the rule are recorded, where they can be known.
+            clips: Whether actions are clipped to the bounds of a ``Box``.
+
+        Raises:
+            DefinitionError: A mapping requires more arguments than the decision function has.
+        """
+        self.hook = hook
+        self.definition = definition
+        self.agent = agent
+        self.policy = policy
+        self._settings = records, clips
+        self.name_agent = self._callable("agent") or (lambda *args, **kwargs: agent)
+        observation = self._mapped("observation_space_mapping")
+        reward = self._mapped("reward_mapping")
+        self.observation_mapping = observation.call
+        self.reward_mapping = reward.call
+        self.takes_for_reward = reward
+        self.cast = spaces.observation_cast(definition.observation_space)
+        self.check = actions.action_check(definition.action_space, clips=clips)
+        self.convert: Callable[[Action], Model] = definition.action_space_mapping or _same
+        self.applies = definition.apply is not None
+        self.deliver = self._delivery()
+        self._labels = {
+            name: self._mapped(name)
+            for name in ("action_labels", "observation_labels")
+            if callable(getattr(definition, name))
+        }
+        self.legal = self._legal()
+        self.takes_for_observation = [observation] + [
+            self._mapped(name)
+            for name in ("action_mask_mapping", "choices")
+            if getattr(definition, name) is not None
+        ]
+        taken = [*self.takes_for_observation, reward, *self._labels.values()]
+        self.taken_places = number_of_places(taken)
+        self.taken_keys = union_of_keys(taken)
+        self.split = self._callable("split")
+        self.gather = self._callable("gather", leading=2)
+        self.part = self._callable("part", leading=2)
+        self.removed_by = {**hook.removed_by, **definition.removed_by}
+        self.rule_action_mapping = self._rule_action_mapping()
+        self.masked_parts: list[str] = []
+        if self.legal is not None:
+            self.masked_parts = _masked_parts(definition.observation_space)
+        self.informs_rule_action = definition.rule_action_mapping is not None
+        is_invertible = definition.choices is not None or inverse(definition) is not None
+        self.reports_rule = self.informs_rule_action or (records and is_invertible)
+        self.is_plain = self.legal is None and not self.informs_rule_action
+        self.expects_one = definition.agent is None and hook.bound
+        self.needs_simulation = _with_simulation(definition, None) is not definition
+
+    def bind(self, simulation: Model) -> Point:
+        """Return this point with the simulation given to the mappings that ask for it."""
+        if not self.needs_simulation:
+            return self
+        definition = _with_simulation(self.definition, simulation)
+        records, clips = self._settings
+        return Point(self.hook, definition, self.agent, self.policy, records=records, clips=clips)
+
+    def decisions_of(self, call: Sequence[Model]) -> list[tuple[Args, Kwargs]]:
+        """Return the bound arguments of the decisions of a call: one, or one for each item."""
+        args, kwargs = self.hook.bind(tuple(call), BOUND) or (tuple(call), BOUND)
+        if self.split is None:
+            return [(args, kwargs)]
+        return [((item, *args), kwargs) for item in self.split(*args, **kwargs)]
+
+    # -- callables of the definition --------------------------------------------------------------
+
+    def _mapped(self, name: str, leading: int = 0) -> Mapped:
+        """Return a callable of the definition, callable with all arguments of a call."""
+        function = getattr(self.definition, name)
+        return adapt(function, name, self.hook, leading + self._items_before(name))
+
+    def _callable(self, name: str, leading: int = 0) -> Callable[..., Model] | None:
+        if not callable(getattr(self.definition, name)):
+            return None
+        return self._mapped(name, leading).call
+
+    def _items_before(self, name: str) -> int:
+        """Return how many items of a split call come before the arguments of the call."""
+        return int(self.definition.split is not None and name not in _WITHOUT_ITEM)
+
+    def _rule_action_mapping(self) -> Callable[..., Model] | None:
+        mapping = self.definition.rule_action_mapping
+        if mapping is None or isinstance(mapping, Mapping):
+            return None
+        try:
+            inspect.signature(mapping)
+        except (TypeError, ValueError):  # a builtin, such as int
+            return lambda decision, *args, **kwargs: mapping(decision)
+        return self._mapped("rule_action_mapping", leading=1).call
+
+    def _legal(self) -> Callable[[Args, Kwargs], tuple[Mask, list[Model] | None]] | None:
+        """Make the function that returns the mask of a call, and its choices."""
+        space = self.definition.action_space
+        mapping = self._callable("action_mask_mapping")
+        if mapping is not None:
+            cast = actions.mask_cast(space)
+            return lambda args, kwargs: (cast(mapping(*args, **kwargs)), None)
+        choose = self._callable("choices")
+        if choose is None or not isinstance(space, gym_spaces.Discrete):
+            return None
+        most = int(space.n)
+        name = self.hook.name
+
+        def legal(args: Args, kwargs: Kwargs) -> tuple[Mask, list[Model]]:
+            choices = list(choose(*args, **kwargs))
+            if not 1 <= len(choices) <= most:
+                raise MaskError(
+                    f"{name} has {len(choices)} choices; its action space holds 1 to {most}"
+                )
+            mask = np.zeros(most, np.int8)
+            mask[: len(choices)] = 1
+            return mask, choices
+
+        return legal
+
+    # -- observations -----------------------------------------------------------------------------
+
+    def observe(self, args: Args, kwargs: Kwargs, mask: Mask) -> Observation:
+        """Observe a call, with the mask where the observation space has an entry for it."""
+        return self.cast(self._with_mask(self.observation_mapping(*args, **kwargs), mask))
+
+    def blank(self) -> Observation:
+        """Make the observation of an agent before the first one: zero, with all actions legal."""
+        observation = spaces.blank(self.definition.observation_space)
+        if not self.masked_parts:
+            return observation
+        return self.cast(self._with_mask(observation, self.open_mask()))
+
+    def _with_mask(self, observation: Observation, mask: Mask) -> Observation:
+        for key in self.masked_parts:
+            part = observation[key] if key else observation
+            if not isinstance(part, Mapping):
+                continue
+            part = {**part, MASK: mask}
+            observation = {**observation, key: part} if key else part
+        return observation
+
+    # -- labels -----------------------------------------------------------------------------------
+
+    def action_labels(self, choices: Sequence[Model] | None, args: Args, kwargs: Kwargs) -> Labels:
+        """Return the texts of the actions of a call. Default: choices, decisions or numbers."""
+        definition = self.definition
+        space = definition.action_space
+        labels = definition.action_labels
+        if labels is None and choices is not None:
+            labels = dict(enumerate(map(str, choices)))
+        elif labels is None and isinstance(space, gym_spaces.Discrete):
+            decisions = inverse(definition) or {}
+            labels = {action: str(decision) for decision, action in decisions.items()}
+        elif callable(labels):
+            labels = self._labels_of_call("action_labels", space, args, kwargs)
+        return _labels(space, labels)
+
+    def observation_labels(self, args: Args, kwargs: Kwargs) -> Labels:
+        """Return the texts of the parts of an observation of a call."""
+        space = self.definition.observation_space
+        labels = self.definition.observation_labels
+        if callable(labels):
+            labels = self._labels_of_call("observation_labels", space, args, kwargs)
+        return _labels(space, labels)
+
+    def _labels_of_call(self, name: str, space: Space, args: Args, kwargs: Kwargs) -> Labels:
+        labels: Labels = self._labels[name].call(*args, **kwargs)
+        # Labels of a Discrete may leave out the illegal actions of this call.
+        is_partial = isinstance(labels, Mapping) and isinstance(space, gym_spaces.Discrete)
+        if not is_partial and not fit_labels(space, labels):
+            raise DefinitionError(
+                f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"
+                f" not texts for the parts of {short_repr(space)}"
+            )
+        return labels
+
+    # -- actions ----------------------------------------------------------------------------------
+
+    def open_mask(self) -> Mask:
+        """Make the mask that allows all actions."""
+        mask: Mask = actions.open_mask(self.definition.action_space)
+        return mask
+
+    def allows(self, mask: Mask, action: Action) -> bool:
+        """Whether a mask allows an action that is in the space."""
+        return actions.mask_allows(self.definition.action_space, mask, action)
+
+    def validate(self, action: Action, agent: str, mask: Mask | None) -> Action:
+        """Validate an action; return it as ``convert`` receives it.
+
+        Raises:
+            InvalidActionError: The action is not in the space, or it is masked.
+            OptionValueError: The action is an awaitable of a policy that is no coroutine function.
+        """
+        legal = self.check(action)
+        space = self.definition.action_space
+        if legal is ILLEGAL and inspect.isawaitable(action):
+            getattr(action, "close", int)()
+            raise OptionValueError(
+                f"the policy of {agent!r} has returned an awaitable; make it a coroutine function"
+                " by async def, or give it an attribute waits = True"
+            )
+        if legal is ILLEGAL:
+            raise InvalidActionError(
+                f"the action {short_repr(action)} of {agent!r} is not in its action space"
+                f" {short_repr(space)}"
+            )
+        if mask is not None and not self.allows(mask, legal):
+            raise InvalidActionError(
+                f"the action {short_repr(action)} of {agent!r} is masked; its mask is"
+                f" {short_repr(mask)}"
+            )
+        return legal
+
+    # -- in the simulation ------------------------------------------------------------------------
+
+    def _delivery(self) -> Callable[..., Model] | None:
+        """Make the function that turns a reply into the value of a call.
+
+        For a generator or coroutine function it returns a generator or an awaitable. A reply to an
+        ``apply`` comes with its agent. A choice comes in a list, which is emptied, so that the
+        user's side keeps no reference to it.
+        """
+        has_choices = self.definition.choices is not None
+        kind = self.hook.kind
+        if not self.applies and not has_choices and kind == "function":
+            return None
+        wrap = {"function": _same, "generator": _returning, "coroutine": _awaiting}[kind]
+        apply = self._apply()
+
+        def deliver(reply: Model, *args: Model, **kwargs: Model) -> Model:
+            if apply is None:
+                return wrap(reply.pop() if has_choices else reply)
+            agent, action = reply
+            agent.begin_apply()
+            try:
+                value = apply(action.pop() if has_choices else action, *args, **kwargs)
+            finally:
+                agent.end_apply()
+            if kind != "function" and inspect.isgenerator(value):
+                return _applying(agent, value)
+            if kind != "function" and inspect.isawaitable(value):
+                return coroutine(_applying)(agent, value.__await__())
+            return wrap(value)
+
+        return deliver
+
+    def _apply(self) -> Callable[..., Model] | None:
+        apply = self.definition.apply
+        if apply is None:
+            return None
+        hook = self.hook
+        if asks_for(apply, "_rule"):
+            apply = partial(apply, _rule=lambda *args, **kwargs: hook.rule(*args, **kwargs))
+        return adapt(apply, "apply", hook, 1 + self._items_before("apply")).call
+
+
+def _with_simulation(definition: Definition, simulation: Model) -> Definition:
+    """Give the simulation to the mappings that ask for it. Return the same object if none asks."""
+
+    def bound(part: Model) -> Model:
+        return partial(part, _simulation=simulation) if asks_for(part, "_simulation") else part
+
+    parts = {name: bound(part) for name, part in vars(definition).items()}
+    parts["removed_by"] = {name: bound(agent) for name, agent in definition.removed_by.items()}
+    return definition if parts == vars(definition) else replace(definition, **parts)
+
+
+def warn_of_several(name: str, agent: str) -> None:
+    """Warn that several objects decide under the name of one agent."""
+    warn_user(
+        f"several objects decide at {name} as one agent, {agent!r}: their rewards and differences"
+        " mix. Set agent= of its make_step to a callable that names an agent for each object, or to"
+        " a string if one agent is meant"
+    )
+
+
+def _labels(space: Space, labels: Labels) -> Labels:
+    """Return labels as a dict or a tuple, completed by numbers. None if a space has no labels."""
+    if isinstance(space, gym_spaces.Discrete):
+        start = int(space.start)
+        texts = labels if isinstance(labels, Mapping) else dict(enumerate(labels or (), start))
+        return {action: str(texts.get(action, action)) for action in range(start, start + space.n)}
+    if isinstance(space, gym_spaces.Dict):
+        return labels if isinstance(labels, Mapping) else {key: key for key in space.spaces}
+    if space.shape is None or len(space.shape) != 1:
+        return None
+    places = range(space.shape[0])
+    return tuple(str(place) if labels is None else labels[place] for place in places)
+
+
+def _masked_parts(space: Space) -> list[str]:
+    """Return the keys of the parts of an observation that contain a mask."""
+    parts: dict[str, Space] = {"": space}
+    if isinstance(space, gym_spaces.Dict) and "desired_goal" in space.spaces:
+        parts["observation"] = space["observation"]
+    return [
+        key
+        for key, part in parts.items()
+        if isinstance(part, gym_spaces.Dict) and MASK in part.spaces
+    ]
+
+
+def _same(value: Model) -> Model:
+    return value
+
+
+def _returning(value: Model) -> Generator[Model, Model, Model]:
+    return value
+    yield
+
+
+async def _awaiting(value: Model) -> Model:
+    return value
+
+
+def _applying(
+    agent: Applier, inner: Generator[Model, Model, Model]
+) -> Generator[Model, Model, Model]:
+    """Run a generator of ``apply``. The agent's calls run the rule while it runs, not while it waits."""
+    resume: Callable[[Model], Model] = inner.send
+    sent: Model = None
+    while True:
+        agent.begin_apply()
+        try:
+            waits = resume(sent)
+        except StopIteration as end:
+            return end.value
+        finally:
+            agent.end_apply()
+        try:
+            sent = yield waits
+            resume = inner.send
+        except BaseException as error:
+            resume, sent = inner.throw, error

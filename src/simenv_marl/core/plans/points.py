@@ -1,0 +1,315 @@
+"""The decision points, agents and policies that options name.
+
+If an environment names an undecorated function, the hook of that function exists only as long as
+the environment needs it. For all other callers the function does not change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
+from sys import modules
+from types import FunctionType, MappingProxyType
+from typing import Any, Final, TypeAlias
+
+from ...decision import (
+    BY_NAME,
+    DecisionPoint,
+    Definition,
+    decision_points,
+    point_for,
+    point_of,
+    registered,
+)
+from ...errors import (
+    AgentError,
+    DefinitionError,
+    OptionValueError,
+    PatchError,
+    SimEnvError,
+    UnknownPointError,
+    name_of,
+    short_repr,
+)
+from ...hooks.hook import unwrap
+from ...hooks.places import (
+    PlacedHook,
+    all_classes,
+    find_hook,
+    is_importable,
+    raw_attribute,
+    resolve,
+)
+from ...simulation import RULE, Model
+from .point import Point, Policy
+from .policies import two_arguments
+
+Key: TypeAlias = "str | Callable[..., Any]"
+"""A dotted name, or a function."""
+
+Points: TypeAlias = "Key | Iterable[Key] | Mapping[Any, Definition | None] | None"
+"""The ways to name decision points: see ``generate_env``."""
+
+Definitions = Mapping[DecisionPoint, Definition]
+"""Decision points with their definitions."""
+
+_NONE: Final[Definitions] = MappingProxyType({})
+
+# -- points by name or function -------------------------------------------------------------------
+
+
+def locate(key: Key, own: Definitions = _NONE) -> DecisionPoint:
+    """Return the point of a dotted name or function, whether it has a definition or not.
+
+    ``own`` are the points of the simulation itself, some of which are in no module.
+    """
+    if not isinstance(key, str):
+        return point_for(find_hook(key, UnknownPointError))
+    for point in own:
+        if point.name == key and hasattr(point.function, BY_NAME):
+            return point
+    decorated = registered().get(key)
+    return point_for(find_hook(key, UnknownPointError)) if decorated is None else decorated
+
+
+def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
+    """Return the definitions in the attribute ``points``. Names that lead to nothing are left out."""
+    points = getattr(simulation, "points", None)
+    own: dict[DecisionPoint, Definition] = {}
+    if isinstance(points, Mapping):
+        for key, definition in points.items():
+            with suppress(UnknownPointError, PatchError):
+                own[locate(key)] = definition
+    return own
+
+
+def owner_class(point: DecisionPoint) -> type | None:
+    """Return the class of which a point is a method. None if it is no method, or is gone."""
+    try:
+        owner, _ = resolve(point.name, UnknownPointError)
+    except (UnknownPointError, PatchError):
+        return None
+    return owner if isinstance(owner, type) else None
+
+
+def overrides(point: DecisionPoint) -> list[str]:
+    """Return the dotted names of the functions by which derived classes override a point."""
+    owner = owner_class(point)
+    if owner is None:
+        return []
+    attribute = point.name.rpartition(".")[2]
+    return [
+        f"{kind.__module__}.{kind.__qualname__}.{attribute}"
+        for kind in all_classes(owner)
+        if kind is not owner and attribute in vars(kind)
+    ]
+
+
+# -- points with their definitions ----------------------------------------------------------------
+
+
+def find_points(
+    points: Points, own: Definitions, *, empty: bool = False
+) -> dict[DecisionPoint, Definition]:
+    """Find the decision points that ``points=`` names, with their definitions, in that order.
+
+    Args:
+        points: The names. None: all decorated points.
+        own: The points of the simulation itself.
+        empty: Whether there may be none.
+    """
+    if points is None:
+        points = _all_points()
+    if isinstance(points, str) or not isinstance(points, Iterable):
+        points = [points]
+    pairs = points.items() if isinstance(points, Mapping) else [(key, None) for key in points]
+    found: dict[DecisionPoint, Definition] = {}
+    for key, given in pairs:
+        point, definition = find_point(key, given, own=own)
+        if point in found:
+            raise UnknownPointError(f"the decision point {point.name} was named twice")
+        found[point] = definition
+    if not found and not empty:
+        raise UnknownPointError("no decision point was named: points is empty")
+    return found
+
+
+def _all_points() -> list[str]:
+    """Return the names of all decorated points, which must belong to one package."""
+    points = decision_points()
+    if not points:
+        raise UnknownPointError(
+            "there is no decision point: decorate a function with make_step or name points="
+        )
+    packages = sorted({name.partition(".")[0] for name in points})
+    if len(packages) > 1:
+        raise UnknownPointError(
+            f"decision points of more than one package are registered ({', '.join(packages)});"
+            " say which are meant with points=, or with an attribute points of the simulation"
+        )
+    return points
+
+
+def find_point(
+    key: Key, definition: Definition | None = None, *, own: Definitions = _NONE
+) -> tuple[DecisionPoint, Definition]:
+    """Find one decision point, and its definition, as ``find_points`` does."""
+    if definition is not None and not isinstance(definition, Definition):
+        raise DefinitionError(
+            f"the definition of {name_of(key)} must come from make_step, not"
+            f" {short_repr(definition)}"
+        )
+    point = locate(key, own)
+    decorated = None if isinstance(key, str) else point_of(getattr(key, "__func__", key))
+    if decorated is not None:  # a name means the latest definition, a decision function its own
+        definition = definition or decorated[1]
+    definition = definition or own.get(point) or point.definition or _inherited(point)
+    if definition is None:
+        raise DefinitionError(
+            f"{point.name} has no definition here: decorate it with make_step, or give its"
+            f" definition in points={{{point.name!r}: make_step(...)}}"
+        )
+    return point, definition
+
+
+def _inherited(point: DecisionPoint) -> Definition | None:
+    """Return the definition that a class inherits together with the decision function."""
+    if not isinstance(point, PlacedHook) or not point.inherited:
+        return None
+    known = point_of(raw_attribute(point.owner, point.attribute))
+    return known and (known[1] or known[0].definition)
+
+
+def _named(key: object, points: Iterable[DecisionPoint]) -> DecisionPoint | None:
+    """Return the one of some points that a key names."""
+    for point in points:
+        if key == point.name or unwrap(key) is point.function:
+            return point
+    return None
+
+
+# -- agents and policies --------------------------------------------------------------------------
+
+
+def agent_names(definitions: Definitions) -> dict[DecisionPoint, str | None]:
+    """Name the agent of each point. None if a callable names it."""
+    owners: dict[str, DecisionPoint] = {}
+    for point, definition in definitions.items():
+        agent = definition.agent
+        if isinstance(agent, str) and owners.setdefault(agent, point) is not point:
+            raise AgentError(f"{owners[agent].name} and {point.name} have the same agent {agent!r}")
+    names: dict[DecisionPoint, str | None] = {}
+    for point, definition in definitions.items():
+        if callable(definition.agent):
+            names[point] = None
+        else:
+            names[point] = definition.agent or _free_name(point, owners)
+    return names
+
+
+def _free_name(point: DecisionPoint, owners: dict[str, DecisionPoint]) -> str:
+    """Return the first default name of a point's agent that no other point has."""
+    number = 0
+    while owners.setdefault(f"{point.letters}_{number}", point) is not point:
+        number += 1
+    return f"{point.letters}_{number}"
+
+
+def declared_agents(declared: Mapping[Any, Iterable[str]] | Iterable[str] | None) -> list[str]:
+    """Return the names in ``possible_agents``."""
+    if isinstance(declared, Mapping):
+        return [name for names in declared.values() for name in names]
+    return list(declared or ())
+
+
+def resolve_roster(
+    active: list[Point],
+    declared: Mapping[Any, Iterable[str]] | list[str] | None,
+    known: Collection[str | None],
+) -> tuple[dict[str, Point], bool]:
+    """Find out which agents are known beforehand, and whether there can be no others."""
+    naming = [point.hook for point in active if point.agent is None]
+    if declared is not None and not isinstance(declared, Mapping):
+        others = [name for name in declared if name not in known]
+        if len(naming) > 1 or (others and not naming):
+            raise OptionValueError(
+                "possible_agents must be a dict from decision points to names, unless exactly one"
+                f" point names its agents by a callable; here {len(naming)} do"
+            )
+        declared = {point.name: others for point in naming}
+    names: dict[DecisionPoint, Iterable[str]] = {}
+    for key, agents in (declared or {}).items():
+        hook = _named(key, naming)
+        if hook is None:
+            raise OptionValueError(
+                f"possible_agents names {short_repr(key)}, which is not an active decision point"
+                f" with a callable as agent=; these are: {[point.name for point in naming]}"
+            )
+        names[hook] = agents
+    roster: dict[str, Point] = {}
+    for point in active:
+        for name in names.get(point.hook, ()) if point.agent is None else [point.agent]:
+            if not isinstance(name, str) or name in roster:
+                raise AgentError(
+                    f"possible_agents must be different strings, not {short_repr(name)}"
+                )
+            roster[name] = point
+    return roster, not naming or declared is not None
+
+
+def resolve_policies(
+    policies: Mapping[Any, Policy], named: Definitions, own: Definitions
+) -> tuple[dict[DecisionPoint, Policy], dict[str, Policy], dict[DecisionPoint, Definition]]:
+    """Return the policies by point and by agent, and all points that are named.
+
+    These are the points in ``named``, and those that only ``policies`` names.
+    """
+    by_point: dict[DecisionPoint, Policy] = {}
+    by_agent: dict[str, Policy] = {}
+    definitions = dict(named)
+    agents = agent_names(named).values()
+    for key, value in policies.items():
+        policy = value if value is RULE else two_arguments(value)
+        if isinstance(key, str) and key in agents:
+            by_agent[key] = policy
+            continue
+        point = _named(key, named)
+        if point is None:
+            try:
+                point, definition = find_point(key, own=own)
+            except SimEnvError as error:
+                if policy is RULE and isinstance(error, DefinitionError):
+                    continue  # the rule decides there anyway
+                if isinstance(error, UnknownPointError) and None in agents and _may_be_agent(key):
+                    by_agent[key] = policy
+                    continue
+                known = sorted([*filter(None, agents), *(point.name for point in named)])
+                raise UnknownPointError(
+                    f"policies names {short_repr(key)}, which is neither an agent nor a decision"
+                    f" point ({error}); known are {', '.join(known)}"
+                ) from error
+            definitions.setdefault(point, definition)
+        by_point[point] = policy
+    return by_point, by_agent, definitions
+
+
+def _may_be_agent(key: object) -> bool:
+    """Return whether a callable may name an agent so later. A name in a loaded module is a point."""
+    if not isinstance(key, str):
+        return False
+    first, dot, _ = key.partition(".")
+    return not dot or first not in modules
+
+
+# -- points in other processes --------------------------------------------------------------------
+
+
+def portable(key: Model, name: str | None = None) -> Model:
+    """Return a key for other processes: the dotted name of a function, if it leads there."""
+    function = unwrap(key)
+    if not isinstance(function, FunctionType):
+        return key
+    if hasattr(function, BY_NAME):
+        return getattr(function, BY_NAME)
+    name = name or f"{function.__module__}.{function.__qualname__}"
+    return name if is_importable(name) else function

@@ -1,0 +1,298 @@
+"""Policies: who answers a decision, and what a policy is called with.
+
+A *planner* has a keyword-only parameter ``_environment``, and gets the environment in which it
+decides. A policy with ``_decision`` gets the pending ``Decision``. A coroutine function is awaited.
+All other policies get an observation, or an observation and an info.
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from enum import IntEnum
+from functools import partial
+from typing import Any, Final, Protocol, TypeAlias, TypeVar
+
+from ...errors import OptionValueError, short_repr
+from ...simulation import RULE, Action, Model, Observation, asks_for, positional
+from ..switching.awaiting import wait_for
+from .point import Policy
+
+Info: TypeAlias = dict[str, Any]
+Result = TypeVar("Result")
+
+
+class Where(IntEnum):
+    """Where an episode is played. Each place asks fewer policies than the places before it."""
+
+    USER = 0
+    """In the user's environment, all policies are asked."""
+
+    CLONE = 1
+    """In a clone or a branch, policies that wait or record are replaced by their fallback."""
+
+    BRANCH = 2
+    """In a branch that a policy has made of its environment, planners are replaced by their base.
+
+    Otherwise two planners would ask each other without end.
+    """
+
+    PLAN = 3
+    """As BRANCH, in a branch in which a planner tries a candidate. A planner itself knows it, too."""
+
+
+class AskedEpisode(Protocol):
+    """An episode, as policies use it."""
+
+    @property
+    def where(self) -> Where:
+        """Where the episode is played."""
+
+    @property
+    def seed(self) -> int:
+        """The seed of the episode."""
+
+    def planner_view(self) -> object:
+        """Return the environment for a policy that asks for it."""
+
+
+class AskedAgent(Protocol):
+    """An agent, as policies use it."""
+
+    @property
+    def name(self) -> str:
+        """The name of the agent."""
+
+    def describe(self, seed: int, where: Where) -> object:
+        """Return the decision of the agent, for a policy that asks for it."""
+
+
+ASKED: Final = ("_environment", "_decision")
+"""The keyword-only parameters by which policies ask for more."""
+
+
+def takes_info(policy: Callable[..., Action]) -> bool:
+    """Return whether a policy takes the observation and the info, and not the observation alone."""
+    parameters = positional(policy)
+    if len(parameters) < 2:
+        return False
+    return parameters[1].default is parameters[1].empty or parameters[1].name == "info"
+
+
+def is_planner(policy: Policy) -> bool:
+    """Return whether a policy has a keyword-only parameter ``_environment``."""
+    return asks_for(policy, "_environment")
+
+
+def waits(policy: Policy) -> bool:
+    """Return whether a policy is a coroutine function, or says so by an attribute ``waits``."""
+    while isinstance(policy, partial):
+        policy = policy.func
+    call = getattr(type(policy), "__call__", None)  # noqa: B004 - the function itself is needed
+    if inspect.iscoroutinefunction(policy) or inspect.iscoroutinefunction(call):
+        return True
+    return getattr(policy, "waits", False) is True
+
+
+def records(policy: Policy) -> bool:
+    """Return whether a policy says by an attribute ``records`` that it records its answers."""
+    return getattr(policy, "records", False) is True
+
+
+def is_asked_alone(policy: Policy) -> bool:
+    """Return whether a policy answers one decision at a time: see this module."""
+    return is_planner(policy) or asks_for(policy, "_decision") or waits(policy)
+
+
+def two_arguments(policy: Callable[..., Action]) -> Callable[[Observation, Info], Action]:
+    """Make a policy callable with observation and info."""
+    if isinstance(policy, AskingPolicy):
+        return policy
+    if is_asked_alone(policy):
+        return AskingPolicy(policy)
+    return policy if takes_info(policy) else lambda observation, info: policy(observation)
+
+
+def policy_for(policy: Policy, agent: str, where: Where) -> Policy:
+    """Return the policy that answers for an agent. This alone decides who is asked where.
+
+    Args:
+        policy: A policy, policies by agent, or ``RULE``.
+        agent: The name of the agent that decides.
+        where: Where the episode is played.
+
+    Returns:
+        The policy itself, its base or its fallback, or ``RULE``.
+    """
+    while policy is not RULE:
+        if isinstance(policy, Mapping):
+            policy = policy.get(agent, RULE)
+        elif where >= Where.BRANCH and is_planner(policy):
+            policy = getattr(policy, "base", RULE)
+        elif where >= Where.CLONE and (waits(policy) or records(policy)):
+            policy = getattr(policy, "fallback", RULE)
+        else:
+            return policy
+    return RULE
+
+
+COUNTS: Final[dict[str, dict[str, float]]] = {}
+"""The counts of policies in this process, by a token that copies of a policy share."""
+
+
+def count(token: str, **numbers: float) -> None:
+    """Add numbers to the counts of the policies with a token."""
+    counts = COUNTS.setdefault(token, {})
+    for name, number in numbers.items():
+        counts[name] = counts.get(name, 0) + number
+
+
+def has_fallback(policy: Policy) -> bool:
+    """Return whether a policy counts fallbacks, or wraps one that does."""
+    while isinstance(policy, PolicyWrapper) and not policy.counts_fallbacks:
+        policy = policy.policy
+    return isinstance(policy, PolicyWrapper)
+
+
+class Caller:
+    """Calls a policy with the arguments that it takes, which are found out once.
+
+    Attributes:
+        policy: The policy.
+        names: The names of ``ASKED`` that it asks for.
+    """
+
+    def __init__(self, policy: Callable[..., Action]) -> None:
+        self.policy = policy
+        self.names = tuple(name for name in ASKED if asks_for(policy, name))
+        self._takes_info = takes_info(policy)
+
+    def __call__(self, observation: Observation, info: Info, asked: Mapping[str, object]) -> Action:
+        """Call the policy. Return its answer, or an awaitable."""
+        seen = (observation, info) if self._takes_info else (observation,)
+        return self.policy(*seen, **{name: asked[name] for name in self.names})
+
+
+def when_answered(
+    answer: Action | Awaitable[Action], conclude: Callable[[Action], Result]
+) -> Result | Awaitable[Result]:
+    """Apply a function to an answer. Return an awaitable if the answer is one."""
+    if not inspect.isawaitable(answer):
+        return conclude(answer)
+
+    async def wait() -> Result:
+        return conclude(await answer)
+
+    return wait()
+
+
+class PolicyWrapper:
+    """A policy that asks another policy, and so asks for the same arguments.
+
+    Attributes:
+        policy: The other policy.
+        ask: Calls it.
+        waits: Whether it must be awaited.
+        records: Whether it records its answers.
+        counts_fallbacks: Whether evaluations show how many of its answers come from a fallback.
+    """
+
+    counts_fallbacks = False
+
+    def __init__(self, policy: Callable[..., Action], *, asks: Iterable[str] = ()) -> None:
+        """Wrap a policy. ``asks``: the names of ``ASKED`` that the wrapper itself needs."""
+        if not callable(policy):
+            raise OptionValueError(f"the policy must be a callable, not {short_repr(policy)}")
+        self.policy = policy
+        self.ask = Caller(policy)
+        self.waits = waits(policy)
+        self.records = records(policy)
+        names = {*self.ask.names, *asks}
+        kind = inspect.Parameter
+        parameters = [
+            kind(name, kind.POSITIONAL_OR_KEYWORD) for name in ("observation", "info")
+        ] + [kind(name, kind.KEYWORD_ONLY) for name in ASKED if name in names]
+        self.__signature__ = inspect.Signature(parameters)
+
+
+class EpisodePolicy(ABC):
+    """A policy of a plan that is asked with the episode and the agent.
+
+    Attributes:
+        waits: Whether it must be awaited.
+        policy: The user's policy, for errors.
+    """
+
+    waits = False
+    policy: Policy
+
+    @abstractmethod
+    def answer(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action:
+        """Answer one decision at once."""
+
+    def __call__(self, observation: Observation, info: Info) -> Action:
+        """Refuse a call without an episode."""
+        raise OptionValueError(
+            f"the policy {short_repr(self.policy)} is asked for one decision of an environment at a"
+            " time, and here there is no environment; pass the policy in policies="
+        )
+
+
+class DeferredPolicy(EpisodePolicy):
+    """A policy that answers many decisions in one call. An episode waits for it as for its user."""
+
+
+class AskingPolicy(EpisodePolicy):
+    """A policy that is asked for one decision at a time.
+
+    Attributes:
+        plans: Whether it gets the environment.
+        asks: Whether it gets the decision.
+    """
+
+    def __init__(self, policy: Callable[..., Action]) -> None:
+        self.policy = policy
+        self._call = Caller(policy)
+        self.plans = ASKED[0] in self._call.names
+        self.asks = ASKED[1] in self._call.names
+        self.waits = waits(policy)
+        if self.plans and self.waits:
+            raise OptionValueError(
+                f"the policy {short_repr(policy)} waits, and asks for _environment, which only the"
+                " simulation's own thread can use; let it ask for _decision, or let it answer at"
+                " once"
+            )
+
+    def answer(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action:
+        """Answer one decision. Wait for the answer if it must be awaited."""
+        return wait_for(self.begin(episode, agent, observation, info))
+
+    def begin(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action | Awaitable[Action]:
+        """Ask the policy, or its substitute where the episode is played."""
+        policy = policy_for(self.policy, agent.name, episode.where)
+        if policy is self.policy:
+            return self.ask(episode, agent, observation, info)
+        if policy is RULE:
+            return RULE
+        substitute = two_arguments(policy)
+        if isinstance(substitute, AskingPolicy):
+            return substitute.ask(episode, agent, observation, info)
+        return substitute(observation, info)
+
+    def ask(
+        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
+    ) -> Action | Awaitable[Action]:
+        """Ask the policy itself."""
+        asked: dict[str, Model] = {}
+        if self.plans:
+            asked["_environment"] = episode.planner_view()
+        if self.asks:
+            asked["_decision"] = agent.describe(episode.seed, episode.where)
+        return self._call(observation, info, asked)

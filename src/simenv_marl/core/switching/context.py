@@ -1,0 +1,217 @@
+"""The context of an environment's code on the user's side: its lock, plugins and generators.
+
+Models that draw from ``random`` and ``numpy.random`` share one state with the whole process. With
+``global_rng=True`` an environment has a state of its own, which is in place while the environment
+runs.
+"""
+
+from __future__ import annotations
+
+import random
+from contextlib import suppress
+from copy import deepcopy
+from os import getpid
+from threading import RLock, current_thread, get_ident
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from ...errors import ReentrancyError, WrongThreadError
+from ...hooks.stacks import SIMULATION, outside_simulation
+from ...plugins import Plugins
+from .generators import LEGACY, NUMPY, generator_of_torch
+
+if TYPE_CHECKING:
+    from .driver import Driver
+
+
+class ExclusiveLock:
+    """A lock for an environment that any thread may use, but only one at a time.
+
+    One thread may enter it repeatedly.
+    """
+
+    def __init__(self) -> None:
+        self._lock = RLock()
+        self._process = getpid()
+
+    @property
+    def held(self) -> bool:
+        """Whether the current thread uses the environment."""
+        # The method is private, but ``threading.Condition`` relies on it, too.
+        is_owned: bool = self._lock._is_owned()  # type: ignore[attr-defined]
+        return is_owned and self._process == getpid()
+
+    def __enter__(self) -> None:
+        if self._process != getpid():  # after a fork, the thread that held the lock may not exist
+            self._lock = RLock()
+            self._process = getpid()
+        try:
+            acquired = self._lock.acquire(blocking=False)
+        except BaseException:  # an interrupt
+            with suppress(RuntimeError):
+                self._lock.release()
+            raise
+        if not acquired:
+            raise ReentrancyError(
+                "the environment was used from inside its own simulation, or while another thread"
+                " was stepping, resetting or closing it; any thread may use it, but one at a time"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+
+class environment_context(outside_simulation):  # noqa: N801 - it is used like a function
+    """Run code of an environment in its own context, with its plugins and random generators.
+
+    All code that runs for an environment on the user's side needs this context. Only steps in which
+    ``getcurrent()`` is the driver's ``caller`` and ``EVALUATING`` is empty do without it.
+    """
+
+    __slots__ = ("_driver", "_lock", "_rng")
+
+    def __init__(
+        self,
+        plugins: Plugins | None,
+        rng: GlobalRandom | None,
+        lock: ExclusiveLock | None = None,
+        driver: Driver | None = None,
+    ) -> None:
+        """Prepare the context. Without a driver, the simulation cannot be resumed inside."""
+        super().__init__(plugins)
+        self._rng = rng
+        self._lock = lock
+        self._driver = driver
+
+    def __enter__(self) -> None:
+        if self._lock is not None:
+            self._lock.__enter__()
+        try:
+            super().__enter__()
+            if self._driver is not None:
+                # With generators of its own, each step must enter this context.
+                self._driver.enter(direct=self._rng is None)
+            if self._rng is not None:
+                self._rng.enter()
+        except BaseException:
+            self._rng = None  # it was not entered
+            self.__exit__()
+            raise
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            if self._rng is not None:
+                self._rng.leave()
+        finally:
+            super().__exit__()
+            if self._lock is not None:
+                self._lock.__exit__()
+
+
+# -- states of the global generators --------------------------------------------------------------
+
+
+class _State(NamedTuple):
+    """A state of the global generators.
+
+    Attributes:
+        python: The state of Python's generator.
+        bits: NumPy's bit generator.
+        numpy: The state of NumPy's generator, with the bits that it has drawn in advance.
+    """
+
+    python: tuple[Any, ...]
+    bits: np.random.BitGenerator
+    numpy: dict[str, Any]
+
+
+def save_generators() -> _State:
+    """Return the state of the global generators."""
+    return _State(random.getstate(), NUMPY._bit_generator, NUMPY.get_state(legacy=False))
+
+
+def load_generators(state: _State) -> None:
+    """Put a saved state of the global generators in place."""
+    random.setstate(state.python)
+    LEGACY.set_bit_generator(state.bits)
+    NUMPY.set_state(state.numpy)
+
+
+def _copy_bits(state: _State) -> _State:
+    return state._replace(bits=deepcopy(state.bits))
+
+
+class _Entry(NamedTuple):
+    """A state that was put in place: whose it is, in which thread, and the state before."""
+
+    owner: GlobalRandom
+    thread: int
+    before: _State | None
+
+
+class GlobalRandom:
+    """The context in which a simulation has its own state of the global generators."""
+
+    _entered: Final[list[_Entry]] = []
+
+    def __init__(self) -> None:
+        """Copy the present state, which is used until ``begin`` seeds it."""
+        self._own = _copy_bits(save_generators())
+        if not isinstance(self._own.bits, np.random.MT19937):
+            # ``numpy.random.seed`` can seed no other type.
+            bits = np.random.MT19937()
+            numpy = np.random.RandomState(bits).get_state(legacy=False)
+            self._own = self._own._replace(bits=bits, numpy=numpy)
+
+    def begin(self, seed: int) -> None:
+        """Seed both generators, whose state must be in place, with the seed of an episode."""
+        random.seed(seed)
+        np.random.seed(seed % 2**32)
+
+    def enter(self) -> None:
+        """Put this state in place, unless another thread has put that of an environment there."""
+        thread = get_ident()
+        entered = self._entered
+        is_nested = current_thread().name == SIMULATION  # its user waits in another thread
+        if entered and entered[-1].thread != thread and not is_nested:
+            raise WrongThreadError(
+                "two environments with global_rng=True ran in two threads at once, but a process"
+                " has only one state of the global generators; run them one after the other, or in"
+                " separate processes"
+            )
+        before: _State | None = None
+        if not entered or entered[-1].owner is not self:
+            before = save_generators()
+            load_generators(self._own)
+        entered.append(_Entry(self, thread, before))
+
+    def leave(self) -> None:
+        """Restore the state that was in place before."""
+        before = self._entered.pop().before
+        if before is not None:
+            self._own = save_generators()
+            load_generators(before)
+
+    def leave_all(self) -> None:
+        """Leave as often as this state was entered in a row."""
+        while self._entered and self._entered[-1].owner is self:
+            self.leave()
+
+
+class preserve_generators:  # noqa: N801 - it is used like a function
+    """Restore the global generators of the process on exit: Python's, NumPy's and torch's.
+
+    This is a class because the context manager of a generator cannot pass on immutable errors.
+    """
+
+    def __enter__(self) -> None:
+        torch = generator_of_torch()
+        self._torch = None if torch is None else torch.get_state()
+        self._state = save_generators()
+        load_generators(_copy_bits(self._state))
+
+    def __exit__(self, *error: object) -> None:
+        load_generators(self._state)
+        if self._torch is not None:
+            generator_of_torch().set_state(self._torch)

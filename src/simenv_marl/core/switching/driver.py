@@ -1,0 +1,470 @@
+"""Drivers: how control switches between a simulation's stack and its user's stack.
+
+A driver has one stack for a simulation, over all its episodes: a greenlet, or a thread. *Jobs* run
+on it one after the other: the making of the simulation, then its ``reset`` and its ``run`` for each
+episode. On the user's side ``begin`` prepares a job. ``resume`` starts it, and later passes replies
+to the simulation. ``throw`` raises ``SimulationExit`` in it. Both return the simulation's next
+``Event``. The episode calls ``handle`` of the event's handler, which returns the reply.
+
+On the simulation's side a driver enters its stack into the hooks of the model's functions. Each
+hook gets an interceptor, which sends an event and carries out the reply.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Mapping
+from contextvars import Context, copy_context
+from functools import partial
+from threading import Thread, local
+from types import coroutine
+from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
+from weakref import WeakSet, ref
+
+from greenlet import getcurrent, greenlet
+
+from ...errors import SimulationError, WrongThreadError, annotate
+from ...hooks.hook import BOUND, Hook
+from ...hooks.stacks import STACKS, Interceptor, spawner_of
+from ...plugins import Plugins
+from ...simulation import Model, Sentinel
+from .exits import LoopExit, SimulationExit, is_exit
+from .opened import Resource, watch_resources
+
+WAIT: Final = Sentinel("WAIT")
+"""What ``handle`` returns instead of a reply if the episode waits for an action, or is over."""
+
+SECONDS_TO_UNWIND: Final = 5.0
+"""How long a simulation in a thread may take to its next decision or its end while it unwinds."""
+
+UNWINDING_TRIES: Final = 1000
+"""How often ``SimulationExit`` is raised. A SimPy model loses one of its processes at each try."""
+
+Args = tuple[Model, ...]
+Kwargs = dict[str, Model]
+
+
+class Receiver(Protocol):
+    """An episode, as the handlers of events use it."""
+
+    def receive_end(self) -> Sentinel:
+        """Handle the end of ``run``. Return ``WAIT``, or raise the error of ``run``."""
+
+    def receive_refusal(self) -> NoReturn:
+        """Raise the error of a decision that the driver has refused."""
+
+
+EpisodeType = TypeVar("EpisodeType", contravariant=True)
+
+
+class EventHandler(Protocol[EpisodeType]):
+    """Handles one kind of event of a simulation.
+
+    Attributes:
+        deliver: Turns the reply, on the simulation's side, into the value of the call. It gets the
+            reply and the call's arguments. None if the reply is the value.
+        report: Handles the decisions of the rule. None if they are not reported.
+    """
+
+    @property
+    def deliver(self) -> Callable[..., Model] | None: ...
+
+    @property
+    def report(self) -> AnyHandler | None: ...
+
+    def handle(self, episode: EpisodeType, args: Args, kwargs: Kwargs, /) -> Model:
+        """Handle an event with the arguments of the call. Return the reply, or ``WAIT``."""
+
+
+AnyHandler: TypeAlias = EventHandler[Any]
+Event: TypeAlias = tuple[AnyHandler, Args, Kwargs]
+"""A handler, and the arguments of the call."""
+
+
+class _Ended:
+    """Handles the end of a job."""
+
+    deliver = None
+    report = None
+
+    def handle(self, episode: Receiver, args: Args, kwargs: Kwargs) -> Sentinel:
+        return episode.receive_end()
+
+
+class _Refused:
+    """Handles the first event after a refused decision."""
+
+    deliver = None
+    report = None
+
+    def handle(self, episode: Receiver, args: Args, kwargs: Kwargs) -> NoReturn:
+        episode.receive_refusal()
+
+
+ENDED: Final[Event] = _Ended(), (), BOUND
+"""The event of the end of a job."""
+
+_REFUSED: Final = _Refused()
+
+
+class _Identity(local):
+    """What identifies a thread. Unlike the thread's number, it is never used for another thread."""
+
+    token: set[None] | type[Thread] = Thread  # seen by finalizers that run while a token is made
+
+    def __init__(self) -> None:
+        self.token = set[None]()  # because it can be referenced weakly
+
+
+THREAD: Final = _Identity()
+
+
+class Driver(ABC):
+    """The base class of drivers.
+
+    Attributes:
+        resume: Passes a reply to the simulation, and returns its next event.
+        events: The handlers of the events that the simulation sends, by hook. Empty while it is
+            made, reset or closed.
+        caller: The greenlet that may call ``resume`` directly. None: ``enter`` must be called
+            before.
+        given_up: Why a job was given up. None if no job was.
+        ended: Whether the stack has ended, or was given up.
+        idle: Whether no job runs.
+        forked: Whether the simulation has forked this process.
+        opened: The resources that the simulation has opened. None before the first one.
+        stale: Whether code of an earlier stack may still use the simulation, so that it must be
+            made anew.
+    """
+
+    __slots__ = (
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_outcome", "_refused",
+        "_spawned", "_stack", "caller", "ended", "events", "forked", "given_up", "idle", "opened",
+        "plugins", "stale",
+    )  # fmt: skip
+
+    resume: Callable[[Model], Event]
+    _shares_thread = True  # with its user
+
+    def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
+        """Prepare a driver. The first job begins the stack.
+
+        Args:
+            plugins: The handlers that take part in the simulation.
+            earlier: The driver of the same simulation that this one replaces.
+        """
+        self.plugins = plugins
+        self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
+        self.events: Mapping[Hook, AnyHandler] = {}
+        self._stack: greenlet | None = None
+        self._home: Callable[[], object] = ref(THREAD.token)  # the thread of the stack
+        self._spawned = False  # whether other greenlets have decided on this stack
+        self.caller: greenlet | None = None
+        self.opened: WeakSet[Resource] | None = None if earlier is None else earlier.opened
+        self.given_up: str | None = None
+        self.stale = False
+        if earlier is not None:
+            self.stale = earlier.stale or earlier._spawned or earlier.given_up is not None
+        self.ended = False
+        self.idle = True
+        self.forked = False
+        self._exiting = False
+        self._job: Callable[[], Model] | None = None
+        self._context: Context | None = None  # of the job, until it begins
+        self._outcome: list[Model] = []  # the result of the job, or its error
+        self._refused: WrongThreadError | None = None  # until the user gets it
+
+    # -- on the user's side -----------------------------------------------------------------------
+
+    @abstractmethod
+    def enter(self, *, direct: bool = True) -> None:
+        """Prepare to resume the simulation from here, or raise a ``WrongThreadError``.
+
+        ``direct``: whether later steps may do without this.
+        """
+
+    @abstractmethod
+    def throw(self) -> Event | None:
+        """Raise ``SimulationExit``. Return the next event, or None if it does not come in time."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """End the stack."""
+
+    def begin(
+        self,
+        job: Callable[[], Model],
+        events: Mapping[Hook, AnyHandler] | None = None,
+        context: Context | None = None,
+    ) -> None:
+        """Prepare a job. After ``enter``, the next ``resume`` starts it on the stack.
+
+        Args:
+            job: The function to run.
+            events: The handlers of the events that it sends, by hook.
+            context: The context variables of the job. None: a copy of the user's.
+        """
+        self._job = job
+        self.events = events or {}
+        self._refused = None
+        self._outcome = []
+        self._context = copy_context() if context is None else context
+
+    @property
+    def reachable(self) -> bool:
+        """Whether the simulation can be resumed from the current thread and process."""
+        return self._home() is THREAD.token if self._shares_thread else not self.lost
+
+    @property
+    def lost(self) -> bool:
+        """Whether the thread of the stack has ended, or does not exist in this process."""
+        return self._home() is None
+
+    def ready(self) -> Driver:
+        """Return this driver if it can run another job from here, else one that replaces it."""
+        if not self.ended and self.idle and self.reachable:
+            return self
+        self.end()  # before there is another, so that an interrupt leaves no unknown stack behind
+        return type(self)(self.plugins, self)
+
+    def renew(self) -> None:
+        """Note that the simulation was made anew."""
+        self.stale = False
+
+    def run(self, job: Callable[[], Model], context: Context | None = None) -> Model:
+        """Run a job to its end. Decision functions run their rule. Return the result of the job."""
+        try:
+            self.enter()
+            self.begin(job, context=context)
+            self.resume(None)
+        except BaseException:
+            self.unwind()  # because an interrupt has ended the wait
+            raise
+        return self.take_outcome()
+
+    def take_outcome(self) -> Model:
+        """Return the result of the job that has ended, or raise its error."""
+        outcome = self._outcome
+        if self.failed:
+            raise outcome.pop()  # the waiting stack must not keep the error
+        return outcome.pop()
+
+    def clear_exit(self) -> None:
+        """Free the frames of the exit that has ended the job.
+
+        They must be freed in the thread of the stack, because the model's greenlets can unwind in
+        no other one.
+        """
+        error = self._outcome[-1]
+        if isinstance(error, SimulationExit):
+            error.__traceback__ = None
+            error.__context__ = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether the job that has ended has raised an error."""
+        return len(self._outcome) > 1
+
+    def unwind(self) -> list[BaseException]:
+        """Raise ``SimulationExit`` in the job until it ends, or give it up.
+
+        Return the errors that the job raised instead.
+        """
+        self.enter()
+        if self.idle or self.ended:
+            self._job = None  # an interrupt may have come before it began
+            return []
+        self._exiting = True
+        for _ in range(UNWINDING_TRIES):
+            event = self.throw()
+            if event is None:
+                self.give_up(
+                    f"neither decided anything nor ended within {SECONDS_TO_UNWIND} s; it is"
+                    " abandoned"
+                )
+                break
+            if event is ENDED:
+                try:
+                    self.take_outcome()
+                except BaseException as error:
+                    return [] if is_exit(error) else [error]
+                return []
+        else:
+            self.give_up(
+                "refuses to end: it went on after SimulationExit was raised in it"
+                f" {UNWINDING_TRIES} times; it is left suspended. Let the model re-raise exceptions"
+                " that it does not know; callbacks from C need a CallbackGuard"
+            )
+        self.ended = True
+        return []
+
+    def give_up(self, reason: str) -> None:
+        """Note why the job on the stack cannot be unwound."""
+        self.given_up = reason
+
+    # -- on the simulation's side -----------------------------------------------------------------
+
+    @abstractmethod
+    def _decider(
+        self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
+    ) -> Interceptor:
+        """Make the function that sends an event for each call of a hook, and returns its value."""
+
+    def note_opened(self, resource: Resource) -> None:
+        """Note a resource that the simulation has opened."""
+        if self.opened is None:
+            self.opened = WeakSet()  # not before, because an empty one takes a kilobyte
+        self.opened.add(resource)
+
+    def _register(self) -> None:
+        """On the stack: register it as a simulation's stack."""
+        self._stack = getcurrent()
+        self._home = ref(THREAD.token)
+        STACKS[self._stack] = self
+        watch_resources()
+
+    def _work(self) -> None:
+        """On the stack: run a job, and note its outcome."""
+        # No variable here refers to the stack, because a stack that refers to itself cannot be
+        # collected.
+        self.idle = False
+        self._exiting = False
+        job, self._job = self._job, None
+        try:
+            self.enter_hooks()
+            result = None if job is None else job()
+        except BaseException as error:
+            self._note_error(self._explain(error))
+            return
+        finally:
+            job = None
+            self.leave_hooks(self._stack)
+            self.events = {}
+        if self._refused is not None:
+            self._note_error(self.refusal())
+            return
+        self._outcome = [result]
+
+    def _note_error(self, error: BaseException) -> None:
+        self._outcome = [None, error]
+
+    def _explain(self, error: BaseException) -> BaseException:
+        """Return the error to raise on the user's side for an error of the simulation."""
+        if self._refused is not None and self._refused is not error:
+            if isinstance(error, SimulationExit):
+                return self.refusal()
+            annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
+        if type(error) not in (SimulationExit, LoopExit) or self._exiting:
+            return error
+        stray = SimulationError(
+            "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet"
+            " or a thread of that episode has kept; end all of these with their episode (cancel"
+            " them in stop or in a finally)"
+        )
+        stray.__cause__ = error
+        return stray
+
+    def _forget_stack(self) -> None:
+        """Unregister the stack. From now on it takes no part in decisions."""
+        self.ended = True
+        stack, self._stack = self._stack, None
+        self.leave_hooks(stack)
+        self.events = {}
+        if stack is not None:
+            STACKS.pop(stack, None)
+        watch_resources()
+
+    def enter_hooks(self) -> None:
+        """Enter the stack into all hooks, unless another environment runs on it."""
+        stack = self._stack
+        if stack is None or STACKS.get(stack) is not self:
+            return
+        hooks = (*self.events, *self._handled)
+        for hook in hooks:
+            hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
+        if STACKS.get(stack) is not self:  # garbage collection has ended it meanwhile
+            for hook in hooks:
+                hook.leave(stack)
+
+    def leave_hooks(self, stack: greenlet | None) -> None:
+        """Leave all hooks, so that a stack takes no part in calls until ``enter_hooks``."""
+        if stack is not None:
+            for hook in (*self.events, *self._handled):
+                hook.leave(stack)
+
+    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
+        """Return the interceptor of a hook's calls. None if the rule decides.
+
+        Args:
+            hook: The hook.
+            away: Whether the call comes from another greenlet or thread than the stack's.
+        """
+        handler = self.events.get(hook)
+        if handler is None:
+            return None
+        obstacle = self._obstacle(away)
+        if obstacle is not None:
+            return partial(self.refuse, hook, obstacle)
+        self._spawned |= away
+        rule = hook.rule
+        if handler.report is not None:
+            report = _report if hook.kind == "function" else _report_later
+            rule = partial(report, rule, self._decider(hook, rule, handler.report, away), hook)
+        return self._decider(hook, rule, handler, away)
+
+    def _obstacle(self, away: bool) -> str | None:
+        """Return where a call comes from if the environment cannot be asked there."""
+        if self.forked:
+            return "a process that the simulation has forked"
+        if not away:
+            return None
+        if self._home() is not THREAD.token:
+            return "a thread that the simulation has started"
+        if self._shares_thread and spawner_of(getcurrent()) is not None:
+            return (
+                "a greenlet that the simulation has spawned with gevent"
+                ' (driver="thread" allows that)'
+            )
+        return None
+
+    def refuse(self, hook: Hook, where: str, args: Args, kwargs: Kwargs) -> NoReturn:
+        """Refuse a decision. The user gets the error at the simulation's next event."""
+        error = WrongThreadError(
+            f"{hook.name} was called in {where}, where the environment cannot ask for a decision."
+            " Call it where run() runs, and pass the decision on"
+        )
+        if self._refused is None and not self.forked:
+            self._refused = error
+            self.events = dict.fromkeys(self.events, _REFUSED)
+            self.enter_hooks()
+        raise error
+
+    def refuse_all(self) -> None:
+        """Refuse all decisions: the simulation has forked this process, which has no user."""
+        self.forked = True
+        self.enter_hooks()
+
+    def refusal(self) -> WrongThreadError:
+        """Make the error that tells the user of a refused decision."""
+        refused, self._refused = self._refused, None
+        error = WrongThreadError(*() if refused is None else refused.args)
+        error.__cause__ = refused
+        return error
+
+
+def _report(
+    rule: Callable[..., Model], report: Interceptor, hook: Hook, /, *args: Model, **kwargs: Model
+) -> Model:
+    """Run a rule, and pass its decision and the bound call to an interceptor."""
+    decision = rule(*args, **kwargs)
+    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
+    return decision
+
+
+@coroutine
+def _report_later(
+    rule: Callable[..., Model], report: Interceptor, hook: Hook, /, *args: Model, **kwargs: Model
+) -> Generator[Model, Model, Model]:
+    decision = yield from rule(*args, **kwargs)
+    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
+    return decision

@@ -1,0 +1,120 @@
+"""The exception that unwinds a suspended simulation, and how to recognise it after a model has caught it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from sys import modules
+from typing import TYPE_CHECKING, Final
+
+from greenlet import getcurrent, greenlet
+
+from ...errors import error_text
+from ...hooks.stacks import STACKS
+
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+
+ASYNCIO: Final = "asyncio.events"
+"""The module that knows a thread's running event loop. If it is not imported, no loop runs."""
+
+Context = dict[str, object]
+"""The context that an event loop passes to its exception handler."""
+
+
+class SimulationExit(BaseException):
+    """Raised in a suspended simulation to unwind it. It is not an error; models must not catch it.
+
+    It does not derive from ``SystemExit``, because C code that prints the exceptions of callbacks
+    would end the process.
+    """
+
+    def __init__(
+        self, text: str = "SimulationExit: the environment was closed, reset or dropped"
+    ) -> None:
+        """Name the exit in its text, because some engines keep only the text of an exception."""
+        super().__init__(text)
+
+
+class LoopExit(SimulationExit, KeyboardInterrupt):
+    """A ``SimulationExit`` in an event loop, which stores other exceptions in its tasks."""
+
+
+def is_exit(error: BaseException | None) -> bool:
+    """Return whether an error is a ``SimulationExit``, or was raised ``from`` one.
+
+    The text counts too, because some engines keep only that. So does a ``SystemExit`` that was
+    raised because of an exit. A group is an exit if all its errors are.
+    """
+    known = set()  # causes may be cyclic
+    while error is not None and id(error) not in known:
+        if isinstance(error, SimulationExit) or SimulationExit.__name__ in error_text(error):
+            return True
+        if isinstance(error, BaseExceptionGroup):
+            return all(map(is_exit, error.exceptions))
+        known.add(id(error))
+        ends_process = isinstance(error, SystemExit)
+        error = error.__cause__ or (error.__context__ if ends_process else None)
+    return False
+
+
+def make_exit() -> SimulationExit:
+    """Return the exit to raise in this greenlet. Silence the event loop that runs here.
+
+    A ``LoopExit`` ends a loop at once. Where asyncio already closes its loop, the exit must not end
+    it, so that the other tasks end, too.
+    """
+    hub = _hub_of_gevent()
+    if hub is not None:
+        known: tuple[type[BaseException], ...] = getattr(hub, "NOT_ERROR", ())
+        # The hub prints all other exceptions.
+        vars(hub)["NOT_ERROR"] = (*{*known, SimulationExit},)
+        return LoopExit()
+    loop = modules[ASYNCIO]._get_running_loop() if ASYNCIO in modules else None
+    if loop is None:
+        return SimulationExit()
+    _silence(loop)
+    return SimulationExit() if _is_closing_loop() else LoopExit()
+
+
+def _hub_of_gevent() -> greenlet | None:
+    """Return gevent's hub if it has spawned this greenlet."""
+    here: greenlet | None = getcurrent()
+    while here is not None and here not in STACKS:
+        if hasattr(here, "NOT_ERROR"):
+            return here
+        here = here.parent
+    return here if hasattr(here, "NOT_ERROR") else None
+
+
+def _is_closing_loop() -> bool:
+    close = modules["asyncio"].Runner.close.__code__
+    frame = sys._getframe()
+    while frame.f_back is not None:
+        if frame.f_code is close:
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _silence(loop: AbstractEventLoop) -> None:
+    """Let a loop report no tasks that were unwound: no code awaits them any more."""
+    handler = loop.get_exception_handler()
+    if not isinstance(handler, partial):  # an earlier episode has not silenced it yet
+        report = handler or type(loop).default_exception_handler
+        loop.set_exception_handler(partial(_report_task, report))
+
+
+def _report_task(
+    report: Callable[[AbstractEventLoop, Context], object],
+    loop: AbstractEventLoop,
+    context: Context,
+) -> None:
+    """Report an exception of a loop, unless its task was unwound or the loop was closed."""
+    error = context.get("exception")
+    if error is None:
+        if not loop.is_closed():
+            report(loop, context)
+    elif isinstance(error, BaseException) and not is_exit(error):
+        report(loop, context)

@@ -1,0 +1,35 @@
+"""Event loops of asyncio: a simulation in a greenlet has a running loop apart from its user's."""
+
+from __future__ import annotations
+
+import sys
+from sys import modules
+from typing import TYPE_CHECKING, Final
+
+from .exits import ASYNCIO
+
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+    from sys import _asyncgen_hooks as Hooks
+
+LoopState = tuple["AbstractEventLoop | None", "Hooks | tuple[None, None]", int]
+"""The running loop of a thread, its hooks of asynchronous generators, and its tracking depth."""
+
+NO_LOOP: Final[LoopState] = (None, (None, None), 0)
+"""The state of a thread without a loop."""
+
+
+def swap_loop(state: LoopState) -> LoopState:
+    """Return the state of this thread. Set another state if one of the two has a loop."""
+    events = modules.get(ASYNCIO)
+    if events is None:
+        return NO_LOOP
+    loop = events._get_running_loop()
+    present = loop, sys.get_asyncgen_hooks(), sys.get_coroutine_origin_tracking_depth()
+    if loop is None and state[0] is None:
+        return present
+    wanted, hooks, depth = state
+    events._set_running_loop(wanted)
+    sys.set_asyncgen_hooks(*hooks)
+    sys.set_coroutine_origin_tracking_depth(depth)
+    return present

@@ -1,0 +1,103 @@
+"""What simulations open: threads, sockets and processes, which two processes cannot share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial, wraps
+from multiprocessing.process import BaseProcess
+from socket import socket
+from subprocess import Popen
+from threading import Thread
+from typing import Final, Protocol
+
+from greenlet import getcurrent
+
+from ...hooks.stacks import LOCK, STACKS, stack_of
+
+Resource = BaseProcess | Popen[bytes] | Thread | socket
+
+_OPENERS: Final = (
+    (Thread, "start"),
+    (socket, "__init__"),
+    (Popen, "__init__"),
+    (BaseProcess, "start"),
+)
+"""The methods that open something."""
+
+_PATCHES: Final[list[tuple[type, str, Callable[..., None], Callable[..., None]]]] = []
+"""The patched methods: class, name, original and patch. Empty while there are no simulations."""
+
+
+_EPOLLS_BEFORE: Final[set[int]] = set()
+"""The descriptors of the epoll objects that the process had when this module was imported."""
+
+
+def _epolls() -> set[int]:
+    """Return the descriptors of the epoll objects of this process."""
+    numbers: set[int] = set()
+    with suppress(OSError):  # only Linux has this folder
+        for name in os.listdir("/proc/self/fd"):
+            with suppress(OSError):  # it was closed meanwhile
+                if os.readlink(f"/proc/self/fd/{name}") == "anon_inode:[eventpoll]":
+                    numbers.add(int(name))
+    return numbers
+
+
+def new_epolls() -> set[int]:
+    """Return the descriptors of the epoll objects that the process has made since then."""
+    return _epolls() - _EPOLLS_BEFORE
+
+
+_EPOLLS_BEFORE.update(_epolls())
+
+
+class Owner(Protocol):
+    """A driver, for which the resources of its simulation are noted."""
+
+    def note_opened(self, resource: Resource) -> None:
+        """Note a resource that the simulation has opened."""
+
+
+def watch_resources() -> None:
+    """Note the resources that simulations open, while there are simulations."""
+    if bool(STACKS) == bool(_PATCHES):
+        return
+    with LOCK:
+        if not _PATCHES:
+            for owner, name in _OPENERS:
+                original = vars(owner)[name]
+                patch = _noting(original)
+                setattr(owner, name, patch)
+                _PATCHES.append((owner, name, original, patch))
+        while _PATCHES and not STACKS:
+            patched, name, original, patch = _PATCHES.pop()
+            if vars(patched)[name] is patch:  # else other code replaced it, and may still call it
+                setattr(patched, name, original)
+
+
+def _noting(method: Callable[..., None]) -> Callable[..., None]:
+    @wraps(method)
+    def note(self: Resource, *args: object, **kwargs: object) -> None:
+        driver: Owner | None = stack_of(getcurrent()) if STACKS else None
+        if driver is None:
+            method(self, *args, **kwargs)
+            return
+        if isinstance(self, Thread):
+            self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
+        method(self, *args, **kwargs)
+        driver.note_opened(self)
+
+    return note
+
+
+def _run_registered(driver: Owner, run: Callable[[], None]) -> None:
+    """Run a thread that a simulation has started, as a stack of that simulation's driver."""
+    # ``getcurrent()`` is in no variable, because tracebacks keep variables, and greenlets crash
+    # where the root of a thread outlives the thread.
+    STACKS[getcurrent()] = driver
+    try:
+        run()
+    finally:
+        STACKS.pop(getcurrent(), None)

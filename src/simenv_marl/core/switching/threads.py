@@ -1,0 +1,163 @@
+"""The driver that runs a simulation in a thread of its own, for models that need a thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from contextvars import Context
+from queue import Empty, SimpleQueue
+from threading import Thread
+from typing import Final
+
+from ...errors import WrongThreadError
+from ...hooks.hook import BOUND, Hook
+from ...hooks.stacks import SIMULATION, Interceptor
+from ...plugins import Plugins
+from ...simulation import RULE, Model, Sentinel
+from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Args, Driver, Event, Kwargs
+from .exits import make_exit
+
+_LONGEST_WAIT: Final = 1.0
+"""The longest single wait of the user's thread, in seconds. Ctrl-C just before it does not end it."""
+
+_EXIT: Final = Sentinel("EXIT")
+_JOB: Final = Sentinel("JOB")
+_END: Final = Sentinel("END")
+
+
+class ThreadDriver(Driver):
+    """A driver that runs a simulation in a thread. The first ``begin`` starts it; ``end`` joins it.
+
+    Only one of the two threads runs at a time. They pass replies and events through two queues. An
+    interrupt may leave something in a queue, or lose an event. So replies between two jobs are
+    ignored, and each job has a queue of events.
+    """
+
+    __slots__ = ("_arrived", "_replies", "_thread")
+
+    _shares_thread = False
+
+    def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
+        """Prepare a thread. ``caller`` is always None."""
+        super().__init__(plugins, earlier)
+        self._replies: SimpleQueue[Model] = SimpleQueue()
+        self._arrived: SimpleQueue[Event] = SimpleQueue()
+        self._thread: Thread | None = None
+
+    # -- in the user's thread ---------------------------------------------------------------------
+
+    def begin(
+        self,
+        job: Callable[[], Model],
+        events: Mapping[Hook, AnyHandler] | None = None,
+        context: Context | None = None,
+    ) -> None:
+        """Prepare a job, and start the thread if there is none."""
+        with suppress(Empty):
+            while True:
+                self._replies.get_nowait()
+        self._arrived = SimpleQueue()
+        super().begin(job, events, context)
+        if self._thread is not None:
+            return
+        self._thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
+        try:
+            self._thread.start()
+        except Exception:  # there are too many threads
+            self._thread = None
+            raise
+
+    def enter(self, *, direct: bool = True) -> None:
+        """Check that this process was not forked, because the simulation's thread stayed behind."""
+        if self.lost:
+            raise WrongThreadError(
+                "this process was forked in mid-episode, but the simulation is suspended in a"
+                ' thread of the parent process; call reset(), or use driver="greenlet"'
+            )
+
+    def resume(self, reply: Model) -> Event:
+        """Resume the simulation with a reply; return its next event."""
+        self._replies.put(reply if self._job is None else _JOB)
+        while True:
+            with suppress(Empty):
+                return self._arrived.get(True, _LONGEST_WAIT)
+
+    def throw(self) -> Event | None:
+        """Raise ``SimulationExit`` in the simulation, at its next decision if it still runs.
+
+        Return its next event.
+        """
+        self._replies.put(_EXIT)
+        try:
+            return self._arrived.get(True, SECONDS_TO_UNWIND)
+        except Empty:
+            return None
+
+    def end(self) -> None:
+        """End the stack, and join its thread. After an interrupt this can be called again.
+
+        A job that was given up gets another chance to unwind if it decides again.
+        """
+        if self.ended and not self.idle:
+            return
+        if self.idle and self._thread is not None and not self.lost:
+            self.ended = True  # before ``_END``, so that no job can come after it
+            self._replies.put(_END)
+            # A RuntimeError means that this is that thread, or that it was never started.
+            with suppress(RuntimeError):
+                self._thread.join(SECONDS_TO_UNWIND)
+        self._forget_stack()
+        self._thread = None
+
+    # -- in the simulation's thread ---------------------------------------------------------------
+
+    def _serve(self) -> None:
+        self._register()
+        try:
+            while not self.ended and (reply := self._replies.get()) is not _END:
+                if reply is _JOB:
+                    self._do()
+                reply = None
+        finally:
+            self._forget_stack()
+
+    def _do(self) -> None:
+        context, self._context = self._context, None
+        try:
+            (context or Context()).run(self._work)
+        except BaseException as error:  # raised from another thread, so that its user does not wait
+            self._note_error(error)
+        context = None
+        self.clear_exit()
+        if self.forked:
+            self.ended = True
+            self.take_outcome()  # raises an error here, because this process has no user
+        self.idle = True
+        self._arrived.put(ENDED)
+
+    def _decider(
+        self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
+    ) -> Interceptor:
+        """Make the function that sends an event for each call of a hook, and returns its value."""
+        deliver = handler.deliver
+        bind = hook.bind
+        send = self._arrived.put
+        receive = self._replies.get
+
+        def decide(args: Args, kwargs: Kwargs) -> Model:
+            bound = args
+            named = kwargs
+            if kwargs is not BOUND:
+                call = bind(args, kwargs)
+                if call is None:  # a handler has changed the arguments
+                    return rule(*args, **kwargs)
+                bound, named = call
+            send((handler, bound, named))
+            reply = receive()
+            if reply is RULE:
+                return rule(*args, **kwargs)
+            if reply is _EXIT:
+                raise make_exit()
+            return reply if deliver is None else deliver(reply, *bound, **named)
+
+        return decide

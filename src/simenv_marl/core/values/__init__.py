@@ -1,0 +1,1 @@
+"""Casts, checks and stacks of observations and actions. It uses nothing else of the core."""

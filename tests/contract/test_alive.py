@@ -1,0 +1,350 @@
+"""What an environment keeps alive of a model, where the model can see who is alive."""
+
+import gc
+import random
+import weakref
+from collections import deque, namedtuple
+from weakref import WeakSet
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    SimulationInterface,
+    aec_env,
+    joint_env,
+    make_step,
+    parallel_env,
+    simulate,
+    single_env,
+)
+from tests.worlds.models import define
+
+PREY = f"{__name__}.Animal.eat"
+
+
+class Animal:
+    """Eats a neighbour now and then. Weak sets and scheduled events see who is alive."""
+
+    def __init__(self, meadow, number):
+        self.meadow = meadow
+        self.number = number
+
+    def eat(self, neighbours, *, nearest=None):
+        """Decide which of the neighbours to eat; None of them in three of four cases."""
+        return self.meadow.rng.randrange(4 * len(neighbours)) if neighbours else None
+
+    def act(self):
+        others = [other for other in self.meadow.living() if other is not self]
+        neighbours = self.meadow.kind(others)
+        place = self.eat(neighbours, nearest=others[0] if others else None)
+        del neighbours
+        if place is not None and place < len(others):
+            victim = others.pop(place)
+            self.meadow.held.remove(victim)
+            self.meadow.log.append(f"{self.number} eats {victim.number}")
+
+
+class Meadow(SimulationInterface):
+    """Steps all animals that a weak set holds, by events that hold them weakly."""
+
+    kind = list
+
+    def reset(self, seed=None):
+        self.rng = random.Random(seed)
+        self.log = []
+        self.held = [Animal(self, number) for number in range(8)]
+        self.alive = WeakSet(self.held)
+        for animal in self.held:
+            weakref.finalize(animal, self.log.append, f"{animal.number} is gone")
+
+    def living(self):
+        return sorted(self.alive, key=lambda animal: animal.number)
+
+    def run(self):
+        for _ in range(6):
+            events = [weakref.ref(animal) for animal in self.living()]
+            while events:
+                animal = events.pop(0)()
+                if animal is not None:
+                    animal.act()
+                del animal
+            self.log.append([animal.number for animal in self.living()])
+
+    def expected_calls(self, point):
+        return [(animal, self.kind(self.living())) for animal in self.living()]
+
+
+def as_dict(animals):
+    return {animal: animal.number for animal in animals}
+
+
+class Pair(namedtuple("Pair", "first rest")):
+    """A named tuple that contains a list."""
+
+
+def as_pair(animals):
+    return Pair(animals[0], animals[1:]) if animals else []
+
+
+KINDS = {
+    "list": list,
+    "tuple": tuple,
+    "set": set,
+    "deque": deque,
+    "dict": as_dict,
+    "nested": lambda animals: [[animal] for animal in animals],
+}
+
+
+def meadow_of(kind):
+    return type("Meadow", (Meadow,), {"kind": staticmethod(KINDS[kind])})
+
+
+def definition(**changes):
+    return define(
+        action_space=spaces.Discrete(100),
+        observation_space=spaces.Box(0, 100, (2,), np.float64),
+        observation_space_mapping=lambda animal, neighbours, *, nearest: [
+            len(neighbours), -1 if nearest is None else nearest.number + 1
+        ],
+        reward_mapping=lambda animal, neighbours: float(len(neighbours)),
+        **changes,
+    )  # fmt: skip
+
+
+def plain_log(source, seed):
+    simulation = source()
+    simulation.reset(seed)
+    simulation.run()
+    log = simulation.log[:]
+    return log
+
+
+def rule_log(view, source, seed, **changes):
+    agent = changes.pop("agent", lambda animal: f"animal_{animal.number}")
+    options = {"possible_agents": [f"animal_{number}" for number in range(8)]}
+    if isinstance(agent, str) or view is aec_env:
+        options = {}
+    env = view(source, {PREY: definition(agent=agent, **changes)}, **options)
+    env.reset(seed=seed)
+    if view is aec_env:
+        for name in env.agent_iter():
+            ended = env.terminations[name] or env.truncations[name]
+            env.step(None if ended else RULE)
+    elif view is parallel_env:
+        while env.agents:
+            env.step(RULE)
+    else:
+        while not any(env.step(RULE)[2:4]):
+            pass
+    log = env.unwrapped.simulation.log[:]
+    env.close()
+    return log
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env])
+@pytest.mark.filterwarnings("ignore:actions that no decision used")
+def test_rule_equals_the_plain_run_where_weak_sets_see_who_is_alive(view, kind):
+    source = meadow_of(kind)
+    for seed in range(4):
+        expected = plain_log(source, seed)
+        assert any(" eats " in str(entry) for entry in expected)
+        assert rule_log(view, source, seed) == expected
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rule_equals_the_plain_run_of_one_agent_with_a_name(kind):
+    source = meadow_of(kind)
+    for seed in range(4):
+        for view in (aec_env, single_env, parallel_env):
+            assert rule_log(view, source, seed, agent="animals") == plain_log(source, seed)
+
+
+def test_policies_that_answer_rule_change_nothing():
+    source = meadow_of("list")
+    for seed in range(4):
+        point = {PREY: definition(agent=lambda animal: f"animal_{animal.number}")}
+        simulation = simulate(source, {PREY: lambda observation: RULE}, points=point, seed=seed)
+        assert simulation.log == plain_log(source, seed)
+
+
+# -- choices and splits ---------------------------------------------------------------------------
+
+
+class Item:
+    """An object that can be referenced weakly."""
+
+    def __init__(self, number):
+        self.number = number
+
+
+class Bag(SimulationInterface):
+    """Chooses one of some items and frees the others, or decides for each of them."""
+
+    def reset(self, seed=None):
+        self.log = []
+
+    def choose(self, items):
+        return items[0]
+
+    def mark(self, items):
+        return [item.number for item in items]
+
+    def run(self):
+        for _ in range(3):
+            items = [Item(number) for number in range(3)]
+            references = [weakref.ref(item) for item in items]
+            self.log.append(self.choose(items).number)
+            del items
+            self.log.append([reference() is None for reference in references])
+            items = [Item(number) for number in range(3)]
+            references = [weakref.ref(item) for item in items]
+            self.log.append(self.mark(items))
+            del items
+            self.log.append([reference() is None for reference in references])
+
+
+BAG = {
+    f"{__name__}.Bag.choose": make_step(
+        observation_space=spaces.Discrete(10),
+        observation_space_mapping=lambda bag, items: len(items),
+        action_space=spaces.Discrete(3),
+        choices=lambda bag, items: items,
+        reward_mapping=lambda bag: 1.0,
+        agent="chooser",
+    ),
+    f"{__name__}.Bag.mark": make_step(
+        observation_space=spaces.Discrete(10),
+        observation_space_mapping=lambda item: item.number,
+        action_space=spaces.Discrete(10),
+        action_space_mapping=lambda action: action,
+        reward_mapping=lambda item: 1.0,
+        split=lambda bag, items: items,
+        agent=lambda item: f"item_{item.number}",
+    ),
+}
+
+
+@pytest.mark.parametrize("action", [RULE, 2])
+def test_items_and_choices_are_freed_with_their_call(action):
+    env = aec_env(Bag, BAG)
+    env.reset(seed=1)
+    for name in env.agent_iter():
+        ended = env.terminations[name] or env.truncations[name]
+        env.step(None if ended else action)
+    log = env.unwrapped.simulation.log
+    assert log[1::2] == [[True] * 3] * 6
+    assert log[2::4] == [[0, 1, 2] if action is RULE else [2, 2, 2]] * 3
+
+
+# -- what stays, and what the last values are -----------------------------------------------------
+
+FREED = f"{__name__}.Cell.split"
+
+
+class Cell:
+    def split(self, size, food):
+        return size
+
+
+class Dish(SimulationInterface):
+    """Frees its cell before the end."""
+
+    def reset(self, seed=None):
+        self.food = [1.0, 2.0]
+
+    def run(self):
+        cell = Cell()
+        for size in (3.0, 4.0):
+            cell.split(size, self.food)
+            self.food[0] += size
+        reference = weakref.ref(cell)
+        del cell
+        self.is_freed = reference() is None
+
+
+def dish(**changes):
+    given = {
+        "observation_space": spaces.Box(0, 100, (1,), np.float64),
+        "action_space": spaces.Discrete(10),
+        "agent": "cell",
+    }
+    env = single_env(Dish, {FREED: define(**given | changes)})
+    env.reset(seed=1)
+    env.step(RULE)
+    return env
+
+
+def test_a_freed_argument_of_the_reward_mapping_makes_the_last_reward_zero():
+    env = dish(observation_space_mapping=lambda cell: [5.0], reward_mapping=lambda cell, size: size)
+    with pytest.warns(UserWarning, match=r"has freed self .*the reward is 0\.0.*removed_by"):
+        observation, reward, terminated, _, _ = env.step(RULE)
+    assert env.unwrapped.simulation.is_freed
+    assert (list(observation), reward, terminated) == ([5.0], 0.0, True)
+
+
+def test_mappings_that_take_other_arguments_are_asked_at_the_end():
+    env = dish(
+        observation_space_mapping=lambda *, food: food[:1], reward_mapping=lambda *, size: size
+    )
+    observation, reward, terminated, _, _ = env.step(RULE)
+    assert env.unwrapped.simulation.is_freed
+    assert (list(observation), reward, terminated) == ([8.0], 4.0, True)
+
+
+def test_a_freed_argument_of_the_observation_mapping_keeps_the_last_observation():
+    env = dish(
+        observation_space_mapping=lambda cell, size: [size], reward_mapping=lambda *, size: size
+    )
+    with pytest.warns(UserWarning, match="has freed self .*the last observation stays"):
+        observation, reward, terminated, _, _ = env.step(RULE)
+    assert (list(observation), reward, terminated) == ([4.0], 4.0, True)
+
+
+def test_containers_come_back_with_their_living_elements():
+    from simenv_marl.core.episodes.arguments import GONE, restore, weaken
+
+    living, freed = Item(1), Item(2)
+    Row = namedtuple("Row", "item number")
+    given = {
+        "list": [living, freed, 3],
+        "nested": {"a": [living], "b": [freed], "c": (freed, living)},
+        "keys": {living: 1, freed: 2},
+        "row": Row(living, 1),
+        "freed row": Row(freed, 1),
+        "set": {living, freed},
+        "deque": deque([freed, living]),
+        "plain": [1, "two", np.zeros(3)],
+        "method": living.__init__,
+    }
+    plain = given["plain"]
+    held = {name: weaken(value) for name, value in given.items()}
+    given.clear()
+    del freed
+    gc.collect()
+    assert {name: restore(value) for name, value in held.items()} == {
+        "list": [living, 3],
+        "nested": {"a": [living], "b": [], "c": (living,)},
+        "keys": {living: 1},
+        "row": Row(living, 1),
+        "freed row": GONE,
+        "set": {living},
+        "deque": deque([living]),
+        "plain": plain,
+        "method": living.__init__,
+    }
+    assert restore(held["plain"]) is plain
+    assert type(restore(held["row"])) is Row
+
+
+def test_a_set_that_the_model_holds_is_read_as_it_stands():
+    from simenv_marl.core.episodes.arguments import restore, weaken
+
+    held = {Item(1)}
+    weak = weaken(held)
+    held.add(2)
+    assert restore(weak) is held

@@ -1,31 +1,35 @@
 """Callbacks that C code calls: an exception in one of them is raised where C was called."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Callable
 from functools import partial, wraps
-from typing import Any
+
+from ..simulation import Model
 
 
 class CallbackGuard:
-    """Carries exceptions of callbacks (errors, Ctrl-C, the exit from an episode) past the C code that called them.
+    """Carries exceptions of callbacks (errors, Ctrl-C, the exit from an episode) past the C code.
 
     The first one is raised at the end of the block ``with guard:`` around the call into C. ``stop``
     asks C to return.
     """
 
-    def __init__(self, stop: Callable[[], Any] | None = None) -> None:
-        self._stop, self._depth = stop or (lambda: None), 0
+    def __init__(self, stop: Callable[[], object] | None = None) -> None:
+        self._stop = stop or (lambda: None)
+        self._depth = 0
         self._error: BaseException | None = None
 
-    def callback(self, function: Callable[..., Any], result: Any = 0) -> Callable[..., Any]:
+    def callback(self, function: Callable[..., Model], result: Model = 0) -> Callable[..., Model]:
         """Wrap a function for C, which gets ``result`` after an exception.
 
         Void functions of cffi need None.
         """
 
-        # the wrapper of a decision function is not a decision function
+        # ``updated=()``, because the wrapper of a decision function is not a decision function
         @wraps(function, updated=())
-        def callback(*args: Any) -> Any:
+        def callback(*args: Model) -> Model:
             try:
                 return function(*args) if self._error is None else result
             except BaseException as error:
@@ -50,16 +54,29 @@ class CallbackGuard:
                 self._error = None
 
     def _record(self, error: BaseException) -> None:
+        """Record the first exception, and stop C."""
         if self._error is None:
             self._error = error
             self._stop()
 
+    def _interrupt(self, error: BaseException) -> None:
+        """Record an interrupt, even in place of the exit from an episode."""
+        self._record(error)
+        self._error = error
 
-def _record_interrupt(print_error: Callable[[Any], Any], unraisable: Any) -> None:
-    """Record Ctrl-C: it mostly arrives while C runs, and is raised before the first line of the next callback."""
-    guard = unraisable.exc_traceback and unraisable.exc_traceback.tb_frame.f_locals.get("self")
-    if isinstance(guard, CallbackGuard) and guard._depth:
-        guard._record(unraisable.exc_value)
-        guard._error = unraisable.exc_value  # also in place of an exit
+
+def _record_interrupt(
+    print_error: Callable[[sys.UnraisableHookArgs], object], unraisable: sys.UnraisableHookArgs
+) -> None:
+    """Record Ctrl-C with the guard of the callback in which Python raised it; print other errors.
+
+    Ctrl-C mostly arrives while C runs. Python raises it before the first line of the next callback,
+    and passes it to this hook.
+    """
+    traceback = unraisable.exc_traceback
+    error = unraisable.exc_value
+    guard = traceback and traceback.tb_frame.f_locals.get("self")
+    if isinstance(guard, CallbackGuard) and guard._depth and error:
+        guard._interrupt(error)
     else:
         print_error(unraisable)

@@ -1,9 +1,10 @@
-"""The guardian of a process's simulators: it ends them when the process has ended, also if that was killed.
+"""The guardian: a shell that ends the simulators of this process when this process has ended.
 
-A simulator that computes does not notice the end of its pipe. On Linux, the kernel can signal a
-process when its parent ends, but means the thread that started it, and no further processes of the
-simulator. So a shell waits for the end of this process instead, and then kills the groups of its
-simulators. It runs while there are simulators.
+The guardian works even if this process was killed. A simulator that computes does not notice the
+end of its pipe. On Linux, the kernel can signal a process when its parent ends, but then the parent
+is the thread that started it, and the signal misses other processes of the simulator. So a shell
+waits for the end of this process, and then kills the process groups of its simulators. The shell
+runs while there are simulators.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import os
 from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen
 from threading import RLock
-from typing import Any, Final
+from typing import Final
 
 _SCRIPT: Final = """
 groups=
@@ -24,7 +25,7 @@ while read -r sign group; do
 done
 for group in $groups; do kill -s KILL -- "-$group"; done
 """
-"""Its input ends when no process has the other end of the pipe any more."""
+"""The shell reads the process groups from a pipe, which ends with the last process that has it."""
 
 _lock = RLock()
 _groups: Final[set[int]] = set()
@@ -32,13 +33,12 @@ _shell: Popen[bytes] | None = None
 
 
 def guard(group: int) -> None:
-    """Let a process group end with this process."""
+    """End a process group when this process has ended."""
     global _shell
     with _lock:
         if _shell is None:
-            command = ["/bin/sh", "-c", _SCRIPT]
             _shell = Popen(
-                command,
+                ["/bin/sh", "-c", _SCRIPT],
                 bufsize=0,
                 cwd="/",
                 stdin=PIPE,
@@ -47,40 +47,43 @@ def guard(group: int) -> None:
                 start_new_session=True,
             )
         _groups.add(group)
-        _tell(_shell, f"+ {group}\n")
+        _send(_shell, f"+ {group}\n")
 
 
 def release(group: int) -> None:
-    """Leave a process group alone, because it has ended. After the last one, the shell ends."""
+    """Remove a process group that has ended. The shell ends after the last one."""
     global _shell
     with _lock:
-        if group not in _groups:
+        shell = _shell
+        if shell is None or group not in _groups:
             return
-        assert _shell is not None  # as long as there are groups
         _groups.remove(group)
         if _groups:
-            _tell(_shell, f"- {group}\n")
+            _send(shell, f"- {group}\n")
         else:
-            shell, _shell = _shell, None
-            shell.kill()  # it may have been stopped, and other processes may have the pipe
+            _shell = None
+            # not by the end of its input: it may be stopped, and a fork may have the pipe
+            shell.kill()
             shell.communicate()
 
 
-def _tell(shell: Popen[Any], line: str) -> None:
+def _send(shell: Popen[bytes], line: str) -> None:
     assert shell.stdin is not None
-    with suppress(BrokenPipeError):  # it was killed
+    with suppress(BrokenPipeError):  # the shell was killed
         shell.stdin.write(line.encode())
 
 
 def _forget() -> None:
-    """In a forked process: close its copy of the pipe, because its simulators are those of its parent."""
+    """Close the pipe in a forked process, because the simulators are those of its parent."""
     global _shell, _lock
-    shell, _shell, _lock = _shell, None, RLock()
+    shell = _shell
+    _shell = None
+    _lock = RLock()
     _groups.clear()
     if shell is not None:
         assert shell.stdin is not None
         shell.stdin.close()
-        shell.returncode = 0  # only its owner waits for it
+        shell.poll()  # because Popen warns of processes that it believes to run
 
 
 if hasattr(os, "register_at_fork"):

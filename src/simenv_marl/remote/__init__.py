@@ -1,14 +1,14 @@
-"""Simulators outside Python: simulations whose models run in processes of their own.
+"""Simulators outside Python: simulations whose models run in other processes.
 
 ::
 
-    check      runs episodes of a simulator, and reports its errors
-    process    ProcessSimulation: from frames to calls of decision functions, and back
-    calls      the calls as mappings see them, and the functions that represent a simulator's points
-    child      the process: starting it, its frames, waiting for it, ending it
+    check      check_wire: tests whether a simulator follows the protocol
+    process    ProcessSimulation: starts a simulator and runs its episodes
+    calls      the calls of an episode, as mappings receive them, and the decision functions
+    child      the process: starting it, sending and receiving frames, ending it
     guardian   ends the processes of simulators when this process has ended
     callbacks  CallbackGuard: exceptions in callbacks of C code
-    wire       lines, their JSON, and what frames may contain
+    wire       the protocol: frames, their JSON, and their checks
 """
 
 from .callbacks import CallbackGuard

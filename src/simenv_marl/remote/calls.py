@@ -1,18 +1,27 @@
-"""The calls of a simulator's decision points, as mappings see them, and the functions that represent the points."""
+"""The calls of a simulator's decision points: as mappings receive them, and as decision functions.
+
+``RemoteEpisode`` turns the frames of an episode into calls of the decision functions that
+``point_functions`` makes. Their argument is a ``RemoteCall``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from types import CodeType, FunctionType
+from typing import Final, NamedTuple, TypeAlias
+from weakref import WeakKeyDictionary
 
 from ..decision import BY_NAME, point_for
+from ..errors import SimulationError, WireError, annotate, short_repr
 from ..hooks.hook import Hook
-from ..simulation import RULE
+from ..simulation import RULE, Model
+from .child import Child
+from .wire import Entity, Frame
 
 
 class RemoteCall:
-    """An entity's latest call of a decision point: the argument of mappings, ``agent`` and ``apply``.
+    """An entity's latest call of a decision point: the argument of mappings and ``apply``.
 
     The call's arguments are its attributes and items: ``call.level``, ``call["queue-length"]``.
     Each entity at a point has one object, which changes from call to call. A copy of it does not
@@ -21,26 +30,17 @@ class RemoteCall:
     Attributes:
         point: The name of the decision point.
         entity: The deciding entity, as the process names it; None if it names none.
-        time: The process's time; None if it tells none.
+        time: The process's time; None if it sent none.
     """
 
-    __slots__ = ("__dict__", "__weakref__", "_rule", "entity", "point", "time")
+    __slots__ = ("__dict__", "__weakref__", "entity", "point", "time")
 
-    def __init__(self, point: str, entity: Any) -> None:
-        self.point, self.entity = point, entity
+    def __init__(self, point: str, entity: Entity) -> None:
+        self.point = point
+        self.entity = entity
         self.time: float | None = None
-        # returns the rule's decision, while one is due and can be known
-        self._rule: Callable[[], Any] | None = None
 
-    def __getstate__(self) -> Any:
-        return self.__dict__, {
-            "point": self.point,
-            "entity": self.entity,
-            "time": self.time,
-            "_rule": None,
-        }
-
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> Model:
         if name in ("entity", "time"):
             return getattr(self, name)
         if name not in self.__dict__:
@@ -53,10 +53,14 @@ class RemoteCall:
     def __len__(self) -> int:
         return len(self.__dict__)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Model:
         if name in RemoteCall.__slots__:  # a copy is being made
             raise AttributeError(name)
         raise AttributeError(self._missing(name))
+
+    def __repr__(self) -> str:
+        arguments = "".join(f", {name}={value!r}" for name, value in self.__dict__.items())
+        return f"RemoteCall({self.point}, entity={self.entity!r}, time={self.time!r}{arguments})"
 
     def _missing(self, name: str) -> str:
         return (
@@ -64,38 +68,154 @@ class RemoteCall:
             f" {', '.join(self.__dict__) or 'none'}"
         )
 
-    def __repr__(self) -> str:
-        arguments = "".join(f", {name}={value!r}" for name, value in self.__dict__.items())
-        return f"RemoteCall({self.point}, entity={self.entity!r}, time={self.time!r}{arguments})"
+    def _update(self, arguments: dict[str, Model], time: float | None) -> None:
+        self.__dict__ = arguments
+        self.time = time
+
+
+# -- decision functions ---------------------------------------------------------------------------
+
+DecisionFunction: TypeAlias = Callable[[RemoteCall], Model]
+
+
+_DECIDING: Final[WeakKeyDictionary[RemoteCall, Child]] = WeakKeyDictionary()
+"""The processes that wait for the decisions of calls, by call."""
 
 
 class PointFunctions(NamedTuple):
     """The functions that represent a decision point of a simulator."""
 
-    decide: Callable[[RemoteCall], Any]
+    decide: DecisionFunction
     """The decision function.
 
-    Its rule has the process decide, and returns what it decided; ``RULE`` if it tells not.
+    Its rule has the process decide, and returns the decision; ``RULE`` if the process does not
+    report it.
     """
 
-    remove: Callable[[RemoteCall], None]
+    remove: DecisionFunction
     """Ends the agent of an entity that is gone."""
 
 
 @cache
 def point_functions(name: str) -> PointFunctions:
     """Return the functions that represent decision points of that name, in all simulators."""
-    decide_hook = _named_hook(lambda call: RULE if call._rule is None else call._rule(), name)
-    remove_hook = _named_hook(lambda call: None, f"{name} (removed)")
+    decide_hook = _named_hook(_decide_by_rule.__code__, name)
+    remove_hook = _named_hook(_remove.__code__, f"{name} (removed)")
     functions = PointFunctions(decide_hook.make_wrapper(), remove_hook.make_wrapper())
     point_for(decide_hook).removed_by[functions.remove] = None
     return functions
 
 
-def _named_hook(function: Any, name: str) -> Hook:
+def _decide_by_rule(call: RemoteCall) -> Model:
+    child = _DECIDING.get(call)
+    return RULE if child is None or "decided" not in child.can else child.decide_by_rule()
+
+
+def _remove(call: RemoteCall) -> None:
+    pass
+
+
+def _named_hook(code: CodeType, name: str) -> Hook:
     """Return the hook of a function that is found by a name, not in a module."""
+    code = code.replace(co_name=name.rpartition(".")[2], co_qualname=name)
+    function = FunctionType(code, globals())
     setattr(function, BY_NAME, name)
-    function.__name__, function.__qualname__ = name.rpartition(".")[2], name
     hook = Hook(function, name)
-    hook.bound = hook.alone = hook.exposed = True
+    hook.bound = True
+    hook.alone = True
+    hook.exposed = True
     return hook
+
+
+# -- episodes -------------------------------------------------------------------------------------
+
+
+class RemoteEpisode:
+    """An episode in a process, whose calls become calls of decision functions.
+
+    Attributes:
+        time: The process's time; None if it sent none.
+        begun: Whether ``run`` was called.
+    """
+
+    def __init__(
+        self, child: Child, functions: Mapping[str, DecisionFunction], start: bytes
+    ) -> None:
+        """Begin an episode in a process with a line; ``functions`` are those of its points."""
+        self._child = child
+        self._functions = functions
+        self._calls: dict[tuple[str, Entity], RemoteCall] = {}
+        self._expected: dict[RemoteCall, None] = {}
+        self._first_frame = child.begin(start)
+        self.time = child.time
+        self.begun = False
+
+    def run(self) -> Frame:
+        """Run the episode once; return the "end" of its last frame.
+
+        Raises:
+            ProcessError: As ``Child.next_frame``.
+            SimulationError: A handler or ``apply`` has replaced a decision of the rule.
+        """
+        self.begun = True
+        frame = self._first_frame
+        while "end" not in frame:
+            self.time = self._child.time
+            for item in frame.get("expect", [frame]):
+                if item["point"] in self._functions:
+                    self._handle(item)
+                elif "decide" in item:
+                    self._child.decide_by_rule()
+            frame = self._child.next_frame()
+        end: Frame = frame["end"]
+        return end
+
+    def expected_calls(self, point: str) -> list[tuple[RemoteCall]]:
+        """Return the calls of a point that the process has announced and not made yet."""
+        return [(call,) for call in self._expected if call.point == point]
+
+    def _handle(self, frame: Frame) -> None:
+        """Handle a frame of an entity at a point, or an item of an "expect"."""
+        key = frame["point"], frame["entity"]
+        call = self._calls.get(key)
+        if call is None:
+            if "update" in frame or "remove" in frame:
+                return  # the entity has made no call that could change
+            call = self._calls[key] = RemoteCall(*key)
+        if "remove" in frame:
+            self._expected.pop(call, None)
+            del self._calls[key]
+            point_functions(call.point).remove(call)
+            return
+        call._update(frame.get("args") or {}, self._child.time)
+        if "decide" in frame:
+            self._expected.pop(call, None)
+            self._decide(call)
+        elif "update" not in frame:
+            self._expected[call] = None
+
+    def _decide(self, call: RemoteCall) -> None:
+        """Get the decision of a call, and send it unless the rule has decided already."""
+        child = self._child
+        _DECIDING[call] = child
+        try:
+            value = self._functions[call.point](call)
+        finally:
+            del _DECIDING[call]
+        if child.decided is not None:
+            decision = child.decided["value"]
+            if value is not decision and value is not RULE:
+                raise SimulationError(
+                    f"the rule of {call.point} has decided {short_repr(decision)} for"
+                    f" {call.entity!r}, and the process continues with that: {short_repr(value)}"
+                    " cannot replace it. A handler or apply that asks the rule must return the"
+                    " rule's decision; of a call that is split, answer all items by RULE, or none"
+                )
+        elif value is RULE:
+            child.decide_by_rule()
+        else:
+            try:
+                child.answer(value)
+            except WireError as error:
+                annotate(error, f"simenv_marl: in the decision of {call.entity!r} at {call.point}")
+                raise

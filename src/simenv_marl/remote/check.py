@@ -1,32 +1,34 @@
-"""A check for authors of clients: does a simulator speak the wire as it should?"""
+"""``check_wire``, for authors of clients: tests whether a simulator follows the protocol."""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from math import inf
-from subprocess import DEVNULL, PIPE, TimeoutExpired, run
+from subprocess import DEVNULL, TimeoutExpired, run
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from ..core import is_seed
 from ..errors import (
     OptionValueError,
     ProcessDiedError,
     ProcessError,
+    RemoteError,
     WireError,
     did_you_mean,
     short_repr,
 )
-from ..simulation import RULE
 from .child import MOST_FRAMES, Child
-from .wire import DESCRIPTORS, KEYS, decode, encode, encode_answer
+from .wire import KEYS, Entity, Frame, Json, decode, encode
 
-OK, NOTE, WRONG = "ok", "note", "wrong"
+OK = "ok"
+NOTE = "note"
+WRONG = "wrong"
 
 PADDING: Final = 1 << 20
 """The number of blanks in a long line, which is longer than any pipe's buffer."""
@@ -38,22 +40,22 @@ INVALID: Final = {
     "half a line, then the end of its input": b'{"act',
     "the end of its input in mid-episode": b"",
 }
-"""What a simulator must refuse in place of an answer.
-
-Its input ends after a line without an end.
-"""
+"""Answers that a simulator must refuse. After a line without an end, its input ends."""
 
 ABILITIES: Final = ("decided", "expect", "reseed")
-"""What the "can" of a hello may list."""
+"""The abilities that the "can" of a hello may list."""
 
-GUESSES: Final = ((0, 1, 100), (False, True))
-"""Values that a decision may have, for simulators that do not tell what their rules decide."""
+GUESSES: Final[Sequence[Sequence[Json]]] = ((0, 1, 100), (False, True))
+"""Possible decisions, for simulators that do not report the decisions of their rules."""
 
 HIGH: Final = 1 << 30
 """The highest bit of a seed."""
 
-Outcome = tuple[str, str]
-"""The verdict of a test, and what happened."""
+Outcome: TypeAlias = tuple[str, str]
+"""The verdict of a test that has not failed, "ok" or "note", and its text."""
+
+Frames: TypeAlias = list[Frame]
+"""The frames of an episode."""
 
 
 class Finding(NamedTuple):
@@ -64,15 +66,15 @@ class Finding(NamedTuple):
     text: str
 
 
+@dataclass
 class WireReport:
-    """The findings of ``check_wire``, one for each test, in the list ``findings``."""
+    """The findings of ``check_wire``, one for each test."""
 
-    def __init__(self) -> None:
-        self.findings: list[Finding] = []
+    findings: list[Finding]
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether no test has failed."""
         return all(finding.verdict != WRONG for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
@@ -80,13 +82,10 @@ class WireReport:
         return {"ok": self.ok, "findings": [finding._asdict() for finding in self.findings]}
 
     def __str__(self) -> str:
-        lines = [
-            f"{finding.verdict:5}  {finding.tried}: {finding.text}" for finding in self.findings
-        ]
+        lines = [f"{verdict:5}  {tried}: {text}" for tried, verdict, text in self.findings]
         wrong = sum(finding.verdict == WRONG for finding in self.findings)
-        return "\n".join(
-            [*lines, "", f"{wrong} of {len(lines)} tests failed" if wrong else "nothing is wrong"]
-        )
+        summary = f"{wrong} of {len(lines)} tests failed" if wrong else "nothing is wrong"
+        return "\n".join([*lines, "", summary])
 
 
 def check_wire(
@@ -127,48 +126,53 @@ def check_wire(
 
 
 class _Check:
-    """A check of one simulator."""
+    """A check of one simulator. Its tests raise a ``ProcessError`` if they fail."""
 
-    def __init__(self, command: Sequence[str], start: bytes, most: int, timeout: float) -> None:
-        self._command, self._start, self._most, self._timeout = command, start, most, timeout
-        self._report = WireReport()
-        # the frames of an episode by the rule, in a new process
-        self._first: list[dict[str, Any]] = []
-        self._decisions = 0  # of that episode
+    def __init__(self, command: Sequence[str], start: bytes, longest: int, timeout: float) -> None:
+        self._command = command
+        self._start = start
+        self._longest = longest
+        self._timeout = timeout
+        self._first: Frames = []  # an episode by the rule, in a new process
+        self._calls: Frames = []  # the "decide" frames of it
         self._draws = False  # whether other random numbers are known to change an episode
 
     def run(self) -> WireReport:
         """Run all tests; if a simulator fails one of the first two, only these."""
-        self._try("starts, and says hello", self._hello)
-        if self._report.ok:
-            self._try("an episode by its own rule", self._episode)
-        if not self._report.ok:
-            return self._report
-        self._try("two episodes in a row with the same seed", self._repeat)
-        for number in sorted({1, (self._decisions + 1) // 2, self._decisions}):
-            self._try(
-                f"stop in place of the answer to call {number}", partial(self._repeat, stop=number)
-            )
-        self._try("a line of 1 MiB", self._long_line)
-        self._try("reseed", self._reseed)
-        self._try("other seeds", self._seeds)
-        for point in dict.fromkeys(frame["point"] for frame in self._first if "decide" in frame):
-            self._try(f"other decisions at {point}", partial(self._values, point))
-        for what, line in INVALID.items():
-            self._try(what, partial(self._refusal, line))
-        self._try("the end of its input between episodes", self._end_of_input)
-        self._try("a run without an environment", self._plain_run)
-        return self._report
+        findings = []
+        for name, test in self._tests():
+            try:
+                verdict, text = test()
+            except ProcessError as error:
+                verdict, text = WRONG, str(error)
+            findings.append(Finding(name, verdict, text))
+            if verdict == WRONG and not self._calls:
+                break
+        return WireReport(findings)
 
-    def _try(self, tried: str, test: Callable[[], Outcome]) -> None:
-        try:
-            verdict, text = test()
-        except ProcessError as error:
-            verdict, text = WRONG, str(error)
-        self._report.findings.append(Finding(tried, verdict, text))
+    def _tests(self) -> Iterator[tuple[str, Callable[[], Outcome]]]:
+        """Yield all tests with their names. Those after the second need its frames."""
+        yield "starts, and says hello", self._hello
+        yield "an episode by its own rule", self._episode
+        yield "two episodes in a row with the same seed", self._repeat
+        for number in sorted({1, self._middle(), len(self._calls)}):
+            yield f"stop in place of the answer to call {number}", partial(self._repeat, number)
+        yield "a line of 1 MiB", self._long_line
+        yield "reseed", self._reseed
+        yield "other seeds", self._seeds
+        for point in dict.fromkeys(call["point"] for call in self._calls):
+            yield f"other decisions at {point}", partial(self._values, point)
+        for name, line in INVALID.items():
+            yield name, partial(self._refusal, line)
+        yield "the end of its input between episodes", self._end_of_input
+        yield "a run without an environment", self._plain_run
 
     def _child(self) -> closing[Child]:
         return closing(Child(self._command, self._timeout))
+
+    def _middle(self) -> int:
+        """Return the number of a call in the middle of the first episode."""
+        return (len(self._calls) + 1) // 2
 
     def _play(
         self,
@@ -176,55 +180,55 @@ class _Check:
         *,
         start: bytes | None = None,
         stop: int = 0,
-        reseed: tuple[int, int] = (0, 0),
-        decisions: Mapping[str, Any] = MappingProxyType({}),
-    ) -> list[dict[str, Any]]:
+        seeds: Mapping[int, int] = MappingProxyType({}),
+        decisions: Mapping[str, Json] = MappingProxyType({}),
+    ) -> Frames:
         """Play an episode by the rule; return its frames.
 
-        ``start`` replaces the usual line. ``stop`` is the call at which to break off, ``reseed`` a
-        call and a seed. ``decisions`` has a value for each point at which the rule does not decide.
+        ``start`` replaces the usual line. ``stop`` is the call at which to break off. ``seeds`` has
+        a seed for each call at which to reseed, and ``decisions`` a value for each point at which
+        the rule does not decide.
         """
-        frames, removed = [child.begin(start or self._start)], set[tuple[str, Any]]()
+        frames: Frames = []
+        removed: set[tuple[str, Entity]] = set()
+        frame = child.begin(start or self._start)
         while True:
-            frame = frames[-1]
             _check_keys(frame)
+            frames.append(frame)
             if "end" in frame:
                 return frames
-            who = frame.get("point", ""), frame.get("entity")
+            point = frame.get("point", "")
+            entity = frame.get("entity")
             if "remove" in frame:
-                removed.add(who)
+                removed.add((point, entity))
             elif "decide" in frame:
                 number = child.number
-                if who in removed:
+                if (point, entity) in removed:
                     raise WireError(
-                        f"call {number} is of {who[1]!r} at {who[0]}, which was removed before; an"
-                        " entity that comes"
-                        ' needs a name that none had in the episode, and "remove" comes after the'
-                        " last call"
+                        f"call {number} is of {entity!r} at {point}, which was removed before; an"
+                        " entity that comes needs a name that none had in the episode, and"
+                        ' "remove" comes after the last call'
                     )
-                if number in (stop, self._most) or len(frames) > MOST_FRAMES:
+                if number in (stop, self._longest) or len(frames) > MOST_FRAMES:
                     child.break_off()
                     return frames
-                if who[0] in decisions:
-                    child.answer(encode_answer(number, decisions[who[0]]))
+                if number in seeds:
+                    child.reseed(seeds[number])
+                if point in decisions:
+                    child.answer(decisions[point])
                 else:
-                    value = child.leave_to_rule(
-                        encode({"reseed": reseed[1]}) if number == reseed[0] else b""
-                    )
-                    frames += [] if value is RULE else [{"decided": number, "value": value}]
-            frames.append(child.next_frame())
+                    child.decide_by_rule()
+                    frames += [child.decided] if child.decided else []
+            frame = child.next_frame()
 
-    def _compare(self, frames: list[dict[str, Any]]) -> Outcome:
+    def _compare(self, frames: Frames) -> Outcome:
         """Compare an episode with the first one."""
-        for number, (one, other) in enumerate(zip_longest(self._first, frames)):
-            if one != other:
-                what = f"frame {number} is {short_repr(other)}, and in a new process it was {short_repr(one)}"
-                return (
-                    WRONG,
-                    (
-                        f'{what}; seed all generators by the seed of "start", and keep nothing of'
-                        " other episodes"
-                    ),
+        for number, (first, other) in enumerate(zip_longest(self._first, frames)):
+            if first != other:
+                raise WireError(
+                    f"frame {number} is {short_repr(other)}, and in a new process it was"
+                    f' {short_repr(first)}; seed all generators by the seed of "start", and forget'
+                    " other episodes"
                 )
         return OK, "the same as in a new process"
 
@@ -233,25 +237,29 @@ class _Check:
     def _hello(self) -> Outcome:
         with self._child() as child:
             if not child.points:
-                return WRONG, "it has no points"
+                raise WireError("it has no points")
             _check_keys(child.hello)
             for name in child.can.difference(ABILITIES):
                 hint = did_you_mean(name, ABILITIES) or f"; it may list {', '.join(ABILITIES)}"
-                return WRONG, f'the "can" of its hello lists {name!r}, which does not exist{hint}'
+                raise WireError(
+                    f'the "can" of its hello lists {name!r}, which does not exist{hint}'
+                )
             can = ", ".join(sorted(child.can)) or "nothing else"
             return OK, f"points {', '.join(sorted(child.points))}; can {can}"
 
     def _episode(self) -> Outcome:
         with self._child() as child:
-            self._first, self._decisions = self._play(child), child.number
-        count = Counter(frame["point"] for frame in self._first if "decide" in frame)
-        points = ", ".join(f"{point} {number}" for point, number in count.items())
-        if not count:
-            return WRONG, "it asked for no decision"
+            self._first = self._play(child)
+        self._calls = [frame for frame in self._first if "decide" in frame]
+        if not self._calls:
+            raise WireError("it asked for no decision")
+        counts = Counter(call["point"] for call in self._calls)
+        points = ", ".join(f"{point} {count}" for point, count in counts.items())
         end = self._first[-1].get("end")
         if end is None:
-            return NOTE, f"it was stopped after {self._most} decisions ({points})"
-        return OK, f"{self._decisions} decisions ({points}), result {short_repr(end.get('result'))}"
+            return NOTE, f"it was stopped after {self._longest} decisions ({points})"
+        result = short_repr(end.get("result"))
+        return OK, f"{len(self._calls)} decisions ({points}), result {result}"
 
     def _repeat(self, stop: int = 0) -> Outcome:
         with self._child() as child:
@@ -259,90 +267,66 @@ class _Check:
             try:
                 return self._compare(self._play(child))
             except ProcessDiedError:
-                if child.number == 0 and child.exit_code() == 0:
-                    return self._restart()
-                raise
-
-    def _restart(self) -> Outcome:
-        """Compare an episode in another process, for a simulator that exits after each."""
+                if child.number != 0 or child.exit_code() != 0:
+                    raise
         with self._child() as child:
-            verdict, text = self._compare(self._play(child))
-        if verdict == OK:
-            return (
-                NOTE,
-                (
-                    "it exits with code 0 after an episode, and plays the same in a new process:"
-                    " one for each"
-                ),
-            )
-        return verdict, text
+            self._compare(self._play(child))
+        return NOTE, (
+            "it exits with code 0 after an episode, and plays the same in a new process: one for"
+            " each"
+        )
 
     def _long_line(self) -> Outcome:
+        start = self._start.replace(b"\n", b" " * PADDING + b"\n")
         with self._child() as child:
-            return self._compare(
-                self._play(child, start=self._start.replace(b"\n", b" " * PADDING + b"\n"))
-            )
+            return self._compare(self._play(child, start=start))
 
     def _reseed(self) -> Outcome:
-        middle, futures = (self._decisions + 1) // 2, []
+        middle = self._middle()
+        futures = []
         for seed in (11, 11, 12):
             with self._child() as child:
                 if "reseed" not in child.can:
-                    return (
-                        NOTE,
-                        (
-                            'the "can" of its hello does not list "reseed": no branches with other'
-                            " futures"
-                        ),
+                    return NOTE, (
+                        'the "can" of its hello does not list "reseed": no branches with other'
+                        " futures"
                     )
-                futures.append(self._play(child, reseed=(middle, seed)))
+                futures.append(self._play(child, seeds={middle: seed}))
         one, again, other = futures
         if one != again:
-            return WRONG, "the same seed has led to two futures; seed all generators by it"
+            raise WireError("the same seed has led to two futures; seed all generators by it")
         if one == other:
             return NOTE, "two seeds have led to the same future; is nothing in the model random?"
         self._draws = True
-        return (
-            OK,
-            (
-                f"at call {middle}, two seeds lead to two futures, and the same seed to the same"
-                " future"
-            ),
+        return OK, (
+            f"at call {middle}, two seeds lead to two futures, and the same seed to the same future"
         )
 
     def _seeds(self) -> Outcome:
-        """Play episodes with four low seeds, and with four that differ from them in the highest bit alone."""
-        low, high = ([self._seeded(base + number) for number in range(1, 5)] for base in (0, HIGH))
-        if all(one == low[0] for one in [*low, *high]):
+        """Play episodes with four low seeds, and with four that differ in the highest bit alone."""
+        low = [self._seeded(number) for number in range(1, 5)]
+        high = [self._seeded(HIGH + number) for number in range(1, 5)]
+        if len(_distinct(low + high)) == 1:
             text = "seeds 1 to 4 lead to the same episode"
             if self._draws:
-                return (
-                    WRONG,
-                    (
-                        f'{text}, though "reseed" changes it: seed the generators with the seed of'
-                        ' "start"'
-                    ),
+                raise WireError(
+                    f'{text}, though "reseed" changes it: seed the generators with the seed of'
+                    ' "start"'
                 )
-            return (
-                NOTE,
-                f'{text}; is nothing in the model random, or does it ignore the seed of "start"?',
+            return NOTE, (
+                f'{text}; is nothing in the model random, or does it ignore the seed of "start"?'
             )
-        different = sum(one not in low[:number] for number, one in enumerate(low))
-        for same, what in (
-            (low == high, f"seeds 1 to 4 lead to the same episodes as {HIGH + 1} to {HIGH + 4}"),
-            (
-                all(one == high[0] for one in high),
-                f"seeds {HIGH + 1} to {HIGH + 4} lead to the same episode",
-            ),
-        ):
-            if same and different > 2:  # with fewer, it can be chance
-                return (
-                    WRONG,
-                    f"{what}: keep all 31 bits of the seed, in an integer of 32 or 64 bits",
-                )
+        different = len(_distinct(low))
+        if different > 2:  # with fewer, it can be chance
+            remedy = "keep all 31 bits of the seed, in an integer of 32 or 64 bits"
+            high_seeds = f"{HIGH + 1} to {HIGH + 4}"
+            if low == high:
+                raise WireError(f"seeds 1 to 4 lead to the same episodes as {high_seeds}: {remedy}")
+            if len(_distinct(high)) == 1:
+                raise WireError(f"seeds {high_seeds} lead to the same episode: {remedy}")
         return OK, f"four seeds lead to {different} different episodes, and all their bits count"
 
-    def _seeded(self, seed: int) -> list[dict[str, Any]]:
+    def _seeded(self, seed: int) -> Frames:
         """Play an episode with another seed, in a new process."""
         start = encode({"start": {**decode(self._start)["start"], "seed": seed}})
         with self._child() as child:
@@ -350,36 +334,30 @@ class _Check:
 
     def _values(self, point: str) -> Outcome:
         """Play episodes in which all decisions of a point have the same value."""
-        calls = {
-            frame["decide"]
-            for frame in self._first
-            if frame.get("point") == point and "decide" in frame
-        }
-        told = [frame["value"] for frame in self._first if frame.get("decided") in calls]
-        known = next(([told[0], value] for value in told if value != told[0]), None)
-        for values in GUESSES if known is None else [known]:
+        calls = [call["decide"] for call in self._calls if call["point"] == point]
+        legal = _distinct(frame["value"] for frame in self._first if frame.get("decided") in calls)[
+            :2
+        ]
+        known = len(legal) == 2
+        for values in [legal] if known else GUESSES:
             try:
-                episodes = [self._valued(point, value) for value in values]
+                episodes = [self._decided(point, value) for value in values]
             except ProcessError as error:
-                if known is not None or isinstance(error, WireError):
+                if known or isinstance(error, WireError):
                     raise
                 continue  # it does not take such a value
-            shown = ", ".join(map(short_repr, values))
-            if all(episode == episodes[0] for episode in episodes):
-                return (
-                    WRONG,
-                    (
-                        f"the decisions {shown} lead to the same episode: continue with the"
-                        ' "value" of "act"'
-                    ),
+            decisions = f"the decisions {', '.join(map(short_repr, values))}"
+            if len(_distinct(episodes)) == 1:
+                raise WireError(
+                    f'{decisions} lead to the same episode: continue with the "value" of "act"'
                 )
-            return OK, f"the decisions {shown} lead to different episodes"
-        return (
-            NOTE,
-            "it takes neither numbers nor booleans here, so that other decisions were not tried",
+            return OK, f"{decisions} lead to different episodes"
+        return NOTE, (
+            "it takes neither numbers nor booleans here, so that other decisions were not tried"
         )
 
-    def _valued(self, point: str, value: Any) -> list[dict[str, Any]]:
+    def _decided(self, point: str, value: Json) -> Frames:
+        """Play an episode with decisions of one value at a point, in a new process."""
         with self._child() as child:
             return self._play(child, decisions={point: value})
 
@@ -388,64 +366,58 @@ class _Check:
             frame = child.begin(self._start)
             while "decide" not in frame:
                 frame = child.next_frame()
-            child.answer(line)
+            child.send(line)
             if not line.endswith(b"\n"):
                 child.close_input()
-            last = self._last_frame(child)
-        if last is None:
-            return OK, "it ends"
-        if "error" in last:
-            return OK, f"it sends the error {short_repr(last['error'])}"
-        return WRONG, f"it continues with {short_repr(last)}; it must end, or send an error"
+            try:
+                frame = child.receive()
+            except ProcessDiedError:
+                return OK, "it ends"
+            except RemoteError as error:
+                return OK, f"it reports an error: {error}"
+        raise WireError(f"it continues with {short_repr(frame)}; it must end, or send an error")
 
     def _end_of_input(self) -> Outcome:
         with self._child() as child:
             self._play(child)
             child.close_input()
-            last = self._last_frame(child)
-        return (OK, "it ends") if last is None else (WRONG, f"it sends {short_repr(last)}")
-
-    def _last_frame(self, child: Child) -> dict[str, Any] | None:
-        """Return what a process that should end sends before; None if it ends at once."""
-        try:
-            return child.receive()
-        except ProcessDiedError:
-            return None
+            with suppress(ProcessDiedError):
+                raise WireError(f"it sends {short_repr(child.receive())}")
+        return OK, "it ends"
 
     def _plain_run(self) -> Outcome:
-        env = {name: value for name, value in os.environ.items() if name != DESCRIPTORS}
         try:
-            done = run(
+            process = run(
                 self._command,
-                env=env,
                 stdin=DEVNULL,
-                stdout=DEVNULL,
-                stderr=PIPE,
+                capture_output=True,
                 timeout=self._timeout,
             )
         except TimeoutExpired:
             return NOTE, f"it still ran after {self._timeout:g} s"
-        if done.returncode != 0:
-            last = done.stderr.decode(errors="replace").strip()[-300:]
-            return NOTE, f"it has exited with code {done.returncode}: {last}"
+        if process.returncode != 0:
+            stderr = process.stderr.decode(errors="replace").strip()[-300:]
+            return NOTE, f"it has exited with code {process.returncode}: {stderr}"
         return OK, "it runs on its own rule, and exits with code 0"
 
 
-def _check_keys(frame: Mapping[str, Any]) -> None:
-    """Check that a frame has no keys that the wire does not know.
+def _distinct(items: Iterable[Any]) -> list[Any]:
+    """Return the first of all equal items, in their order."""
+    distinct: list[Any] = []
+    for item in items:
+        if item not in distinct:
+            distinct.append(item)
+    return distinct
 
-    Raises:
-        WireError: It has one.
-    """
+
+def _check_keys(frame: Frame) -> None:
+    """Raise a ``WireError`` if a frame has a key that the protocol does not have."""
     kind = next(kind for kind in KEYS if kind in frame)
     parts = [(frame, {kind, *KEYS[kind]})]
     if kind == "end":
         parts.append((frame["end"], {"truncated", "result"}))
     for part, keys in parts:
-        for key in part:
-            if key not in keys:
-                hint = (
-                    did_you_mean(key, keys)
-                    or "; an argument belongs into args, another result into result"
-                )
-                raise WireError(f"the key {key!r} of {short_repr(frame)} does not exist{hint}")
+        for key in part.keys() - keys:
+            hint = did_you_mean(key, keys)
+            hint = hint or "; an argument belongs into args, another result into result"
+            raise WireError(f"the key {key!r} of {short_repr(frame)} does not exist{hint}")

@@ -1,8 +1,8 @@
-"""The process of a simulator: starting it, its frames, waiting for it, ending it.
+"""The process of a simulator: starting it, sending and receiving frames, ending it.
 
-Every wait has an end. The standard error of the process is read while the process is waited for, so
-that it never blocks; errors show the last part of it. The process leads its own process group,
-which ends with it.
+Every wait has an end. While this process waits, it reads the standard error of the simulator, so
+that the simulator never blocks; errors show the last part of it. The simulator leads a process
+group, which ends with it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
-from typing import Any, Final, NoReturn
+from typing import Final, Literal, NoReturn, TypeAlias
 from weakref import WeakSet, finalize
 
 from ..errors import (
@@ -27,11 +27,21 @@ from ..errors import (
     WrongThreadError,
     describe_error,
     short_repr,
-    warn_user,
 )
-from ..simulation import RULE
+from ..simulation import RULE, Model
 from . import guardian
-from .wire import DESCRIPTORS, LONGEST, STOP, VERSION, check_frame, decode, encode_answer
+from .wire import (
+    DESCRIPTORS,
+    LONGEST,
+    STOP,
+    VERSION,
+    Frame,
+    check_frame,
+    decode,
+    encode,
+    encode_answer,
+    is_integer,
+)
 
 CHUNK: Final = 1 << 16
 """The number of bytes to read at once; pipes hold no more."""
@@ -52,17 +62,20 @@ MOST_BYTES: Final = 1 << 30
 """The number of bytes that may come between two calls."""
 
 MOST_WAITS: Final = 20
-"""How many times the time to wait for a line the frames between two calls may take."""
+"""The time that the frames between two calls may take, in times to wait for a line."""
 
 LOST: Final = 1 << 16
 """The exit code of a process whose exit code was lost. No process can exit with it."""
 
+StrPath: TypeAlias = str | os.PathLike[str]
+
 
 class Child:
-    """A simulator in another process, which speaks the wire protocol.
+    """A simulator in another process, which speaks the protocol of ``wire``.
 
     Attributes:
         pid: The id of the process.
+        launch: The command, timeout, environment variables and folder that it was started with.
         hello: Its first frame.
         points: The names of its decision points.
         can: Its further abilities, such as "reseed".
@@ -70,18 +83,29 @@ class Child:
         state: "idle" between episodes, "running" its model, "waiting" for the answer to a call, or
             "stopped".
         number: The number of its latest call in the episode; 0 before the first one.
+        decided: The frame with the rule's decision of the latest call; None before it has come.
         time: Its latest time in the episode; None if it sent none.
-        origin: What it was started with, and in; equal for processes that can replace each other.
     """
 
-    origin: Any = None
+    state: Literal["idle", "running", "waiting", "stopped"] = "idle"
+    number = 0
+    decided: Frame | None = None
+    time: float | None = None
+
+    _closed = False
+    _exit_code_lost = False
+    _received = b""  # the first part of the next lines
+    _bytes = 0  # since the latest call, as the frames
+    _frames = 0
+    _running_since = 0.0
+    _seed: int | None = None  # to send with the next answer
 
     def __init__(
         self,
         command: Sequence[str],
         timeout: float,
         env: Mapping[str, str] | None = None,
-        cwd: Any = None,
+        cwd: StrPath | None = None,
     ) -> None:
         """Start the process, and read its first frame.
 
@@ -89,14 +113,13 @@ class Child:
 
         Raises:
             ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or breaks the rules
-                of the wire.
+                of the protocol.
             RemoteError: It reported an error.
         """
-        self.timeout, self.state, self.number = timeout, "idle", 0
-        self.time: float | None = None
-        self._rest = b""  # received bytes of the next lines
-        self._tail = bytearray()  # the last part of its standard error
-        self._owner, self._closed = os.getpid(), False
+        self.launch = command, timeout, env, cwd
+        self.timeout = timeout
+        self._owner = os.getpid()
+        self._stderr_tail = bytearray()
         try:
             self._start(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
@@ -104,44 +127,28 @@ class Child:
                 f"{command[0]!r} cannot be started: {describe_error(error)}"
             ) from error
         self.pid = self._popen.pid
-        _children.add(self)
         self._name = f"the process {self.pid} ({command[0]})"
-        self._output = self._poll(self._reading, select.POLLIN)
+        _children.add(self)
         try:
             guardian.guard(self.pid)
-            hello = self.receive()
+            self.hello = self.receive()
         except BaseException:  # an interrupt, too
             self.close(patience=0.0)
             raise
-        self.hello = hello
-        version, points, can = hello.get("hello"), hello.get("points", ()), hello.get("can", [])
-        if version is None:
-            self.refuse(hello, f"began with {short_repr(hello)}, not with a hello")
-        if type(version) is not int or version != VERSION:
-            self.fail(
-                WireError(
-                    f"{self} speaks version {short_repr(version)} of the wire; this is version"
-                    f" {VERSION}"
-                )
-            )
-        for names in (points, can):
-            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                what = f'{short_repr(hello)}; its "points" and "can" must be lists of strings'
-                self.fail(WireError(f"{self} has said {what}"))
-        self.points: frozenset[str] = frozenset(points)
-        self.can: frozenset[str] = frozenset(can)
+        self._check_hello()
+        self.points = frozenset(self.hello["points"])
+        self.can = frozenset(self.hello["can"])
 
-    def _start(self, command: Sequence[str], env: Mapping[str, str], cwd: Any) -> None:
+    def _start(self, command: Sequence[str], env: Mapping[str, str], cwd: StrPath | None) -> None:
         """Start the process with its pipes."""
-        ends: list[int] = []
+        child_reading, self._writing = os.pipe()
+        self._reading, child_writing = os.pipe()
         try:
-            ends += os.pipe()
-            ends += os.pipe()
-            child_reading, self._writing, self._reading, child_writing = ends
             self._popen = Popen(
                 command,
                 stdin=DEVNULL,
                 stderr=PIPE,
+                bufsize=0,
                 pass_fds=(child_reading, child_writing),
                 env={**env, DESCRIPTORS: f"{child_reading},{child_writing}"},
                 cwd=cwd,
@@ -149,45 +156,60 @@ class Child:
                 start_new_session=True,
             )
         except BaseException:
-            for end in ends:
-                os.close(end)
+            os.close(self._writing)
+            os.close(self._reading)
             raise
-        os.close(child_reading)
-        os.close(child_writing)
+        finally:
+            os.close(child_reading)
+            os.close(child_writing)
         assert self._popen.stderr is not None
         self._stderr = self._popen.stderr
         for descriptor in (self._reading, self._writing, self._stderr.fileno()):
             os.set_blocking(descriptor, False)
+
+    def _check_hello(self) -> None:
+        self.hello.setdefault("can", [])
+        hello = short_repr(self.hello)
+        if "hello" not in self.hello:
+            self.fail(f"began with {hello}, not with a hello")
+        version = self.hello["hello"]
+        if not is_integer(version, VERSION):
+            self.fail(
+                f"speaks version {short_repr(version)} of the wire; this is version {VERSION}"
+            )
+        for key in ("points", "can"):
+            names = self.hello.get(key)
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                self.fail(f'has said {hello}; its "points" and "can" must be lists of strings')
 
     def __str__(self) -> str:
         return self._name
 
     # -- episodes ---------------------------------------------------------------------------------
 
-    def begin(self, start: bytes) -> dict[str, Any]:
+    def begin(self, start: bytes) -> Frame:
         """Begin an episode with a line; return the first frame, as ``next_frame``."""
         stopped = self.state == "stopped"
-        # First, because the process may have exited.
-        self.state, self.number, self.time, self._frames = "running", 0, None, 0
-        if self._rest or self._reading in dict(self._output.poll(0)):
-            frame = self.receive()
-            self.refuse(frame, f"has sent {short_repr(frame)} before the start of an episode")
+        self.number = 0
+        self.decided = None
+        self.time = None
+        self._seed = None
+        self._run()  # before frames are read, because the process may have exited
+        with suppress(BlockingIOError):
+            self._received += os.read(self._reading, CHUNK)
+        if self._received:
+            self._refuse(self.receive(), " before the start of an episode")
         self.send(start)
         frame = self.next_frame()
         if stopped and "end" in frame:
-            self.refuse(
-                frame,
-                (
-                    f'has sent {short_repr(frame)} after "stop"; it must be silent until the next'
-                    " start"
-                ),
-            )
+            self._refuse(frame, ' after "stop"; it must be silent until the next start')
         return frame
 
-    def next_frame(self) -> dict[str, Any]:
-        """Wait for the next frame of the episode, a "decide", "expect", "update", "remove" or "end", and check it.
+    def next_frame(self) -> Frame:
+        """Wait for the next frame of the episode, and check it.
 
-        All but the last always get an item "entity"; of "expect", each item gets it.
+        It is a "decide", "expect", "update", "remove" or "end". All but "end" always get an item
+        "entity"; of "expect", each item gets it.
 
         Raises:
             ProcessDiedError, ProcessTimeoutError: As ``receive``.
@@ -198,114 +220,132 @@ class Child:
         try:
             time = check_frame(frame, self.points)
         except WireError as error:
-            self.fail(WireError(f"{self} has {error}"))
+            self.fail(f"has {error}")
         if time is not None:
             self.time = time
         if "end" in frame:
             self.state = "idle"
         elif "decide" in frame:
-            number, due = frame["decide"], self.number + 1
-            if type(number) is not int or number != due:
-                self.fail(
-                    WireError(f"{self} has made call {short_repr(number)} where call {due} was due")
-                )
-            self.number, self.state, self._frames = number, "waiting", 0
-        elif not (
-            "update" in frame or "remove" in frame or ("expect" in frame and "expect" in self.can)
-        ):
-            unasked = [name for name in ("decided", "expect") if name in frame]
-            why = (
-                'is not due, or not in the "can" of its hello'
-                if unasked
-                else "is not a frame of the wire"
-            )
-            self.refuse(frame, f"has sent {short_repr(frame)}, which {why}")
-        if self.state == "running":
+            due = self.number + 1
+            if not is_integer(frame["decide"], due):
+                number = short_repr(frame["decide"])
+                self.fail(f"has made call {number} where call {due} was due")
+            self.number = due
+            self.decided = None
+            self.state = "waiting"
+        elif {"update", "remove", *self.can & {"expect"}} & frame.keys():
             self._check_flood()
+        elif {"decided", "expect"} & frame.keys():
+            self._refuse(frame, ', which is not due, or not in the "can" of its hello')
+        else:
+            self._refuse(frame, ", which is not a frame of the wire")
         return frame
+
+    def _run(self) -> None:
+        """Begin to count what the process sends until its next call."""
+        self.state = "running"
+        self._frames = 0
+        self._bytes = 0
+        self._running_since = monotonic()
 
     def _check_flood(self) -> None:
         """Count a frame that is neither a call nor an end, so that such frames end some time."""
-        if not self._frames:  # the first one since the latest call
-            self._bytes, self._since = 0, monotonic()
-        self._frames, self._bytes = self._frames + 1, self._bytes + self._length
+        self._frames += 1
         if self._frames > MOST_FRAMES or self._bytes > MOST_BYTES:
-            what = f"{self._frames:,} frames of {self._bytes:,} bytes"
             self.fail(
-                WireError(
-                    f"{self} has sent {what} since its latest call, and neither a call nor an end"
-                )
+                f"has sent {self._frames:,} frames of {self._bytes:,} bytes since its latest call,"
+                " and neither a call nor an end"
             )
-        if monotonic() - self._since > MOST_WAITS * self.timeout:
-            what = f"has sent updates and removals for {MOST_WAITS * self.timeout:g} s, and neither a call nor an end"
-            self.fail(ProcessTimeoutError(f"{self} {what}"))
+        limit = MOST_WAITS * self.timeout
+        if monotonic() - self._running_since > limit:
+            self.fail(
+                f"has sent updates and removals for {limit:g} s, and neither a call nor an end",
+                ProcessTimeoutError,
+            )
 
-    def leave_to_rule(self, before: bytes = b"") -> Any:
-        """Answer the call by the process's rule, after other lines.
+    def reseed(self, seed: int) -> None:
+        """Send a seed for the process's generators with the next answer."""
+        self._seed = seed
+
+    def decide_by_rule(self) -> Model:
+        """Answer the call by the process's rule, at most once.
 
         Returns:
-            The rule's decision; ``RULE`` if the process does not tell it.
+            The rule's decision; ``RULE`` if the process does not report it.
 
         Raises:
-            WireError: The process tells another thing. Other errors are those of ``receive``.
+            WireError: The process sends another frame. Other errors are those of ``receive``.
         """
-        self.answer(before + encode_answer(self.number, RULE))
-        if "decided" not in self.can:
-            return RULE
-        frame = self.receive()
-        if (
-            frame.get("decided") != self.number
-            or type(frame["decided"]) is not int
-            or "value" not in frame
-        ):
-            due = f'{{"decided": {self.number}, "value": ...}} was due: what its rule decided'
-            self.refuse(frame, f"has sent {short_repr(frame)} where {due}")
-        return frame["value"]
+        if self.decided is None:
+            self.answer(RULE)
+            if "decided" not in self.can:
+                return RULE
+            frame = self.receive()
+            if "value" not in frame or not is_integer(frame.get("decided"), self.number):
+                due = f'{{"decided": {self.number}, "value": ...}}'
+                self._refuse(frame, f" where {due} was due: the decision of its rule")
+            self.decided = frame
+        return self.decided["value"]
 
-    def answer(self, lines: bytes) -> None:
-        """Send the lines that answer the call for which it waits."""
-        self.state = "running"
+    def answer(self, value: Model) -> None:
+        """Answer the call for which the process waits, by a decision or ``RULE``.
+
+        Raises:
+            WireError: The decision is not JSON data. Other errors are those of ``send``.
+        """
+        lines = encode_answer(self.number, value)
+        if self._seed is not None:
+            lines = encode({"reseed": self._seed}) + lines
+            self._seed = None
+        self._run()
         self.send(lines)
 
     def break_off(self) -> None:
-        """End the episode, if one is under way: a waiting process unwinds, a running one is ended."""
-        if self.usable and self.state == "waiting":
+        """End the episode, if one is under way: a waiting process unwinds, a running one ends."""
+        if not self.usable:
+            return
+        if self.state == "waiting":
             self.state = "stopped"
             with suppress(SimEnvError):  # it is ended then, and the next episode starts a new one
                 self.send(STOP)
-        elif self.usable and self.state == "running":
+        elif self.state == "running":
             self.close(patience=0.0)
 
     # -- lines ------------------------------------------------------------------------------------
 
-    def receive(self) -> dict[str, Any]:
+    def receive(self) -> Frame:
         """Wait for the next frame.
 
         Raises:
             ProcessDiedError: The process has ended, or has closed its pipe.
             ProcessTimeoutError: Nothing came.
-            WireError: It sent something that is not a frame.
+            RemoteError: It reported an error.
+            WireError: It sent a line that is not a frame.
         """
-        begun, reading = monotonic(), self._reading
-        line, complete, self._rest = self._rest.partition(b"\n")
+        deadline = monotonic() + self.timeout
+        line, complete, self._received = self._received.partition(b"\n")
         while not complete:
-            self._wait(self._output, reading, begun, "half a line" if line else "nothing")
-            chunk = os.read(reading, CHUNK)
+            sent = "half a line" if line else "nothing"
+            self._wait(self._reading, select.POLLIN, deadline, sent)
+            chunk = os.read(self._reading, CHUNK)
             if not chunk:
                 self._wait_for_exit(GRACE)
                 where = " in the middle of a line" if line else ""
-                self.fail(
-                    ProcessDiedError(f"{self} has closed its pipe{where}, and {self._exit()}")
-                )
-            part, complete, self._rest = chunk.partition(b"\n")
+                self.fail(f"has closed its pipe{where}, and {self._exit()}", ProcessDiedError)
+            part, complete, self._received = chunk.partition(b"\n")
             line += part
             if len(line) >= LONGEST:
-                self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
-        self._length = len(line)
+                self.fail(f"has sent a line of more than {LONGEST:,} bytes")
+        self._bytes += len(line)
         try:
-            return decode(line)
+            frame = decode(line)
         except WireError as error:
-            self.fail(WireError(f"{self} has sent {error}"))
+            self.fail(f"has sent {error}")
+        report = frame.get("error")
+        if isinstance(report, dict):
+            kind, text, trace = (report.get(key) or "" for key in ("type", "text", "trace"))
+            self.fail(f"has raised {kind or 'an error'}: {text}\n{trace}".rstrip(), RemoteError)
+        return frame
 
     def send(self, lines: bytes) -> None:
         """Send lines.
@@ -315,59 +355,50 @@ class Child:
 
         Raises:
             ProcessTimeoutError: It does not read.
+            ProcessDiedError: It was closed before.
+            WrongThreadError: This process is a fork of the one that started it.
         """
-        begun = 0.0
         if self._owner != os.getpid():
             raise WrongThreadError(
                 f"{self} belongs to the process from which this one was forked; reset() starts"
                 " another one"
             )
+        deadline = monotonic() + self.timeout
         while lines:
             try:
                 lines = lines[os.write(self._writing, lines) :]
             except BrokenPipeError:
                 return
             except BlockingIOError:
-                begun = begun or monotonic()
-                poll = self._poll(self._writing, select.POLLOUT)
-                self._wait(poll, self._writing, begun, "nothing and read nothing")
+                self._wait(self._writing, select.POLLOUT, deadline, "nothing and read nothing")
             except OSError as error:  # its input is closed
                 raise ProcessDiedError(f"{self} has been ended already") from error
 
     def _read_stderr(self) -> bool:
         """Read its standard error; return whether more may come."""
-        try:
-            chunk = os.read(self._stderr.fileno(), CHUNK)
-        except BlockingIOError:
-            return True
-        self._tail += chunk
-        del self._tail[:-STDERR_TAIL]
-        return bool(chunk)
+        chunk = self._stderr.read(CHUNK)  # None if nothing has come
+        self._stderr_tail += chunk or b""
+        del self._stderr_tail[:-STDERR_TAIL]
+        return chunk != b""
 
-    def _poll(self, descriptor: int, event: int) -> select.poll:
-        """Make an object that waits for an event and for standard error."""
+    def _wait(self, descriptor: int, event: int, deadline: float, sent: str) -> None:
+        """Wait for an event of a descriptor; read standard error meanwhile."""
+        stderr = self._stderr.fileno()
         poll = select.poll()
         poll.register(descriptor, event)
-        poll.register(self._stderr, select.POLLIN)
-        return poll
-
-    def _wait(self, poll: select.poll, descriptor: int, begun: float, sent: str) -> None:
-        """Wait until a descriptor is ready; read standard error meanwhile."""
-        found = False
-        while not found:
-            left = begun + self.timeout - monotonic()
-            # it takes no more than some weeks
-            for which, _ in poll.poll(1000 * max(0, min(left, 3600))):
-                if which == descriptor:
-                    found = True
-                elif not self._read_stderr():
-                    poll.unregister(which)
+        poll.register(stderr, select.POLLIN)
+        ready: dict[int, int] = {}
+        while descriptor not in ready:
+            left = deadline - monotonic()
             if left <= 0:  # even if data keeps trickling in
                 self.fail(
-                    ProcessTimeoutError(
-                        f"{self} {self._exit()}; it has sent {sent} for {self.timeout:g} s"
-                    )
+                    f"{self._exit()}; it has sent {sent} for {self.timeout:g} s",
+                    ProcessTimeoutError,
                 )
+            # at most an hour, because ``poll`` refuses more than some weeks
+            ready = dict(poll.poll(1000 * min(left, 3600)))
+            if stderr in ready and not self._read_stderr():
+                poll.unregister(stderr)
 
     # -- ends -------------------------------------------------------------------------------------
 
@@ -384,56 +415,52 @@ class Child:
         if self._popen.returncode is None:
             try:
                 os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-            except ChildProcessError:  # ``poll`` would say 0
-                self._popen.returncode = LOST
-        return self._popen.poll()
+            except ChildProcessError:  # ``poll`` returns 0 then
+                self._exit_code_lost = True
+        code = self._popen.poll()
+        return LOST if self._exit_code_lost else code
 
-    def fail(self, error: SimEnvError) -> NoReturn:
-        """End the process at once, and raise an error with the last part of its standard error."""
+    def fail(self, text: str, kind: type[SimEnvError] = WireError) -> NoReturn:
+        """End the process at once, and raise an error.
+
+        Its message has the name of the process, the text, and the last part of standard error.
+        """
         self.close(patience=0.0)
-        text = self._tail.decode(errors="replace").strip()
-        raise type(error)(
-            f"{error}. The end of its standard error:\n{text}" if text else str(error)
-        )
+        stderr = self._stderr_tail.decode(errors="replace").strip()
+        if stderr:
+            text = f"{text}. The end of its standard error:\n{stderr}"
+        raise kind(f"{self} {text}")
 
-    def refuse(self, frame: Mapping[str, Any], what: str) -> NoReturn:
-        """Raise the error that a frame reports, or say that the frame is invalid or not due."""
-        error = frame.get("error")
-        if not isinstance(error, dict):
-            self.fail(WireError(f"{self} {what}"))
-        kind, text, trace = (error.get(name) or "" for name in ("type", "text", "trace"))
-        where = f"\n{trace}" if trace else ""
-        self.fail(
-            RemoteError(f"the model in {self} has raised {kind or 'an error'}: {text}{where}")
-        )
+    def _refuse(self, frame: Frame, reason: str) -> NoReturn:
+        self.fail(f"has sent {short_repr(frame)}{reason}")
 
     def close_input(self) -> None:
         """Close its input; its output can still be received."""
         if self._writing >= 0:
             os.close(self._writing)
-            self._writing, self._without_input = -1, monotonic()  # when it was closed
+            self._writing = -1
+            self._input_closed_at = monotonic()
 
     def close(self, patience: float = GRACE) -> None:
-        """Close its pipes.
-
-        ``patience`` seconds after the end of its input at the latest, kill it and its group.
+        """Close its pipes; kill it and its group ``patience`` seconds after the end of its input.
 
         So processes whose inputs were closed together end together. A fork of this process only
         closes its copies of the pipes.
         """
         if self._closed:
             return
-        self._closed, mine = True, self._owner == os.getpid()
+        owned = self.usable
+        self._closed = True
         try:
             os.close(self._reading)
             self.close_input()
-            if mine:
-                self._wait_for_exit(self._without_input + patience - monotonic())
+            if owned:
+                self._wait_for_exit(self._input_closed_at + patience - monotonic())
         finally:  # also after an interrupt
-            if mine:
+            if owned:
                 self._kill()
             else:
-                self._popen.returncode = 0  # only its owner waits for it
+                self._popen.poll()  # because Popen warns of processes that it believes to run
             self._stderr.close()
 
     def _kill(self) -> None:
@@ -441,15 +468,14 @@ class Child:
         with suppress(ProcessLookupError, PermissionError):  # the group is empty
             os.killpg(self.pid, signal.SIGKILL)
         guardian.release(self.pid)
-        try:
+        with suppress(TimeoutExpired):
             self._popen.wait(GRACE)
-        except TimeoutExpired:
-            warn_user(f"{self} was killed and has not ended yet", ResourceWarning)
         self._read_stderr()
 
     def _wait_for_exit(self, patience: float) -> None:
         """Wait for its exit, at most ``patience`` seconds."""
-        deadline, pause = monotonic() + patience, 0.0005
+        deadline = monotonic() + patience
+        pause = 0.0005
         while self.exit_code() is None and monotonic() < deadline:
             self._read_stderr()
             sleep(pause)
@@ -479,13 +505,14 @@ _children: Final[WeakSet[Child]] = WeakSet()
 
 
 def _close_inputs() -> None:
-    """Close the inputs of all simulators, so that those that do not notice are waited for together."""
+    """Close the inputs of all simulators, so that this process waits for all of them together."""
     for child in list(_children):
         if child.usable:
             child.break_off()
             child.close_input()
 
 
-# registers the hook by which finalizers run at exit, for this one to run before it
+# ``atexit`` calls the latest function first: this one before the finalizers of simulations, whose
+# function the first finalizer registers.
 finalize(Child, int).detach()
 atexit.register(_close_inputs)

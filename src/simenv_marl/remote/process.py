@@ -1,9 +1,12 @@
-"""A simulation whose model runs in a process of its own, and calls for decisions over a pair of pipes."""
+"""A simulation whose model runs in another process, and requests decisions over a pair of pipes."""
+
+from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from math import inf
-from typing import Any
 from weakref import finalize
 
 import numpy as np
@@ -18,18 +21,16 @@ from ..errors import (
     ProcessError,
     SimulationError,
     UnknownPointError,
-    WireError,
-    annotate,
     short_repr,
 )
-from ..simulation import RULE, TRUNCATED, SimulationInterface
-from .calls import RemoteCall, point_functions
-from .child import Child
-from .wire import encode, encode_answer
+from ..simulation import TRUNCATED, Model, SimulationInterface
+from .calls import DecisionFunction, RemoteCall, RemoteEpisode, point_functions
+from .child import Child, StrPath
+from .wire import encode
 
 
 class ProcessSimulation(SimulationInterface):
-    """A simulation whose model runs in a process of its own (POSIX), in any language.
+    """A simulation whose model runs in another process (POSIX), in any language.
 
     The first ``reset`` starts the process. It plays one episode after the other, and is ended when
     the environment is closed or garbage-collected. It calls for decisions in its own order.
@@ -47,12 +48,12 @@ class ProcessSimulation(SimulationInterface):
 
     def __init__(
         self,
-        command: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        command: StrPath | Sequence[StrPath],
         points: Mapping[str, Definition],
         *,
         timeout: float = 30.0,
         env: Mapping[str, str] | None = None,
-        cwd: str | os.PathLike[str] | None = None,
+        cwd: StrPath | None = None,
     ) -> None:
         """Define how the process is started, and its decision points.
 
@@ -76,7 +77,7 @@ class ProcessSimulation(SimulationInterface):
             raise ProcessError(
                 "ProcessSimulation needs POSIX: elsewhere a process cannot inherit the descriptors"
             )
-        self.command = _words(command)
+        self.command = _command_words(command)
         if (
             isinstance(timeout, bool)
             or not isinstance(timeout, (int, float, np.number))
@@ -85,47 +86,33 @@ class ProcessSimulation(SimulationInterface):
             raise OptionValueError(
                 f"timeout must be a positive number of seconds, not {short_repr(timeout)}"
             )
-        words = [word for pair in env.items() for word in pair] if isinstance(env, Mapping) else []
-        if not (env is None or isinstance(env, Mapping)) or not all(
-            isinstance(word, str) for word in words
-        ):
+        if env is not None and not _are_variables(env):
             raise OptionValueError(
                 f"env must be a dict from names to values, all strings, not {short_repr(env)}"
             )
         if cwd is not None and not isinstance(cwd, (str, os.PathLike)):
             raise OptionValueError(f"cwd must be the path of a folder, not {short_repr(cwd)}")
-        self.timeout, self.env, self.cwd = float(timeout), None if env is None else dict(env), cwd
+        self.timeout = float(timeout)
+        self.env = None if env is None else dict(env)
+        self.cwd = cwd
         self.points = _by_function(points)
-        self.result: Any = None
+        self.result: Model = None
         self._child: Child | None = None
-        self._finalizer: Any = None  # ends the process with the simulation
-        self._clear()
+        self._episode: RemoteEpisode | None = None
+        # ends the process with the simulation
+        self._finalizer: finalize[[float], ProcessSimulation] | None = None
 
-    def _clear(self) -> None:
-        """Forget the latest episode."""
-        # the first frame of an episode that does not run yet
-        self._frame: dict[str, Any] | None = None
-        # the latest call of each entity at each point
-        self._calls: dict[tuple[str, Any], RemoteCall] = {}
-        # those of entities that are going to decide
-        self._expected: dict[tuple[str, Any], RemoteCall] = {}
-        self._time: float | None = None
-        self._seed: int | None = None  # the seed to send with the next answer
-
-    def __getstate__(self) -> dict[str, Any]:
-        points = {
-            getattr(function, BY_NAME): definition for function, definition in self.points.items()
-        }
-        of_this_process = dict.fromkeys(("_child", "_finalizer", "_frame", "_calls", "_expected"))
+    def __getstate__(self) -> dict[str, Model]:
+        points = {name: self.points[function] for name, function in self._functions().items()}
+        of_this_process = dict.fromkeys(("_child", "_episode", "_finalizer"))
         return {**vars(self), "points": points, **of_this_process}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, Model]) -> None:
         vars(self).update(state, points=_by_function(state["points"]))
-        self._clear()
 
     # -- episodes ---------------------------------------------------------------------------------
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def reset(self, seed: int | None = None, options: dict[str, Model] | None = None) -> None:
         """Begin an episode, in the existing process or in a new one.
 
         Args:
@@ -140,9 +127,9 @@ class ProcessSimulation(SimulationInterface):
         """
         start = encode({"start": {"seed": seed, "options": options or {}}})
         self.result = None
-        self._clear()
-        origin = self._origin()
-        child = self._child or acquire(origin)
+        self._episode = None
+        launch = self._launch()
+        child = self._child or acquire(launch)
         if child is not None:
             child.break_off()
             try:
@@ -152,14 +139,24 @@ class ProcessSimulation(SimulationInterface):
             except ProcessDiedError:
                 if child.exit_code() != 0:
                     raise
-        child = Child(self.command, self.timeout, self.env, self.cwd)
-        child.origin = origin
-        self._begin(child, start)
+        self._begin(Child(*launch), start)
 
-    def _origin(self) -> tuple[Any, ...]:
-        """Return a value that is equal for processes that can replace each other, if they are started now."""
-        env = dict(os.environ if self.env is None else self.env)
-        return self.command, self.timeout, env, os.path.abspath(self.cwd or "")
+    def _begin(self, child: Child, start: bytes) -> None:
+        """Begin an episode in a process with a line, and wait for the first frame."""
+        self._use(child)
+        functions = self._functions()
+        missing = [name for name in functions if name not in child.points]
+        if missing:
+            existing = ", ".join(sorted(child.points)) or "none"
+            child.fail(
+                f"has no decision point {', '.join(missing)}; it has {existing}",
+                UnknownPointError,
+            )
+        try:
+            self._episode = RemoteEpisode(child, functions, start)
+        except BaseException:
+            child.break_off()
+            raise
 
     def _use(self, child: Child | None) -> None:
         """Use a process, or none, from now on."""
@@ -168,25 +165,7 @@ class ProcessSimulation(SimulationInterface):
         self._child = child
         self._finalizer = None if child is None else finalize(self, child.close)
 
-    def _begin(self, child: Child, start: bytes) -> None:
-        """Begin an episode in a process with a line, and wait for the first frame."""
-        self._use(child)
-        missing = [name for name in self._functions() if name not in child.points]
-        if missing:
-            has = ", ".join(sorted(child.points)) or "none"
-            child.fail(
-                UnknownPointError(
-                    f"{child} has no decision point {', '.join(missing)}; it has {has}"
-                )
-            )
-        try:
-            self._frame = child.begin(start)
-        except BaseException:
-            child.break_off()
-            raise
-        self._time = child.time
-
-    def run(self) -> Any:
+    def run(self) -> Model:
         """Run the episode in the process; its calls become calls of the points' decision functions.
 
         Returns:
@@ -198,25 +177,18 @@ class ProcessSimulation(SimulationInterface):
             ProcessDiedError, ProcessTimeoutError: It has ended, or does not answer.
             SimulationError: No episode was begun.
         """
-        child, frame, self._frame = self._child, self._frame, None
-        if child is None or frame is None:
+        child = self._child
+        episode = self._episode
+        if child is None or episode is None or episode.begun:
             raise SimulationError("run() runs each episode once: call reset() first")
-        functions = self._functions()
         try:
-            while "end" not in frame:
-                self._time = child.time
-                for item in frame.get("expect", [frame]):
-                    if item["point"] in functions:
-                        self._handle(child, item, functions[item["point"]])
-                    elif "decide" in item:
-                        child.leave_to_rule()
-                frame = child.next_frame()
+            end = episode.run()
         except BaseException:
             if self._child is child:  # otherwise it may serve another simulation already
                 child.break_off()
             raise
-        self.result = frame["end"].get("result")
-        return TRUNCATED if frame["end"].get("truncated") else None
+        self.result = end.get("result")
+        return TRUNCATED if end.get("truncated") else None
 
     def close(self, last: bool = True) -> None:
         """End the process, if no other episode follows.
@@ -228,7 +200,7 @@ class ProcessSimulation(SimulationInterface):
         if last and child is not None:
             self._use(None)
             child.break_off()
-            if not release(child.origin, child):
+            if not release(child.launch, child):
                 child.close()
 
     @property
@@ -237,9 +209,9 @@ class ProcessSimulation(SimulationInterface):
 
         The attribute is missing if the process tells no time.
         """
-        if self._time is None:
+        if self._episode is None or self._episode.time is None:
             raise AttributeError("the process has not sent a time")
-        return lambda: self._time  # type: ignore[return-value]
+        return partial(getattr, self._episode, "time")
 
     @property
     def expected_calls(self) -> Callable[[str], list[tuple[RemoteCall]]]:
@@ -247,14 +219,13 @@ class ProcessSimulation(SimulationInterface):
 
         Missing if the process did not announce "expect".
         """
-        if self._child is None or "expect" not in self._child.can:
+        episode = self._episode
+        if episode is None or self._child is None or "expect" not in self._child.can:
             raise AttributeError('the process has not announced "expect" in its hello')
-        return lambda point: [
-            (call,) for (name, _), call in self._expected.items() if name == point
-        ]
+        return episode.expected_calls
 
     def reseed(self, seed: int) -> None:
-        """Ask the process to reseed its generators, so that it draws new random numbers from here on.
+        """Ask the process to reseed its generators, for new random numbers from here on.
 
         Raises:
             BranchError: The process did not announce "reseed".
@@ -265,105 +236,46 @@ class ProcessSimulation(SimulationInterface):
                 f'{child or "a process that was not started"} has not announced "reseed" in its'
                 " hello"
             )
-        self._seed = int(seed)
+        child.reseed(int(seed))
 
-    # -- frames -----------------------------------------------------------------------------------
+    def _launch(self) -> tuple[list[str], float, dict[str, str], str]:
+        """Return the arguments of ``Child``, equal for processes that can replace each other."""
+        env = dict(os.environ if self.env is None else self.env)
+        return self.command, self.timeout, env, os.path.abspath(self.cwd or "")
 
-    def _handle(
-        self, child: Child, frame: dict[str, Any], function: Callable[[RemoteCall], Any]
-    ) -> None:
-        """Handle a frame of an entity at a point, or an item of an "expect", given the point's decision function."""
-        key = frame["point"], frame["entity"]
-        call = self._calls.get(key)
-        if call is None:
-            if "update" in frame or "remove" in frame:
-                return  # an entity without a call so far
-            call = self._calls[key] = RemoteCall(*key)
-        if "remove" in frame:
-            self._expected.pop(key, None)
-            del self._calls[key]
-            point_functions(call.point).remove(call)
-            return
-        call.__dict__, call.time = frame.get("args") or {}, child.time
-        if "decide" in frame:
-            self._expected.pop(key, None)
-            self._decide(child, call, function)
-        elif "update" not in frame:
-            self._expected[key] = call
-
-    def _decide(
-        self, child: Child, call: RemoteCall, function: Callable[[RemoteCall], Any]
-    ) -> None:
-        """Get the decision of a call, and send it.
-
-        If the rule is run, the process decides at once.
-        """
-        ruled: list[Any] = []
-
-        def rule() -> Any:
-            if not ruled:
-                ruled.append(child.leave_to_rule(self._reseeding()))
-            return ruled[0]
-
-        call._rule = rule if "decided" in child.can else None
-        try:
-            value = function(call)
-        finally:
-            call._rule = None
-        if ruled:
-            if value is not ruled[0] and value is not RULE:
-                raise SimulationError(
-                    f"the rule of {call.point} has decided {short_repr(ruled[0])} for"
-                    f" {call.entity!r}, and the process continues with that: {short_repr(value)}"
-                    " cannot replace it. A handler or apply that asks the rule must return what it"
-                    " decided; of a call that is split, answer all items by RULE, or none"
-                )
-        elif value is RULE:
-            rule()
-        else:
-            try:
-                line = encode_answer(child.number, value)
-            except WireError as error:
-                annotate(error, f"simenv_marl: in the decision of {call.entity!r} at {call.point}")
-                raise
-            child.answer(self._reseeding() + line)
-
-    def _reseeding(self) -> bytes:
-        """Return the line that reseeds the process, if one is due."""
-        seed, self._seed = self._seed, None
-        return b"" if seed is None else encode({"reseed": seed})
-
-    def _functions(self) -> dict[str, Any]:
+    def _functions(self) -> dict[str, DecisionFunction]:
         """Return the decision functions of the points, by name."""
         return {getattr(function, BY_NAME): function for function in self.points}
 
 
-def _words(command: Any) -> list[str]:
+def _command_words(
+    command: StrPath | Sequence[StrPath],
+) -> list[str]:
     """Return the program and its arguments, as strings."""
     words = [command] if isinstance(command, (str, os.PathLike)) else command
-    if (
-        not isinstance(words, Sequence)
-        or not words
-        or not all(isinstance(word, (str, os.PathLike)) for word in words)
-    ):
-        raise OptionValueError(
-            "command must be a program and its arguments, a list of strings, not"
-            f" {short_repr(command)}"
-        )
-    return [os.fspath(word) for word in words]
+    with suppress(TypeError):
+        if words:
+            return [os.fspath(word) for word in words]
+    raise OptionValueError(
+        f"command must be a program and its arguments, a list of strings, not {short_repr(command)}"
+    )
 
 
-def _by_function(points: Any) -> dict[Any, Definition]:
+def _are_variables(env: Mapping[str, str]) -> bool:
+    """Return whether a user's environment variables are a mapping of strings."""
+    return isinstance(env, Mapping) and all(isinstance(word, str) for word in [*env, *env.values()])
+
+
+def _by_function(points: Mapping[str, Definition]) -> dict[DecisionFunction, Definition]:
     """Return the definitions by the decision functions of their names."""
     if not isinstance(points, Mapping) or not points:
         raise DefinitionError(
-            "points must be a dict from the process's names to definitions, not"
-            f" {short_repr(points)}"
+            f"points must be a dict from names to definitions, not {short_repr(points)}"
         )
     for name, definition in points.items():
         if not isinstance(name, str) or not name or not isinstance(definition, Definition):
             raise DefinitionError(
-                "points must be a dict from the process's names to what make_step returns, not"
-                f" {short_repr(name)}: {short_repr(definition)}"
+                "points must be a dict from the process's names to definitions, the results of"
+                f" make_step, not {short_repr(name)}: {short_repr(definition)}"
             )
     return {point_functions(name).decide: definition for name, definition in points.items()}

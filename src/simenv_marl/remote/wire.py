@@ -1,7 +1,8 @@
-"""The wire between an environment and a simulator in another process: one JSON object, a *frame*, per line, version 1.
+"""The protocol between an environment and a simulator in another process, version 1.
 
-It only uses what every language can represent: keys are strings, and numbers that are not finite
-are sent as ``{"float": "nan"}``, ``{"float": "inf"}`` and ``{"float": "-inf"}``.
+Each line is one JSON object, a *frame*. Frames use only data that every language can represent:
+keys are strings, and numbers that are not finite are sent as ``{"float": "nan"}``,
+``{"float": "inf"}`` and ``{"float": "-inf"}``.
 """
 
 from __future__ import annotations
@@ -9,23 +10,31 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping
 from math import inf, isfinite, nan
-from types import NoneType
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, TypeAlias
 
 import numpy as np
 
 from ..errors import WireError, describe_error, short_repr
-from ..simulation import RULE
+from ..simulation import RULE, Model
+
+Frame: TypeAlias = dict[str, Any]
+"""A JSON object that is sent or was received."""
+
+Entity: TypeAlias = str | int | None
+"""The name of an entity in its simulator; None for a call without an entity."""
+
+Json: TypeAlias = "str | int | float | list[Json] | dict[str, Json] | None"
 
 VERSION: Final = 1
 
 DESCRIPTORS: Final = "SIMENV_MARL_FDS"
-"""The environment variable that has the numbers of a simulator's two descriptors, ``"R,W"``."""
+"""The environment variable with the numbers of a simulator's two descriptors, ``"R,W"``."""
 
 LONGEST: Final = 16 << 20
 """The largest number of bytes in a line."""
 
 _CALL: Final = frozenset({"point", "entity", "time", "args"})
+"""The keys of a call, and of an entity's update or removal."""
 
 KEYS: Final[Mapping[str, frozenset[str]]] = {
     "hello": frozenset({"points", "can"}),
@@ -39,19 +48,19 @@ KEYS: Final[Mapping[str, frozenset[str]]] = {
 }
 """The kinds of frames that a simulator sends, and the other keys of each."""
 
-RESERVED: Final = frozenset({"entity", "point", "time"})
-"""What a call has besides its arguments. No argument can have such a name."""
+_RESERVED: Final = _CALL - {"args"}
+"""Names that no argument can have, because calls have other attributes of these names."""
 
 _NOT_FINITE: Final = {"nan": nan, "inf": inf, "-inf": -inf}
 
 STOP: Final = b'{"stop":true}\n'
 
 
-def encode(frame: Mapping[str, Any]) -> bytes:
+def encode(frame: Mapping[str, Model]) -> bytes:
     """Return the line of a frame.
 
     Raises:
-        WireError: Something in it cannot be sent, or it is too long.
+        WireError: The frame contains a value that is not JSON data, or is too long.
     """
     try:
         line = _ENCODER.encode(_to_json(frame)).encode() + b"\n"
@@ -68,7 +77,7 @@ def encode(frame: Mapping[str, Any]) -> bytes:
     return line
 
 
-def encode_answer(number: int, value: Any) -> bytes:
+def encode_answer(number: int, value: Model) -> bytes:
     """Return the line that answers a call with a decision; ``RULE`` leaves it to the process.
 
     Raises:
@@ -76,49 +85,42 @@ def encode_answer(number: int, value: Any) -> bytes:
     """
     if value is RULE:
         return b'{"act":%d,"rule":true}\n' % number
-    if type(value) is int:  # most decisions are integers, which need no conversion
-        return b'{"act":%d,"value":%d}\n' % (number, value)
-    if type(value) is float and value - value == 0.0:
+    if type(value) in (int, float) and abs(value) < 1e300:  # most decisions need no conversion
         return b'{"act":%d,"value":%a}\n' % (number, value)
     return encode({"act": number, "value": value})
 
 
-def _to_json(value: Any, where: str = "") -> Any:
-    """Convert a value to JSON data; ``where`` is its path in the frame, for the error."""
-    if value is None or isinstance(value, (str, bool, int)):
+def _to_json(value: Model, path: str = "") -> Json:
+    """Convert a value to JSON data; ``path`` is its place in the frame, for the error."""
+    if value is None or isinstance(value, (str, int)):
         return value
     if isinstance(value, float):
         return float(value) if isfinite(value) else {"float": repr(float(value))}
     if isinstance(value, (np.ndarray, np.generic)):
-        return _to_json(value.tolist(), where)
+        return _to_json(value.tolist(), path)
     if isinstance(value, (list, tuple)):
-        return [_to_json(item, f"{where}[{place}]") for place, item in enumerate(value)]
+        return [_to_json(item, f"{path}[{index}]") for index, item in enumerate(value)]
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
-                raise WireError(
-                    f"{short_repr(key)} cannot be a key in a message to a process; keys must be"
-                    f" strings{_at(where)}"
-                )
-        return {key: _to_json(item, f"{where}[{key!r}]") for key, item in value.items()}
-    raise WireError(f"{short_repr(value)} cannot be sent to a process: it is not JSON{_at(where)}")
+                raise _not_json(key, path, "the keys of JSON must be strings")
+        return {key: _to_json(item, f"{path}[{key!r}]") for key, item in value.items()}
+    raise _not_json(value, path, "it is not JSON")
 
 
-def _at(where: str) -> str:
-    return f" (at {where})" if where else ""
+def _not_json(value: Model, path: str, reason: str) -> WireError:
+    place = f" (at {path})" if path else ""
+    return WireError(f"{short_repr(value)} cannot be sent to a process: {reason}{place}")
 
 
-def decode(line: bytes) -> dict[str, Any]:
+def decode(line: bytes) -> Frame:
     """Return the frame of a line.
 
     Raises:
-        WireError: The line is not a JSON object in UTF-8.
+        WireError: The line is not a JSON object in UTF-8. The message completes "it has sent ...".
     """
     try:
-        text = line.decode().strip()
-        frame, end = (_WITH_OBJECTS if '"float"' in text else _DECODER).raw_decode(text)
-        if end < len(text):
-            raise ValueError(f"more follows after {end} characters")
+        frame = _DECODER.decode(line.decode())
     except (ValueError, RecursionError) as error:
         raise WireError(
             f"a line that is not JSON in UTF-8 ({describe_error(error)}): {short_repr(line)}"
@@ -128,63 +130,77 @@ def decode(line: bytes) -> dict[str, Any]:
     return frame
 
 
-def check_frame(frame: dict[str, Any], points: Collection[str]) -> float | None:
-    """Check what is in a frame of a simulator that has these points, but not whether the frame is due.
+def check_frame(frame: Frame, points: Collection[str]) -> float | None:
+    """Check a frame of a simulator with these points, but not whether the frame is due.
 
     Calls, updates and removals get an item "entity", and so do the items of "expect".
 
     Returns:
-        The time that it tells; None if it tells none.
+        The latest time in the frame; None if there is none.
 
     Raises:
-        WireError: It is wrong. The text continues "the process has".
+        WireError: The frame is invalid. The message completes "it has ...".
     """
-    if len(kinds := KEYS.keys() & frame.keys()) > 1:
-        text = f"sent {' and '.join(sorted(kinds))} in one frame, {short_repr(frame)}; each needs a line of its own"
-        raise WireError(text)
-    if "end" in frame:
-        end = frame["end"]
-        if not isinstance(end, dict) or type(end.get("truncated", False)) is not bool:
-            what = 'it must be an object with "truncated" (true or false) and "result"'
-            raise WireError(f"sent the end {short_repr(end)}; {what}")
-    elif "expect" in frame:
-        items = frame["expect"]
-        if not isinstance(items, list) or not all(
-            isinstance(item, dict) and item.keys() <= _CALL for item in items
-        ):
-            what = 'it must be a list of objects with "point", "entity" and "args"'
-            raise WireError(f'sent "expect" with {short_repr(items)}; {what}')
-        times = [_check_call(item, item.get("entity"), points) for item in items]
-        return next((time for time in reversed(times) if time is not None), None)
-    elif kinds & {"decide", "update", "remove"}:
-        entity = (
-            frame.get("entity") if "decide" in frame else frame.get("update", frame.get("remove"))
+    kinds = sorted(KEYS.keys() & frame.keys())
+    if len(kinds) > 1:
+        raise WireError(
+            f"sent {' and '.join(kinds)} in one frame, {short_repr(frame)}; each needs a"
+            " separate line"
         )
-        return _check_call(frame, entity, points)
-    return None
+    calls: list[Frame] = []
+    if "end" in frame:
+        _check_end(frame["end"])
+    elif "expect" in frame:
+        calls = frame["expect"]
+        if not isinstance(calls, list) or not all(map(_is_call, calls)):
+            raise WireError(
+                f'sent "expect" with {short_repr(calls)}; it must be a list of objects with'
+                ' "point", "entity" and "args"'
+            )
+    elif kinds and KEYS[kinds[0]] is _CALL:
+        calls = [frame]
+    times = [_check_call(call, points) for call in calls]
+    known = [time for time in times if time is not None]
+    return known[-1] if known else None
 
 
-def _check_call(frame: dict[str, Any], entity: Any, points: Collection[str]) -> float | None:
-    """Check the point, entity, arguments and time of a frame.
+def _check_end(end: Json) -> None:
+    if not isinstance(end, dict) or type(end.get("truncated", False)) is not bool:
+        raise WireError(
+            f'sent the end {short_repr(end)}; it must be an object with "truncated" (true or false)'
+            ' and "result"'
+        )
 
-    Note the entity in it, and return the time.
+
+def _is_call(item: Json) -> bool:
+    return isinstance(item, dict) and item.keys() <= _CALL
+
+
+def _check_call(frame: Frame, points: Collection[str]) -> float | None:
+    """Check the point, the entity, the arguments and the time of a frame.
+
+    Set its item "entity", and return its time.
     """
-    name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
+    name = frame.get("point")
+    entity = frame.get("update", frame.get("remove", frame.get("entity")))
+    arguments = {} if frame.get("args") is None else frame["args"]
+    time = frame.get("time")
     if not isinstance(name, str) or name not in points:
         raise WireError(f"named the point {short_repr(name)}, which is not in its hello")
-    if type(entity) not in (str, int, NoneType):
+    if entity is not None and type(entity) not in (str, int):
         raise WireError(
             f"sent the entity {short_repr(entity)} for {name}; an entity must be a string or an"
             " integer"
         )
-    if arguments is not None and not isinstance(arguments, dict):
+    if not isinstance(arguments, dict):
         raise WireError(f"sent args for {name} that are not an object: {short_repr(arguments)}")
-    if arguments and not RESERVED.isdisjoint(arguments):
-        what = min(RESERVED & arguments.keys())
+    reserved = _RESERVED & arguments.keys()
+    if reserved:
         raise WireError(
-            f"sent an argument {what!r} for {name}; calls have that besides: rename the argument"
+            f"sent an argument {min(reserved)!r} for {name}; calls have another attribute of this"
+            " name: rename the argument"
         )
-    if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
+    if type(time) is int and abs(time) < 1 << 1000:  # larger ones may exceed floats
         time = float(time)
     if time is not None and type(time) is not float:
         raise WireError(f"sent the time {short_repr(time)} for {name}, which is not a number")
@@ -192,18 +208,22 @@ def _check_call(frame: dict[str, Any], entity: Any, points: Collection[str]) -> 
     return time
 
 
-def _number(found: dict[str, Any]) -> Any:
-    """Return the non-finite number that an object represents, or the object itself."""
-    name = found.get("float")
-    return _NOT_FINITE.get(name, found) if len(found) == 1 and isinstance(name, str) else found
+def is_integer(value: Json, number: int) -> bool:
+    """Return whether JSON data is this integer, and neither a boolean nor a float."""
+    return type(value) is int and value == number
 
 
-def _refuse(constant: str) -> NoReturn:
+def _read_object(item: Frame) -> Frame | float:
+    """Return the non-finite number that a JSON object represents, or the object itself."""
+    name = item.get("float")
+    return _NOT_FINITE.get(name, item) if len(item) == 1 and isinstance(name, str) else item
+
+
+def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(
-        f"{constant} is not in JSON; numbers that are not finite travel as {{'float': 'nan'}}"
+        f"{name} is not in JSON; send numbers that are not finite as {{'float': 'nan'}}"
     )
 
 
 _ENCODER: Final = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False)
-_DECODER: Final = json.JSONDecoder(parse_constant=_refuse)
-_WITH_OBJECTS: Final = json.JSONDecoder(parse_constant=_refuse, object_hook=_number)
+_DECODER: Final = json.JSONDecoder(parse_constant=_refuse_constant, object_hook=_read_object)

@@ -53,22 +53,17 @@ class CallbackGuard:
             finally:
                 self._error = None
 
-    def _record(self, error: BaseException) -> None:
-        """Record the first exception, and stop C."""
-        if self._error is None:
+    def _record(self, error: BaseException, replace: bool = False) -> None:
+        """Record the first exception, or one that replaces it, and stop C."""
+        if self._error is None or replace:
             self._error = error
             self._stop()
-
-    def _interrupt(self, error: BaseException) -> None:
-        """Record an interrupt, even in place of the exit from an episode."""
-        self._record(error)
-        self._error = error
 
 
 def _record_interrupt(
     print_error: Callable[[sys.UnraisableHookArgs], object], unraisable: sys.UnraisableHookArgs
 ) -> None:
-    """Record Ctrl-C with the guard of the callback in which Python raised it; print other errors.
+    """Record Ctrl-C with the guard of its callback; print other errors.
 
     Ctrl-C mostly arrives while C runs. Python raises it before the first line of the next callback,
     and passes it to this hook.
@@ -77,6 +72,6 @@ def _record_interrupt(
     error = unraisable.exc_value
     guard = traceback and traceback.tb_frame.f_locals.get("self")
     if isinstance(guard, CallbackGuard) and guard._depth and error:
-        guard._interrupt(error)
+        guard._record(error, replace=True)  # even in place of the exit from an episode
     else:
         print_error(unraisable)

@@ -1,15 +1,13 @@
-"""The calls of a simulator's decision points: as mappings receive them, and as decision functions.
+"""The calls of a simulator's decision points.
 
-``RemoteEpisode`` turns the frames of an episode into calls of the decision functions that
-``point_functions`` makes. Their argument is a ``RemoteCall``.
+``RemoteEpisode`` turns the frames of an episode into calls of decision functions, which
+``decision_function`` makes. Their argument, which mappings receive, is a ``RemoteCall``.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from functools import cache
 from types import CodeType, FunctionType
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 from weakref import WeakKeyDictionary
 
 from ..decision import BY_NAME, point_for
@@ -29,7 +27,7 @@ class RemoteCall:
 
     Attributes:
         point: The name of the decision point.
-        entity: The deciding entity, as the process names it; None if it names none.
+        entity: The name of the deciding entity in the process; None without an entity.
         time: The process's time; None if it sent none.
     """
 
@@ -41,11 +39,9 @@ class RemoteCall:
         self.time: float | None = None
 
     def __getitem__(self, name: str) -> Model:
-        if name in ("entity", "time"):
+        if name in self.__dict__ or name in ("entity", "time"):
             return getattr(self, name)
-        if name not in self.__dict__:
-            raise KeyError(self._missing(name))
-        return self.__dict__[name]
+        raise KeyError(self._missing(name))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.__dict__)
@@ -59,8 +55,10 @@ class RemoteCall:
         raise AttributeError(self._missing(name))
 
     def __repr__(self) -> str:
-        arguments = "".join(f", {name}={value!r}" for name, value in self.__dict__.items())
-        return f"RemoteCall({self.point}, entity={self.entity!r}, time={self.time!r}{arguments})"
+        return (
+            f"RemoteCall({self.point}, entity={self.entity!r}, time={self.time!r},"
+            f" arguments={self.__dict__})"
+        )
 
     def _missing(self, name: str) -> str:
         return (
@@ -77,33 +75,26 @@ class RemoteCall:
 
 DecisionFunction: TypeAlias = Callable[[RemoteCall], Model]
 
-
 _DECIDING: Final[WeakKeyDictionary[RemoteCall, Child]] = WeakKeyDictionary()
 """The processes that wait for the decisions of calls, by call."""
 
 
-class PointFunctions(NamedTuple):
-    """The functions that represent a decision point of a simulator."""
-
-    decide: DecisionFunction
-    """The decision function.
+@cache
+def decision_function(name: str) -> DecisionFunction:
+    """Return the function that represents decision points of that name, in all simulators.
 
     Its rule has the process decide, and returns the decision; ``RULE`` if the process does not
     report it.
     """
-
-    remove: DecisionFunction
-    """Ends the agent of an entity that is gone."""
+    hook = _named_hook(_decide_by_rule.__code__, name)
+    point_for(hook).removed_by[removal_function(name)] = None
+    return hook.make_wrapper()
 
 
 @cache
-def point_functions(name: str) -> PointFunctions:
-    """Return the functions that represent decision points of that name, in all simulators."""
-    decide_hook = _named_hook(_decide_by_rule.__code__, name)
-    remove_hook = _named_hook(_remove.__code__, f"{name} (removed)")
-    functions = PointFunctions(decide_hook.make_wrapper(), remove_hook.make_wrapper())
-    point_for(decide_hook).removed_by[functions.remove] = None
-    return functions
+def removal_function(name: str) -> DecisionFunction:
+    """Return the function that ends the agent of an entity at decision points of that name."""
+    return _named_hook(_remove.__code__, f"{name} (removed)").make_wrapper()
 
 
 def _decide_by_rule(call: RemoteCall) -> Model:
@@ -138,12 +129,13 @@ class RemoteEpisode:
         begun: Whether ``run`` was called.
     """
 
-    def __init__(
-        self, child: Child, functions: Mapping[str, DecisionFunction], start: bytes
-    ) -> None:
-        """Begin an episode in a process with a line; ``functions`` are those of its points."""
+    def __init__(self, child: Child, points: Collection[str], start: bytes) -> None:
+        """Begin an episode in a process with a line.
+
+        The process decides itself at points other than these.
+        """
         self._child = child
-        self._functions = functions
+        self._points = points
         self._calls: dict[tuple[str, Entity], RemoteCall] = {}
         self._expected: dict[RemoteCall, None] = {}
         self._first_frame = child.begin(start)
@@ -162,7 +154,7 @@ class RemoteEpisode:
         while "end" not in frame:
             self.time = self._child.time
             for item in frame.get("expect", [frame]):
-                if item["point"] in self._functions:
+                if item["point"] in self._points:
                     self._handle(item)
                 elif "decide" in item:
                     self._child.decide_by_rule()
@@ -171,7 +163,7 @@ class RemoteEpisode:
         return end
 
     def expected_calls(self, point: str) -> list[tuple[RemoteCall]]:
-        """Return the calls of a point that the process has announced and not made yet."""
+        """Return the calls of a point that the process has announced and has not made yet."""
         return [(call,) for call in self._expected if call.point == point]
 
     def _handle(self, frame: Frame) -> None:
@@ -185,7 +177,7 @@ class RemoteEpisode:
         if "remove" in frame:
             self._expected.pop(call, None)
             del self._calls[key]
-            point_functions(call.point).remove(call)
+            removal_function(call.point)(call)
             return
         call._update(frame.get("args") or {}, self._child.time)
         if "decide" in frame:
@@ -199,7 +191,7 @@ class RemoteEpisode:
         child = self._child
         _DECIDING[call] = child
         try:
-            value = self._functions[call.point](call)
+            value = decision_function(call.point)(call)
         finally:
             del _DECIDING[call]
         if child.decided is not None:

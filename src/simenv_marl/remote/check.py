@@ -1,17 +1,14 @@
 """``check_wire``, for authors of clients: tests whether a simulator follows the protocol."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from math import inf
 from subprocess import DEVNULL, TimeoutExpired, run
-from types import MappingProxyType
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 from ..core import is_seed
 from ..errors import (
@@ -24,11 +21,7 @@ from ..errors import (
     short_repr,
 )
 from .child import MOST_FRAMES, Child
-from .wire import KEYS, Entity, Frame, Json, decode, encode
-
-OK = "ok"
-NOTE = "note"
-WRONG = "wrong"
+from .wire import KEYS, Frame, Json, decode, encode
 
 PADDING: Final = 1 << 20
 """The number of blanks in a long line, which is longer than any pipe's buffer."""
@@ -51,7 +44,9 @@ GUESSES: Final[Sequence[Sequence[Json]]] = ((0, 1, 100), (False, True))
 HIGH: Final = 1 << 30
 """The highest bit of a seed."""
 
-Outcome: TypeAlias = tuple[str, str]
+Verdict: TypeAlias = Literal["ok", "note", "wrong"]
+
+Outcome: TypeAlias = tuple[Verdict, str]
 """The verdict of a test that has not failed, "ok" or "note", and its text."""
 
 Frames: TypeAlias = list[Frame]
@@ -59,10 +54,10 @@ Frames: TypeAlias = list[Frame]
 
 
 class Finding(NamedTuple):
-    """The outcome of one test: the verdict is "ok", "wrong", or "note" for what may be intended."""
+    """The outcome of one test: "ok", "wrong", or "note" for a result that may be intended."""
 
     tried: str
-    verdict: str
+    verdict: Verdict
     text: str
 
 
@@ -75,7 +70,7 @@ class WireReport:
     @property
     def ok(self) -> bool:
         """Whether no test has failed."""
-        return all(finding.verdict != WRONG for finding in self.findings)
+        return all(finding.verdict != "wrong" for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as JSON data."""
@@ -83,7 +78,7 @@ class WireReport:
 
     def __str__(self) -> str:
         lines = [f"{verdict:5}  {tried}: {text}" for tried, verdict, text in self.findings]
-        wrong = sum(finding.verdict == WRONG for finding in self.findings)
+        wrong = sum(finding.verdict == "wrong" for finding in self.findings)
         summary = f"{wrong} of {len(lines)} tests failed" if wrong else "nothing is wrong"
         return "\n".join([*lines, "", summary])
 
@@ -134,7 +129,8 @@ class _Check:
         self._longest = longest
         self._timeout = timeout
         self._first: Frames = []  # an episode by the rule, in a new process
-        self._calls: Frames = []  # the "decide" frames of it
+        self._calls: Frames = []  # its "decide" frames
+        self._can: frozenset[str] = frozenset()
         self._draws = False  # whether other random numbers are known to change an episode
 
     def run(self) -> WireReport:
@@ -144,9 +140,9 @@ class _Check:
             try:
                 verdict, text = test()
             except ProcessError as error:
-                verdict, text = WRONG, str(error)
+                verdict, text = "wrong", str(error)
             findings.append(Finding(name, verdict, text))
-            if verdict == WRONG and not self._calls:
+            if verdict == "wrong" and not self._calls:
                 break
         return WireReport(findings)
 
@@ -167,8 +163,9 @@ class _Check:
         yield "the end of its input between episodes", self._end_of_input
         yield "a run without an environment", self._plain_run
 
-    def _child(self) -> closing[Child]:
-        return closing(Child(self._command, self._timeout))
+    def _child(self, child: Child | None = None) -> AbstractContextManager[Child]:
+        """Return a process, or a new one, which is closed at the end of the block."""
+        return nullcontext(child) if child else closing(Child(self._command, self._timeout))
 
     def _middle(self) -> int:
         """Return the number of a call in the middle of the first episode."""
@@ -176,50 +173,51 @@ class _Check:
 
     def _play(
         self,
-        child: Child,
+        child: Child | None = None,
         *,
         start: bytes | None = None,
         stop: int = 0,
-        seeds: Mapping[int, int] = MappingProxyType({}),
-        decisions: Mapping[str, Json] = MappingProxyType({}),
+        reseed: int | None = None,
+        point: str | None = None,
+        value: Json = None,
     ) -> Frames:
-        """Play an episode by the rule; return its frames.
+        """Play an episode by the rule, in a process or a new one; return its frames.
 
-        ``start`` replaces the usual line. ``stop`` is the call at which to break off. ``seeds`` has
-        a seed for each call at which to reseed, and ``decisions`` a value for each point at which
-        the rule does not decide.
+        ``start`` replaces the usual line. ``stop`` is the number of the call that ends the
+        episode. ``reseed`` is a seed to send in the middle of the episode. ``value`` replaces the
+        rule's decisions at ``point``.
         """
-        frames: Frames = []
-        removed: set[tuple[str, Entity]] = set()
-        frame = child.begin(start or self._start)
-        while True:
-            _check_keys(frame)
-            frames.append(frame)
-            if "end" in frame:
-                return frames
-            point = frame.get("point", "")
-            entity = frame.get("entity")
-            if "remove" in frame:
-                removed.add((point, entity))
-            elif "decide" in frame:
-                number = child.number
-                if (point, entity) in removed:
-                    raise WireError(
-                        f"call {number} is of {entity!r} at {point}, which was removed before; an"
-                        " entity that comes needs a name that none had in the episode, and"
-                        ' "remove" comes after the last call'
-                    )
-                if number in (stop, self._longest) or len(frames) > MOST_FRAMES:
-                    child.break_off()
+        frames = []
+        removed = set()
+        with self._child(child) as child:
+            frame = child.begin(start or self._start)
+            while True:
+                _check_keys(frame)
+                frames.append(frame)
+                if "end" in frame:
                     return frames
-                if number in seeds:
-                    child.reseed(seeds[number])
-                if point in decisions:
-                    child.answer(decisions[point])
-                else:
-                    child.decide_by_rule()
-                    frames += [child.decided] if child.decided else []
-            frame = child.next_frame()
+                caller = frame.get("point", ""), frame.get("entity")
+                if "remove" in frame:
+                    removed.add(caller)
+                elif "decide" in frame:
+                    number = child.number
+                    if caller in removed:
+                        raise WireError(
+                            f"call {number} is of {caller[1]!r} at {caller[0]}, which was removed"
+                            " before; an entity that comes needs a name that none had in the"
+                            ' episode, and "remove" comes after the last call'
+                        )
+                    if number in (stop, self._longest) or len(frames) > MOST_FRAMES:
+                        child.break_off()
+                        return frames
+                    if reseed is not None and number == self._middle():
+                        child.reseed(reseed)
+                    if caller[0] == point:
+                        child.answer(value)
+                    else:
+                        child.decide_by_rule()
+                        frames += [child.decided] if child.decided else []
+                frame = child.next_frame()
 
     def _compare(self, frames: Frames) -> Outcome:
         """Compare an episode with the first one."""
@@ -230,7 +228,7 @@ class _Check:
                     f' {short_repr(first)}; seed all generators by the seed of "start", and forget'
                     " other episodes"
                 )
-        return OK, "the same as in a new process"
+        return "ok", "the same as in a new process"
 
     # -- tests ------------------------------------------------------------------------------------
 
@@ -239,17 +237,17 @@ class _Check:
             if not child.points:
                 raise WireError("it has no points")
             _check_keys(child.hello)
+            self._can = child.can
             for name in child.can.difference(ABILITIES):
                 hint = did_you_mean(name, ABILITIES) or f"; it may list {', '.join(ABILITIES)}"
                 raise WireError(
                     f'the "can" of its hello lists {name!r}, which does not exist{hint}'
                 )
             can = ", ".join(sorted(child.can)) or "nothing else"
-            return OK, f"points {', '.join(sorted(child.points))}; can {can}"
+            return "ok", f"points {', '.join(sorted(child.points))}; can {can}"
 
     def _episode(self) -> Outcome:
-        with self._child() as child:
-            self._first = self._play(child)
+        self._first = self._play()
         self._calls = [frame for frame in self._first if "decide" in frame]
         if not self._calls:
             raise WireError("it asked for no decision")
@@ -257,9 +255,9 @@ class _Check:
         points = ", ".join(f"{point} {count}" for point, count in counts.items())
         end = self._first[-1].get("end")
         if end is None:
-            return NOTE, f"it was stopped after {self._longest} decisions ({points})"
+            return "note", f"it was stopped after {self._longest} decisions ({points})"
         result = short_repr(end.get("result"))
-        return OK, f"{len(self._calls)} decisions ({points}), result {result}"
+        return "ok", f"{len(self._calls)} decisions ({points}), result {result}"
 
     def _repeat(self, stop: int = 0) -> Outcome:
         with self._child() as child:
@@ -269,37 +267,30 @@ class _Check:
             except ProcessDiedError:
                 if child.number != 0 or child.exit_code() != 0:
                     raise
-        with self._child() as child:
-            self._compare(self._play(child))
-        return NOTE, (
+        self._compare(self._play())
+        return "note", (
             "it exits with code 0 after an episode, and plays the same in a new process: one for"
             " each"
         )
 
     def _long_line(self) -> Outcome:
         start = self._start.replace(b"\n", b" " * PADDING + b"\n")
-        with self._child() as child:
-            return self._compare(self._play(child, start=start))
+        return self._compare(self._play(start=start))
 
     def _reseed(self) -> Outcome:
-        middle = self._middle()
-        futures = []
-        for seed in (11, 11, 12):
-            with self._child() as child:
-                if "reseed" not in child.can:
-                    return NOTE, (
-                        'the "can" of its hello does not list "reseed": no branches with other'
-                        " futures"
-                    )
-                futures.append(self._play(child, seeds={middle: seed}))
-        one, again, other = futures
+        if "reseed" not in self._can:
+            return "note", (
+                'the "can" of its hello does not list "reseed": no branches with other futures'
+            )
+        one, again, other = [self._play(reseed=seed) for seed in (11, 11, 12)]
         if one != again:
             raise WireError("the same seed has led to two futures; seed all generators by it")
         if one == other:
-            return NOTE, "two seeds have led to the same future; is nothing in the model random?"
+            return "note", "two seeds have led to the same future; is nothing in the model random?"
         self._draws = True
-        return OK, (
-            f"at call {middle}, two seeds lead to two futures, and the same seed to the same future"
+        return "ok", (
+            f"at call {self._middle()}, two seeds lead to two futures, and the same seed to the"
+            " same future"
         )
 
     def _seeds(self) -> Outcome:
@@ -313,7 +304,7 @@ class _Check:
                     f'{text}, though "reseed" changes it: seed the generators with the seed of'
                     ' "start"'
                 )
-            return NOTE, (
+            return "note", (
                 f'{text}; is nothing in the model random, or does it ignore the seed of "start"?'
             )
         different = len(_distinct(low))
@@ -324,24 +315,22 @@ class _Check:
                 raise WireError(f"seeds 1 to 4 lead to the same episodes as {high_seeds}: {remedy}")
             if len(_distinct(high)) == 1:
                 raise WireError(f"seeds {high_seeds} lead to the same episode: {remedy}")
-        return OK, f"four seeds lead to {different} different episodes, and all their bits count"
+        return "ok", f"four seeds lead to {different} different episodes, and all their bits count"
 
     def _seeded(self, seed: int) -> Frames:
         """Play an episode with another seed, in a new process."""
         start = encode({"start": {**decode(self._start)["start"], "seed": seed}})
-        with self._child() as child:
-            return self._play(child, start=start)
+        return self._play(start=start)
 
     def _values(self, point: str) -> Outcome:
-        """Play episodes in which all decisions of a point have the same value."""
+        """Play episodes with one value for all decisions of a point."""
         calls = [call["decide"] for call in self._calls if call["point"] == point]
-        legal = _distinct(frame["value"] for frame in self._first if frame.get("decided") in calls)[
-            :2
-        ]
+        decided = [frame for frame in self._first if frame.get("decided") in calls]
+        legal = _distinct(frame["value"] for frame in decided)[:2]
         known = len(legal) == 2
         for values in [legal] if known else GUESSES:
             try:
-                episodes = [self._decided(point, value) for value in values]
+                episodes = [self._play(point=point, value=value) for value in values]
             except ProcessError as error:
                 if known or isinstance(error, WireError):
                     raise
@@ -351,15 +340,10 @@ class _Check:
                 raise WireError(
                     f'{decisions} lead to the same episode: continue with the "value" of "act"'
                 )
-            return OK, f"{decisions} lead to different episodes"
-        return NOTE, (
+            return "ok", f"{decisions} lead to different episodes"
+        return "note", (
             "it takes neither numbers nor booleans here, so that other decisions were not tried"
         )
-
-    def _decided(self, point: str, value: Json) -> Frames:
-        """Play an episode with decisions of one value at a point, in a new process."""
-        with self._child() as child:
-            return self._play(child, decisions={point: value})
 
     def _refusal(self, line: bytes) -> Outcome:
         with self._child() as child:
@@ -372,9 +356,9 @@ class _Check:
             try:
                 frame = child.receive()
             except ProcessDiedError:
-                return OK, "it ends"
+                return "ok", "it ends"
             except RemoteError as error:
-                return OK, f"it reports an error: {error}"
+                return "ok", f"it reports an error: {short_repr(str(error))}"
         raise WireError(f"it continues with {short_repr(frame)}; it must end, or send an error")
 
     def _end_of_input(self) -> Outcome:
@@ -383,7 +367,7 @@ class _Check:
             child.close_input()
             with suppress(ProcessDiedError):
                 raise WireError(f"it sends {short_repr(child.receive())}")
-        return OK, "it ends"
+        return "ok", "it ends"
 
     def _plain_run(self) -> Outcome:
         try:
@@ -394,11 +378,11 @@ class _Check:
                 timeout=self._timeout,
             )
         except TimeoutExpired:
-            return NOTE, f"it still ran after {self._timeout:g} s"
+            return "note", f"it still ran after {self._timeout:g} s"
         if process.returncode != 0:
             stderr = process.stderr.decode(errors="replace").strip()[-300:]
-            return NOTE, f"it has exited with code {process.returncode}: {stderr}"
-        return OK, "it runs on its own rule, and exits with code 0"
+            return "note", f"it has exited with code {process.returncode}: {stderr}"
+        return "ok", "it runs on its own rule, and exits with code 0"
 
 
 def _distinct(items: Iterable[Any]) -> list[Any]:
@@ -417,7 +401,7 @@ def _check_keys(frame: Frame) -> None:
     if kind == "end":
         parts.append((frame["end"], {"truncated", "result"}))
     for part, keys in parts:
-        for key in part.keys() - keys:
+        for key in sorted(part.keys() - keys):
             hint = did_you_mean(key, keys)
             hint = hint or "; an argument belongs into args, another result into result"
             raise WireError(f"the key {key!r} of {short_repr(frame)} does not exist{hint}")

@@ -5,8 +5,6 @@ that the simulator never blocks; errors show the last part of it. The simulator 
 group, which ends with it.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import select
@@ -55,14 +53,14 @@ GRACE: Final = 2.0
 MOST_FRAMES: Final = 100_000
 """The number of frames that may come between two calls.
 
-A birth, an update and a removal are one each.
+Announced calls, updates and removals count.
 """
 
 MOST_BYTES: Final = 1 << 30
 """The number of bytes that may come between two calls."""
 
 MOST_WAITS: Final = 20
-"""The time that the frames between two calls may take, in times to wait for a line."""
+"""The time that the frames between two calls may take, as a multiple of ``timeout``."""
 
 LOST: Final = 1 << 16
 """The exit code of a process whose exit code was lost. No process can exit with it."""
@@ -109,7 +107,7 @@ class Child:
     ) -> None:
         """Start the process, and read its first frame.
 
-        The arguments are those of ``ProcessSimulation``.
+        The arguments are described at ``ProcessSimulation``.
 
         Raises:
             ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or breaks the rules
@@ -121,13 +119,12 @@ class Child:
         self._owner = os.getpid()
         self._stderr_tail = bytearray()
         try:
-            self._start(command, os.environ if env is None else env, cwd)
+            self._start()
         except (OSError, ValueError) as error:
             raise ProcessDiedError(
                 f"{command[0]!r} cannot be started: {describe_error(error)}"
             ) from error
         self.pid = self._popen.pid
-        self._name = f"the process {self.pid} ({command[0]})"
         _children.add(self)
         try:
             guardian.guard(self.pid)
@@ -139,8 +136,9 @@ class Child:
         self.points = frozenset(self.hello["points"])
         self.can = frozenset(self.hello["can"])
 
-    def _start(self, command: Sequence[str], env: Mapping[str, str], cwd: StrPath | None) -> None:
+    def _start(self) -> None:
         """Start the process with its pipes."""
+        command, _, env, cwd = self.launch
         child_reading, self._writing = os.pipe()
         self._reading, child_writing = os.pipe()
         try:
@@ -150,7 +148,10 @@ class Child:
                 stderr=PIPE,
                 bufsize=0,
                 pass_fds=(child_reading, child_writing),
-                env={**env, DESCRIPTORS: f"{child_reading},{child_writing}"},
+                env={
+                    **(os.environ if env is None else env),
+                    DESCRIPTORS: f"{child_reading},{child_writing}",
+                },
                 cwd=cwd,
                 # so that its group can be ended, and a terminal's interrupts miss it
                 start_new_session=True,
@@ -172,18 +173,16 @@ class Child:
         hello = short_repr(self.hello)
         if "hello" not in self.hello:
             self.fail(f"began with {hello}, not with a hello")
-        version = self.hello["hello"]
-        if not is_integer(version, VERSION):
-            self.fail(
-                f"speaks version {short_repr(version)} of the wire; this is version {VERSION}"
-            )
+        if not is_integer(self.hello["hello"], VERSION):
+            version = short_repr(self.hello["hello"])
+            self.fail(f"speaks version {version} of the wire; this is version {VERSION}")
         for key in ("points", "can"):
             names = self.hello.get(key)
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 self.fail(f'has said {hello}; its "points" and "can" must be lists of strings')
 
     def __str__(self) -> str:
-        return self._name
+        return f"the process {self.pid} ({self.launch[0][0]})"
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -191,10 +190,9 @@ class Child:
         """Begin an episode with a line; return the first frame, as ``next_frame``."""
         stopped = self.state == "stopped"
         self.number = 0
-        self.decided = None
         self.time = None
         self._seed = None
-        self._run()  # before frames are read, because the process may have exited
+        self._set_running()  # before frames are read, because the process may have exited
         with suppress(BlockingIOError):
             self._received += os.read(self._reading, CHUNK)
         if self._received:
@@ -208,8 +206,8 @@ class Child:
     def next_frame(self) -> Frame:
         """Wait for the next frame of the episode, and check it.
 
-        It is a "decide", "expect", "update", "remove" or "end". All but "end" always get an item
-        "entity"; of "expect", each item gets it.
+        It is a "decide", "expect", "update", "remove" or "end". Calls, updates and removals get an
+        item "entity", and so do the items of "expect".
 
         Raises:
             ProcessDiedError, ProcessTimeoutError: As ``receive``.
@@ -228,8 +226,7 @@ class Child:
         elif "decide" in frame:
             due = self.number + 1
             if not is_integer(frame["decide"], due):
-                number = short_repr(frame["decide"])
-                self.fail(f"has made call {number} where call {due} was due")
+                self.fail(f"has made call {short_repr(frame['decide'])} where call {due} was due")
             self.number = due
             self.decided = None
             self.state = "waiting"
@@ -241,15 +238,15 @@ class Child:
             self._refuse(frame, ", which is not a frame of the wire")
         return frame
 
-    def _run(self) -> None:
-        """Begin to count what the process sends until its next call."""
+    def _set_running(self) -> None:
+        """Begin to count the frames until the next call."""
         self.state = "running"
         self._frames = 0
         self._bytes = 0
         self._running_since = monotonic()
 
     def _check_flood(self) -> None:
-        """Count a frame that is neither a call nor an end, so that such frames end some time."""
+        """Count a frame between two calls; limit the number, size and time of such frames."""
         self._frames += 1
         if self._frames > MOST_FRAMES or self._bytes > MOST_BYTES:
             self.fail(
@@ -274,7 +271,8 @@ class Child:
             The rule's decision; ``RULE`` if the process does not report it.
 
         Raises:
-            WireError: The process sends another frame. Other errors are those of ``receive``.
+            WireError: The process sends another frame.
+            ProcessError: As ``answer`` and ``receive``.
         """
         if self.decided is None:
             self.answer(RULE)
@@ -282,22 +280,26 @@ class Child:
                 return RULE
             frame = self.receive()
             if "value" not in frame or not is_integer(frame.get("decided"), self.number):
-                due = f'{{"decided": {self.number}, "value": ...}}'
-                self._refuse(frame, f" where {due} was due: the decision of its rule")
+                self._refuse(
+                    frame,
+                    f' where {{"decided": {self.number}, "value": ...}} was due: the decision of'
+                    " its rule",
+                )
             self.decided = frame
         return self.decided["value"]
 
     def answer(self, value: Model) -> None:
-        """Answer the call for which the process waits, by a decision or ``RULE``.
+        """Answer the pending call, by a decision or ``RULE``.
 
         Raises:
-            WireError: The decision is not JSON data. Other errors are those of ``send``.
+            WireError: The decision is not JSON data.
+            ProcessError: As ``send``.
         """
         lines = encode_answer(self.number, value)
         if self._seed is not None:
             lines = encode({"reseed": self._seed}) + lines
             self._seed = None
-        self._run()
+        self._set_running()
         self.send(lines)
 
     def break_off(self) -> None:
@@ -306,7 +308,9 @@ class Child:
             return
         if self.state == "waiting":
             self.state = "stopped"
-            with suppress(SimEnvError):  # it is ended then, and the next episode starts a new one
+            with suppress(
+                SimEnvError
+            ):  # which has ended it, so that the next episode starts a new one
                 self.send(STOP)
         elif self.state == "running":
             self.close(patience=0.0)
@@ -329,9 +333,11 @@ class Child:
             self._wait(self._reading, select.POLLIN, deadline, sent)
             chunk = os.read(self._reading, CHUNK)
             if not chunk:
-                self._wait_for_exit(GRACE)
+                self._wait_for_exit(monotonic() + GRACE)
                 where = " in the middle of a line" if line else ""
-                self.fail(f"has closed its pipe{where}, and {self._exit()}", ProcessDiedError)
+                self.fail(
+                    f"has closed its pipe{where}, and {self._describe_exit()}", ProcessDiedError
+                )
             part, complete, self._received = chunk.partition(b"\n")
             line += part
             if len(line) >= LONGEST:
@@ -350,8 +356,8 @@ class Child:
     def send(self, lines: bytes) -> None:
         """Send lines.
 
-        If the process is gone, nothing happens here: ``receive`` raises the error, which may have
-        the reason.
+        If the process has ended, this does nothing, because ``receive`` raises an error with the
+        reason.
 
         Raises:
             ProcessTimeoutError: It does not read.
@@ -371,7 +377,7 @@ class Child:
                 return
             except BlockingIOError:
                 self._wait(self._writing, select.POLLOUT, deadline, "nothing and read nothing")
-            except OSError as error:  # its input is closed
+            except OSError as error:  # because its input is closed
                 raise ProcessDiedError(f"{self} has been ended already") from error
 
     def _read_stderr(self) -> bool:
@@ -387,24 +393,25 @@ class Child:
         poll = select.poll()
         poll.register(descriptor, event)
         poll.register(stderr, select.POLLIN)
-        ready: dict[int, int] = {}
-        while descriptor not in ready:
+        while True:
             left = deadline - monotonic()
             if left <= 0:  # even if data keeps trickling in
                 self.fail(
-                    f"{self._exit()}; it has sent {sent} for {self.timeout:g} s",
+                    f"{self._describe_exit()}; it has sent {sent} for {self.timeout:g} s",
                     ProcessTimeoutError,
                 )
             # at most an hour, because ``poll`` refuses more than some weeks
             ready = dict(poll.poll(1000 * min(left, 3600)))
             if stderr in ready and not self._read_stderr():
                 poll.unregister(stderr)
+            if descriptor in ready:
+                return
 
     # -- ends -------------------------------------------------------------------------------------
 
     @property
     def usable(self) -> bool:
-        """Whether it was not closed and belongs to this process."""
+        """Whether it is open, and was started by this process."""
         return not self._closed and self._owner == os.getpid()
 
     def exit_code(self) -> int | None:
@@ -415,7 +422,7 @@ class Child:
         if self._popen.returncode is None:
             try:
                 os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-            except ChildProcessError:  # ``poll`` returns 0 then
+            except ChildProcessError:  # for which ``poll`` would return 0
                 self._exit_code_lost = True
         code = self._popen.poll()
         return LOST if self._exit_code_lost else code
@@ -444,8 +451,8 @@ class Child:
     def close(self, patience: float = GRACE) -> None:
         """Close its pipes; kill it and its group ``patience`` seconds after the end of its input.
 
-        So processes whose inputs were closed together end together. A fork of this process only
-        closes its copies of the pipes.
+        The time runs from the end of the input, so that several processes can end together. A fork
+        of this process only closes its copies of the pipes.
         """
         if self._closed:
             return
@@ -455,7 +462,7 @@ class Child:
             os.close(self._reading)
             self.close_input()
             if owned:
-                self._wait_for_exit(self._input_closed_at + patience - monotonic())
+                self._wait_for_exit(self._input_closed_at + patience)
         finally:  # also after an interrupt
             if owned:
                 self._kill()
@@ -472,16 +479,14 @@ class Child:
             self._popen.wait(GRACE)
         self._read_stderr()
 
-    def _wait_for_exit(self, patience: float) -> None:
-        """Wait for its exit, at most ``patience`` seconds."""
-        deadline = monotonic() + patience
+    def _wait_for_exit(self, deadline: float) -> None:
         pause = 0.0005
         while self.exit_code() is None and monotonic() < deadline:
             self._read_stderr()
             sleep(pause)
             pause = min(2 * pause, 0.02)
 
-    def _exit(self) -> str:
+    def _describe_exit(self) -> str:
         """Describe its exit."""
         code = self.exit_code()
         if code is None:
@@ -504,15 +509,17 @@ class Child:
 _children: Final[WeakSet[Child]] = WeakSet()
 
 
-def _close_inputs() -> None:
-    """Close the inputs of all simulators, so that this process waits for all of them together."""
-    for child in list(_children):
-        if child.usable:
-            child.break_off()
-            child.close_input()
+def _close_all() -> None:
+    """Close all simulators. Their inputs end first, so that this process waits for all together."""
+    children = [child for child in _children if child.usable]
+    for child in children:
+        child.break_off()
+        child.close_input()
+    for child in children:
+        child.close()
 
 
-# ``atexit`` calls the latest function first: this one before the finalizers of simulations, whose
+# ``atexit`` calls the latest function first: this one before the finalizers of environments, whose
 # function the first finalizer registers.
 finalize(Child, int).detach()
-atexit.register(_close_inputs)
+atexit.register(_close_all)

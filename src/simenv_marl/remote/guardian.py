@@ -7,8 +7,6 @@ waits for the end of this process, and then kills the process groups of its simu
 runs while there are simulators.
 """
 
-from __future__ import annotations
-
 import os
 from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen
@@ -25,7 +23,7 @@ while read -r sign group; do
 done
 for group in $groups; do kill -s KILL -- "-$group"; done
 """
-"""The shell reads the process groups from a pipe, which ends with the last process that has it."""
+"""The shell reads process groups from its input, until no process has the other end."""
 
 _lock = RLock()
 _groups: Final[set[int]] = set()
@@ -74,16 +72,15 @@ def _send(shell: Popen[bytes], line: str) -> None:
 
 
 def _forget() -> None:
-    """Close the pipe in a forked process, because the simulators are those of its parent."""
+    """Close the pipe in a forked process, because its parent owns the simulators."""
     global _shell, _lock
     shell = _shell
     _shell = None
     _lock = RLock()
     _groups.clear()
     if shell is not None:
-        assert shell.stdin is not None
-        shell.stdin.close()
-        shell.poll()  # because Popen warns of processes that it believes to run
+        # closes the pipe, and does not wait, because the shell is no child of this process
+        shell.communicate()
 
 
 if hasattr(os, "register_at_fork"):

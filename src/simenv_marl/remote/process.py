@@ -1,13 +1,10 @@
 """A simulation whose model runs in another process, and requests decisions over a pair of pipes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from math import inf
-from weakref import finalize
 
 import numpy as np
 
@@ -24,7 +21,7 @@ from ..errors import (
     short_repr,
 )
 from ..simulation import TRUNCATED, Model, SimulationInterface
-from .calls import DecisionFunction, RemoteCall, RemoteEpisode, point_functions
+from .calls import DecisionFunction, RemoteCall, RemoteEpisode, decision_function
 from .child import Child, StrPath
 from .wire import encode
 
@@ -32,9 +29,9 @@ from .wire import encode
 class ProcessSimulation(SimulationInterface):
     """A simulation whose model runs in another process (POSIX), in any language.
 
-    The first ``reset`` starts the process. It plays one episode after the other, and is ended when
-    the environment is closed or garbage-collected. It calls for decisions in its own order.
-    Decisions that are left to ``RULE`` it takes itself.
+    The first ``reset`` starts the process, which plays one episode after the other. The process
+    ends when the environment is closed or garbage-collected. It requests decisions in its own
+    order, and decides itself if the answer is ``RULE``.
 
     Mappings, ``agent`` and ``apply`` get one object for each entity at a point. The call's
     arguments are its attributes and items (``call.level``, ``call["queue-length"]``); it also has
@@ -45,6 +42,9 @@ class ProcessSimulation(SimulationInterface):
         points: The decision points with their definitions.
         result: The result that the process sent at the end of the latest episode; None before.
     """
+
+    _child: Child | None = None
+    _episode: RemoteEpisode | None = None
 
     def __init__(
         self,
@@ -65,8 +65,8 @@ class ProcessSimulation(SimulationInterface):
                 process follows its own rule.
             timeout: The time to wait for each line of the process, and for it to read a message, in
                 seconds.
-            env: The environment variables of the process. None: those of this process.
-            cwd: The folder in which it runs. None: that of this process.
+            env: The environment variables of the process. None: the variables of this process.
+            cwd: The working directory of the process. None: the directory of this process.
 
         Raises:
             OptionValueError: The command, the timeout, ``env`` or ``cwd`` is invalid.
@@ -86,7 +86,10 @@ class ProcessSimulation(SimulationInterface):
             raise OptionValueError(
                 f"timeout must be a positive number of seconds, not {short_repr(timeout)}"
             )
-        if env is not None and not _are_variables(env):
+        if env is not None and not (
+            isinstance(env, Mapping)
+            and all(isinstance(text, str) for text in [*env, *env.values()])
+        ):
             raise OptionValueError(
                 f"env must be a dict from names to values, all strings, not {short_repr(env)}"
             )
@@ -97,15 +100,14 @@ class ProcessSimulation(SimulationInterface):
         self.cwd = cwd
         self.points = _by_function(points)
         self.result: Model = None
-        self._child: Child | None = None
-        self._episode: RemoteEpisode | None = None
-        # ends the process with the simulation
-        self._finalizer: finalize[[float], ProcessSimulation] | None = None
+
+    def __del__(self) -> None:
+        if self._child is not None:
+            self._child.close()
 
     def __getstate__(self) -> dict[str, Model]:
-        points = {name: self.points[function] for name, function in self._functions().items()}
-        of_this_process = dict.fromkeys(("_child", "_episode", "_finalizer"))
-        return {**vars(self), "points": points, **of_this_process}
+        points = dict(zip(self._names(), self.points.values(), strict=True))
+        return {**vars(self), "points": points, "_child": None, "_episode": None}
 
     def __setstate__(self, state: dict[str, Model]) -> None:
         vars(self).update(state, points=_by_function(state["points"]))
@@ -128,7 +130,9 @@ class ProcessSimulation(SimulationInterface):
         start = encode({"start": {"seed": seed, "options": options or {}}})
         self.result = None
         self._episode = None
-        launch = self._launch()
+        # equal for processes that can replace each other
+        variables = dict(os.environ if self.env is None else self.env)
+        launch = self.command, self.timeout, variables, os.path.abspath(self.cwd or "")
         child = self._child or acquire(launch)
         if child is not None:
             child.break_off()
@@ -143,9 +147,9 @@ class ProcessSimulation(SimulationInterface):
 
     def _begin(self, child: Child, start: bytes) -> None:
         """Begin an episode in a process with a line, and wait for the first frame."""
-        self._use(child)
-        functions = self._functions()
-        missing = [name for name in functions if name not in child.points]
+        self._child = child
+        names = self._names()
+        missing = [name for name in names if name not in child.points]
         if missing:
             existing = ", ".join(sorted(child.points)) or "none"
             child.fail(
@@ -153,17 +157,10 @@ class ProcessSimulation(SimulationInterface):
                 UnknownPointError,
             )
         try:
-            self._episode = RemoteEpisode(child, functions, start)
+            self._episode = RemoteEpisode(child, names, start)
         except BaseException:
             child.break_off()
             raise
-
-    def _use(self, child: Child | None) -> None:
-        """Use a process, or none, from now on."""
-        if self._finalizer is not None:
-            self._finalizer.detach()
-        self._child = child
-        self._finalizer = None if child is None else finalize(self, child.close)
 
     def run(self) -> Model:
         """Run the episode in the process; its calls become calls of the points' decision functions.
@@ -198,7 +195,7 @@ class ProcessSimulation(SimulationInterface):
         """
         child = self._child
         if last and child is not None:
-            self._use(None)
+            self._child = None
             child.break_off()
             if not release(child.launch, child):
                 child.close()
@@ -219,10 +216,9 @@ class ProcessSimulation(SimulationInterface):
 
         Missing if the process did not announce "expect".
         """
-        episode = self._episode
-        if episode is None or self._child is None or "expect" not in self._child.can:
-            raise AttributeError('the process has not announced "expect" in its hello')
-        return episode.expected_calls
+        if self._child and self._episode and "expect" in self._child.can:
+            return self._episode.expected_calls
+        raise AttributeError('the process has not announced "expect" in its hello')
 
     def reseed(self, seed: int) -> None:
         """Ask the process to reseed its generators, for new random numbers from here on.
@@ -238,14 +234,8 @@ class ProcessSimulation(SimulationInterface):
             )
         child.reseed(int(seed))
 
-    def _launch(self) -> tuple[list[str], float, dict[str, str], str]:
-        """Return the arguments of ``Child``, equal for processes that can replace each other."""
-        env = dict(os.environ if self.env is None else self.env)
-        return self.command, self.timeout, env, os.path.abspath(self.cwd or "")
-
-    def _functions(self) -> dict[str, DecisionFunction]:
-        """Return the decision functions of the points, by name."""
-        return {getattr(function, BY_NAME): function for function in self.points}
+    def _names(self) -> list[str]:
+        return [getattr(function, BY_NAME) for function in self.points]
 
 
 def _command_words(
@@ -261,11 +251,6 @@ def _command_words(
     )
 
 
-def _are_variables(env: Mapping[str, str]) -> bool:
-    """Return whether a user's environment variables are a mapping of strings."""
-    return isinstance(env, Mapping) and all(isinstance(word, str) for word in [*env, *env.values()])
-
-
 def _by_function(points: Mapping[str, Definition]) -> dict[DecisionFunction, Definition]:
     """Return the definitions by the decision functions of their names."""
     if not isinstance(points, Mapping) or not points:
@@ -278,4 +263,4 @@ def _by_function(points: Mapping[str, Definition]) -> dict[DecisionFunction, Def
                 "points must be a dict from the process's names to definitions, the results of"
                 f" make_step, not {short_repr(name)}: {short_repr(definition)}"
             )
-    return {point_functions(name).decide: definition for name, definition in points.items()}
+    return {decision_function(name): definition for name, definition in points.items()}

@@ -1,11 +1,9 @@
 """The protocol between an environment and a simulator in another process, version 1.
 
-Each line is one JSON object, a *frame*. Frames use only data that every language can represent:
+Each line is one JSON object, a *frame*. Frames contain only data that every language can represent:
 keys are strings, and numbers that are not finite are sent as ``{"float": "nan"}``,
 ``{"float": "inf"}`` and ``{"float": "-inf"}``.
 """
-
-from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
@@ -36,7 +34,7 @@ LONGEST: Final = 16 << 20
 _CALL: Final = frozenset({"point", "entity", "time", "args"})
 """The keys of a call, and of an entity's update or removal."""
 
-KEYS: Final[Mapping[str, frozenset[str]]] = {
+KEYS: Final = {
     "hello": frozenset({"points", "can"}),
     "decide": _CALL,
     "decided": frozenset({"value"}),
@@ -149,10 +147,17 @@ def check_frame(frame: Frame, points: Collection[str]) -> float | None:
         )
     calls: list[Frame] = []
     if "end" in frame:
-        _check_end(frame["end"])
+        end = frame["end"]
+        if not isinstance(end, dict) or type(end.get("truncated", False)) is not bool:
+            raise WireError(
+                f'sent the end {short_repr(end)}; it must be an object with "truncated" (true or'
+                ' false) and "result"'
+            )
     elif "expect" in frame:
         calls = frame["expect"]
-        if not isinstance(calls, list) or not all(map(_is_call, calls)):
+        if not isinstance(calls, list) or not all(
+            isinstance(call, dict) and call.keys() <= _CALL for call in calls
+        ):
             raise WireError(
                 f'sent "expect" with {short_repr(calls)}; it must be a list of objects with'
                 ' "point", "entity" and "args"'
@@ -162,18 +167,6 @@ def check_frame(frame: Frame, points: Collection[str]) -> float | None:
     times = [_check_call(call, points) for call in calls]
     known = [time for time in times if time is not None]
     return known[-1] if known else None
-
-
-def _check_end(end: Json) -> None:
-    if not isinstance(end, dict) or type(end.get("truncated", False)) is not bool:
-        raise WireError(
-            f'sent the end {short_repr(end)}; it must be an object with "truncated" (true or false)'
-            ' and "result"'
-        )
-
-
-def _is_call(item: Json) -> bool:
-    return isinstance(item, dict) and item.keys() <= _CALL
 
 
 def _check_call(frame: Frame, points: Collection[str]) -> float | None:

@@ -54,10 +54,12 @@ class CallbackGuard:
                 self._error = None
 
     def _record(self, error: BaseException, replace: bool = False) -> None:
-        """Record the first exception, or one that replaces it, and stop C."""
-        if self._error is None or replace:
+        """Record the first exception and stop C, or replace the first exception."""
+        if self._error is None:
             self._error = error
             self._stop()
+        elif replace:
+            self._error = error
 
 
 def _record_interrupt(

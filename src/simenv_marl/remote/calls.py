@@ -126,7 +126,7 @@ class RemoteEpisode:
 
     Attributes:
         time: The process's time; None if it sent none.
-        begun: Whether ``run`` was called.
+        has_run: Whether ``run`` was called.
     """
 
     def __init__(self, child: Child, points: Collection[str], start: bytes) -> None:
@@ -137,10 +137,10 @@ class RemoteEpisode:
         self._child = child
         self._points = points
         self._calls: dict[tuple[str, Entity], RemoteCall] = {}
-        self._expected: dict[RemoteCall, None] = {}
+        self._expected_calls: dict[RemoteCall, None] = {}
         self._first_frame = child.begin(start)
         self.time = child.time
-        self.begun = False
+        self.has_run = False
 
     def run(self) -> Frame:
         """Run the episode once; return the "end" of its last frame.
@@ -149,7 +149,7 @@ class RemoteEpisode:
             ProcessError: As ``Child.next_frame``.
             SimulationError: A handler or ``apply`` has replaced a decision of the rule.
         """
-        self.begun = True
+        self.has_run = True
         frame = self._first_frame
         while "end" not in frame:
             self.time = self._child.time
@@ -164,7 +164,7 @@ class RemoteEpisode:
 
     def expected_calls(self, point: str) -> list[tuple[RemoteCall]]:
         """Return the calls of a point that the process has announced and has not made yet."""
-        return [(call,) for call in self._expected if call.point == point]
+        return [(call,) for call in self._expected_calls if call.point == point]
 
     def _handle(self, frame: Frame) -> None:
         """Handle a frame of an entity at a point, or an item of an "expect"."""
@@ -175,16 +175,16 @@ class RemoteEpisode:
                 return  # the entity has made no call that could change
             call = self._calls[key] = RemoteCall(*key)
         if "remove" in frame:
-            self._expected.pop(call, None)
+            self._expected_calls.pop(call, None)
             del self._calls[key]
             removal_function(call.point)(call)
             return
         call._update(frame.get("args") or {}, self._child.time)
         if "decide" in frame:
-            self._expected.pop(call, None)
+            self._expected_calls.pop(call, None)
             self._decide(call)
         elif "update" not in frame:
-            self._expected[call] = None
+            self._expected_calls[call] = None
 
     def _decide(self, call: RemoteCall) -> None:
         """Get the decision of a call, and send it unless the rule has decided already."""
@@ -194,8 +194,8 @@ class RemoteEpisode:
             value = decision_function(call.point)(call)
         finally:
             del _DECIDING[call]
-        if child.decided is not None:
-            decision = child.decided["value"]
+        if child.rule_frame is not None:
+            decision = child.rule_frame["value"]
             if value is not decision and value is not RULE:
                 raise SimulationError(
                     f"the rule of {call.point} has decided {short_repr(decision)} for"

@@ -38,7 +38,7 @@ INVALID: Final = {
 ABILITIES: Final = ("decided", "expect", "reseed")
 """The abilities that the "can" of a hello may list."""
 
-GUESSES: Final[Sequence[Sequence[Json]]] = ((0, 1, 100), (False, True))
+GUESSES: Final = ([0, 1, 100], [False, True])
 """Possible decisions, for simulators that do not report the decisions of their rules."""
 
 HIGH: Final = 1 << 30
@@ -188,7 +188,7 @@ class _Check:
         rule's decisions at ``point``.
         """
         frames = []
-        removed = set()
+        removed_callers = set()
         with self._child(child) as child:
             frame = child.begin(start or self._start)
             while True:
@@ -198,10 +198,10 @@ class _Check:
                     return frames
                 caller = frame.get("point", ""), frame.get("entity")
                 if "remove" in frame:
-                    removed.add(caller)
+                    removed_callers.add(caller)
                 elif "decide" in frame:
                     number = child.number
-                    if caller in removed:
+                    if caller in removed_callers:
                         raise WireError(
                             f"call {number} is of {caller[1]!r} at {caller[0]}, which was removed"
                             " before; an entity that comes needs a name that none had in the"
@@ -216,7 +216,7 @@ class _Check:
                         child.answer(value)
                     else:
                         child.decide_by_rule()
-                        frames += [child.decided] if child.decided else []
+                        frames += [child.rule_frame] if child.rule_frame else []
                 frame = child.next_frame()
 
     def _compare(self, frames: Frames) -> Outcome:
@@ -325,8 +325,8 @@ class _Check:
     def _values(self, point: str) -> Outcome:
         """Play episodes with one value for all decisions of a point."""
         calls = [call["decide"] for call in self._calls if call["point"] == point]
-        decided = [frame for frame in self._first if frame.get("decided") in calls]
-        legal = _distinct(frame["value"] for frame in decided)[:2]
+        rule_frames = [frame for frame in self._first if frame.get("decided") in calls]
+        legal = _distinct(frame["value"] for frame in rule_frames)[:2]
         known = len(legal) == 2
         for values in [legal] if known else GUESSES:
             try:

@@ -81,18 +81,18 @@ class Child:
         state: "idle" between episodes, "running" its model, "waiting" for the answer to a call, or
             "stopped".
         number: The number of its latest call in the episode; 0 before the first one.
-        decided: The frame with the rule's decision of the latest call; None before it has come.
+        rule_frame: The frame with the rule's decision of the latest call; None before it has come.
         time: Its latest time in the episode; None if it sent none.
     """
 
     state: Literal["idle", "running", "waiting", "stopped"] = "idle"
     number = 0
-    decided: Frame | None = None
+    rule_frame: Frame | None = None
     time: float | None = None
 
     _closed = False
     _exit_code_lost = False
-    _received = b""  # the first part of the next lines
+    _buffer = b""  # of received bytes
     _bytes = 0  # since the latest call, as the frames
     _frames = 0
     _running_since = 0.0
@@ -194,8 +194,8 @@ class Child:
         self._seed = None
         self._set_running()  # before frames are read, because the process may have exited
         with suppress(BlockingIOError):
-            self._received += os.read(self._reading, CHUNK)
-        if self._received:
+            self._buffer += os.read(self._reading, CHUNK)
+        if self._buffer:
             self._refuse(self.receive(), " before the start of an episode")
         self.send(start)
         frame = self.next_frame()
@@ -228,7 +228,7 @@ class Child:
             if not is_integer(frame["decide"], due):
                 self.fail(f"has made call {short_repr(frame['decide'])} where call {due} was due")
             self.number = due
-            self.decided = None
+            self.rule_frame = None
             self.state = "waiting"
         elif {"update", "remove", *self.can & {"expect"}} & frame.keys():
             self._check_flood()
@@ -274,7 +274,7 @@ class Child:
             WireError: The process sends another frame.
             ProcessError: As ``answer`` and ``receive``.
         """
-        if self.decided is None:
+        if self.rule_frame is None:
             self.answer(RULE)
             if "decided" not in self.can:
                 return RULE
@@ -285,8 +285,8 @@ class Child:
                     f' where {{"decided": {self.number}, "value": ...}} was due: the decision of'
                     " its rule",
                 )
-            self.decided = frame
-        return self.decided["value"]
+            self.rule_frame = frame
+        return self.rule_frame["value"]
 
     def answer(self, value: Model) -> None:
         """Answer the pending call, by a decision or ``RULE``.
@@ -327,7 +327,7 @@ class Child:
             WireError: It sent a line that is not a frame.
         """
         deadline = monotonic() + self.timeout
-        line, complete, self._received = self._received.partition(b"\n")
+        line, complete, self._buffer = self._buffer.partition(b"\n")
         while not complete:
             sent = "half a line" if line else "nothing"
             self._wait(self._reading, select.POLLIN, deadline, sent)
@@ -338,7 +338,7 @@ class Child:
                 self.fail(
                     f"has closed its pipe{where}, and {self._describe_exit()}", ProcessDiedError
                 )
-            part, complete, self._received = chunk.partition(b"\n")
+            part, complete, self._buffer = chunk.partition(b"\n")
             line += part
             if len(line) >= LONGEST:
                 self.fail(f"has sent a line of more than {LONGEST:,} bytes")

@@ -176,7 +176,7 @@ class ProcessSimulation(SimulationInterface):
         """
         child = self._child
         episode = self._episode
-        if child is None or episode is None or episode.begun:
+        if child is None or episode is None or episode.has_run:
             raise SimulationError("run() runs each episode once: call reset() first")
         try:
             end = episode.run()

@@ -165,8 +165,8 @@ def check_frame(frame: Frame, points: Collection[str]) -> float | None:
     elif kinds and KEYS[kinds[0]] is _CALL:
         calls = [frame]
     times = [_check_call(call, points) for call in calls]
-    known = [time for time in times if time is not None]
-    return known[-1] if known else None
+    known_times = [time for time in times if time is not None]
+    return known_times[-1] if known_times else None
 
 
 def _check_call(frame: Frame, points: Collection[str]) -> float | None:

@@ -151,9 +151,9 @@ class ProcessSimulation(SimulationInterface):
         names = self._names()
         missing = [name for name in names if name not in child.points]
         if missing:
-            existing = ", ".join(sorted(child.points)) or "none"
             child.fail(
-                f"has no decision point {', '.join(missing)}; it has {existing}",
+                f"has no decision point {', '.join(missing)}; it has"
+                f" {', '.join(sorted(child.points)) or 'none'}",
                 UnknownPointError,
             )
         try:
@@ -204,7 +204,7 @@ class ProcessSimulation(SimulationInterface):
     def time(self) -> Callable[[], float]:
         """A method that returns the process's time.
 
-        The attribute is missing if the process tells no time.
+        The attribute is missing if the process sends no time.
         """
         if self._episode is None or self._episode.time is None:
             raise AttributeError("the process has not sent a time")
@@ -238,13 +238,11 @@ class ProcessSimulation(SimulationInterface):
         return [getattr(function, BY_NAME) for function in self.points]
 
 
-def _command_words(
-    command: StrPath | Sequence[StrPath],
-) -> list[str]:
+def _command_words(command: StrPath | Sequence[StrPath]) -> list[str]:
     """Return the program and its arguments, as strings."""
     words = [command] if isinstance(command, (str, os.PathLike)) else command
     with suppress(TypeError):
-        if words:
+        if words and isinstance(words, Sequence):
             return [os.fspath(word) for word in words]
     raise OptionValueError(
         f"command must be a program and its arguments, a list of strings, not {short_repr(command)}"

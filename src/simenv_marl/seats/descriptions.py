@@ -11,7 +11,6 @@ from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
-from numpy.typing import NDArray
 
 from ..core.clone import pending_view
 from ..core.pending import Decision, Texts, decision_of
@@ -25,10 +24,12 @@ MOST: Final = 200
 JSON: TypeAlias = "Mapping[str, JSON] | Sequence[JSON] | str | float | None"
 """A value that ``json.dumps`` takes."""
 
+MISFITS: Final = (ValueError, TypeError, LookupError, OverflowError)
+"""The errors of values that are no actions, with ``InvalidActionError``, a ``ValueError``."""
+
 UNLABELLED_NUMBER: Final = ("0",)
 """The labels of a ``Box`` of one number that the user has not labelled."""
 
-Key = TypeVar("Key")
 Result = TypeVar("Result")
 
 
@@ -147,7 +148,7 @@ def labelled(value: Observation, labels: Texts) -> JSON:
     return value if isinstance(value, list) else _label(labels, value)
 
 
-def _label(labels: Texts, key: Key) -> Key | str:
+def _label(labels: Texts, key: JSON) -> JSON:
     """Return the label of a part or a ``Discrete`` value; itself if it has none."""
     return labels.get(key, key) if isinstance(labels, Mapping) else key
 
@@ -174,7 +175,7 @@ def _value_text(value: JSON) -> str:
 # -- legal actions --------------------------------------------------------------------------------
 
 
-def legal_actions(space: Discrete, mask: NDArray[np.int8] | None) -> list[int]:
+def legal_actions(space: Discrete, mask: Sequence[int] | None) -> list[int]:
     """Return the actions of a ``Discrete`` space that a mask allows; all without a mask."""
     offsets = range(int(space.n)) if mask is None else np.flatnonzero(mask).tolist()
     return [int(space.start) + offset for offset in offsets]
@@ -258,7 +259,7 @@ def _parts(space: Space[Any], labels: Texts) -> dict[str, Space[Any]]:
     Return an empty dict for other spaces, and for arrays of two or more dimensions.
     """
     if isinstance(space, Dict):
-        return {_label(labels, str(key)): part for key, part in space.items()}
+        return {str(_label(labels, key)): part for key, part in space.items()}
     parts: Sequence[Space[Any]] = ()
     if isinstance(space, Tuple):
         parts = space.spaces
@@ -289,11 +290,11 @@ def _parse(decision: Decision, text: str) -> Action:
     for value in _readings(text):
         if isinstance(value, dict) and value.keys() == {"action"} and not has_key:
             value = value["action"]
-        with suppress(InvalidActionError, ValueError, TypeError, LookupError, OverflowError):
+        with suppress(*MISFITS):
             action = (
                 _labelled_action(decision, legal, value)
                 if legal
-                else _action(space, decision.action_labels, value)
+                else to_action(space, value, decision.action_labels)
             )
             decision.validate(action)
             return action
@@ -333,7 +334,7 @@ def _labelled_action(decision: Decision, legal: Mapping[str, int], value: JSON) 
     names += legal.items()
     meanings = {action for label, action in names if _comparable(label) == _comparable(text)}
     if not meanings:
-        return _whole(float(text))
+        return _whole_number(text)
     if len(meanings) > 1:
         raise ValueError(f"{text} names several actions")
     return int(meanings.pop())
@@ -350,12 +351,6 @@ def _comparable(text: str) -> str | float:
         return text.casefold()
 
 
-def _whole(number: float) -> int:
-    if not number.is_integer():
-        raise ValueError(f"{number} is no integer")
-    return int(number)
-
-
 def _only_label(text: str, labels: Collection[str]) -> str | None:
     """Return the label that stands in a text; None if there is none, or several."""
     if not labels:
@@ -365,29 +360,48 @@ def _only_label(text: str, labels: Collection[str]) -> str | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _action(space: Space[Any], labels: Texts, value: Action) -> Action:
-    """Return the action that a value of JSON means, which may be illegal.
+def to_action(space: Space[Any], value: Action, labels: Texts = None) -> Action:
+    """Return the action for its JSON. It may be illegal.
+
+    Args:
+        space: The action space.
+        value: The JSON. An array may be an object with a key for each component, or a text.
+        labels: The labels of the components, which are keys of ``value``.
 
     Raises:
-        ValueError, TypeError, LookupError, OverflowError: It means none.
+        ValueError, TypeError, LookupError, OverflowError: The JSON does not fit the space.
     """
     if isinstance(space, Discrete):
-        return int(value)
+        return _whole_number(value)
     if isinstance(space, Dict):
-        keys = {_label(labels, key): key for key in space.spaces}
-        parts = {keys.get(name, name): part for name, part in dict(value).items()}
-        return {key: _action(part, None, parts[key]) for key, part in space.spaces.items()}
+        values = dict(value)
+        return {
+            key: to_action(part, values.get(_label(labels, key), values.get(key)))
+            for key, part in space.items()
+        }
+    if not isinstance(space, (Tuple, Box, MultiDiscrete, MultiBinary)):
+        return value
     if isinstance(value, Mapping):
         names = labels or _indices(len(value))
         if set(value) != set(names):
             raise ValueError("components are missing, or unknown")
         value = [value[name] for name in names]
     if isinstance(space, Tuple):
-        return tuple(_action(part, None, value[place]) for place, part in enumerate(space.spaces))
+        return tuple(to_action(part, value[place]) for place, part in enumerate(space))
     if isinstance(value, str):
-        value = [float(part) for part in value.replace(",", " ").split()]
-    numbers = np.asarray(value, np.float64).reshape(space.shape)
-    is_integer = space.dtype is not None and space.dtype.kind in "iu"
-    if is_integer and (numbers != np.round(numbers)).any():
-        raise ValueError("the components must be integers")
-    return numbers.astype(space.dtype)
+        value = value.replace(",", " ").split()
+    numbers = np.asarray(value).reshape(space.shape)
+    if numbers.dtype.kind == "U":
+        numbers = numbers.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        array = numbers.astype(space.dtype)
+    if array.dtype.kind in "iu" and not np.array_equal(array, numbers):
+        raise ValueError("the components are no integers of this size")
+    return array
+
+
+def _whole_number(value: str | float) -> int:
+    number = float(value)
+    if not number.is_integer():
+        raise ValueError(f"{value} is no integer")
+    return int(number)

@@ -14,12 +14,12 @@ from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 from uuid import uuid4
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Space, Tuple
 
 from ..core.pending import Decision
 from ..core.policies import COUNTS, Caller, PolicyWrapper, count, waits, when_answered
 from ..errors import InvalidActionError, OptionValueError, describe_error, short_repr, warn_user
 from ..simulation import RULE, Action, Observation, Sentinel
+from .descriptions import to_action
 
 KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
 """The events that a ``FallbackPolicy`` counts."""
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 def check_count(name: str, value: object) -> None:
     """Check that an argument is a non-negative integer, or raise an ``OptionValueError``."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+    if type(value) is not int or value < 0:
         raise OptionValueError(f"{name} must be a non-negative integer, not {short_repr(value)}")
 
 
@@ -141,17 +141,16 @@ class FallbackPolicy(PolicyWrapper):
         self, observation: Observation, info: object, context: Mapping[str, Any]
     ) -> Action:
         """Ask the policy; raise a ``TimeoutError`` if its answer takes too long."""
+        problem = f"the answer took longer than {self.timeout} s"
         start = monotonic()
         try:
             answer = self.ask(observation, info, context)
             if isawaitable(answer) and self.waits:
                 answer = await asyncio.wait_for(answer, self.timeout)
-            if self.timeout is not None and monotonic() - start > self.timeout:
-                raise TimeoutError
         except TimeoutError as error:
-            if str(error):
-                raise
-            raise TimeoutError(f"the answer took longer than {self.timeout} s") from None
+            raise TimeoutError(str(error) or problem) from error
+        if self.timeout is not None and monotonic() - start > self.timeout:
+            raise TimeoutError(problem)
         return answer
 
     def _count(self, decision: Decision, kind: str) -> None:
@@ -272,7 +271,8 @@ class RecordedPolicy(PolicyWrapper):
             except InvalidActionError:
                 return answer
             space = decision.action_space
-            recorded = space.to_jsonable([_with_arrays(space, action)])
+            # A legal action for a Box of one number may be a scalar, but to_jsonable needs arrays.
+            recorded = space.to_jsonable([to_action(space, action)])
         line = json.dumps(key._asdict() | {"answer": recorded})
         self._write(line.encode() + b"\n")
         assert self._answers is not None
@@ -282,17 +282,6 @@ class RecordedPolicy(PolicyWrapper):
     def _write(self, line: bytes) -> None:
         with open(self.path, "ab", buffering=0) as file:
             file.write(line)  # in one call, so that processes can share the file
-
-
-def _with_arrays(space: Space[Any], action: Action) -> Action:
-    """Return a legal action with an array for each ``Box``, because ``to_jsonable`` needs these."""
-    if isinstance(space, Dict):
-        return {key: _with_arrays(part, action[key]) for key, part in space.spaces.items()}
-    if isinstance(space, Tuple):
-        return tuple(map(_with_arrays, space.spaces, action))
-    if isinstance(space, Box):
-        return np.asarray(action, space.dtype).reshape(space.shape)
-    return action
 
 
 def digest_of(observation: Observation) -> str:

@@ -66,7 +66,7 @@ def pending_decision(decision: Decision) -> dict[str, Any]:
     }
 
 
-def entries_of(observation: Observation, labels: Texts = None) -> list[tuple[str, JSON]]:
+def entries_of(observation: Observation, labels: Texts = None) -> list[tuple[str, Any]]:
     """Return the first entries of an observation, each as its name and its number or text."""
     return [*islice(_entries(labelled(observation, labels)), MOST_ENTRIES)]
 

@@ -65,27 +65,13 @@ class Link:
     """A connection to a page.
 
     Of each type of message, only the latest waits to be sent, because it replaces those before.
-
-    Attributes:
-        seat: The seat of the person; "": a spectator.
-        waiting: The number of messages from the page that wait for the game.
     """
 
     def __init__(self, websocket: WebSocket) -> None:
         """Make the link of an accepted websocket."""
         self.websocket = websocket
-        self.seat = ""
-        self.waiting = 0
         self._outbox: dict[str, str] = {}
         self._ready = asyncio.Event()
-
-    def take_seat(self, seat: str) -> None:
-        """Seat the person."""
-        self.seat = seat
-
-    def count_waiting(self, change: int) -> None:
-        """Add to the number of waiting messages."""
-        self.waiting += change
 
     def send(self, kind: str, text: str) -> None:
         """Send a message soon."""
@@ -123,7 +109,9 @@ class Table:
         self.latest: dict[str, str] = {}  # the latest message of each type, for newcomers
         self._connection = connection
         self._announce = announce
-        self._keys: dict[str, str] = {}
+        self._keys: dict[str, str] = {}  # of the seats
+        self._seats: dict[int, str] = {}  # of the links; spectators have none
+        self._waiting: Counter[int] = Counter()  # messages of each link that wait for the game
         self._numbers = count(1)
         self._inbox: asyncio.Queue[bytes] = asyncio.Queue()
         self._show(state)
@@ -134,9 +122,9 @@ class Table:
         link = Link(websocket)
         number = next(self._numbers)
         if len(self.links) >= MOST_PAGES:
-            oldest = next((other for other in self.links.values() if not other.seat), link)
+            spectators = (self.links[other] for other in self.links if other not in self._seats)
             with suppress(RuntimeError):
-                await oldest.websocket.close(1013)  # try again later
+                await next(spectators, link).websocket.close(1013)  # try again later
         self.links[number] = link
         for kind, text in self.latest.items():
             link.send(kind, text)
@@ -144,7 +132,7 @@ class Table:
         writer = asyncio.create_task(link.write())
         try:
             while (message := await websocket.receive())["type"] == "websocket.receive":
-                problem = self._pass_on(number, link, message.get("text") or "")
+                problem = self._pass_on(number, message.get("text") or "")
                 if problem:
                     link.send("error", json.dumps({"type": "error", "text": problem}))
                 await asyncio.sleep(PAUSE)
@@ -152,10 +140,11 @@ class Table:
             pass
         finally:
             writer.cancel()
-            del self.links[number]
+            del self.links[number], self._waiting[number]
+            self._seats.pop(number, None)
             self._tell_people()
 
-    def _pass_on(self, number: int, link: Link, text: str) -> str:
+    def _pass_on(self, number: int, text: str) -> str:
         """Check a message, and pass it on to the game; return the problem, or ""."""
         try:
             message = json.loads(text, parse_constant=str)
@@ -168,19 +157,19 @@ class Table:
         if not expected or not hmac.compare_digest(expected.encode(), key.encode(errors="replace")):
             return "the link of this page has no key of this game: ask for the link of your seat"
         if message.get("do") == "take":
-            link.take_seat(seat)
+            self._seats[number] = seat
             self._tell_people()
-        elif link.waiting >= MOST_WAITING or self._inbox.qsize() > MOST_WAITING * MOST_PAGES:
+        elif self._waiting[number] >= MOST_WAITING:
             return "the game is busy; try again"
         else:
-            link.count_waiting(1)
+            self._waiting[number] += 1
             self._inbox.put_nowait(parcel)
         return ""
 
     def _tell_people(self) -> None:
         """Tell pages and game which seats people have."""
-        taken = Counter(link.seat for link in self.links.values())
-        spectators = taken.pop("", 0)
+        taken = Counter(self._seats.values())
+        spectators = len(self.links) - taken.total()
         self._send_all({"type": "people", "spectators": spectators, "taken": taken})
         self._inbox.put_nowait(pickle.dumps((None, None, {"taken": taken})))
 
@@ -202,12 +191,13 @@ class Table:
         with suppress(EOFError, OSError):
             while True:
                 number, message = await asyncio.to_thread(self._connection.recv)
-                if number is None:
-                    self._show(message)
-                elif number in self.links:
-                    link = self.links[number]
-                    link.count_waiting(-1)
-                    if message is not None:
+                link = self.links.get(number)
+                if link is not None:
+                    self._waiting[number] -= 1
+                if message is not None:
+                    if number is None:
+                        self._show(message)
+                    elif link is not None:
                         link.send("error", json.dumps(message))
 
     async def write_game(self) -> None:

@@ -1,20 +1,17 @@
 """Pending decisions as text and as JSON, and texts as actions, by the labels of ``make_step``."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Final, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 
 from ..core.clone import pending_view
 from ..core.pending import Decision, Texts, decision_of
-from ..envs.base import View
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import Action, Observation
 
@@ -30,18 +27,8 @@ MISFITS: Final = (ValueError, TypeError, LookupError, OverflowError)
 UNLABELLED_NUMBER: Final = ("0",)
 """The labels of a ``Box`` of one number that the user has not labelled."""
 
-Result = TypeVar("Result")
 
-
-class Environment(Protocol):
-    """A Gymnasium or PettingZoo environment of one simulation, with or without wrappers."""
-
-    @property
-    def unwrapped(self) -> object:
-        """The environment without its wrappers."""
-
-
-def describe(env_or_decision: Environment | Decision, *, as_json: bool = False) -> Any:
+def describe(env_or_decision: object, *, as_json: bool = False) -> Any:
     """Describe the pending decision.
 
     The description has the agent, the time, its observation, its legal actions, and the reward of
@@ -61,7 +48,7 @@ def describe(env_or_decision: Environment | Decision, *, as_json: bool = False) 
     return at_decision(env_or_decision, "describe", _as_json if as_json else _as_text)
 
 
-def parse(env_or_decision: Environment | Decision, text: str) -> Action:
+def parse(env_or_decision: object, text: str) -> Action:
     """Return the action that a text names.
 
     A text names an action by its label, by its value, or as JSON such as ``{"action": "open"}``.
@@ -78,11 +65,8 @@ def parse(env_or_decision: Environment | Decision, text: str) -> Action:
 
 
 def at_decision(
-    env_or_decision: Environment | Decision,
-    user: str,
-    function: Callable[..., Result],
-    *args: object,
-) -> Result:
+    env_or_decision: object, user: str, function: Callable[..., Any], *args: object
+) -> Any:
     """Call a function with a decision; for an environment, with its pending one.
 
     A clone calls the function in its own process, so that a decision is never pickled.
@@ -95,12 +79,10 @@ def at_decision(
     """
     if isinstance(env_or_decision, Decision):
         return function(env_or_decision, *args)
-    view: View = pending_view(env_or_decision, user)
-    result: Result = view.call(_call_in_view, function, *args)
-    return result
+    return pending_view(env_or_decision, user).call(_call_in_view, function, *args)
 
 
-def _call_in_view(env: Any, function: Callable[..., Result], *args: object) -> Result:
+def _call_in_view(env: Any, function: Callable[..., Any], *args: object) -> Any:
     episode = env.unwrapped.episode
     return function(decision_of(episode, episode.deciding), *args)
 
@@ -192,10 +174,11 @@ def legal_labels(decision: Decision) -> dict[str, int]:
         return {}
     legal = legal_actions(space, decision.mask)
     occurrences = Counter(labels[action] for action in legal)
-    return {
-        f"{label} ({action})" if occurrences[label] > 1 else label: action
-        for action, label in ((action, labels[action]) for action in legal)
-    }
+    names = {}
+    for action in legal:
+        label = labels[action]
+        names[f"{label} ({action})" if occurrences[label] > 1 else label] = action
+    return names
 
 
 def _legal_lines(decision: Decision) -> list[str]:

@@ -1,7 +1,5 @@
 """A policy that asks a language model, over an endpoint that speaks OpenAI's chat completions."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os
@@ -28,7 +26,7 @@ from ..errors import (
 )
 from ..many.parallel import import_extra
 from ..simulation import Action, Observation
-from .descriptions import JSON, Environment, action_schema, at_decision, describe, parse
+from .descriptions import JSON, action_schema, at_decision, describe, parse
 from .policies import check_count
 
 LONGEST_WAIT: Final = 30.0
@@ -130,13 +128,14 @@ class LanguageModelPolicy:
         names = ("requests", "prompt_tokens", "completion_tokens", "seconds")
         return {name: counts.get(name, 0) for name in names}
 
-    def prompt(self, env_or_decision: Environment | Decision) -> str:
+    def prompt(self, env_or_decision: object) -> str:
         """Return the prompt for the pending decision: the instructions and the description.
 
         Raises:
             ResetNeededError: No decision is pending.
         """
-        return at_decision(env_or_decision, "prompt", self._prompt)
+        text: str = at_decision(env_or_decision, "prompt", self._prompt)
+        return text
 
     def _prompt(self, decision: Decision) -> str:
         return f"{self._system_text(decision)}\n\n{self._question(decision)}"
@@ -305,5 +304,5 @@ def _request_error(model: str, error: Exception) -> Exception:
 
 def _close(client: Any, process: int) -> None:
     """Close the connections of a client in the policies' thread, without waiting for it."""
-    if os.getpid() == process:
+    if os.getpid() == process:  # not in a fork, which has no part in the connections
         Answer(client.close(), lambda answer: None)

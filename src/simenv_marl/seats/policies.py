@@ -1,7 +1,5 @@
 """Policies around policies: fallbacks for failing policies, and recordings of answers."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

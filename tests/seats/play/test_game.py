@@ -109,7 +109,7 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ga
     assert (game.turn, game.over, game.pending["agent"]) == (14, "", "buyer")
     assert settle(game)["seats"] == ["buyer"]
     game.handle("buyer", {"do": "redo"})
-    assert (game.turn, game.over, game.returns()) == (16, "terminated", state["returns"])
+    assert (game.turn, game.over, game.returns) == (16, "terminated", state["returns"])
     game.handle("buyer", {"do": "undo"})
     assert play(game, [2])["returns"] == state["returns"]
 
@@ -206,7 +206,7 @@ def test_without_reseed_there_is_one_future_and_a_note(make_game):
     assert {one["n"] for one in fan["candidates"]} == {1}
     assert "reseed" in fan["note"]
     play(game, [2] * 8)
-    assert game.returns()["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
+    assert game.returns["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
 
 
 def test_observations_and_actions_have_a_form_in_json():

@@ -1,7 +1,5 @@
 """Decisions, action spaces, pictures and actions as JSON, for the page and for recordings."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from base64 import b64encode
@@ -9,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from math import isfinite
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
@@ -18,9 +16,12 @@ from numpy.typing import NDArray
 from ...core.pending import Decision, Texts
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
-from ...simulation import Action, Observation
+from ...simulation import RULE, Action, Observation
 from ..descriptions import JSON, MISFITS, labelled, legal_actions, to_action
 from ..policies import digest_of
+
+Message: TypeAlias = dict[str, Any]
+"""A message between the page, the server and the game, or a part of one."""
 
 MOST_CANDIDATES: Final = 12
 """The largest number of candidates for a decision."""
@@ -50,7 +51,7 @@ def jsonable(value: object) -> JSON:
     return short_repr(value)
 
 
-def pending_decision(decision: Decision) -> dict[str, Any]:
+def pending_decision(decision: Decision) -> Message:
     """Return a decision as JSON, for the page."""
     return {
         "agent": decision.agent,
@@ -82,7 +83,7 @@ def _entries(value: JSON, name: str = "") -> Iterator[tuple[str, JSON]]:
         yield name or "value", jsonable(value)
 
 
-def describe_space(space: Space[Any]) -> dict[str, JSON]:
+def describe_space(space: Space[Any]) -> Message:
     """Describe an action space as JSON, from which the page makes its inputs."""
     if isinstance(space, Discrete):
         return {"kind": "discrete", "start": int(space.start), "n": int(space.n)}
@@ -114,7 +115,7 @@ def candidates_of(space: Space[Any], mask: Sequence[int] | None) -> list[Action]
     return []
 
 
-def picture_of(env: SimulationAECEnv) -> dict[str, str] | None:
+def picture_of(env: SimulationAECEnv) -> Message | None:
     """Return the rendered image as JSON: a text, or the PNG of an array ``(height, width, 3)``."""
     try:
         rendered = None if env.render_mode is None else env.render()
@@ -142,10 +143,12 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 
 
 def action_of(space: Space[Any], value: Action) -> Action:
-    """Return the action for its JSON.
+    """Return the action for its JSON; ``RULE`` for None.
 
     A value that does not fit is returned as it is, so that the environment refuses it.
     """
+    if value is None:
+        return RULE
     with suppress(*MISFITS):
         return to_action(space, value)
     return value

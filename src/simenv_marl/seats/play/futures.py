@@ -1,11 +1,9 @@
 """The futures of a pending decision: clones in which its candidates are tried out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -13,8 +11,7 @@ from ... import RULE, clone
 from ...envs import SimulationAECEnv
 from ...errors import describe_error
 from ...simulation import Action, Observation
-from ..descriptions import JSON
-from .forms import MOST_CANDIDATES, action_of, candidates_of, entries_of, jsonable
+from .forms import MOST_CANDIDATES, Message, action_of, candidates_of, entries_of, jsonable
 
 FUTURES: Final = 16
 """The number of futures in which each candidate is tried out."""
@@ -57,7 +54,7 @@ class Futures:
     """
 
     env: SimulationAECEnv
-    pending: dict[str, Any]
+    pending: Message
     turn: int
     horizon: int
     seed: int
@@ -72,7 +69,7 @@ class Futures:
         entries = enumerate(self.pending["observation"])
         numbers = [(place, name) for place, (name, value) in entries if type(value) in NUMBERS]
         self.measures = dict(numbers[:MOST_MEASURES])
-        self.rule_action: dict[str, JSON] = {}
+        self.rule_action: Message = {}
 
     def add(self, action: Action) -> None:
         """Add a candidate, as JSON.
@@ -86,7 +83,7 @@ class Futures:
         if len(actions) < MOST_CANDIDATES and action not in actions:
             self.candidates.append(Candidate(action, []))
 
-    def explore(self) -> Iterator[dict[str, Any] | None]:
+    def explore(self) -> Iterator[Message | None]:
         """Try out the candidates.
 
         Yields:
@@ -115,7 +112,7 @@ class Futures:
         try:
             with closing(clone(self.env, seed=seed, time_limit=TIME_LIMIT)) as twin:
                 action = candidate.action
-                twin.step(RULE if action is None else action_of(self.space, action))
+                twin.step(action_of(self.space, action))
                 while twin.agents:
                     is_own = twin.agent_selection == self.agent
                     observation, reward, terminated, truncated, info = twin.last(observe=is_own)
@@ -137,7 +134,7 @@ class Futures:
         values = [value for _, value in entries_of(observation)]
         return [total, *(float(values[place]) for place in self.measures)]
 
-    def message(self) -> dict[str, Any]:
+    def message(self) -> Message:
         """Return the message for the page.
 
         Its ``bands`` have, for each measure, the lower end of the 80 % band, the median and the

@@ -6,19 +6,18 @@ with the number None are for all pages. Work that takes time is a generator, whi
 between two steps of the simulation when a message has come.
 """
 
-from __future__ import annotations
-
 import json
 import signal
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, NotRequired, TypedDict
+from typing import Any, Final, NamedTuple, NotRequired, TypedDict
 
-from ... import RULE, aec_env, clone
+from ... import aec_env, clone
 from ...envs import SimulationAECEnv
 from ...errors import (
     InvalidActionError,
@@ -31,7 +30,7 @@ from ...errors import (
 )
 from ...simulation import Action, Model
 from ..descriptions import JSON, at_decision
-from .forms import action_of, jsonable, pending_decision, picture_of
+from .forms import Message, action_of, jsonable, pending_decision, picture_of
 from .futures import MOST_MEASURES, Futures
 
 CHECKPOINTS: Final = 24
@@ -69,73 +68,77 @@ class Row(TypedDict):
     reward: NotRequired[float | None]
 
 
+class Checkpoint(NamedTuple):
+    """A clone at a former decision, and the returns of the agents there."""
+
+    env: SimulationAECEnv
+    returns: dict[str, float]
+
+
+@dataclass
 class Game:
     """An episode with its past.
 
     Attributes:
+        simulation: The simulation, as ``aec_env`` takes it.
+        name: The name of the simulation.
+        seats: The agents that people play; none: all agents.
+        seed: The seed of the episode.
+        limit: The time limit of a person's decision, in seconds.
+        record: The file of the recording.
+        can_fork: Whether checkpoints can be made. Else the way back is a replay.
+        horizon: The number of an agent's decisions in its futures.
+        occupied: The seats that people have.
+        late: The number of decisions of each seat that the rule took because of the time limit.
+        checkpoints: The checkpoints, by turn.
+        root: The environment that was made for the game.
+        env: The environment at the pending decision: ``root`` or a clone.
+        agents: The agents that are known.
         timeline: The decisions, also those after the pending one that were undone.
         turn: The place of the pending decision in the timeline.
         pending: The pending decision as JSON; None at the end.
         over: Why the episode is over: "terminated", "truncated" or an error. "": it is not.
-        notice: A warning for the page.
+        returns: The return of each agent so far.
+        latest: The turn of the latest decision of each agent.
         futures: The futures of the pending decision, once they are explored.
-        root: The environment that was made for the game.
-        env: The environment at the pending decision: ``root`` or a clone.
-        checkpoints: Clones at former decisions, by turn.
-        can_fork: Whether checkpoints can be made. Else the way back is a replay.
-        occupied: The seats that people have.
+        deadline: The time of ``monotonic`` at which the rule decides, in seconds; None: never.
         delegated: How many of its next decisions each seat leaves to the rule.
-        late: The number of decisions of each seat that the rule took because of the time limit.
-        deadline: When the rule decides, in seconds of ``monotonic``; None: it does not.
+        skipping: The seat until whose next decision the rule plays for free seats.
+        notice: A warning for the page.
     """
 
-    def __init__(
-        self,
-        simulation: Model,
-        *,
-        name: str,
-        seats: Sequence[str],
-        seed: int,
-        limit: float | None,
-        record: Path | None,
-    ) -> None:
-        """Begin an episode.
+    simulation: Model
+    name: str
+    seats: Sequence[str]
+    seed: int
+    limit: float | None = None
+    record: Path | None = None
+    can_fork: bool = True
+    horizon: int = 8
+    occupied: Collection[str] = ()
+    late: Counter[str] = field(default_factory=Counter)
+    checkpoints: dict[int, Checkpoint] = field(default_factory=dict)
 
-        Args:
-            simulation: The simulation, as ``aec_env`` takes it.
-            name: The name of the simulation.
-            seats: The agents that people play; none: all agents.
-            seed: The seed of the first episode.
-            limit: The time limit of a person's decision, in seconds.
-            record: The file of the recording.
+    def __post_init__(self) -> None:
+        """Begin an episode.
 
         Raises:
             OptionValueError: An argument has an invalid value, or the episode cannot begin.
         """
-        if limit is not None and not 0 < limit < 1e6:
-            raise OptionValueError(f"limit must be a positive number of seconds, not {limit}")
-        modes = aec_env(simulation).metadata["render_modes"]
+        if self.limit is not None and not 0 < self.limit < 1e6:
+            raise OptionValueError(f"limit must be a positive number of seconds, not {self.limit}")
+        modes = aec_env(self.simulation).metadata["render_modes"]
         mode = next((mode for mode in ("rgb_array", "ansi") if mode in modes), None)
-        self.root = aec_env(simulation, render_mode=mode)
+        self.root = self.env = aec_env(self.simulation, render_mode=mode)
         agents: list[str] = getattr(self.root, "possible_agents", [])
-        for seat in set(seats).difference(agents or seats):
+        for seat in set(self.seats).difference(agents or self.seats):
             raise OptionValueError(
                 f"there is no agent {seat!r}; the agents are {agents}{did_you_mean(seat, agents)}"
             )
-        self.name = name
-        self.limit = limit
-        self.record = record
-        self.can_fork = True
-        self.env: SimulationAECEnv = self.root
-        self.checkpoints: dict[int, SimulationAECEnv] = {}
-        self.occupied: Collection[str] = ()
-        self.late: Counter[str] = Counter()
-        self._persons = seats
-        self._seats = dict.fromkeys(seats or agents)
-        self._horizon = 8
-        self.restart(seed)
+        self.agents = dict.fromkeys(self.seats or agents)
+        self.restart(self.seed)
         if self.over or self.notice:
-            raise OptionValueError(f"{name} cannot be played: {self.over or self.notice}")
+            raise OptionValueError(f"{self.name} cannot be played: {self.over or self.notice}")
 
     def restart(self, seed: int) -> None:
         """Begin another episode."""
@@ -143,10 +146,9 @@ class Game:
         self.seed = seed
         self.notice = ""
         self.timeline: list[Row] = []
-        self._ends: dict[str, tuple[int, float]] = {}  # the turn and the return of ended agents
         self._stop_rule()
         self._return_to(0)
-        self._record({"simulation": self.name, "seed": seed, "seats": list(self._seats)})
+        self._record({"simulation": self.name, "seed": seed, "seats": list(self.agents)})
 
     def decide(self, action: Action, by: str) -> None:
         """Take the pending decision.
@@ -166,11 +168,11 @@ class Game:
         line = {key: value for key, value in row.items() if key in RECORDED}
         self._arrive(self.turn + 1)
         if self.over:
-            line |= {"end": self.over, "returns": self.returns()}
-            absent = [seat for seat in self._persons if seat not in self._latest]
+            line |= {"end": self.over, "returns": self.returns}
+            absent = [seat for seat in self.seats if seat not in self.latest]
             if absent:
                 names = ", ".join(absent)
-                others = ", ".join(self._latest)
+                others = ", ".join(self.latest)
                 self.notice = f"No decision was one of {names}; {others} decided."
         self._record(line)
 
@@ -193,26 +195,18 @@ class Game:
     def forget(self, turn: int) -> None:
         """Close the checkpoints after a turn."""
         for later in [start for start in self.checkpoints if start > turn]:
-            self.checkpoints.pop(later).close()
+            self.checkpoints.pop(later).env.close()
 
     def plays(self, agent: str) -> bool:
         """Return whether the agent's seat is for a person."""
-        return not self._persons or agent in self._persons
-
-    def returns(self) -> dict[str, float]:
-        """Return the return of each agent so far."""
-        running = {agent: self.timeline[turn]["before"] for agent, turn in self._latest.items()}
-        return running | {agent: total for agent, (_, total) in self._ends.items()}
+        return not self.seats or agent in self.seats
 
     def _stop_rule(self) -> None:
         self.delegated: Counter[str] = Counter()
-        self._skipping: str | None = None  # the seat for whose next decision the rule plays on
+        self.skipping: str | None = None  # the seat for whose next decision the rule plays on
 
     def _step(self, agent: str, action: Action) -> None:
-        if action is None:
-            self._attempt(self.env.step, RULE)
-        else:
-            self._attempt(self.env.step, action_of(self.env.action_space(agent), action))
+        self._attempt(self.env.step, action_of(self.env.action_space(agent), action))
 
     def _attempt(self, function: Callable[..., Any], *args: object) -> Any:
         """Call a function of the environment; an error ends the episode.
@@ -232,10 +226,14 @@ class Game:
         """Continue at a checkpoint. The beginning needs none."""
         checkpoint = self.checkpoints.get(turn)
         previous = self.env
-        self.env = self.root if checkpoint is None else clone(checkpoint)
+        if checkpoint is None:
+            self.env = self.root
+            self.returns: dict[str, float] = {}
+        else:
+            self.env = clone(checkpoint.env)
+            self.returns = {**checkpoint.returns}
         self.over = ""
-        self._ends = {agent: end for agent, end in self._ends.items() if end[0] <= turn}
-        self._latest = {row["agent"]: row["turn"] for row in self.timeline[:turn]}
+        self.latest = {row["agent"]: row["turn"] for row in self.timeline[:turn]}
         if checkpoint is None:
             self._attempt(self.root.reset, self.seed)
         if previous is not self.root:
@@ -245,32 +243,31 @@ class Game:
     def _arrive(self, turn: int) -> None:
         """Note the reward of the agent that decides next, and the agents that have ended."""
         self.turn = turn
-        self.pending: dict[str, Any] | None = None
+        self.pending: Message | None = None
         self.deadline: float | None = None
         self.futures: Futures | None = None
-        self._picture: dict[str, str] | None = None
+        self.picture: Message | None = None
         end = ""
         while self.env.agents and not self.over:
             agent = self.env.agent_selection
             _, reward, terminated, truncated, _ = self.env.last(observe=False)
-            total = self._reward(agent, reward)
+            self._add_reward(agent, reward)
             if not (terminated or truncated):
-                self._note_pending(agent, total)
+                self._note_pending(agent)
                 return
-            self._ends[agent] = (turn, total)
             end = "truncated" if truncated else "terminated"
             self.env.step(None)
         self.over = self.over or end
 
-    def _reward(self, agent: str, reward: float) -> float:
-        """Add a reward to the agent's previous decision, and return the agent's return."""
-        if agent not in self._latest:
-            return 0.0
-        row = self.timeline[self._latest[agent]]
-        row["reward"] = reward
-        return row["before"] + reward
+    def _add_reward(self, agent: str, reward: float) -> None:
+        """Add the reward of an agent's previous decision to its return."""
+        self.returns.setdefault(agent, 0.0)
+        if agent in self.latest:
+            row = self.timeline[self.latest[agent]]
+            row["reward"] = reward
+            self.returns[agent] = row["before"] + reward
 
-    def _note_pending(self, agent: str, total: float) -> None:
+    def _note_pending(self, agent: str) -> None:
         """Note the pending decision in the timeline, which may have it with its action."""
         pending = self._attempt(at_decision, self.env, "play", pending_decision)
         if pending is None:
@@ -278,7 +275,7 @@ class Game:
         row: Row = {
             "turn": self.turn,
             "agent": agent,
-            "before": total,
+            "before": self.returns[agent],
             "seen": pending["seen"],
             "time": pending["time"],
             "values": [value for _, value in pending["observation"][:MOST_MEASURES]],
@@ -294,11 +291,11 @@ class Game:
         if self.turn == len(self.timeline):
             self.timeline.append(row)
         self.pending = pending
-        self._latest[agent] = self.turn
-        if not self._persons:
-            self._seats[agent] = None
+        self.latest[agent] = self.turn
+        if not self.seats:
+            self.agents[agent] = None
 
-    def _record(self, line: Mapping[str, object]) -> None:
+    def _record(self, line: Message) -> None:
         """Append a line to the recording, which is closed in between: clones need not copy it."""
         if self.record is None:
             return
@@ -350,7 +347,7 @@ class Game:
         connection.send((number, reply))
         return changed
 
-    def handle(self, seat: str | None, message: Mapping[str, Any]) -> bool:
+    def handle(self, seat: str | None, message: Message) -> bool:
         """Handle a message from a seat, or from the server if that is None.
 
         Returns:
@@ -363,7 +360,7 @@ class Game:
         if seat is None:
             self.occupied = message["taken"]
             self._start_clock()
-            return self._skipping is not None
+            return self.skipping is not None
         match message.get("do"):
             case "act":
                 self.decide(self._action_in(message, seat), "person")
@@ -378,7 +375,7 @@ class Game:
                 self._stop_rule()
                 self.delegated[seat] = _whole_number(message, 0, 100_000)
             case "skip":
-                self._skipping = seat
+                self.skipping = seat
             case "undo":
                 self.jump(max((turn for turn in self._turns(seat) if turn < self.turn), default=0))
             case "redo":
@@ -389,7 +386,7 @@ class Game:
             case "restart":
                 self.restart(_whole_number(message, 0, 2**31 - 1))
             case "horizon":
-                self._horizon = _whole_number(message, 1, 100)
+                self.horizon = _whole_number(message, 1, 100)
                 self.futures = None
             case unknown:
                 raise OptionValueError(f"the game does not know {short_repr(unknown)}")
@@ -398,13 +395,13 @@ class Game:
     def _turns(self, seat: str) -> list[int]:
         return [row["turn"] for row in self.timeline if row["agent"] == seat]
 
-    def _check_turn(self, message: Mapping[str, Any], seat: str) -> None:
+    def _check_turn(self, message: Message, seat: str) -> None:
         if self.pending is None or message.get("turn") != self.turn:
             raise InvalidActionError("another decision is pending by now")
         if self.pending["agent"] != seat:
             raise InvalidActionError(f"it is not your turn: {self.pending['agent']} decides")
 
-    def _action_in(self, message: Mapping[str, Any], seat: str) -> Action:
+    def _action_in(self, message: Message, seat: str) -> Action:
         self._check_turn(message, seat)
         action = message.get("action")
         if action is None:
@@ -422,7 +419,7 @@ class Game:
 
     # -- work --------------------------------------------------------------------------------------
 
-    def work(self) -> Iterator[dict[str, Any] | None]:
+    def work(self) -> Iterator[Message | None]:
         """Let the rule decide for seats without a person; then explore the futures.
 
         Yields:
@@ -438,10 +435,10 @@ class Game:
         if self.pending is not None:
             self._make_checkpoint()
             if self.futures is None:
-                self.futures = Futures(self.env, self.pending, self.turn, self._horizon, self.seed)
+                self.futures = Futures(self.env, self.pending, self.turn, self.horizon, self.seed)
             self._start_clock()
         if self.over in ENDS:
-            self._picture = picture_of(self.env)
+            self.picture = picture_of(self.env)
         yield self.snapshot()
         if self.futures is not None:
             yield from self.futures.explore()
@@ -449,47 +446,47 @@ class Game:
     def _leaves_to_rule(self, agent: str) -> bool:
         if not self.plays(agent):
             return True
-        if self._skipping == agent:
-            self._skipping = None
+        if self.skipping == agent:
+            self.skipping = None
         if self.delegated[agent]:
             self.delegated[agent] -= 1
             return True
-        return self._skipping is not None and agent not in self.occupied
+        return self.skipping is not None and agent not in self.occupied
 
     def _make_checkpoint(self) -> None:
         """Make a checkpoint of the pending decision. If there are too many, thin out the oldest."""
         if not self.can_fork or self.turn in self.checkpoints:
             return
         try:
-            self.checkpoints[self.turn] = clone(self.env, method="fork")
+            twin = clone(self.env, method="fork")
+            self.checkpoints[self.turn] = Checkpoint(twin, {**self.returns})
         except SimEnvError:
             self.can_fork = False
         if len(self.checkpoints) > CHECKPOINTS:
             for turn in sorted(self.checkpoints)[1 : CHECKPOINTS // 2 : 2]:
-                self.checkpoints.pop(turn).close()
+                self.checkpoints.pop(turn).env.close()
 
-    def snapshot(self) -> dict[str, Any]:
+    def snapshot(self) -> Message:
         """Return the message with the state of the game, without its futures."""
-        answered = [row for row in self.timeline[-1:] if "action" not in row]
         return {
             "type": "state",
             "simulation": self.name,
             "seed": self.seed,
-            "seats": list(self._seats),
+            "seats": list(self.agents),
             "turn": self.turn,
-            "length": len(self.timeline) - len(answered),
+            "length": sum("action" in row for row in self.timeline),
             "pending": self.pending,
             "over": self.over,
-            "returns": self.returns(),
+            "returns": self.returns,
             "history": self.timeline[max(0, self.turn - MOST_ROWS) : self.turn + 1],
             "left": self._seconds_left(),
             "late": self.late,
-            "picture": self._picture,
+            "picture": self.picture,
             "notice": self.notice,
         }
 
 
-def _whole_number(message: Mapping[str, Any], low: int, high: int) -> int:
+def _whole_number(message: Message, low: int, high: int) -> int:
     """Return the number ``n`` of a message, or raise an ``OptionValueError``."""
     value = message.get("n")
     if type(value) is not int or not low <= value <= high:

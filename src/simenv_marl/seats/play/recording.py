@@ -1,15 +1,13 @@
 """Recordings of the page, and the episodes that they describe."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TypeAlias, Unpack
 
-from ... import RULE, aec_env
+from ... import aec_env
 from ...core.options import EpisodeOptions
 from ...core.points import Points
 from ...data import Trajectories, collect_episodes
@@ -17,18 +15,18 @@ from ...envs import SimulationAECEnv
 from ...errors import InvalidActionError, OptionValueError, ResetNeededError, StoreError, short_repr
 from ...simulation import Action, Model
 from ..policies import digest_of
-from .forms import action_of
+from .forms import Message, action_of
 
-Line = dict[str, Any]
-"""A line of a recording: a decision."""
+Episode: TypeAlias = tuple[int, list[Message]]
+"""The seed of an episode, and the lines of its decisions."""
 
 
-def read(path: str | os.PathLike[str]) -> list[tuple[int, list[Line]]]:
+def read(path: str | os.PathLike[str]) -> list[Episode]:
     """Read the episodes of a recording: seeds and decisions.
 
     A decision replaces the earlier ones from its turn on, which were undone.
     """
-    episodes: list[tuple[int, list[Line]]] = []
+    episodes: list[Episode] = []
     try:
         for text in Path(path).read_text(encoding="utf-8").splitlines():
             line = json.loads(text)
@@ -87,10 +85,7 @@ def replay(
                         f"{problem}: decision {turn} was one of {line['agent']!r}, and is now one"
                         f" of {agent!r}, or with another observation"
                     )
-                action = line["action"]
-                actions.append(
-                    RULE if action is None else action_of(env.action_space(agent), action)
-                )
+                actions.append(action_of(env.action_space(agent), line["action"]))
                 env.step(actions[-1])
     except (InvalidActionError, ResetNeededError) as error:
         raise OptionValueError(f"{problem}: {error}") from error

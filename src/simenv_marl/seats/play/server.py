@@ -1,7 +1,5 @@
 """The server of the page: it connects people's browsers with the process of the game."""
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import json
@@ -10,14 +8,14 @@ import secrets
 import select
 import socket
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from ipaddress import ip_address
 from itertools import count
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from urllib.parse import quote, urlsplit
 
 import uvicorn
@@ -30,6 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ...errors import OptionValueError, ProcessDiedError
 from ...simulation import Model
+from .forms import Message
 from .game import run_game
 
 MOST_PAGES: Final = 64
@@ -95,7 +94,7 @@ class Table:
     def __init__(
         self,
         connection: Connection,
-        state: Mapping[str, Any],
+        state: Message,
         announce: Callable[[str], None],
     ) -> None:
         """Take over the game's connection.
@@ -173,14 +172,14 @@ class Table:
         self._send_all({"type": "people", "spectators": spectators, "taken": taken})
         self._inbox.put_nowait(pickle.dumps((None, None, {"taken": taken})))
 
-    def _show(self, message: Mapping[str, Any]) -> None:
+    def _show(self, message: Message) -> None:
         for seat in message.get("seats", ()):
             if seat not in self._keys:
                 self._keys[seat] = secrets.token_hex(16)
                 self._announce(f"/seat/{quote(seat, safe='')}?key={self._keys[seat]}")
         self._send_all(message)
 
-    def _send_all(self, message: Mapping[str, Any]) -> None:
+    def _send_all(self, message: Message) -> None:
         kind = message["type"]
         text = self.latest[kind] = json.dumps(message)
         for link in self.links.values():

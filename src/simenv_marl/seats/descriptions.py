@@ -5,10 +5,12 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
+from math import isfinite
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from numpy.typing import NDArray
 
 from ..core.clone import pending_view
 from ..core.pending import Decision, Texts, decision_of
@@ -118,16 +120,18 @@ def _as_json(decision: Decision) -> dict[str, JSON]:
 
 def labelled(value: Observation, labels: Texts) -> JSON:
     """Return an observation as JSON, with the labels of its parts."""
-    if isinstance(value, Mapping):
-        return {str(_label(labels, key)): labelled(part, None) for key, part in value.items()}
-    if isinstance(value, tuple):
-        return [labelled(part, None) for part in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        numbers = value.tolist()
-        value = _rounded(numbers)
-        if isinstance(labels, Sequence) and labels and isinstance(numbers, list):
-            return dict(zip(labels, value, strict=True))
-    return value if isinstance(value, list) else _label(labels, value)
+    match value:
+        case Mapping():
+            return {str(_label(labels, key)): labelled(part, None) for key, part in value.items()}
+        case tuple():
+            return [labelled(part, None) for part in value]
+        case np.ndarray() | np.generic():
+            numbers = _rounded(value.tolist())
+            if isinstance(numbers, list):
+                return dict(zip(labels, numbers, strict=True)) if labels else numbers
+            return _label(labels, numbers)
+        case _:
+            return _label(labels, value)
 
 
 def _label(labels: Texts, key: JSON) -> JSON:
@@ -137,9 +141,13 @@ def _label(labels: Texts, key: JSON) -> JSON:
 
 def _rounded(value: JSON) -> JSON:
     """Round numbers to seven digits, because a float32 has no more; keep other values."""
-    if isinstance(value, list):
-        return [_rounded(part) for part in value]
-    return float(f"{value:.7g}") if isinstance(value, float) else value
+    match value:
+        case list():
+            return [_rounded(part) for part in value]
+        case float():
+            return float(f"{value:.7g}")
+        case _:
+            return value
 
 
 def _observation_lines(observation: JSON) -> list[str]:
@@ -198,11 +206,13 @@ def _legal_lines(decision: Decision) -> list[str]:
 
 
 def _limits(space: Space[Any]) -> str:
-    if isinstance(space, Discrete):
-        return f"an integer from {space.start} to {space.start + space.n - 1}"
-    if isinstance(space, Box) and space.shape in ((), (1,)):
-        return f"a number from {space.low.item():.6g} to {space.high.item():.6g}"
-    return str(space)
+    match space:
+        case Discrete():
+            return f"an integer from {space.start} to {space.start + space.n - 1}"
+        case Box(shape=() | (1,)):
+            return f"a number from {space.low.item():.6g} to {space.high.item():.6g}"
+        case _:
+            return str(space)
 
 
 def action_schema(decision: Decision) -> dict[str, JSON]:
@@ -214,17 +224,15 @@ def action_schema(decision: Decision) -> dict[str, JSON]:
 
 
 def _schema(space: Space[Any], labels: Texts) -> dict[str, JSON]:
-    if isinstance(space, Discrete):
-        first = int(space.start)
-        return {"type": "integer", "minimum": first, "maximum": first + int(space.n) - 1}
-    if isinstance(space, Box) and space.shape in ((), (1,)):
-        limits = {"minimum": space.low.item(), "maximum": space.high.item()}
-        is_float = isinstance(limits["minimum"], float)
-        schema: dict[str, JSON] = {"type": "number" if is_float else "integer"}
-        schema |= {name: limit for name, limit in limits.items() if np.isfinite(limit)}
-        if isinstance(labels, tuple) and labels != UNLABELLED_NUMBER:
-            schema["description"] = labels[0]
-        return schema
+    match space:
+        case Discrete():
+            first = int(space.start)
+            return {"type": "integer", "minimum": first, "maximum": first + int(space.n) - 1}
+        case Box(shape=() | (1,)):
+            schema = _number_schema(space.low.item(), space.high.item())
+            if labels and labels != UNLABELLED_NUMBER:
+                schema["description"] = labels[0]
+            return schema
     parts = _parts(space, labels)
     if not parts:
         raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
@@ -236,26 +244,33 @@ def _schema(space: Space[Any], labels: Texts) -> dict[str, JSON]:
     }
 
 
+def _number_schema(low: float, high: float) -> dict[str, JSON]:
+    limits = {"minimum": low, "maximum": high}
+    finite = {name: limit for name, limit in limits.items() if isfinite(limit)}
+    return {"type": "number" if isinstance(low, float) else "integer", **finite}
+
+
 def _parts(space: Space[Any], labels: Texts) -> dict[str, Space[Any]]:
     """Return the spaces of an action's components, by label, or else by key or index.
 
     Return an empty dict for other spaces, and for arrays of two or more dimensions.
     """
-    if isinstance(space, Dict):
-        return {str(_label(labels, key)): part for key, part in space.items()}
-    parts: Sequence[Space[Any]] = ()
-    if isinstance(space, Tuple):
-        parts = space.spaces
-    elif space.shape is None or len(space.shape) != 1:
-        return {}
-    elif isinstance(space, Box):
-        limits = zip(space.low, space.high, strict=True)
-        parts = [Box(low, high, (), low.dtype) for low, high in limits]
-    elif isinstance(space, MultiDiscrete):
-        sizes = zip(space.nvec, space.start, strict=True)
-        parts = [Discrete(size, start=start) for size, start in sizes]
-    elif isinstance(space, MultiBinary):
-        parts = [Discrete(2)] * space.shape[0]
+    parts: Sequence[Space[Any]]
+    match space:
+        case Dict():
+            return {str(_label(labels, key)): part for key, part in space.items()}
+        case Tuple():
+            parts = space.spaces
+        case Box(shape=(_,)):
+            limits = zip(space.low, space.high, strict=True)
+            parts = [Box(low, high, (), low.dtype) for low, high in limits]
+        case MultiDiscrete(shape=(_,)):
+            sizes = zip(space.nvec, space.start, strict=True)
+            parts = [Discrete(size, start=start) for size, start in sizes]
+        case MultiBinary(shape=(size,)):
+            parts = [Discrete(2)] * size
+        case _:
+            return {}
     return dict(zip(labels or _indices(len(parts)), parts, strict=True))
 
 
@@ -354,23 +369,35 @@ def to_action(space: Space[Any], value: Action, labels: Texts = None) -> Action:
     Raises:
         ValueError, TypeError, LookupError, OverflowError: The JSON does not fit the space.
     """
-    if isinstance(space, Discrete):
-        return _whole_number(value)
-    if isinstance(space, Dict):
-        values = dict(value)
-        return {
-            key: to_action(part, values.get(_label(labels, key), values.get(key)))
-            for key, part in space.items()
-        }
-    if not isinstance(space, (Tuple, Box, MultiDiscrete, MultiBinary)):
+    match space:
+        case Discrete():
+            return _whole_number(value)
+        case Dict():
+            values = dict(value)
+            return {
+                key: to_action(part, values.get(_label(labels, key), values.get(key)))
+                for key, part in space.items()
+            }
+        case Tuple():
+            values = _listed(value, labels)
+            return tuple(to_action(part, values[place]) for place, part in enumerate(space))
+        case Box() | MultiDiscrete() | MultiBinary():
+            return _to_array(space, _listed(value, labels))
+        case _:
+            return value
+
+
+def _listed(value: Action, labels: Texts) -> Action:
+    """Return the components of an object as a list, and another value as it is."""
+    if not isinstance(value, Mapping):
         return value
-    if isinstance(value, Mapping):
-        names = labels or _indices(len(value))
-        if set(value) != set(names):
-            raise ValueError("components are missing, or unknown")
-        value = [value[name] for name in names]
-    if isinstance(space, Tuple):
-        return tuple(to_action(part, value[place]) for place, part in enumerate(space))
+    names = labels or _indices(len(value))
+    if set(value) != set(names):
+        raise ValueError("components are missing, or unknown")
+    return [value[name] for name in names]
+
+
+def _to_array(space: Space[Any], value: Action) -> NDArray[Any]:
     if isinstance(value, str):
         value = value.replace(",", " ").split()
     numbers = np.asarray(value).reshape(space.shape)

@@ -107,42 +107,42 @@ class FallbackPolicy(PolicyWrapper):
         **context: object,
     ) -> Action | Awaitable[Action]:
         """Answer a decision. Return an awaitable if one of the two policies has to be awaited."""
-        answer = self._answer(observation, info, {**context, "_decision": _decision})
+        context["_decision"] = _decision
+        answer = self._answer(_decision, observation, info, context)
         return answer if self.waits else _run_without_waiting(answer)
 
-    async def _answer(
-        self, observation: Observation, info: object, context: Mapping[str, Any]
-    ) -> Action:
-        decision: Decision = context["_decision"]
+    async def _answer(self, decision: Decision, *arguments: Any) -> Action:
+        """Answer with the arguments of a ``Caller``."""
         self._count(decision, "asked")
         for attempt in range(self.retries + 1):
             if attempt:
                 self._count(decision, "retried")
             try:
-                answer = await self._ask_in_time(observation, info, context)
+                answer = await self._ask_in_time(*arguments)
                 if answer is not RULE:
                     decision.validate(answer)
                 return answer
             except OptionValueError:  # a mistake in the program, which no fallback should hide
                 raise
+            except TimeoutError as error:
+                self._note(decision, "late", error)
+            except InvalidActionError as error:
+                self._note(decision, "illegal", error)
             except Exception as error:
-                self.last_error = describe_error(error)
-                self._count(decision, _kind_of(error))
+                self._note(decision, "failed", error)
         self._count(decision, "fallbacks")
         decision.count_fallback()
         if self._ask_fallback is None:
             return RULE
-        answer = self._ask_fallback(observation, info, context)
+        answer = self._ask_fallback(*arguments)
         return await answer if isawaitable(answer) else answer
 
-    async def _ask_in_time(
-        self, observation: Observation, info: object, context: Mapping[str, Any]
-    ) -> Action:
+    async def _ask_in_time(self, *arguments: Any) -> Action:
         """Ask the policy; raise a ``TimeoutError`` if its answer takes too long."""
         problem = f"the answer took longer than {self.timeout} s"
         start = monotonic()
         try:
-            answer = self.ask(observation, info, context)
+            answer = self.ask(*arguments)
             if isawaitable(answer) and self.waits:
                 answer = await asyncio.wait_for(answer, self.timeout)
         except TimeoutError as error:
@@ -151,16 +151,13 @@ class FallbackPolicy(PolicyWrapper):
             raise TimeoutError(problem)
         return answer
 
+    def _note(self, decision: Decision, kind: str, error: Exception) -> None:
+        self.last_error = describe_error(error)
+        self._count(decision, kind)
+
     def _count(self, decision: Decision, kind: str) -> None:
         if not decision.in_clone:
             count(self._token, **{kind: 1})
-
-
-def _kind_of(error: Exception) -> str:
-    """Return the member of ``KINDS`` that an error of a policy counts as."""
-    if isinstance(error, TimeoutError):
-        return "late"
-    return "illegal" if isinstance(error, InvalidActionError) else "failed"
 
 
 def _run_without_waiting(coroutine: Coroutine[None, None, Result]) -> Result:
@@ -238,7 +235,8 @@ class RecordedPolicy(PolicyWrapper):
             if recorded is None:
                 return RULE
             return _decision.action_space.from_jsonable(recorded)[0]
-        answer = self.ask(observation, info, {**context, "_decision": _decision})
+        context["_decision"] = _decision
+        answer = self.ask(observation, info, context)
         return when_answered(answer, lambda answer: self._record(key, answer, _decision))
 
     def _read(self) -> dict[DecisionKey, Action]:
@@ -287,18 +285,19 @@ def digest_of(observation: Observation) -> str:
     digest = blake2b(digest_size=12)
 
     def add(part: Observation) -> None:
-        if isinstance(part, Mapping):
-            for name in sorted(part, key=str):
-                digest.update(str(name).encode())
-                add(part[name])
-        elif isinstance(part, (tuple, list)):
-            for item in part:
-                add(item)
-        elif isinstance(part, (np.ndarray, np.generic)) and part.dtype != object:
-            digest.update(f"{part.dtype.str}{part.shape}".encode())
-            digest.update(np.ascontiguousarray(part).tobytes())
-        else:
-            digest.update(repr(part).encode())
+        match part:
+            case Mapping():
+                for name in sorted(part, key=str):
+                    digest.update(str(name).encode())
+                    add(part[name])
+            case tuple() | list():
+                for item in part:
+                    add(item)
+            case np.ndarray() | np.generic() if part.dtype != object:
+                digest.update(f"{part.dtype.str}{part.shape}".encode())
+                digest.update(np.ascontiguousarray(part).tobytes())
+            case _:
+                digest.update(repr(part).encode())
 
     add(observation)
     return digest.hexdigest()

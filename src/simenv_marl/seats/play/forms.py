@@ -38,17 +38,19 @@ def jsonable(value: object) -> JSON:
 
     Arrays become lists. Numbers that are not finite, and objects, become texts.
     """
-    if isinstance(value, (np.ndarray, np.generic)):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [jsonable(part) for part in value]
-    if isinstance(value, float) and not isfinite(value):
-        return str(value)
-    if value is None or isinstance(value, (str, int, float)):
-        return value
-    return short_repr(value)
+    match value:
+        case np.ndarray() | np.generic():
+            return jsonable(value.tolist())
+        case Mapping():
+            return {str(key): jsonable(part) for key, part in value.items()}
+        case list() | tuple():
+            return [jsonable(part) for part in value]
+        case float() if not isfinite(value):
+            return str(value)
+        case str() | int() | float() | None:
+            return value
+        case _:
+            return short_repr(value)
 
 
 def pending_decision(decision: Decision) -> Message:
@@ -73,32 +75,35 @@ def entries_of(observation: Observation, labels: Texts = None) -> list[tuple[str
 
 
 def _entries(value: JSON, name: str = "") -> Iterator[tuple[str, JSON]]:
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            yield from _entries(part, f"{name} {key}".strip())
-    elif isinstance(value, list):
-        for place, part in enumerate(value):
-            yield from _entries(part, f"{name}[{place}]")
-    else:
-        yield name or "value", jsonable(value)
+    match value:
+        case Mapping():
+            for key, part in value.items():
+                yield from _entries(part, f"{name} {key}".strip())
+        case list():
+            for place, part in enumerate(value):
+                yield from _entries(part, f"{name}[{place}]")
+        case _:
+            yield name or "value", jsonable(value)
 
 
 def describe_space(space: Space[Any]) -> Message:
     """Describe an action space as JSON, from which the page makes its inputs."""
-    if isinstance(space, Discrete):
-        return {"kind": "discrete", "start": int(space.start), "n": int(space.n)}
-    if isinstance(space, Box):
-        return {
-            "kind": "box",
-            "low": jsonable(space.low),
-            "high": jsonable(space.high),
-            "whole": space.low.dtype.kind in "iu",
-        }
-    if isinstance(space, MultiDiscrete) and space.nvec.ndim == 1:
-        return {"kind": "grid", "sizes": space.nvec.tolist(), "starts": space.start.tolist()}
-    if isinstance(space, MultiBinary) and isinstance(space.n, int):
-        return {"kind": "grid", "sizes": [2] * space.n, "starts": [0] * space.n}
-    return {"kind": "other", "text": short_repr(space)}
+    match space:
+        case Discrete():
+            return {"kind": "discrete", "start": int(space.start), "n": int(space.n)}
+        case Box():
+            return {
+                "kind": "box",
+                "low": jsonable(space.low),
+                "high": jsonable(space.high),
+                "whole": space.low.dtype.kind in "iu",
+            }
+        case MultiDiscrete(shape=(_,)):
+            return {"kind": "grid", "sizes": space.nvec.tolist(), "starts": space.start.tolist()}
+        case MultiBinary(shape=(size,)):
+            return {"kind": "grid", "sizes": [2] * size, "starts": [0] * size}
+        case _:
+            return {"kind": "other", "text": short_repr(space)}
 
 
 def candidates_of(space: Space[Any], mask: Sequence[int] | None) -> list[Action]:
@@ -107,12 +112,14 @@ def candidates_of(space: Space[Any], mask: Sequence[int] | None) -> list[Action]
     These are the legal actions of a ``Discrete``, or five actions of a bounded ``Box`` of one
     number. Other spaces have none.
     """
-    if isinstance(space, Discrete):
-        return legal_actions(space, mask)[: MOST_CANDIDATES - 1]
-    if isinstance(space, Box) and space.low.size == 1 and space.is_bounded():
-        grid = np.linspace(space.low, space.high, 5).astype(space.dtype)
-        return [*np.unique(grid, axis=0).tolist()]
-    return []
+    match space:
+        case Discrete():
+            return legal_actions(space, mask)[: MOST_CANDIDATES - 1]
+        case Box() if space.low.size == 1 and space.is_bounded():
+            grid = np.linspace(space.low, space.high, 5).astype(space.dtype)
+            return [*np.unique(grid, axis=0).tolist()]
+        case _:
+            return []
 
 
 def picture_of(env: SimulationAECEnv) -> Message | None:
@@ -121,13 +128,15 @@ def picture_of(env: SimulationAECEnv) -> Message | None:
         rendered = None if env.render_mode is None else env.render()
     except Exception as error:
         rendered = f"render has failed: {describe_error(error)}"
-    if rendered is None:
-        return None
-    if not isinstance(rendered, np.ndarray):
-        return {"text": str(rendered)[:LONGEST_TEXT]}
-    if rendered.shape[2:] != (3,) or rendered.dtype != np.uint8 or not rendered.size:
-        return {"text": f"an array of shape {rendered.shape}"}
-    return {"png": b64encode(_png(rendered)).decode()}
+    match rendered:
+        case None:
+            return None
+        case np.ndarray(dtype=np.uint8, shape=(_, _, 3)) if rendered.size:
+            return {"png": b64encode(_png(rendered)).decode()}
+        case np.ndarray():
+            return {"text": f"an array of shape {rendered.shape}"}
+        case _:
+            return {"text": str(rendered)[:LONGEST_TEXT]}
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:

@@ -361,52 +361,46 @@ class Game:
             self.occupied = message["taken"]
             self._start_clock()
             return self.skipping is not None
-        match message.get("do"):
-            case "act":
-                self.decide(self._action_in(message, seat), "person")
-            case "rule":
-                self._check_turn(message, seat)
+        match message:
+            case {"do": "rule", "turn": turn}:
+                self._check_turn(turn, seat)
                 self.decide(None, "rule")
-            case "try":
-                action = self._action_in(message, seat)
+            case {"do": "act", "turn": turn, "action": action} if action is not None:
+                self._check_turn(turn, seat)
+                self.decide(action, "person")
+            case {"do": "try", "turn": turn, "action": action} if action is not None:
+                self._check_turn(turn, seat)
                 if self.futures is not None:
                     self.futures.add(action)
-            case "delegate":
-                self._stop_rule()
-                self.delegated[seat] = _whole_number(message, 0, 100_000)
-            case "skip":
+            case {"do": "delegate", "n": int(number)} if 0 <= number <= 100_000:
+                self.delegated[seat] = number
+                self.skipping = None
+            case {"do": "skip"}:
                 self.skipping = seat
-            case "undo":
-                self.jump(max((turn for turn in self._turns(seat) if turn < self.turn), default=0))
-            case "redo":
-                later = [turn for turn in self._turns(seat) if turn > self.turn]
-                self.jump(min(later, default=len(self.timeline)))
-            case "jump":
-                self.jump(_whole_number(message, 0, len(self.timeline)))
-            case "restart":
-                self.restart(_whole_number(message, 0, 2**31 - 1))
-            case "horizon":
-                self.horizon = _whole_number(message, 1, 100)
+            case {"do": "undo"}:
+                self.jump(max(self._turns(seat, range(self.turn)), default=0))
+            case {"do": "redo"}:
+                end = len(self.timeline)
+                self.jump(min(self._turns(seat, range(self.turn + 1, end)), default=end))
+            case {"do": "jump", "n": int(number)} if 0 <= number <= len(self.timeline):
+                self.jump(number)
+            case {"do": "restart", "n": int(seed)} if 0 <= seed < 2**31:
+                self.restart(seed)
+            case {"do": "horizon", "n": int(number)} if 0 < number <= 100:
+                self.horizon = number
                 self.futures = None
-            case unknown:
-                raise OptionValueError(f"the game does not know {short_repr(unknown)}")
+            case _:
+                raise OptionValueError(f"the game cannot follow {short_repr(message)}")
         return True
 
-    def _turns(self, seat: str) -> list[int]:
-        return [row["turn"] for row in self.timeline if row["agent"] == seat]
+    def _turns(self, seat: str, turns: range) -> list[int]:
+        return [turn for turn in turns if self.timeline[turn]["agent"] == seat]
 
-    def _check_turn(self, message: Message, seat: str) -> None:
-        if self.pending is None or message.get("turn") != self.turn:
+    def _check_turn(self, turn: int, seat: str) -> None:
+        if self.pending is None or turn != self.turn:
             raise InvalidActionError("another decision is pending by now")
         if self.pending["agent"] != seat:
             raise InvalidActionError(f"it is not your turn: {self.pending['agent']} decides")
-
-    def _action_in(self, message: Message, seat: str) -> Action:
-        self._check_turn(message, seat)
-        action = message.get("action")
-        if action is None:
-            raise InvalidActionError("the message has no action")
-        return action
 
     def _start_clock(self) -> None:
         """Begin the time limit of the pending decision, once a person is there."""
@@ -484,16 +478,6 @@ class Game:
             "picture": self.picture,
             "notice": self.notice,
         }
-
-
-def _whole_number(message: Message, low: int, high: int) -> int:
-    """Return the number ``n`` of a message, or raise an ``OptionValueError``."""
-    value = message.get("n")
-    if type(value) is not int or not low <= value <= high:
-        raise OptionValueError(
-            f"n must be a whole number from {low} to {high}, not {short_repr(value)}"
-        )
-    return value
 
 
 def _message_of(error: Exception) -> str:

@@ -46,6 +46,9 @@ PAUSE: Final = 0.05
 MOST_WAITING: Final = 4
 """The largest number of messages of a page that wait for the game."""
 
+INVALID: Final = "the message is not one of this page"
+"""The answer to an invalid message."""
+
 FILES: Final = ("/page.js", "/page.css")
 """The files of the page."""
 
@@ -146,12 +149,13 @@ class Table:
     def _pass_on(self, number: int, text: str) -> str:
         """Check a message, and pass it on to the game; return the problem, or ""."""
         try:
-            message = json.loads(text, parse_constant=str)
-            seat = str(message.pop("seat"))
-            key = str(message.pop("key"))
-            parcel = pickle.dumps((number, seat, message))  # here, because it may be too deep
-        except (ValueError, RecursionError, TypeError, LookupError, AttributeError):
-            return "the message is not one of this page"
+            match json.loads(text, parse_constant=str):
+                case {"seat": str(seat), "key": str(key), **message}:
+                    parcel = pickle.dumps((number, seat, message))  # it may be too deep
+                case _:
+                    return INVALID
+        except (ValueError, RecursionError):
+            return INVALID
         expected = self._keys.get(seat, "")
         if not expected or not hmac.compare_digest(expected.encode(), key.encode(errors="replace")):
             return "the link of this page has no key of this game: ask for the link of your seat"

@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from math import isfinite
 from typing import Any, Final, TypeAlias
 
@@ -63,11 +64,13 @@ def parse(env_or_decision: object, text: str) -> Action:
         InvalidActionError: The text names no legal action. The error lists the legal actions.
         ResetNeededError: No decision is pending.
     """
-    return at_decision(env_or_decision, "parse", _parse, text)
+    return at_decision(env_or_decision, "parse", partial(_parse, text))
 
 
 def at_decision(
-    env_or_decision: object, user: str, function: Callable[..., Any], *args: object
+    env_or_decision: object,
+    user: str,
+    function: Callable[[Decision], Any],
 ) -> Any:
     """Call a function with a decision; for an environment, with its pending one.
 
@@ -76,17 +79,16 @@ def at_decision(
     Args:
         env_or_decision: The environment, or the decision.
         user: The name of the public function, for errors.
-        function: A function of the decision and ``args``.
-        *args: Its further arguments.
+        function: The function, which can be pickled.
     """
     if isinstance(env_or_decision, Decision):
-        return function(env_or_decision, *args)
-    return pending_view(env_or_decision, user).call(_call_in_view, function, *args)
+        return function(env_or_decision)
+    return pending_view(env_or_decision, user).call(_call_in_view, function)
 
 
-def _call_in_view(env: Any, function: Callable[..., Any], *args: object) -> Any:
+def _call_in_view(env: Any, function: Callable[[Decision], Any]) -> Any:
     episode = env.unwrapped.episode
-    return function(decision_of(episode, episode.deciding), *args)
+    return function(decision_of(episode, episode.deciding))
 
 
 def _as_text(decision: Decision) -> str:
@@ -229,7 +231,11 @@ def _schema(space: Space[Any], labels: Texts) -> dict[str, JSON]:
             first = int(space.start)
             return {"type": "integer", "minimum": first, "maximum": first + int(space.n) - 1}
         case Box(shape=() | (1,)):
-            schema = _number_schema(space.low.item(), space.high.item())
+            limits = {"minimum": space.low.item(), "maximum": space.high.item()}
+            schema: dict[str, JSON] = {
+                name: limit for name, limit in limits.items() if isfinite(limit)
+            }
+            schema["type"] = "integer" if space.low.dtype.kind in "iu" else "number"
             if labels and labels != UNLABELLED_NUMBER:
                 schema["description"] = labels[0]
             return schema
@@ -242,12 +248,6 @@ def _schema(space: Space[Any], labels: Texts) -> dict[str, JSON]:
         "required": list(parts),
         "additionalProperties": False,
     }
-
-
-def _number_schema(low: float, high: float) -> dict[str, JSON]:
-    limits = {"minimum": low, "maximum": high}
-    finite = {name: limit for name, limit in limits.items() if isfinite(limit)}
-    return {"type": "number" if isinstance(low, float) else "integer", **finite}
 
 
 def _parts(space: Space[Any], labels: Texts) -> dict[str, Space[Any]]:
@@ -281,7 +281,7 @@ def _indices(length: int) -> list[str]:
 # -- answers --------------------------------------------------------------------------------------
 
 
-def _parse(decision: Decision, text: str) -> Action:
+def _parse(text: str, decision: Decision) -> Action:
     space = decision.action_space
     legal = legal_labels(decision)
     has_key = isinstance(space, Dict) and "action" in space.spaces

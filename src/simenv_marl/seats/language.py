@@ -150,10 +150,15 @@ class LanguageModelPolicy:
             LanguageModelError: The last request failed, or brought no answer.
             MissingExtraError: The package ``openai`` is missing.
         """
-        turns = self._turns(_decision)
-        question = _message("user", self._question(_decision))
-        system = _message("system", self._system_text(_decision))
-        messages = [system, *chain.from_iterable(turns), question]
+        turns: deque[tuple[Message, Message]] = _decision.memory.setdefault(
+            self._token, deque(maxlen=self._history_length)
+        )
+        question = {"role": "user", "content": self._question(_decision)}
+        messages = [
+            {"role": "system", "content": self._system_text(_decision)},
+            *chain.from_iterable(turns),
+            question,
+        ]
         retry = 0
         while True:
             try:
@@ -162,13 +167,16 @@ class LanguageModelPolicy:
             except InvalidActionError as error:
                 if retry == self._retries:
                     raise
-                messages += [_message("assistant", text), _message("user", str(error))]
+                messages += [
+                    {"role": "assistant", "content": text},
+                    {"role": "user", "content": str(error)},
+                ]
             except _TransientError as error:
                 if retry == self._retries:
                     raise LanguageModelError(f"{self.model} gave no answer: {error}") from error
                 await asyncio.sleep(min(LONGEST_WAIT, max(error.seconds, 0.5 * 2**retry)))
             else:
-                turns.append((question, _message("assistant", text)))
+                turns.append((question, {"role": "assistant", "content": text}))
                 return action
             retry += 1
 
@@ -188,13 +196,6 @@ class LanguageModelPolicy:
 
     def _question(self, decision: Decision) -> str:
         return describe(decision) if self._describe is None else self._describe(decision)
-
-    def _turns(self, decision: Decision) -> deque[tuple[Message, Message]]:
-        """Return the latest questions and answers of an agent in an episode."""
-        turns: deque[tuple[Message, Message]] = decision.memory.setdefault(
-            self._token, deque(maxlen=self._history_length)
-        )
-        return turns
 
     # -- requests ---------------------------------------------------------------------------------
 
@@ -266,10 +267,6 @@ class _TransientError(Exception):
     def __init__(self, text: str, seconds: float = 0.0) -> None:
         super().__init__(text)
         self.seconds = seconds
-
-
-def _message(role: str, text: str) -> Message:
-    return {"role": role, "content": text}
 
 
 def _answer_schema(decision: Decision) -> dict[str, JSON]:

@@ -19,9 +19,6 @@ FUTURES: Final = 16
 MOST_MEASURES: Final = 12
 """The largest number of observed numbers that are shown."""
 
-NUMBERS: Final = (int, float)
-"""The types of measures: not bool."""
-
 TIME_LIMIT: Final = 30.0
 """The time limit of each operation in a future, in seconds."""
 
@@ -66,9 +63,11 @@ class Futures:
         self.space = self.env.action_space(self.agent)
         actions = [None, *candidates_of(self.space, self.pending["mask"])]
         self.candidates = [Candidate(action, []) for action in actions]
-        entries = enumerate(self.pending["observation"])
-        numbers = [(place, name) for place, (name, value) in entries if type(value) in NUMBERS]
-        self.measures = dict(numbers[:MOST_MEASURES])
+        self.measures: dict[int, str] = {}
+        for place, (name, value) in enumerate(self.pending["observation"]):
+            is_number = type(value) in (int, float)  # not a bool
+            if is_number and len(self.measures) < MOST_MEASURES:
+                self.measures[place] = name
         self.rule_action: Message = {}
 
     def add(self, action: Action) -> None:

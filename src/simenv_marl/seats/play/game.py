@@ -25,7 +25,6 @@ from ...errors import (
     SimEnvError,
     describe_error,
     did_you_mean,
-    error_text,
     short_repr,
 )
 from ...simulation import Action, Model
@@ -183,8 +182,10 @@ class Game:
         """
         if turn < len(self.timeline) or "action" not in self.timeline[-1]:
             stops = [row["turn"] for row in self.timeline if self.plays(row["agent"])] or [0]
-            turn = max((stop for stop in stops if stop <= turn), default=stops[0])
-        self._return_to(max((start for start in self.checkpoints if start <= turn), default=0))
+            earlier = [stop for stop in stops if stop <= turn]
+            turn = max(earlier, default=stops[0])
+        starts = [start for start in self.checkpoints if start <= turn]
+        self._return_to(max(starts, default=0))
         for row in self.timeline[self.turn : turn]:
             if self.over or self.timeline[self.turn] is not row:
                 break  # the simulation does not repeat itself
@@ -206,7 +207,8 @@ class Game:
         self.skipping: str | None = None  # the seat for whose next decision the rule plays on
 
     def _step(self, agent: str, action: Action) -> None:
-        self._attempt(self.env.step, action_of(self.env.action_space(agent), action))
+        space = self.env.action_space(agent)
+        self._attempt(self.env.step, action_of(space, action))
 
     def _attempt(self, function: Callable[..., Any], *args: object) -> Any:
         """Call a function of the environment; an error ends the episode.
@@ -378,10 +380,12 @@ class Game:
             case {"do": "skip"}:
                 self.skipping = seat
             case {"do": "undo"}:
-                self.jump(max(self._turns(seat, range(self.turn)), default=0))
+                earlier = self._turns(seat, range(self.turn))
+                self.jump(max(earlier, default=0))
             case {"do": "redo"}:
                 end = len(self.timeline)
-                self.jump(min(self._turns(seat, range(self.turn + 1, end)), default=end))
+                later = self._turns(seat, range(self.turn + 1, end))
+                self.jump(min(later, default=end))
             case {"do": "jump", "n": int(number)} if 0 <= number <= len(self.timeline):
                 self.jump(number)
             case {"do": "restart", "n": int(seed)} if 0 <= seed < 2**31:
@@ -429,7 +433,13 @@ class Game:
         if self.pending is not None:
             self._make_checkpoint()
             if self.futures is None:
-                self.futures = Futures(self.env, self.pending, self.turn, self.horizon, self.seed)
+                self.futures = Futures(
+                    self.env,
+                    self.pending,
+                    self.turn,
+                    self.horizon,
+                    self.seed,
+                )
             self._start_clock()
         if self.over in ENDS:
             self.picture = picture_of(self.env)
@@ -481,7 +491,7 @@ class Game:
 
 
 def _message_of(error: Exception) -> str:
-    return error_text(error) if isinstance(error, SimEnvError) else describe_error(error)
+    return str(error) if isinstance(error, SimEnvError) else describe_error(error)
 
 
 def run_game(connection: Connection, find: Callable[[], Model], options: dict[str, Any]) -> None:

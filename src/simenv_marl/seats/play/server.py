@@ -217,7 +217,7 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
 
-def make_app(table: Table, host: str, lifespan: Lifespan[Starlette] | None = None) -> ASGIApp:
+def make_app(table: Table, host: str, lifespan: Lifespan[Starlette]) -> ASGIApp:
     """Make the application. It answers only requests to its own names and from its own pages."""
 
     async def page(request: Request) -> FileResponse:

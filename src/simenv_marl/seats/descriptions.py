@@ -125,13 +125,15 @@ def labelled(value: Observation, labels: Texts) -> JSON:
     match value:
         case Mapping():
             return {str(_label(labels, key)): labelled(part, None) for key, part in value.items()}
-        case tuple():
-            return [labelled(part, None) for part in value]
+        case np.ndarray(shape=(_,)) if labels:
+            parts = zip(labels, value.tolist(), strict=True)
+            return {label: labelled(part, None) for label, part in parts}
         case np.ndarray() | np.generic():
-            numbers = _rounded(value.tolist())
-            if isinstance(numbers, list):
-                return dict(zip(labels, numbers, strict=True)) if labels else numbers
-            return _label(labels, numbers)
+            return labelled(value.tolist(), labels)
+        case tuple() | list():
+            return [labelled(part, None) for part in value]
+        case float():
+            return float(f"{value:.7g}")  # because a float32 has no more digits
         case _:
             return _label(labels, value)
 
@@ -139,17 +141,6 @@ def labelled(value: Observation, labels: Texts) -> JSON:
 def _label(labels: Texts, key: JSON) -> JSON:
     """Return the label of a part or a ``Discrete`` value; itself if it has none."""
     return labels.get(key, key) if isinstance(labels, Mapping) else key
-
-
-def _rounded(value: JSON) -> JSON:
-    """Round numbers to seven digits, because a float32 has no more; keep other values."""
-    match value:
-        case list():
-            return [_rounded(part) for part in value]
-        case float():
-            return float(f"{value:.7g}")
-        case _:
-            return value
 
 
 def _observation_lines(observation: JSON) -> list[str]:

@@ -8,7 +8,7 @@ from hashlib import blake2b
 from inspect import isawaitable
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple
 from uuid import uuid4
 
 import numpy as np
@@ -22,10 +22,8 @@ from .descriptions import to_action
 KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
 """The events that a ``FallbackPolicy`` counts."""
 
-Policy: TypeAlias = Callable[..., Action | Awaitable[Action]]
+Policy = Callable[..., Action | Awaitable[Action]]
 """A policy, as ``simulate`` takes them. It may be a coroutine function."""
-
-Result = TypeVar("Result")
 
 
 def check_count(name: str, value: object) -> None:
@@ -160,13 +158,12 @@ class FallbackPolicy(PolicyWrapper):
             count(self._token, **{kind: 1})
 
 
-def _run_without_waiting(coroutine: Coroutine[None, None, Result]) -> Result:
+def _run_without_waiting(coroutine: Coroutine[None, None, Action]) -> Action:
     """Return the result of a coroutine that awaits nothing."""
     try:
         coroutine.send(None)
     except StopIteration as end:
-        result: Result = end.value
-        return result
+        return end.value
     raise AssertionError("the coroutine waits")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from math import isfinite
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
@@ -20,7 +20,7 @@ from ...simulation import RULE, Action, Observation
 from ..descriptions import JSON, MISFITS, labelled, legal_actions, to_action
 from ..policies import digest_of
 
-Message: TypeAlias = dict[str, Any]
+Message = dict[str, Any]
 """A message between the page, the server and the game, or a part of one."""
 
 MOST_CANDIDATES: Final = 12

@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TypeAlias, Unpack
+from typing import Unpack
 
 from ... import aec_env
 from ...core.options import EpisodeOptions
@@ -17,7 +17,7 @@ from ...simulation import Action, Model
 from ..policies import digest_of
 from .forms import Message, action_of
 
-Episode: TypeAlias = tuple[int, list[Message]]
+Episode = tuple[int, list[Message]]
 """The seed of an episode, and the lines of its decisions."""
 
 

@@ -10,7 +10,15 @@ from math import isfinite
 from typing import Any, Final, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from gymnasium.spaces import (
+    Box,
+    Dict,
+    Discrete,
+    MultiBinary,
+    MultiDiscrete,
+    Space,
+    Tuple,
+)
 from numpy.typing import NDArray
 
 from ..core.clone import pending_view
@@ -31,7 +39,11 @@ UNLABELLED_NUMBER: Final = ("0",)
 """The labels of a ``Box`` of one number that the user has not labelled."""
 
 
-def describe(env_or_decision: object, *, as_json: bool = False) -> Any:
+def describe(
+    env_or_decision: object,
+    *,
+    as_json: bool = False,
+) -> Any:
     """Describe the pending decision.
 
     The description has the agent, the time, its observation, its legal actions, and the reward of
@@ -140,7 +152,9 @@ def labelled(value: Observation, labels: Texts) -> JSON:
 
 def _label(labels: Texts, key: JSON) -> JSON:
     """Return the label of a part or a ``Discrete`` value; itself if it has none."""
-    return labels.get(key, key) if isinstance(labels, Mapping) else key
+    if isinstance(labels, Mapping):
+        return labels.get(key, key)
+    return key
 
 
 def _observation_lines(observation: JSON) -> list[str]:
@@ -160,8 +174,10 @@ def _value_text(value: JSON) -> str:
 
 def legal_actions(space: Discrete, mask: Sequence[int] | None) -> list[int]:
     """Return the actions of a ``Discrete`` space that a mask allows; all without a mask."""
-    offsets = range(int(space.n)) if mask is None else np.flatnonzero(mask).tolist()
-    return [int(space.start) + offset for offset in offsets]
+    first = int(space.start)
+    if mask is None:
+        return list(range(first, first + int(space.n)))
+    return [first + offset for offset in np.flatnonzero(mask).tolist()]
 
 
 def legal_labels(decision: Decision) -> dict[str, int]:
@@ -178,7 +194,9 @@ def legal_labels(decision: Decision) -> dict[str, int]:
     names = {}
     for action in legal:
         label = labels[action]
-        names[f"{label} ({action})" if occurrences[label] > 1 else label] = action
+        if occurrences[label] > 1:
+            label = f"{label} ({action})"
+        names[label] = action
     return names
 
 
@@ -262,7 +280,8 @@ def _parts(space: Space[Any], labels: Texts) -> dict[str, Space[Any]]:
             parts = [Discrete(2)] * size
         case _:
             return {}
-    return dict(zip(labels or _indices(len(parts)), parts, strict=True))
+    names = labels or _indices(len(parts))
+    return dict(zip(names, parts, strict=True))
 
 
 def _indices(length: int) -> list[str]:
@@ -280,11 +299,10 @@ def _parse(text: str, decision: Decision) -> Action:
         if isinstance(value, dict) and value.keys() == {"action"} and not has_key:
             value = value["action"]
         with suppress(*MISFITS):
-            action = (
-                _labelled_action(decision, legal, value)
-                if legal
-                else to_action(space, value, decision.action_labels)
-            )
+            if legal:
+                action = _labelled_action(decision, legal, value)
+            else:
+                action = to_action(space, value, decision.action_labels)
             decision.validate(action)
             return action
     label = _only_label(text, legal)
@@ -308,7 +326,11 @@ def _readings(text: str) -> Iterator[JSON]:
             yield json.loads(text[start:end])
 
 
-def _labelled_action(decision: Decision, legal: Mapping[str, int], value: JSON) -> int:
+def _labelled_action(
+    decision: Decision,
+    legal: Mapping[str, int],
+    value: JSON,
+) -> int:
     """Return the action of a ``Discrete`` that a value names, by its label or by its number.
 
     Raises:
@@ -321,7 +343,8 @@ def _labelled_action(decision: Decision, legal: Mapping[str, int], value: JSON) 
     # Labels of masked actions count, too, so that they are not mistaken for a legal action's.
     names = [(label, action) for action, label in decision.action_labels.items()]
     names += legal.items()
-    meanings = {action for label, action in names if _comparable(label) == _comparable(text)}
+    sought = _comparable(text)
+    meanings = {action for label, action in names if _comparable(label) == sought}
     if not meanings:
         return _whole_number(text)
     if len(meanings) > 1:
@@ -344,12 +367,17 @@ def _only_label(text: str, labels: Collection[str]) -> str | None:
     """Return the label that stands in a text; None if there is none, or several."""
     if not labels:
         return None
-    words = "|".join(re.escape(label) for label in sorted(labels, key=len, reverse=True))
+    longest_first = sorted(labels, key=len, reverse=True)
+    words = "|".join(map(re.escape, longest_first))
     found = set(re.findall(rf"(?<![\w.-])(?:{words})(?!\w|\.\d)", text))
     return found.pop() if len(found) == 1 else None
 
 
-def to_action(space: Space[Any], value: Action, labels: Texts = None) -> Action:
+def to_action(
+    space: Space[Any],
+    value: Action,
+    labels: Texts = None,
+) -> Action:
     """Return the action for its JSON. It may be illegal.
 
     Args:
@@ -365,10 +393,13 @@ def to_action(space: Space[Any], value: Action, labels: Texts = None) -> Action:
             return _whole_number(value)
         case Dict():
             values = dict(value)
-            return {
-                key: to_action(part, values.get(_label(labels, key), values.get(key)))
-                for key, part in space.items()
-            }
+            action = {}
+            for key, part in space.items():
+                label = _label(labels, key)
+                if label not in values:
+                    label = key
+                action[key] = to_action(part, values[label])
+            return action
         case Tuple():
             values = _listed(value, labels)
             return tuple(to_action(part, values[place]) for place, part in enumerate(space))

@@ -174,7 +174,8 @@ class LanguageModelPolicy:
             except _TransientError as error:
                 if retry == self._retries:
                     raise LanguageModelError(f"{self.model} gave no answer: {error}") from error
-                await asyncio.sleep(min(LONGEST_WAIT, max(error.seconds, 0.5 * 2**retry)))
+                seconds = max(error.seconds, 0.5 * 2**retry)
+                await asyncio.sleep(min(LONGEST_WAIT, seconds))
             else:
                 turns.append((question, {"role": "assistant", "content": text}))
                 return action
@@ -195,7 +196,9 @@ class LanguageModelPolicy:
         return "\n".join(lines)
 
     def _question(self, decision: Decision) -> str:
-        return describe(decision) if self._describe is None else self._describe(decision)
+        if self._describe is None:
+            return describe(decision)
+        return self._describe(decision)
 
     # -- requests ---------------------------------------------------------------------------------
 

@@ -14,8 +14,21 @@ from uuid import uuid4
 import numpy as np
 
 from ..core.pending import Decision
-from ..core.policies import COUNTS, Caller, PolicyWrapper, count, waits, when_answered
-from ..errors import InvalidActionError, OptionValueError, describe_error, short_repr, warn_user
+from ..core.policies import (
+    COUNTS,
+    Caller,
+    PolicyWrapper,
+    count,
+    waits,
+    when_answered,
+)
+from ..errors import (
+    InvalidActionError,
+    OptionValueError,
+    describe_error,
+    short_repr,
+    warn_user,
+)
 from ..simulation import RULE, Action, Observation, Sentinel
 from .descriptions import to_action
 
@@ -107,7 +120,9 @@ class FallbackPolicy(PolicyWrapper):
         """Answer a decision. Return an awaitable if one of the two policies has to be awaited."""
         context["_decision"] = _decision
         answer = self._answer(_decision, observation, info, context)
-        return answer if self.waits else _run_without_waiting(answer)
+        if self.waits:
+            return answer
+        return _run_without_waiting(answer)
 
     async def _answer(self, decision: Decision, *arguments: Any) -> Action:
         """Answer with the arguments of a ``Caller``."""
@@ -133,7 +148,9 @@ class FallbackPolicy(PolicyWrapper):
         if self._ask_fallback is None:
             return RULE
         answer = self._ask_fallback(*arguments)
-        return await answer if isawaitable(answer) else answer
+        if isawaitable(answer):
+            return await answer
+        return answer
 
     async def _ask_in_time(self, *arguments: Any) -> Action:
         """Ask the policy; raise a ``TimeoutError`` if its answer takes too long."""
@@ -149,7 +166,12 @@ class FallbackPolicy(PolicyWrapper):
             raise TimeoutError(problem)
         return answer
 
-    def _note(self, decision: Decision, kind: str, error: Exception) -> None:
+    def _note(
+        self,
+        decision: Decision,
+        kind: str,
+        error: Exception,
+    ) -> None:
         self.last_error = describe_error(error)
         self._count(decision, kind)
 
@@ -226,7 +248,12 @@ class RecordedPolicy(PolicyWrapper):
         """
         if self._answers is None:
             self._answers = self._read()
-        key = DecisionKey(_decision.seed, _decision.agent, _decision.number, digest_of(observation))
+        key = DecisionKey(
+            _decision.seed,
+            _decision.agent,
+            _decision.number,
+            digest_of(observation),
+        )
         if key in self._answers:
             recorded = self._answers[key]
             if recorded is None:
@@ -255,7 +282,12 @@ class RecordedPolicy(PolicyWrapper):
             self._write(b"\n")
         return answers
 
-    def _record(self, key: DecisionKey, answer: Action, decision: Decision) -> Action:
+    def _record(
+        self,
+        key: DecisionKey,
+        answer: Action,
+        decision: Decision,
+    ) -> Action:
         """Record an answer, unless it is illegal, and return it."""
         recorded = None
         if answer is not RULE:

@@ -69,7 +69,10 @@ def pending_decision(decision: Decision) -> Message:
     }
 
 
-def entries_of(observation: Observation, labels: Texts = None) -> list[tuple[str, Any]]:
+def entries_of(
+    observation: Observation,
+    labels: Texts = None,
+) -> list[tuple[str, Any]]:
     """Return the first entries of an observation, each as its name and its number or text."""
     return [*islice(_entries(labelled(observation, labels)), MOST_ENTRIES)]
 
@@ -106,7 +109,10 @@ def describe_space(space: Space[Any]) -> Message:
             return {"kind": "other", "text": short_repr(space)}
 
 
-def candidates_of(space: Space[Any], mask: Sequence[int] | None) -> list[Action]:
+def candidates_of(
+    space: Space[Any],
+    mask: Sequence[int] | None,
+) -> list[Action]:
     """Return actions to try out, as JSON.
 
     These are the legal actions of a ``Discrete``, or five actions of a bounded ``Box`` of one
@@ -116,8 +122,9 @@ def candidates_of(space: Space[Any], mask: Sequence[int] | None) -> list[Action]
         case Discrete():
             return legal_actions(space, mask)[: MOST_CANDIDATES - 1]
         case Box() if space.low.size == 1 and space.is_bounded():
-            grid = np.linspace(space.low, space.high, 5).astype(space.dtype)
-            return [*np.unique(grid, axis=0).tolist()]
+            grid = np.linspace(space.low, space.high, 5)
+            actions = np.unique(grid.astype(space.dtype), axis=0)
+            return [*actions.tolist()]
         case _:
             return []
 
@@ -147,7 +154,9 @@ def _png(image: NDArray[np.uint8]) -> bytes:
     header = struct.pack("!IIBBBBB", width, height, 8, 2, 0, 0, 0)
     png = b"\x89PNG\r\n\x1a\n"
     for chunk in (b"IHDR" + header, b"IDAT" + zlib.compress(lines.tobytes()), b"IEND"):
-        png += struct.pack("!I", len(chunk) - 4) + chunk + struct.pack("!I", zlib.crc32(chunk))
+        png += struct.pack("!I", len(chunk) - 4)  # without the type
+        png += chunk
+        png += struct.pack("!I", zlib.crc32(chunk))
     return png
 
 

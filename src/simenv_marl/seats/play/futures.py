@@ -11,7 +11,14 @@ from ... import RULE, clone
 from ...envs import SimulationAECEnv
 from ...errors import describe_error
 from ...simulation import Action, Observation
-from .forms import MOST_CANDIDATES, Message, action_of, candidates_of, entries_of, jsonable
+from .forms import (
+    MOST_CANDIDATES,
+    Message,
+    action_of,
+    candidates_of,
+    entries_of,
+    jsonable,
+)
 
 FUTURES: Final = 16
 """The number of futures in which each candidate is tried out."""
@@ -21,7 +28,6 @@ MOST_MEASURES: Final = 12
 
 TIME_LIMIT: Final = 30.0
 """The time limit of each operation in a future, in seconds."""
-
 
 Course = list[list[float]]
 """A row for each decision of the agent in a future: its return since now, and its measures."""
@@ -107,7 +113,7 @@ class Futures:
 
     def _play(self, candidate: Candidate, seed: int | None) -> Iterator[None]:
         """Play a future, and add its course to the candidate. Yield after each step."""
-        course: list[list[float]] = []
+        course: Course = []
         try:
             with closing(clone(self.env, seed=seed, time_limit=TIME_LIMIT)) as twin:
                 action = candidate.action
@@ -127,7 +133,10 @@ class Futures:
                     twin.step(None if ended else RULE)
         except Exception as error:
             self.note = f"A future has failed: {describe_error(error)[:300]}"
-        candidate.courses.append(course or [self._row(0.0, self.env.observe(self.agent))])
+        if not course:
+            observation = self.env.observe(self.agent)
+            course = [self._row(0.0, observation)]
+        candidate.courses.append(course)
 
     def _row(self, total: float, observation: Observation) -> list[float]:
         values = [value for _, value in entries_of(observation)]
@@ -141,10 +150,12 @@ class Futures:
         """
         candidates = []
         for action, courses in self.candidates:
-            numbers = [course + course[-1:] * (self.horizon - len(course)) for course in courses]
             bands = []
             if courses:
-                quantiles = np.quantile(np.nan_to_num(numbers), (0.1, 0.5, 0.9), axis=0)
+                # An ended course stays where it is.
+                rows = [course + course[-1:] * (self.horizon - len(course)) for course in courses]
+                numbers = np.nan_to_num(rows)
+                quantiles = np.quantile(numbers, (0.1, 0.5, 0.9), axis=0)
                 bands = quantiles.transpose(2, 0, 1).round(6).tolist()
             candidates.append({"action": action, "n": len(courses), "bands": bands})
         return {

@@ -147,7 +147,13 @@ class Game:
         self.timeline: list[Row] = []
         self._stop_rule()
         self._return_to(0)
-        self._record({"simulation": self.name, "seed": seed, "seats": list(self.agents)})
+        self._record(
+            {
+                "simulation": self.name,
+                "seed": seed,
+                "seats": list(self.agents),
+            }
+        )
 
     def decide(self, action: Action, by: str) -> None:
         """Take the pending decision.
@@ -413,7 +419,9 @@ class Game:
             self.deadline = monotonic() + self.limit
 
     def _seconds_left(self) -> float | None:
-        return None if self.deadline is None else max(0.0, self.deadline - monotonic())
+        if self.deadline is None:
+            return None
+        return max(0.0, self.deadline - monotonic())
 
     # -- work --------------------------------------------------------------------------------------
 
@@ -491,10 +499,16 @@ class Game:
 
 
 def _message_of(error: Exception) -> str:
-    return str(error) if isinstance(error, SimEnvError) else describe_error(error)
+    if isinstance(error, SimEnvError):
+        return str(error)
+    return describe_error(error)
 
 
-def run_game(connection: Connection, find: Callable[[], Model], options: dict[str, Any]) -> None:
+def run_game(
+    connection: Connection,
+    find: Callable[[], Model],
+    options: dict[str, Any],
+) -> None:
     """Play in this process, which the server has started, until the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends this process
     try:

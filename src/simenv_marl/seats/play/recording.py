@@ -12,7 +12,13 @@ from ...core.options import EpisodeOptions
 from ...core.points import Points
 from ...data import Trajectories, collect_episodes
 from ...envs import SimulationAECEnv
-from ...errors import InvalidActionError, OptionValueError, ResetNeededError, StoreError, short_repr
+from ...errors import (
+    InvalidActionError,
+    OptionValueError,
+    ResetNeededError,
+    StoreError,
+    short_repr,
+)
 from ...simulation import Action, Model
 from ..policies import digest_of
 from .forms import Message, action_of
@@ -97,7 +103,13 @@ def replay(
 
     agents = {line["agent"]: policy for line in decisions}
     options["max_steps"] = len(actions)
-    return collect_episodes(simulation, agents, seeds=[seed], points=points, **options)
+    return collect_episodes(
+        simulation,
+        agents,
+        seeds=[seed],
+        points=points,
+        **options,
+    )
 
 
 def _next_agent(env: SimulationAECEnv) -> str:

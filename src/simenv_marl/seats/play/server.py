@@ -1,7 +1,6 @@
 """The server of the page: it connects people's browsers with the process of the game."""
 
 import asyncio
-import hmac
 import json
 import pickle
 import secrets
@@ -22,7 +21,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Lifespan, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -124,9 +123,10 @@ class Table:
         link = Link(websocket)
         number = next(self._numbers)
         if len(self.links) >= MOST_PAGES:
-            spectators = (self.links[other] for other in self.links if other not in self._seats)
+            spectators = [other for other in self.links if other not in self._seats]
+            closed = self.links[spectators[0]] if spectators else link
             with suppress(RuntimeError):
-                await next(spectators, link).websocket.close(1013)  # try again later
+                await closed.websocket.close(1013)  # try again later
         self.links[number] = link
         for kind, text in self.latest.items():
             link.send(kind, text)
@@ -157,7 +157,9 @@ class Table:
         except (ValueError, RecursionError):
             return INVALID
         expected = self._keys.get(seat, "")
-        if not expected or not hmac.compare_digest(expected.encode(), key.encode(errors="replace")):
+        if not expected or not secrets.compare_digest(
+            expected.encode(), key.encode(errors="replace")
+        ):
             return "the link of this page has no key of this game: ask for the link of your seat"
         if message.get("do") == "take":
             self._seats[number] = seat
@@ -217,18 +219,29 @@ class _Server(uvicorn.Server):
         self.should_exit = True
 
 
-def make_app(table: Table, host: str, lifespan: Lifespan[Starlette]) -> ASGIApp:
+def make_app(
+    table: Table,
+    host: str,
+    lifespan: Lifespan[Starlette],
+) -> ASGIApp:
     """Make the application. It answers only requests to its own names and from its own pages."""
 
     async def page(request: Request) -> FileResponse:
-        path = request.url.path if request.url.path in FILES else "/page.html"
+        path = request.url.path
+        if path not in FILES:
+            path = "/page.html"
         return FileResponse(Path(__file__).with_name(path[1:]), headers=HEADERS)
 
-    routes = [Route(path, page) for path in ("/", "/seat/{seat}", *FILES)]
-    app = Starlette(routes=[*routes, WebSocketRoute("/ws", table.serve)], lifespan=lifespan)
+    routes: list[BaseRoute] = [Route(path, page) for path in ("/", "/seat/{seat}", *FILES)]
+    routes.append(WebSocketRoute("/ws", table.serve))
+    app = Starlette(routes=routes, lifespan=lifespan)
     names = {"localhost", host.lower(), socket.gethostname().lower()}
 
-    async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
+    async def guarded(
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+    ) -> None:
         headers = {name: value.decode("latin-1") for name, value in scope.get("headers", ())}
         netloc = headers.get(b"host", "")
         origin = headers.get(b"origin", "")
@@ -283,7 +296,10 @@ def play(
     context = get_context("spawn")
     connection, game_connection = context.Pipe()
     options["seed"] = secrets.randbelow(2**31) if seed is None else seed
-    process = context.Process(target=run_game, args=(game_connection, find, options))
+    process = context.Process(
+        target=run_game,
+        args=(game_connection, find, options),
+    )
     process.start()
     game_connection.close()
 
@@ -303,7 +319,11 @@ def play(
         with socket.create_server((host, port), family=family) as listener:
             base = f"http://{_shown_host(host)}:{listener.getsockname()[1]}"
             print(f"Watch the game at {base}/ or play at the link of a seat:", flush=True)
-            table = Table(connection, state, lambda path: print(f"  {base}{path}", flush=True))
+            table = Table(
+                connection,
+                state,
+                lambda path: print(f"  {base}{path}", flush=True),
+            )
             _run(table, host, listener, end_game)
     except EOFError:
         process.join()

@@ -3,10 +3,10 @@
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -28,6 +28,9 @@ from ..simulation import Action, Observation
 
 MOST: Final = 200
 """The largest number of parts of an observation that are listed one by one."""
+
+Schema = dict[str, Any]
+"""A JSON schema."""
 
 JSON: TypeAlias = "Mapping[str, JSON] | Sequence[JSON] | str | float | None"
 """A value that ``json.dumps`` takes."""
@@ -201,87 +204,89 @@ def legal_labels(decision: Decision) -> dict[str, int]:
 
 
 def _legal_lines(decision: Decision) -> list[str]:
-    legal = legal_labels(decision)
-    if legal:
-        return [f"- {label}" for label in legal]
-    space = decision.action_space
-    labels = decision.action_labels
-    is_number = isinstance(space, Box) and labels == UNLABELLED_NUMBER
-    is_binary = isinstance(space, MultiBinary)
-    parts = {} if is_number or is_binary else _parts(space, labels)
-    lines = [f"- {name}: {_limits(part)}" for name, part in parts.items()]
-    lines = lines or [f"- {_limits(space)}"]
+    try:
+        schema = action_schema(decision)
+    except ViewError:
+        schema = {}
+    match schema:
+        case {"enum": labels}:
+            return [f"- {label}" for label in labels]
+        case {"properties": parts}:
+            lines = [f"- {name}: {_limits(part)}" for name, part in parts.items()]
+        case {"description": label}:
+            lines = [f"- {label}: {_limits(schema)}"]
+        case {"type": _}:
+            lines = [f"- {_limits(schema)}"]
+        case _:
+            lines = [f"- {decision.action_space}"]
     if decision.mask is not None:
         lines.append(f"- of these, the mask allows {short_repr(decision.mask)}")
     return lines
 
 
-def _limits(space: Space[Any]) -> str:
-    match space:
-        case Discrete():
-            return f"an integer from {space.start} to {space.start + space.n - 1}"
-        case Box(shape=() | (1,)):
-            return f"a number from {space.low.item():.6g} to {space.high.item():.6g}"
-        case _:
-            return str(space)
+def _limits(schema: Schema) -> str:
+    if "properties" in schema:
+        parts = schema["properties"].items()
+        return ", ".join(f"{name}: {_limits(part)}" for name, part in parts)
+    noun = "an integer" if schema["type"] == "integer" else "a number"
+    low = _value_text(schema.get("minimum", -inf))
+    high = _value_text(schema.get("maximum", inf))
+    return f"{noun} from {low} to {high}"
 
 
-def action_schema(decision: Decision) -> dict[str, JSON]:
-    """Return the JSON schema of the actions that ``parse`` takes."""
+def action_schema(decision: Decision) -> Schema:
+    """Return the JSON schema of the actions that ``parse`` takes.
+
+    Raises:
+        ViewError: The actions of this space have no names or numbers.
+    """
     legal = legal_labels(decision)
     if legal:
         return {"type": "string", "enum": list(legal)}
     return _schema(decision.action_space, decision.action_labels)
 
 
-def _schema(space: Space[Any], labels: Texts) -> dict[str, JSON]:
+def _schema(space: Space[Any], labels: Texts) -> Schema:
+    parts: Iterable[Schema]
     match space:
         case Discrete():
-            first = int(space.start)
-            return {"type": "integer", "minimum": first, "maximum": first + int(space.n) - 1}
+            return _range(int(space.start), int(space.start + space.n - 1))
         case Box(shape=() | (1,)):
-            limits = {"minimum": space.low.item(), "maximum": space.high.item()}
-            schema: dict[str, JSON] = {
-                name: limit for name, limit in limits.items() if isfinite(limit)
-            }
-            schema["type"] = "integer" if space.low.dtype.kind in "iu" else "number"
+            schema = _range(space.low.item(), space.high.item())
             if labels and labels != UNLABELLED_NUMBER:
                 schema["description"] = labels[0]
             return schema
-    parts = _parts(space, labels)
-    if not parts:
-        raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
+        case Dict():
+            labels = [str(_label(labels, key)) for key in space]
+            parts = [_schema(part, None) for part in space.values()]
+        case Tuple():
+            parts = [_schema(part, None) for part in space]
+        case Box(shape=(_,)):
+            parts = map(_range, space.low.tolist(), space.high.tolist())
+        case MultiDiscrete(shape=(_,)):
+            last = space.start + space.nvec - 1
+            parts = map(_range, space.start.tolist(), last.tolist())
+        case MultiBinary(shape=(size,)):
+            parts = [_range(0, 1)] * size
+        case _:
+            raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
+    parts = list(parts)
+    names = labels or _indices(len(parts))
     return {
         "type": "object",
-        "properties": {name: _schema(part, None) for name, part in parts.items()},
-        "required": list(parts),
+        "properties": dict(zip(names, parts, strict=True)),
+        "required": list(names),
         "additionalProperties": False,
     }
 
 
-def _parts(space: Space[Any], labels: Texts) -> dict[str, Space[Any]]:
-    """Return the spaces of an action's components, by label, or else by key or index.
-
-    Return an empty dict for other spaces, and for arrays of two or more dimensions.
-    """
-    parts: Sequence[Space[Any]]
-    match space:
-        case Dict():
-            return {str(_label(labels, key)): part for key, part in space.items()}
-        case Tuple():
-            parts = space.spaces
-        case Box(shape=(_,)):
-            limits = zip(space.low, space.high, strict=True)
-            parts = [Box(low, high, (), low.dtype) for low, high in limits]
-        case MultiDiscrete(shape=(_,)):
-            sizes = zip(space.nvec, space.start, strict=True)
-            parts = [Discrete(size, start=start) for size, start in sizes]
-        case MultiBinary(shape=(size,)):
-            parts = [Discrete(2)] * size
-        case _:
-            return {}
-    names = labels or _indices(len(parts))
-    return dict(zip(names, parts, strict=True))
+def _range(low: float, high: float) -> Schema:
+    schema: Schema = {"type": "number" if isinstance(low, float) else "integer"}
+    if isfinite(low):
+        schema["minimum"] = low
+    if isfinite(high):
+        schema["maximum"] = high
+    return schema
 
 
 def _indices(length: int) -> list[str]:

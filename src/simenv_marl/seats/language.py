@@ -26,7 +26,7 @@ from ..errors import (
 )
 from ..many.parallel import import_extra
 from ..simulation import Action, Observation
-from .descriptions import JSON, action_schema, at_decision, describe, parse
+from .descriptions import Schema, action_schema, at_decision, describe, parse
 from .policies import check_count
 
 LONGEST_WAIT: Final = 30.0
@@ -196,9 +196,10 @@ class LanguageModelPolicy:
         return "\n".join(lines)
 
     def _question(self, decision: Decision) -> str:
-        if self._describe is None:
-            return describe(decision)
-        return self._describe(decision)
+        if self._describe is not None:
+            return self._describe(decision)
+        text: str = describe(decision)
+        return text
 
     # -- requests ---------------------------------------------------------------------------------
 
@@ -272,7 +273,7 @@ class _TransientError(Exception):
         self.seconds = seconds
 
 
-def _answer_schema(decision: Decision) -> dict[str, JSON]:
+def _answer_schema(decision: Decision) -> Schema:
     return {
         "type": "object",
         "properties": {"action": action_schema(decision)},

@@ -156,10 +156,9 @@ class Table:
                     return INVALID
         except (ValueError, RecursionError):
             return INVALID
-        expected = self._keys.get(seat, "")
-        if not expected or not secrets.compare_digest(
-            expected.encode(), key.encode(errors="replace")
-        ):
+        expected = self._keys.get(seat, "").encode()
+        sent = key.encode(errors="replace")
+        if not expected or not secrets.compare_digest(expected, sent):
             return "the link of this page has no key of this game: ask for the link of your seat"
         if message.get("do") == "take":
             self._seats[number] = seat

@@ -40,7 +40,7 @@ def settle(game):
     states = []
     for update in game.work():
         states += [update] if update else []
-        if game.pending is not None and update and update["type"] == "state" and game.futures:
+        if game.now is not None and update and update["type"] == "state" and game.futures:
             break
     return states[-1]
 
@@ -106,7 +106,7 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ga
     rewards = [row["reward"] for row in game.timeline if row["agent"] == "buyer"]
     assert rewards == models.rewards_of(turns, "buyer")
     game.handle("buyer", {"do": "undo"})
-    assert (game.turn, game.over, game.pending["agent"]) == (14, "", "buyer")
+    assert (game.turn, game.over, game.now["agent"]) == (14, "", "buyer")
     assert settle(game)["seats"] == ["buyer"]
     game.handle("buyer", {"do": "redo"})
     assert (game.turn, game.over, game.returns) == (16, "terminated", state["returns"])
@@ -315,12 +315,12 @@ def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_game, 
     game = make_game(seats=(), record=tmp_path / "game.jsonl")
     for _ in range(3):
         settle(game)
-        game.decide(3 if game.pending["agent"] == "buyer" else [0, 2], "person")
+        game.decide(3 if game.now["agent"] == "buyer" else [0, 2], "person")
     game.handle("buyer", {"do": "undo"})
     for seat in ("buyer", "seller"):
         game.delegated[seat] = 100
     settle(game)
-    game.decide(0, "person") if game.pending and game.pending["agent"] == "buyer" else None
+    game.decide(0, "person") if game.now and game.now["agent"] == "buyer" else None
     state = settle(game)
     assert state["over"]
     found = replay(tmp_path / "game.jsonl", Shop)

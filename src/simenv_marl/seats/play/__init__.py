@@ -1,4 +1,4 @@
-"""``python -m simenv_marl play``: a page on which people decide in a running simulation."""
+"""``python -m simenv_marl play``: a page where people decide in a running simulation."""
 
 from .recording import replay
 

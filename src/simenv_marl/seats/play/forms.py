@@ -90,7 +90,7 @@ def _entries(value: JSON, name: str = "") -> Iterator[tuple[str, JSON]]:
 
 
 def describe_space(space: Space[Any]) -> Message:
-    """Describe an action space as JSON, from which the page makes its inputs."""
+    """Describe an action space as JSON, for the inputs of the page."""
     match space:
         case Discrete():
             return {"kind": "discrete", "start": int(space.start), "n": int(space.n)}

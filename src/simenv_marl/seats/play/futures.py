@@ -1,4 +1,4 @@
-"""The futures of a pending decision: clones in which its candidates are tried out."""
+"""The futures of a pending decision: clones that try out its candidates."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -21,7 +21,7 @@ from .forms import (
 )
 
 FUTURES: Final = 16
-"""The number of futures in which each candidate is tried out."""
+"""The number of futures that try out each candidate."""
 
 MOST_MEASURES: Final = 12
 """The largest number of observed numbers that are shown."""
@@ -42,7 +42,7 @@ class Candidate(NamedTuple):
 
 @dataclass
 class Futures:
-    """The candidates for a pending decision, all tried out in the same futures.
+    """The candidates for a pending decision. All are tried out in the same futures.
 
     Attributes:
         env: The environment whose decision is pending.
@@ -101,7 +101,7 @@ class Futures:
             yield self.message()
 
     def _seeds(self) -> list[int] | list[None]:
-        """Return the seeds of the futures; None for a future in which chance is known."""
+        """Return the seeds of the futures; None for the future of the episode itself."""
         first = self.seed * 1_000_003 + self.turn * 1009
         seeds = [(first + place) % 2**31 for place in range(FUTURES)]
         try:

@@ -33,7 +33,7 @@ from .forms import Message, action_of, jsonable, pending_decision, picture_of
 from .futures import MOST_MEASURES, Futures
 
 CHECKPOINTS: Final = 24
-"""The largest number of checkpoints, each of which is a process."""
+"""The largest number of checkpoints. Each one is a process."""
 
 MOST_ROWS: Final = 150
 """The largest number of decisions that the page receives."""
@@ -95,12 +95,12 @@ class Game:
         agents: The agents that are known.
         timeline: The decisions, also those after the pending one that were undone.
         turn: The place of the pending decision in the timeline.
-        pending: The pending decision as JSON; None at the end.
+        now: The pending decision as JSON; None at the end.
         over: Why the episode is over: "terminated", "truncated" or an error. "": it is not.
         returns: The return of each agent so far.
         latest: The turn of the latest decision of each agent.
         futures: The futures of the pending decision, once they are explored.
-        deadline: The time of ``monotonic`` at which the rule decides, in seconds; None: never.
+        deadline: When the rule decides, in seconds of ``monotonic``; None: there is no limit.
         delegated: How many of its next decisions each seat leaves to the rule.
         skipping: The seat until whose next decision the rule plays for free seats.
         notice: A warning for the page.
@@ -251,7 +251,7 @@ class Game:
     def _arrive(self, turn: int) -> None:
         """Note the reward of the agent that decides next, and the agents that have ended."""
         self.turn = turn
-        self.pending: Message | None = None
+        self.now: Message | None = None
         self.deadline: float | None = None
         self.futures: Futures | None = None
         self.picture: Message | None = None
@@ -298,7 +298,7 @@ class Game:
                 )
         if self.turn == len(self.timeline):
             self.timeline.append(row)
-        self.pending = pending
+        self.now = pending
         self.latest[agent] = self.turn
         if not self.seats:
             self.agents[agent] = None
@@ -337,8 +337,8 @@ class Game:
         Raises:
             EOFError: The message is the end, or the connection is closed.
         """
-        if self.pending is not None and self._seconds_left() == 0.0:
-            self.late[self.pending["agent"]] += 1
+        if self.now is not None and self._seconds_left() == 0.0:
+            self.late[self.now["agent"]] += 1
             self.decide(None, "limit")
             return True
         if not connection.poll(timeout):
@@ -369,15 +369,14 @@ class Game:
             self.occupied = message["taken"]
             self._start_clock()
             return self.skipping is not None
+        if message.get("do") in ("act", "rule", "try"):
+            self._check_turn(message.get("turn"), seat)
         match message:
-            case {"do": "rule", "turn": turn}:
-                self._check_turn(turn, seat)
+            case {"do": "rule"}:
                 self.decide(None, "rule")
-            case {"do": "act", "turn": turn, "action": action} if action is not None:
-                self._check_turn(turn, seat)
+            case {"do": "act", "action": action} if action is not None:
                 self.decide(action, "person")
-            case {"do": "try", "turn": turn, "action": action} if action is not None:
-                self._check_turn(turn, seat)
+            case {"do": "try", "action": action} if action is not None:
                 if self.futures is not None:
                     self.futures.add(action)
             case {"do": "delegate", "n": int(number)} if 0 <= number <= 100_000:
@@ -406,15 +405,15 @@ class Game:
     def _turns(self, seat: str, turns: range) -> list[int]:
         return [turn for turn in turns if self.timeline[turn]["agent"] == seat]
 
-    def _check_turn(self, turn: int, seat: str) -> None:
-        if self.pending is None or turn != self.turn:
+    def _check_turn(self, turn: object, seat: str) -> None:
+        if self.now is None or turn != self.turn:
             raise InvalidActionError("another decision is pending by now")
-        if self.pending["agent"] != seat:
-            raise InvalidActionError(f"it is not your turn: {self.pending['agent']} decides")
+        if self.now["agent"] != seat:
+            raise InvalidActionError(f"it is not your turn: {self.now['agent']} decides")
 
     def _start_clock(self) -> None:
         """Begin the time limit of the pending decision, once a person is there."""
-        is_stopped = self.pending is not None and self.deadline is None
+        is_stopped = self.now is not None and self.deadline is None
         if self.limit and self.occupied and is_stopped:
             self.deadline = monotonic() + self.limit
 
@@ -432,18 +431,18 @@ class Game:
             None after each step of a simulation, or a message for all pages.
         """
         latest = monotonic()
-        while self.pending is not None and self._leaves_to_rule(self.pending["agent"]):
+        while self.now is not None and self._leaves_to_rule(self.now["agent"]):
             self.decide(None, "rule")
             yield None
             if monotonic() > latest + PAUSE:
                 latest = monotonic()
                 yield self.snapshot()
-        if self.pending is not None:
+        if self.now is not None:
             self._make_checkpoint()
             if self.futures is None:
                 self.futures = Futures(
                     self.env,
-                    self.pending,
+                    self.now,
                     self.turn,
                     self.horizon,
                     self.seed,
@@ -487,7 +486,7 @@ class Game:
             "seats": list(self.agents),
             "turn": self.turn,
             "length": sum("action" in row for row in self.timeline),
-            "pending": self.pending,
+            "pending": self.now,
             "over": self.over,
             "returns": self.returns,
             "history": self.timeline[max(0, self.turn - MOST_ROWS) : self.turn + 1],

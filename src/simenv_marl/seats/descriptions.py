@@ -227,7 +227,8 @@ def _legal_lines(decision: Decision) -> list[str]:
 def _limits(schema: Schema) -> str:
     if "properties" in schema:
         parts = schema["properties"].items()
-        return ", ".join(f"{name}: {_limits(part)}" for name, part in parts)
+        texts = [f"{name}: {_limits(part)}" for name, part in parts]
+        return f"({', '.join(texts)})"
     noun = "an integer" if schema["type"] == "integer" else "a number"
     low = _value_text(schema.get("minimum", -inf))
     high = _value_text(schema.get("maximum", inf))
@@ -374,8 +375,8 @@ def _only_label(text: str, labels: Collection[str]) -> str | None:
         return None
     longest_first = sorted(labels, key=len, reverse=True)
     words = "|".join(map(re.escape, longest_first))
-    found = set(re.findall(rf"(?<![\w.-])(?:{words})(?!\w|\.\d)", text))
-    return found.pop() if len(found) == 1 else None
+    matches = set(re.findall(rf"(?<![\w.-])(?:{words})(?!\w|\.\d)", text))
+    return matches.pop() if len(matches) == 1 else None
 
 
 def to_action(

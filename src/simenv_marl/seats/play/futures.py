@@ -52,7 +52,7 @@ class Futures:
         seed: The seed of the game.
         candidates: The candidates. The first one is the rule.
         measures: The names of the numbers in the observation, by their places in its entries.
-        rule_action: The action of the rule as JSON, once it is known.
+        rule_action: The part of the message with the action of the rule, once it is known.
         note: A remark for the page.
     """
 
@@ -107,7 +107,7 @@ class Futures:
         try:
             clone(self.env, seed=seeds[0]).close()
         except Exception as error:
-            self.note = f"One future, in which chance is known: {error!s}"
+            self.note = f"There is one future, with foresight: {error}"
             return [None]
         return seeds
 
@@ -119,10 +119,10 @@ class Futures:
                 action = candidate.action
                 twin.step(action_of(self.space, action))
                 while twin.agents:
-                    is_own = twin.agent_selection == self.agent
-                    observation, reward, terminated, truncated, info = twin.last(observe=is_own)
+                    is_agent = twin.agent_selection == self.agent
+                    observation, reward, terminated, truncated, info = twin.last(observe=is_agent)
                     ended = terminated or truncated
-                    if is_own:
+                    if is_agent:
                         total = course[-1][0] if course else 0.0
                         course.append(self._row(total + reward, observation))
                         if action is None and "rule_action" in info:

@@ -92,7 +92,7 @@ class Game:
         checkpoints: The checkpoints, by turn.
         root: The environment that was made for the game.
         env: The environment at the pending decision: ``root`` or a clone.
-        agents: The agents that are known.
+        agents: The known agents.
         timeline: The decisions, also those after the pending one that were undone.
         turn: The place of the pending decision in the timeline.
         now: The pending decision as JSON; None at the end.
@@ -289,8 +289,8 @@ class Game:
             "values": [value for _, value in pending["observation"][:MOST_MEASURES]],
         }
         if self.turn < len(self.timeline):
-            known = self.timeline[self.turn]
-            if known | row != known:
+            previous = self.timeline[self.turn]
+            if previous | row != previous:
                 del self.timeline[self.turn :]
                 self.notice = (
                     "The simulation does not repeat itself: its randomness does not all come from"

@@ -172,10 +172,10 @@ class Table:
 
     def _tell_people(self) -> None:
         """Tell pages and game which seats people have."""
-        taken = Counter(self._seats.values())
-        spectators = len(self.links) - taken.total()
-        self._send_all({"type": "people", "spectators": spectators, "taken": taken})
-        self._inbox.put_nowait(pickle.dumps((None, None, {"taken": taken})))
+        people = Counter(self._seats.values())
+        spectators = len(self.links) - people.total()
+        self._send_all({"type": "people", "spectators": spectators, "taken": people})
+        self._inbox.put_nowait(pickle.dumps((None, None, {"taken": people})))
 
     def _show(self, message: Message) -> None:
         for seat in message.get("seats", ()):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
-from simenv_marl.core.switching import context
 from simenv_marl.errors import OptionValueError, WrongThreadError
 from tests.worlds.models import define, play
 
@@ -53,12 +52,6 @@ def world():
     return random.getstate(), name, key.tolist(), others
 
 
-@pytest.fixture(params=["copied as bytes", "by their own functions"])
-def _states(request, monkeypatch):
-    if request.param == "by their own functions":
-        monkeypatch.setattr(context, "IS_COPIED", False)
-
-
 @pytest.fixture(autouse=True)
 def _kept():
     """Leaves Python's generator as it was, with a normally distributed number kept in both."""
@@ -79,7 +72,6 @@ def plain(seed):
     return casino.log
 
 
-@pytest.mark.usefixtures("_states")
 @DRIVERS
 @pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
 def test_environments_draw_as_plain_runs_do_whatever_else_draws(make, driver):
@@ -150,7 +142,6 @@ def test_simulations_may_seed_the_generators_themselves():
     assert world() == before
 
 
-@pytest.mark.usefixtures("_states")
 def test_other_bit_generators_of_the_user_stay():
     ours = np.random.get_bit_generator()
     theirs = np.random.PCG64(3)
@@ -207,9 +198,3 @@ def test_two_at_work_at_once_in_two_threads_are_refused():
     env.step(RULE)
     assert env.simulation.log == plain(7)[: len(env.simulation.log)]
     random.setstate(before[0])
-
-
-def test_states_are_copied_as_bytes_but_where_memory_has_another_layout(monkeypatch):
-    assert context.IS_COPIED
-    monkeypatch.setattr(context, "string_at", lambda address, size: bytes(size))
-    assert not context._is_layout_known()

@@ -173,31 +173,3 @@ env = pickle.loads(sys.stdin.buffer.read())
 print([turn.reward for turn in play(env, 2, seed=1)], env.simulation.total, env.simulation.two())
 """
     assert run(code, pickled).decode().strip() == "[0.0, 7.0, 7.0, 7.0] 21 10"
-
-
-def test_copies_of_a_model_of_the_main_module_leave_its_class_as_it_stands():
-    """As in a script that gives its environments to forked processes, or keeps them in a file."""
-    code = """
-two = Model.two
-for env in (
-    single_env(Model, "__main__.Model.one"),
-    single_env(Model(), {"__main__.Model.two": define(agent="two_0")}),
-    aec_env(Model, [Model.one]),
-):
-    parcels = [module.dumps(env) for module in (pickle, cloudpickle)]
-    env.reset()
-    parcels += [module.dumps(env) for module in (pickle, cloudpickle)]
-    Model.rate = len(parcels)
-    for parcel in parcels:
-        twin = pickle.loads(parcel)
-        env.step(2)  # goes on as if nothing were
-        twin.reset(seed=1)
-        for _ in range(3):
-            twin.step(2)
-        print(type(twin.unwrapped.simulation) is Model, twin.unwrapped.simulation.total)
-        env.reset()
-    env.close()
-print(Model.rate, Model.two is two)
-"""
-    told = ["True 36"] * 4 + ["True 9"] * 4 + ["True 36"] * 4
-    assert run(MODEL + code).decode().splitlines() == [*told, "4 True"]

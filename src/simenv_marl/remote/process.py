@@ -133,7 +133,7 @@ class ProcessSimulation(SimulationInterface):
         # equal for processes that can replace each other
         variables = dict(os.environ if self.env is None else self.env)
         launch = self.command, self.timeout, variables, os.path.abspath(self.cwd or "")
-        child = self._child or acquire(launch)
+        child = self._child or acquire(launch, Child)
         if child is not None:
             child.break_off()
             try:

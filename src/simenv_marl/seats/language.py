@@ -1,12 +1,11 @@
 """A policy that asks a language model, over an endpoint that speaks OpenAI's chat completions."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from inspect import cleandoc
 from itertools import chain
 from time import perf_counter
@@ -18,25 +17,37 @@ from ..core import COUNTS, Answer, Decision, count
 from ..errors import (
     InvalidActionError,
     LanguageModelError,
+    MissingExtraError,
     OptionValueError,
     describe_error,
     short_repr,
 )
 from ..many.parallel import import_extra
-from .descriptions import action_schema, describe, parse, pending
+from ..simulation import Action, Observation
+from .descriptions import Schema, action_schema, at_decision, describe, parse
+from .policies import check_count
 
 LONGEST_WAIT: Final = 30.0
 """The longest time before a request is repeated, in seconds."""
+
+CONNECTION_ERRORS: Final = ("APIConnectionError", "APITimeoutError")
+"""The errors of the client that may pass and have no status."""
+
+TRANSIENT_STATUSES: Final = (408, 409, 429)
+"""The statuses below 500 that may pass: a timeout, a conflict, too many requests."""
+
+Message = dict[str, str]
+"""A message of the conversation, with its ``role`` and ``content``."""
 
 
 class LanguageModelPolicy:
     """A coroutine policy that asks a language model for each decision.
 
-    The model gets the decision as ``describe`` puts it, and the JSON schema of the legal actions;
-    endpoints without structured output are asked without it, and an answer in plain text is parsed.
-    An answer is checked here, and where it is wrong, or the endpoint fails for a time, the model is
-    asked again. If it gives no legal answer, the policy raises an error, which a ``FallbackPolicy``
-    catches. In clones, the rule decides.
+    A request contains the decision as ``describe`` puts it, and the JSON schema of the legal
+    actions. Endpoints without structured output are asked without a schema; an answer in plain text
+    is parsed. The policy validates each answer. After an illegal answer or a failure that may pass,
+    it asks again. Then it raises an error, which a ``FallbackPolicy`` catches. In clones, the rule
+    decides.
 
     Attributes:
         model: The name of the model.
@@ -57,17 +68,18 @@ class LanguageModelPolicy:
         timeout: float = 60.0,
         structured: bool = True,
         client: Any = None,
-        **request: Any,
+        **request: object,
     ) -> None:
-        """Define a policy. The extra ``language`` is needed from the first decision on, unless there is a ``client``.
+        """Define a policy.
+
+        The first decision needs the extra ``language``, unless there is a ``client``.
 
         Args:
             model: The name of the model, as the endpoint knows it.
             base_url: The address of the endpoint, such as ``http://localhost:11434/v1``. None:
-                OpenAI's, or that of the environment variable ``OPENAI_BASE_URL``.
-            api_key: The key of the endpoint. None: that of the environment variable
-                ``OPENAI_API_KEY``.
-            instructions: What the model is told besides, at the beginning.
+                OpenAI's, or the environment variable ``OPENAI_BASE_URL``.
+            api_key: The key of the endpoint. None: the environment variable ``OPENAI_API_KEY``.
+            instructions: Further instructions, at the end of the system message.
             describe: A callable of the ``Decision`` that puts it into words. None:
                 ``simenv_marl.seats.describe``.
             history: How many of the latest decisions of the same agent, with their answers, each
@@ -75,52 +87,60 @@ class LanguageModelPolicy:
             retries: How often the model is asked again for a decision.
             timeout: The time limit of a request, in seconds.
             structured: Whether to ask for structured output.
-            client: An ``openai.AsyncOpenAI``, or an object like it, to use instead of another one.
+            client: An ``openai.AsyncOpenAI``, or an object like it, to use instead of a new one.
                 It must not be used in another event loop.
             **request: Further arguments of each request, such as ``temperature=0.0``.
 
         Raises:
             OptionValueError: An argument has an invalid value.
         """
-        for name, value in (("history", history), ("retries", retries)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise OptionValueError(
-                    f"{name} must be a non-negative integer, not {short_repr(value)}"
-                )
+        check_count("history", history)
+        check_count("retries", retries)
         if describe is not None and not callable(describe):
             raise OptionValueError(
                 f"describe must be a callable of a Decision, or None, not {short_repr(describe)}"
             )
-        self.model, self.structured = model, structured
-        self._base_url, self._api_key, self._instructions = base_url, api_key, instructions
-        self._describe, self._most_turns, self._retries = describe, history, retries
+        self.model = model
+        self.structured = structured
+        self._base_url = base_url
+        self._api_key = api_key
+        self._instructions = instructions
+        self._describe = describe
+        self._history_length = history
+        self._retries = retries
         self._request = {"timeout": timeout, **request}
-        self._client, self._own_client = client, None
+        self._client = client
+        self._own_client: Any = None
         self._token = uuid4().hex
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {**vars(self), "_own_client": None}
 
     @property
     def usage(self) -> dict[str, float]:
-        """The numbers of ``requests``, ``prompt_tokens`` and ``completion_tokens``, and the ``seconds`` they took."""
-        counted = COUNTS.get(self._token, {})
-        return {
-            name: counted.get(name, 0)
-            for name in ("requests", "prompt_tokens", "completion_tokens", "seconds")
-        }
+        """The numbers of requests and tokens, and the seconds that the requests took.
 
-    def prompt(self, env_or_decision: Any) -> str:
-        """Return what the model is told about the pending decision of an environment: instructions and description.
+        The keys are ``requests``, ``prompt_tokens``, ``completion_tokens`` and ``seconds``.
+        """
+        counts = COUNTS.get(self._token, {})
+        names = ("requests", "prompt_tokens", "completion_tokens", "seconds")
+        return {name: counts.get(name, 0) for name in names}
+
+    def prompt(self, env_or_decision: object) -> str:
+        """Return the prompt for the pending decision: the instructions and the description.
 
         Raises:
             ResetNeededError: No decision is pending.
         """
-        is_decision = isinstance(env_or_decision, Decision)
-        decision = env_or_decision if is_decision else env_or_decision.unwrapped.call(pending)
-        return f"{self._system(decision)}\n\n{self._words(decision)}"
+        text: str = at_decision(env_or_decision, "prompt", self._prompt)
+        return text
 
-    async def __call__(self, observation: Any, info: Any = None, *, _decision: Decision) -> Any:
+    def _prompt(self, decision: Decision) -> str:
+        return f"{self._system_text(decision)}\n\n{self._question(decision)}"
+
+    async def __call__(
+        self, observation: Observation, info: object = None, *, _decision: Decision
+    ) -> Action:
         """Ask the model for an action.
 
         Raises:
@@ -128,100 +148,87 @@ class LanguageModelPolicy:
             LanguageModelError: The last request failed, or brought no answer.
             MissingExtraError: The package ``openai`` is missing.
         """
-        history = self._history(_decision)
-        asked = {"role": "user", "content": self._words(_decision)}
+        turns: deque[tuple[Message, Message]] = _decision.memory.setdefault(
+            self._token, deque(maxlen=self._history_length)
+        )
+        question = {"role": "user", "content": self._question(_decision)}
         messages = [
-            {"role": "system", "content": self._system(_decision)},
-            *chain.from_iterable(history),
-            asked,
+            {"role": "system", "content": self._system_text(_decision)},
+            *chain.from_iterable(turns),
+            question,
         ]
-        tries = 0
+        retry = 0
         while True:
-            error: Exception
             try:
                 text = await self._ask(messages, _decision)
                 action = parse(_decision, text)
-                history.append([asked, {"role": "assistant", "content": text}])
-                return action
-            except InvalidActionError as problem:
-                error = problem
+            except InvalidActionError as error:
+                if retry == self._retries:
+                    raise
                 messages += [
                     {"role": "assistant", "content": text},
-                    {"role": "user", "content": str(problem)},
+                    {"role": "user", "content": str(error)},
                 ]
-            except _PassingError as problem:
-                error = LanguageModelError(f"{self.model} gave no answer: {problem}")
-                if tries < self._retries:
-                    await asyncio.sleep(min(LONGEST_WAIT, max(problem.seconds, 0.5 * 2**tries)))
-            tries += 1
-            if tries > self._retries:
-                raise error
+            except _TransientError as error:
+                if retry == self._retries:
+                    raise LanguageModelError(f"{self.model} gave no answer: {error}") from error
+                seconds = max(error.seconds, 0.5 * 2**retry)
+                await asyncio.sleep(min(LONGEST_WAIT, seconds))
+            else:
+                turns.append((question, {"role": "assistant", "content": text}))
+                return action
+            retry += 1
 
-    # -- what the model is told -------------------------------------------------------------------
+    # -- prompts ----------------------------------------------------------------------------------
 
-    def _system(self, decision: Decision) -> str:
-        parts = [f"You decide for {decision.agent!r} in a running simulation."]
+    def _system_text(self, decision: Decision) -> str:
+        lines = [f"You decide for {decision.agent!r} in a running simulation."]
         if decision.doc:
-            parts.append(f"What it decides: {cleandoc(decision.doc)}")
-        schema = json.dumps(self._answer_schema(decision), ensure_ascii=False)
-        parts.append(
+            lines.append(f"What it decides: {cleandoc(decision.doc)}")
+        schema = json.dumps(_answer_schema(decision), ensure_ascii=False)
+        lines.append(
             f"Answer with one JSON object that fits this JSON schema, and nothing else: {schema}"
         )
-        return "\n".join([*parts, self._instructions] if self._instructions else parts)
+        if self._instructions:
+            lines.append(self._instructions)
+        return "\n".join(lines)
 
-    def _words(self, decision: Decision) -> str:
-        return describe(decision) if self._describe is None else self._describe(decision)
-
-    @staticmethod
-    def _answer_schema(decision: Decision) -> dict[str, Any]:
-        return {
-            "type": "object",
-            "properties": {"action": action_schema(decision)},
-            "required": ["action"],
-            "additionalProperties": False,
-        }
-
-    def _history(self, decision: Decision) -> deque[list[dict[str, str]]]:
-        """Return the latest decisions of an agent in an episode, each as a question and an answer."""
-        history: deque[list[dict[str, str]]] = decision.memory.setdefault(
-            self._token, deque(maxlen=self._most_turns)
-        )
-        return history
+    def _question(self, decision: Decision) -> str:
+        if self._describe is not None:
+            return self._describe(decision)
+        text: str = describe(decision)
+        return text
 
     # -- requests ---------------------------------------------------------------------------------
 
-    async def _ask(self, messages: list[dict[str, str]], decision: Decision) -> str:
-        """Send a request; return the text of the answer."""
-        openai = import_extra("openai", "LanguageModelPolicy") if self._client is None else None
-        request: dict[str, Any] = {"model": self.model, "messages": messages, **self._request}
+    async def _ask(self, messages: list[Message], decision: Decision) -> str:
+        """Send a request; return the text of the answer.
+
+        Raises:
+            LanguageModelError: The request cannot succeed.
+            _TransientError: The same request may succeed later.
+        """
+        request: dict[str, object] = {
+            "model": self.model,
+            "messages": messages,
+            **self._request,
+        }
         if self.structured:
-            schema = {"name": "decision", "schema": self._answer_schema(decision), "strict": True}
+            schema = {"name": "decision", "schema": _answer_schema(decision), "strict": True}
             request["response_format"] = {"type": "json_schema", "json_schema": schema}
-        began = perf_counter()
+        start = perf_counter()
         try:
-            client = self._client or self._made_client(openai)
+            client = self._client or self._default_client()
             response = await client.chat.completions.create(**request)
-        except asyncio.CancelledError:
+        except MissingExtraError:
             raise
         except Exception as error:
-            status = getattr(error, "status_code", None)
-            if status in (400, 404, 422) and self.structured and "response_format" in str(error):
+            if self.structured and _refuses_schema(error):
                 self.structured = False
                 return await self._ask(messages, decision)
-            if status is None and type(error).__name__ not in (
-                "APIConnectionError",
-                "APITimeoutError",
-            ):
-                raise LanguageModelError(
-                    f"{self.model} cannot be asked: {describe_error(error)}"
-                ) from error
-            if status is not None and status not in (408, 409, 429) and status < 500:
-                raise LanguageModelError(
-                    f"the endpoint refuses to ask {self.model}: {describe_error(error)}"
-                ) from error
-            raise _PassingError(describe_error(error), _seconds_to_wait(error)) from error
+            raise _request_error(self.model, error) from error
         finally:
-            count(self._token, requests=1, seconds=perf_counter() - began)
+            count(self._token, requests=1, seconds=perf_counter() - start)
         usage = getattr(response, "usage", None)
         count(
             self._token,
@@ -231,25 +238,32 @@ class LanguageModelPolicy:
         try:
             message = response.choices[0].message
         except (AttributeError, LookupError, TypeError):
-            raise _PassingError(
+            raise _TransientError(
                 f"the endpoint returned no chat completion but {short_repr(response)}"
             ) from None
         if not isinstance(message.content, str) or not message.content.strip():
-            raise _PassingError(f"it refused: {short_repr(getattr(message, 'refusal', None))}")
+            raise _TransientError(f"it refused: {short_repr(getattr(message, 'refusal', None))}")
         return message.content
 
-    def _made_client(self, openai: Any) -> Any:
+    def _default_client(self) -> Any:
         if self._own_client is None:
-            made = openai.AsyncOpenAI(base_url=self._base_url, api_key=self._api_key, max_retries=0)
-            self._own_client = made
-            finalize(self, _close, made, os.getpid()).atexit = False
+            openai = import_extra("openai", "LanguageModelPolicy")
+            client = openai.AsyncOpenAI(
+                base_url=self._base_url,
+                api_key=self._api_key,
+                max_retries=0,
+            )
+            finalizer = finalize(self, _close, client, os.getpid())
+            finalizer.atexit = False
+            self._own_client = client
         return self._own_client
 
 
-class _PassingError(Exception):
+class _TransientError(Exception):
     """A request failed in a way that may not happen again.
 
-    It may say how long to wait, in seconds.
+    Attributes:
+        seconds: The time to wait before the next request, if the endpoint says so; else 0.0.
     """
 
     def __init__(self, text: str, seconds: float = 0.0) -> None:
@@ -257,16 +271,37 @@ class _PassingError(Exception):
         self.seconds = seconds
 
 
-def _close(client: Any, process: int) -> None:
-    """Close the connections of a client, without waiting for it."""
-    if os.getpid() == process:
-        Answer(client.close(), lambda answer: None)
+def _answer_schema(decision: Decision) -> Schema:
+    return {
+        "type": "object",
+        "properties": {"action": action_schema(decision)},
+        "required": ["action"],
+        "additionalProperties": False,
+    }
 
 
-def _seconds_to_wait(error: Exception) -> float:
-    """Return the seconds that an endpoint asks to wait, 0.0 if it does not say."""
+def _refuses_schema(error: Exception) -> bool:
+    """Return whether an endpoint has refused a request because of its ``response_format``."""
+    status = getattr(error, "status_code", None)
+    return status in (400, 404, 422) and "response_format" in str(error)
+
+
+def _request_error(model: str, error: Exception) -> Exception:
+    """Make the error that ``_ask`` raises for an error of the client."""
+    status = getattr(error, "status_code", None)
+    text = describe_error(error)
+    if status is None and type(error).__name__ not in CONNECTION_ERRORS:
+        return LanguageModelError(f"{model} cannot be asked: {text}")
+    if status is not None and status < 500 and status not in TRANSIENT_STATUSES:
+        return LanguageModelError(f"the endpoint refuses to ask {model}: {text}")
     headers = getattr(getattr(error, "response", None), "headers", None) or {}
-    try:
-        return float(headers.get("retry-after", 0.0))
-    except ValueError:
-        return 0.0
+    seconds = 0.0
+    with suppress(ValueError):  # it may be a date
+        seconds = float(headers.get("retry-after", 0.0))
+    return _TransientError(text, seconds)
+
+
+def _close(client: Any, process: int) -> None:
+    """Close the connections of a client in the policies' thread, without waiting for it."""
+    if os.getpid() == process:  # not in a fork, which has no part in the connections
+        Answer(client.close(), lambda answer: None)

@@ -1,52 +1,68 @@
-"""Policies around policies: a fallback for those that are late, fail or answer illegally, and recordings."""
-
-from __future__ import annotations
+"""Policies around policies: fallbacks for failing policies, and recordings of answers."""
 
 import asyncio
 import json
 import os
-from collections.abc import Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from hashlib import blake2b
 from inspect import isawaitable
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from uuid import uuid4
 
 import numpy as np
-from gymnasium import spaces
 
-from ..core import COUNTS, Caller, Decision, PolicyWrapper, count, waits, when_answered
-from ..errors import InvalidActionError, OptionValueError, describe_error, short_repr, warn_user
-from ..simulation import RULE
+from ..core import COUNTS, Caller, Decision, Info, PolicyWrapper, count, waits, when_answered
+from ..errors import (
+    InvalidActionError,
+    OptionValueError,
+    describe_error,
+    short_repr,
+    warn_user,
+)
+from ..simulation import RULE, Action, Observation, Sentinel
+from .descriptions import to_action
 
 KINDS: Final = ("asked", "retried", "late", "failed", "illegal", "fallbacks")
-"""What a ``FallbackPolicy`` counts."""
+"""The events that a ``FallbackPolicy`` counts."""
+
+Policy = Callable[..., Action | Awaitable[Action]]
+"""A policy, as ``simulate`` takes them. It may be a coroutine function."""
+
+
+def check_count(name: str, value: object) -> None:
+    """Check that an argument is a non-negative integer, or raise an ``OptionValueError``."""
+    if type(value) is not int or value < 0:
+        raise OptionValueError(f"{name} must be a non-negative integer, not {short_repr(value)}")
 
 
 class FallbackPolicy(PolicyWrapper):
-    """A policy that answers by a fallback where another policy is late, raises an exception, or answers illegally.
+    """A policy that answers by a fallback where another policy is late, fails or answers illegally.
 
-    Evaluations show the share of decisions that a fallback has answered. In clones it counts
-    nothing, and where the other policy waits or records, the fallback answers.
+    Evaluations show the share of decisions that a fallback has answered. In clones nothing is
+    counted, and the fallback answers for a policy that waits or records.
 
     Attributes:
         policy, fallback: The two policies.
-        last_error: What was wrong with the latest answer that was not used, as text; None if all
-            were used.
+        last_error: The text of the latest error, delay or illegal answer; None if there was none.
     """
 
     counts_fallbacks = True
 
     def __init__(
-        self, policy: Any, fallback: Any = RULE, *, timeout: float | None = None, retries: int = 0
+        self,
+        policy: Policy,
+        fallback: Policy | Sentinel = RULE,
+        *,
+        timeout: float | None = None,
+        retries: int = 0,
     ) -> None:
         """Wrap a policy.
 
         Args:
-            policy: The policy, as ``simulate`` takes them: a callable, which may be a coroutine
-                function.
-            fallback: What answers instead: ``RULE``, or a policy.
+            policy: The policy, as ``simulate`` takes them. It may be a coroutine function.
+            fallback: ``RULE``, or the policy that answers instead.
             timeout: The time that an answer may take, in seconds. A coroutine is cancelled then;
                 the time of other functions is measured afterwards. None: there is no limit.
             retries: How often the policy is asked again before the fallback answers.
@@ -54,63 +70,67 @@ class FallbackPolicy(PolicyWrapper):
         Raises:
             OptionValueError: An argument has an invalid value.
         """
-        if fallback is not RULE and not callable(fallback):
+        self._ask_fallback: Caller | None = None
+        parameters = {"_decision"}
+        if callable(fallback):
+            self._ask_fallback = Caller(fallback)
+            parameters.update(self._ask_fallback.names)
+        elif fallback is not RULE:
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
-        self._ask_fallback = None if fallback is RULE else Caller(fallback)
-        super().__init__(
-            policy, asks=("_decision", *(self._ask_fallback.names if self._ask_fallback else ()))
-        )
+        super().__init__(policy, asks=parameters)
         if timeout is not None and not (isinstance(timeout, (int, float)) and timeout > 0):
             raise OptionValueError(
                 f"timeout must be a number of seconds or None, not {short_repr(timeout)}"
             )
-        if isinstance(retries, bool) or not isinstance(retries, int) or retries < 0:
-            raise OptionValueError(
-                f"retries must be a non-negative integer, not {short_repr(retries)}"
-            )
-        self.fallback, self.timeout, self.retries = fallback, timeout, retries
+        check_count("retries", retries)
+        self.fallback = fallback
+        self.timeout = timeout
+        self.retries = retries
         self.waits = self.waits or waits(fallback)
         self.last_error: str | None = None
         self._token = uuid4().hex
 
     @property
     def counts(self) -> dict[str, int]:
-        """How often it was asked and retried, was late, failed or answered illegally, and the fallback answered.
+        """The numbers of decisions, retries, faults and fallbacks.
 
-        ``evaluate``, ``run_experiment``, ``simulate_many`` and ``collect_episodes`` add what their
-        workers count.
+        The keys are ``asked`` (decisions), ``retried``, ``late``, ``failed``, ``illegal`` and
+        ``fallbacks``. ``evaluate``, ``run_experiment``, ``simulate_many`` and ``collect_episodes``
+        add the counts of their workers.
         """
-        counted = COUNTS.get(self._token, {})
-        return {kind: int(counted.get(kind, 0)) for kind in KINDS}
+        counts = COUNTS.get(self._token, {})
+        return {kind: int(counts.get(kind, 0)) for kind in KINDS}
 
     def __call__(
-        self, observation: Any, info: Any = None, *, _decision: Decision, **asked: Any
-    ) -> Any:
+        self,
+        observation: Observation,
+        info: Info | None = None,
+        *,
+        _decision: Decision,
+        **context: object,
+    ) -> Action | Awaitable[Action]:
         """Answer a decision. Return an awaitable if one of the two policies has to be awaited."""
-        answer = self._answer(observation, info, {**asked, "_decision": _decision})
-        return answer if self.waits else _finished(answer)
+        context["_decision"] = _decision
+        answer = self._answer(_decision, observation, info, context)
+        if self.waits:
+            return answer
+        return _run_without_waiting(answer)
 
-    async def _answer(self, observation: Any, info: Any, asked: Mapping[str, Any]) -> Any:
-        decision: Decision = asked["_decision"]
+    async def _answer(self, decision: Decision, *arguments: Any) -> Action:
+        """Answer with the arguments of a ``Caller``."""
         self._count(decision, "asked")
-        for number in range(self.retries + 1):
-            if number:
+        for attempt in range(self.retries + 1):
+            if attempt:
                 self._count(decision, "retried")
-            began = monotonic()
             try:
-                answer = self.ask(observation, info, asked)
-                if isawaitable(answer) and self.waits:
-                    answer = await asyncio.wait_for(answer, self.timeout)
-                if self.timeout is not None and monotonic() - began > self.timeout:
-                    raise TimeoutError
+                answer = await self._ask_in_time(*arguments)
                 if answer is not RULE:
                     decision.validate(answer)
                 return answer
-            except OptionValueError:  # the policy was not written or set up well
+            except OptionValueError:  # a mistake in the program, which no fallback should hide
                 raise
             except TimeoutError as error:
-                late = TimeoutError(f"the answer took longer than {self.timeout} s")
-                self._note(decision, "late", error if str(error) else late)
+                self._note(decision, "late", error)
             except InvalidActionError as error:
                 self._note(decision, "illegal", error)
             except Exception as error:
@@ -119,10 +139,31 @@ class FallbackPolicy(PolicyWrapper):
         decision.count_fallback()
         if self._ask_fallback is None:
             return RULE
-        answer = self._ask_fallback(observation, info, asked)
-        return await answer if isawaitable(answer) else answer
+        answer = self._ask_fallback(*arguments)
+        if isawaitable(answer):
+            return await answer
+        return answer
 
-    def _note(self, decision: Decision, kind: str, error: Exception) -> None:
+    async def _ask_in_time(self, *arguments: Any) -> Action:
+        """Ask the policy; raise a ``TimeoutError`` if its answer takes too long."""
+        problem = f"the answer took longer than {self.timeout} s"
+        start = monotonic()
+        try:
+            answer = self.ask(*arguments)
+            if isawaitable(answer) and self.waits:
+                answer = await asyncio.wait_for(answer, self.timeout)
+        except TimeoutError as error:
+            raise TimeoutError(str(error) or problem) from error
+        if self.timeout is not None and monotonic() - start > self.timeout:
+            raise TimeoutError(problem)
+        return answer
+
+    def _note(
+        self,
+        decision: Decision,
+        kind: str,
+        error: Exception,
+    ) -> None:
         self.last_error = describe_error(error)
         self._count(decision, kind)
 
@@ -131,70 +172,98 @@ class FallbackPolicy(PolicyWrapper):
             count(self._token, **{kind: 1})
 
 
-def _finished(coroutine: Coroutine[Any, Any, Any]) -> Any:
+def _run_without_waiting(coroutine: Coroutine[None, None, Action]) -> Action:
     """Return the result of a coroutine that awaits nothing."""
     try:
         coroutine.send(None)
     except StopIteration as end:
         return end.value
-    raise AssertionError("it has nothing to await")
+    raise AssertionError("the coroutine waits")
+
+
+class DecisionKey(NamedTuple):
+    """The fields of a recorded line that identify its decision."""
+
+    seed: int
+    agent: str
+    number: int
+    observation: str
+    """The digest of the observation."""
 
 
 class RecordedPolicy(PolicyWrapper):
-    """A policy that records the answers of another one in a file, and repeats them without asking it.
+    """A policy that records the answers of another one in a file, and repeats them.
 
     Each answer is a line of JSON: the seed of the episode, the agent, the number of the decision, a
-    digest of the observation, and the answer. An answer is repeated where all of these agree. A
-    line is written at once, so that the file can be used after a crash. In clones, the fallback of
-    the other policy answers, or the rule.
+    digest of the observation, and the answer. An answer is repeated without asking the other policy
+    where all of these agree. A line is written at once, so that the file can be used after a crash.
+    In clones, the fallback of the other policy answers, or the rule.
 
     Attributes:
         policy: The other policy.
         path: The path of the file.
     """
 
-    def __init__(self, policy: Any, path: str | os.PathLike[str]) -> None:
+    def __init__(self, policy: Policy, path: str | os.PathLike[str]) -> None:
         """Wrap a policy, as ``simulate`` takes them; it may be a coroutine function.
 
         The file is created if needed.
+
+        Raises:
+            OptionValueError: The folder of the file does not exist.
         """
         super().__init__(policy, asks=("_decision",))
-        self.path, self.records = Path(path), True
+        self.path = Path(path)
+        self.records = True
         if not self.path.parent.is_dir():
             raise OptionValueError(
                 f"{self.path} cannot be written: {self.path.parent} is no folder"
             )
-        self.fallback: Any = getattr(policy, "fallback", RULE)
-        self._known: dict[tuple[Any, ...], Any] | None = None
+        self.fallback: Policy | Sentinel = getattr(policy, "fallback", RULE)
+        self._answers: dict[DecisionKey, Action] | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_known": None}
+    def __getstate__(self) -> dict[str, object]:
+        """Return the state without the answers, because the file has them, too."""
+        return {**vars(self), "_answers": None}
 
     def __call__(
-        self, observation: Any, info: Any = None, *, _decision: Decision, **asked: Any
-    ) -> Any:
+        self,
+        observation: Observation,
+        info: Info | None = None,
+        *,
+        _decision: Decision,
+        **context: object,
+    ) -> Action | Awaitable[Action]:
         """Answer a decision.
 
-        Return an awaitable if the answer is not known and the policy has to be awaited.
+        Return an awaitable if the answer is not recorded and the policy has to be awaited.
         """
-        known = self._read() if self._known is None else self._known
-        key = _decision.seed, _decision.agent, _decision.number, digest_of(observation)
-        if key in known:
-            answer = known[key]
-            return RULE if answer is None else _decision.action_space.from_jsonable(answer)[0]
-        asked["_decision"] = _decision
-        answer = self.ask(observation, info, asked)
-        return when_answered(answer, lambda known: self._record(key, known, _decision))
+        if self._answers is None:
+            self._answers = self._read()
+        key = DecisionKey(
+            _decision.seed,
+            _decision.agent,
+            _decision.number,
+            digest_of(observation),
+        )
+        if key in self._answers:
+            recorded = self._answers[key]
+            if recorded is None:
+                return RULE
+            return _decision.action_space.from_jsonable(recorded)[0]
+        context["_decision"] = _decision
+        answer = self.ask(observation, info, context)
+        return when_answered(answer, lambda answer: self._record(key, answer, _decision))
 
-    def _read(self) -> dict[tuple[Any, ...], Any]:
-        """Read the file. A line that is not finished is ended, so that the next one can be read."""
-        known: dict[tuple[Any, ...], Any] = {}
+    def _read(self) -> dict[DecisionKey, Action]:
+        """Read the file, and end a line that a crash has left unfinished."""
+        answers: dict[DecisionKey, Action] = {}
         content = self.path.read_bytes() if self.path.exists() else b""
         for number, line in enumerate(content.splitlines(), 1):
             try:
                 entry = json.loads(line)
-                key = entry["seed"], entry["agent"], entry["number"], entry["observation"]
-                known[key] = entry["answer"]
+                key = DecisionKey(*(entry[field] for field in DecisionKey._fields))
+                answers[key] = entry["answer"]
             except (ValueError, TypeError, LookupError):
                 if number <= content.count(b"\n"):
                     warn_user(
@@ -203,59 +272,53 @@ class RecordedPolicy(PolicyWrapper):
                     )
         if content and not content.endswith(b"\n"):
             self._write(b"\n")
-        self._known = known
-        return known
+        return answers
 
-    def _record(self, key: tuple[Any, ...], answer: Any, decision: Decision) -> Any:
-        """Record an answer, unless it is illegal."""
+    def _record(
+        self,
+        key: DecisionKey,
+        answer: Action,
+        decision: Decision,
+    ) -> Action:
+        """Record an answer, unless it is illegal, and return it."""
         recorded = None
         if answer is not RULE:
             try:
                 action = decision.validate(answer)
             except InvalidActionError:
                 return answer
-            recorded = decision.action_space.to_jsonable([_in_form(decision.action_space, action)])
-        names = ("seed", "agent", "number", "observation", "answer")
-        self._write(json.dumps(dict(zip(names, (*key, recorded), strict=True))).encode() + b"\n")
-        assert self._known is not None
-        self._known[key] = recorded
+            space = decision.action_space
+            # A legal action for a Box of one number may be a scalar, but to_jsonable needs arrays.
+            recorded = space.to_jsonable([to_action(space, action)])
+        line = json.dumps(key._asdict() | {"answer": recorded})
+        self._write(line.encode() + b"\n")
+        assert self._answers is not None
+        self._answers[key] = recorded
         return answer
 
     def _write(self, line: bytes) -> None:
         with open(self.path, "ab", buffering=0) as file:
-            file.write(line)  # as a whole, so that processes can share the file
+            file.write(line)  # in one call, so that processes can share the file
 
 
-def _in_form(space: spaces.Space[Any], action: Any) -> Any:
-    """Return a legal action in the form that spaces write as JSON: scalars for a ``Box`` as arrays."""
-    if isinstance(space, spaces.Dict):
-        return {key: _in_form(part, action[key]) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(_in_form(part, action[place]) for place, part in enumerate(space.spaces))
-    return (
-        np.asarray(action, space.dtype).reshape(space.shape)
-        if isinstance(space, spaces.Box)
-        else action
-    )
-
-
-def digest_of(observation: Any) -> str:
+def digest_of(observation: Observation) -> str:
     """Return a digest of an observation: of the names, types, shapes and bytes of its parts."""
     digest = blake2b(digest_size=12)
 
-    def add(part: Any) -> None:
-        if isinstance(part, Mapping):
-            for name in sorted(part, key=str):
-                digest.update(str(name).encode())
-                add(part[name])
-        elif isinstance(part, (tuple, list)):
-            for item in part:
-                add(item)
-        elif isinstance(part, (np.ndarray, np.generic)) and part.dtype != object:
-            digest.update(f"{part.dtype.str}{part.shape}".encode())
-            digest.update(np.ascontiguousarray(part).tobytes())
-        else:
-            digest.update(repr(part).encode())
+    def add(part: Observation) -> None:
+        match part:
+            case Mapping():
+                for name in sorted(part, key=str):
+                    digest.update(str(name).encode())
+                    add(part[name])
+            case tuple() | list():
+                for item in part:
+                    add(item)
+            case np.ndarray() | np.generic() if part.dtype != object:
+                digest.update(f"{part.dtype.str}{part.shape}".encode())
+                digest.update(np.ascontiguousarray(part).tobytes())
+            case _:
+                digest.update(repr(part).encode())
 
     add(observation)
     return digest.hexdigest()

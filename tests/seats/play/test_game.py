@@ -40,7 +40,7 @@ def settle(game):
     states = []
     for update in game.work():
         states += [update] if update else []
-        if game.now is not None and update and update["type"] == "state" and game.fan:
+        if game.now is not None and update and update["type"] == "state" and game.futures:
             break
     return states[-1]
 
@@ -103,13 +103,13 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ga
     assert state["over"] == "terminated"
     assert state["returns"]["buyer"] == profit == sum(models.rewards_of(turns, "buyer"))
     assert state["returns"]["seller"] == sum(models.rewards_of(turns, "seller"))
-    rewards = [row["reward"] for row in game.line if row["agent"] == "buyer"]
+    rewards = [row["reward"] for row in game.timeline if row["agent"] == "buyer"]
     assert rewards == models.rewards_of(turns, "buyer")
     game.handle("buyer", {"do": "undo"})
     assert (game.turn, game.over, game.now["agent"]) == (14, "", "buyer")
     assert settle(game)["seats"] == ["buyer"]
     game.handle("buyer", {"do": "redo"})
-    assert (game.turn, game.over, game.returns()) == (16, "terminated", state["returns"])
+    assert (game.turn, game.over, game.returns) == (16, "terminated", state["returns"])
     game.handle("buyer", {"do": "undo"})
     assert play(game, [2])["returns"] == state["returns"]
 
@@ -118,9 +118,9 @@ def test_an_episode_is_that_of_the_environment_and_its_end_can_be_undone(make_ga
 def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks, monkeypatch):
     monkeypatch.setattr("simenv_marl.seats.play.game.CHECKPOINTS", 4)
     game = make_game()
-    game.forks = forks
+    game.can_fork = forks
     play(game, [1, 3, 0, 2])
-    before = json.dumps(game.line)
+    before = json.dumps(game.timeline)
     for turn in (4, 0, 8, 2, 6):
         game.handle("buyer", {"do": "jump", "n": turn})
         assert game.turn == turn
@@ -130,7 +130,7 @@ def test_the_way_back_and_forth_leads_to_the_same_decisions(make_game, forks, mo
     for do, turn in (("undo", 4), ("redo", 6), ("redo", 8), ("redo", 8)):
         game.handle("buyer", {"do": do})
         assert game.turn == turn
-    assert json.dumps(game.line) == before
+    assert json.dumps(game.timeline) == before
     old = game.env
     game.jump(4)
     assert old is game.root or not old.agents
@@ -177,7 +177,7 @@ def test_illegal_and_untimely_messages_are_answered_with_text_and_move_nothing(m
     assert "another decision" in texts[3]
     assert "buyer decides" in texts[4]
     assert "'fly'" in texts[7]
-    assert len(game.line) == 1
+    assert len(game.timeline) == 1
     assert not game.root.agents  # it is closed in the end
 
 
@@ -206,7 +206,7 @@ def test_without_reseed_there_is_one_future_and_a_note(make_game):
     assert {one["n"] for one in fan["candidates"]} == {1}
     assert "reseed" in fan["note"]
     play(game, [2] * 8)
-    assert game.returns()["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
+    assert game.returns["buyer"] == simulate(FixedShop, {"buyer": lambda _: 2}, seed=5).profit
 
 
 def test_observations_and_actions_have_a_form_in_json():
@@ -248,7 +248,7 @@ def test_a_decision_ends_the_thinking(make_game):
         if number is None and update["type"] == "state"
     ]
     assert turns[0] == 0
-    assert len(game.line) > 1
+    assert len(game.timeline) > 1
 
 
 def test_the_rule_plays_on_for_a_seat_and_for_seats_that_nobody_has(make_game):
@@ -281,8 +281,8 @@ def test_after_the_limit_the_rule_decides_and_is_counted(make_game, monkeypatch)
     monkeypatch.setattr("simenv_marl.seats.play.game.monotonic", lambda: next(times))
     game.deadline = 0.0
     game.serve(Connection())
-    assert game.late["buyer"] == sum(row.get("by") == "limit" for row in game.line) >= 1
-    assert (game.line[0]["action"], game.line[0]["by"]) == (None, "limit")
+    assert game.late["buyer"] == sum(row.get("by") == "limit" for row in game.timeline) >= 1
+    assert (game.timeline[0]["action"], game.timeline[0]["by"]) == (None, "limit")
 
 
 def test_errors_of_the_model_and_of_labels_end_the_episode_and_can_be_undone(make_game):
@@ -327,7 +327,7 @@ def test_a_recording_is_replayed_bit_for_bit_without_what_was_undone(make_game, 
     assert {
         agent: float(trajectories.returns[0]) for agent, trajectories in found.items()
     } == state["returns"]
-    rows = [row for row in game.line if row["agent"] == "buyer"]
+    rows = [row for row in game.timeline if row["agent"] == "buyer"]
     assert found["buyer"].rewards.tolist() == [row["reward"] for row in rows]
     assert found["buyer"].by_rule.tolist() == [row["action"] is None for row in rows]
     assert found["seller"].actions[0].tolist() == [0, 2]

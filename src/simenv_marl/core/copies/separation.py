@@ -22,6 +22,7 @@ from subprocess import Popen
 from threading import Thread
 from typing import Final, Protocol
 
+from ..switching.awaiting import policy_loops
 from ..switching.opened import Resource, new_epolls
 from .forks import CAN_FORK, exhausted
 
@@ -123,8 +124,9 @@ def event_loops() -> list[Loop]:
     if events is None:
         return []
     kind = events.BaseSelectorEventLoop
-    loops: list[Loop] = [thing for thing in gc.get_objects() if isinstance(thing, kind)]
-    return [loop for loop in loops if not loop.is_closed()]
+    # The collector does not list frozen objects, and users may freeze the loop of policies.
+    known = [*gc.get_objects(), *policy_loops()]
+    return [thing for thing in known if isinstance(thing, kind) and not thing.is_closed()]
 
 
 def _separate_loop(loop: Loop) -> None:

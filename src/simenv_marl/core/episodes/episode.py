@@ -323,9 +323,9 @@ class Episode(EpisodeState):
 
         If a mapping raises, the decision stays pending.
         """
-        self.pending = None  # so that an action from inside a mapping is refused
-        recorded = _copied(action)  # before a mapping can change it
         try:
+            self.pending = None  # so that an action from inside a mapping is refused
+            recorded = _copied(action)  # before a mapping can change it
             reply = self.answer(agent, action)
         except BaseException:
             self.pending = agent

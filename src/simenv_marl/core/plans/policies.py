@@ -168,7 +168,9 @@ class Caller:
         self.names = tuple(name for name in ASKED if asks_for(policy, name))
         self._takes_info = takes_info(policy)
 
-    def __call__(self, observation: Observation, info: Info, asked: Mapping[str, object]) -> Action:
+    def __call__(
+        self, observation: Observation, info: Info | None, asked: Mapping[str, object]
+    ) -> Action:
         """Call the policy. Return its answer, or an awaitable."""
         seen = (observation, info) if self._takes_info else (observation,)
         return self.policy(*seen, **{name: asked[name] for name in self.names})

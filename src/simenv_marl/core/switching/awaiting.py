@@ -39,6 +39,11 @@ def _loop() -> asyncio.AbstractEventLoop:
     return loop
 
 
+def policy_loops() -> list[asyncio.AbstractEventLoop]:
+    """Return the loops in which policies are awaited."""
+    return list(_loops.values())
+
+
 class Answer:
     """An answer that is on its way. ``value`` and ``error`` hold it when it has been reported."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextvars import ContextVar
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeVar
 
 
 class Resource(Protocol):
@@ -19,6 +19,8 @@ class Resource(Protocol):
     def close(self) -> None:
         """Wait for its end."""
 
+
+ResourceType = TypeVar("ResourceType", bound=Resource)
 
 _FREE: Final[ContextVar[list[tuple[object, Resource]] | None]] = ContextVar(
     "simenv_marl.free", default=None
@@ -56,11 +58,11 @@ def release(key: object, resource: Resource) -> bool:
     return True
 
 
-def acquire(key: object) -> Resource | None:
-    """Return a resource that was released under an equal key. None if there is none."""
+def acquire(key: object, kind: type[ResourceType]) -> ResourceType | None:
+    """Return a resource of a kind that was released under an equal key. None if there is none."""
     free = _FREE.get() or []
     for number, (other, resource) in enumerate(free):
-        if other == key:
+        if other == key and isinstance(resource, kind):
             del free[number]
             return resource
     return None

@@ -1,4 +1,4 @@
-"""A page on which people take agents' seats in a running simulation: ``python -m simenv_marl play``."""
+"""``python -m simenv_marl play``: a page where people decide in a running simulation."""
 
 from .recording import replay
 

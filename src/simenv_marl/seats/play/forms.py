@@ -1,46 +1,60 @@
-"""What goes between the game, the page and the recording: decisions, spaces, pictures and actions as JSON."""
+"""Decisions, action spaces, pictures and actions as JSON, for the page and for recordings."""
 
-from __future__ import annotations
-
-import json
 import struct
 import zlib
 from base64 import b64encode
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from math import isfinite
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
+from numpy.typing import NDArray
 
+from ...core import Decision, Labels
+from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
-from ..descriptions import labelled, pending
+from ...simulation import RULE, Action, Observation
+from ..descriptions import JSON, MISFITS, labelled, legal_actions, to_action
 from ..policies import digest_of
 
-MOST: Final = 12  # candidates of a decision, and entries of its observation in the history
+Message = dict[str, Any]
+"""A message between the page, the server and the game, or a part of one."""
+
+MOST_CANDIDATES: Final = 12
+"""The largest number of candidates for a decision."""
+
+MOST_ENTRIES: Final = 64
+"""The largest number of entries of an observation on the page."""
+
+LONGEST_TEXT: Final = 20_000
+"""The largest number of characters of a rendered text on the page."""
 
 
-def jsonable(value: Any) -> Any:
-    """Return a value as JSON has it: arrays as lists, numbers that are not finite and other things as text."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [jsonable(part) for part in value]
-    if isinstance(value, float) and not isfinite(value):
-        return str(value)
-    return value if value is None or isinstance(value, (str, int, float)) else short_repr(value)
+def jsonable(value: object) -> JSON:
+    """Return a value as JSON.
 
-
-def pending_decision(env: Any) -> dict[str, Any]:
-    """Return the pending decision of an AEC environment as JSON.
-
-    Called in the process where it lives.
+    Arrays become lists. Numbers that are not finite, and objects, become texts.
     """
-    decision = pending(env)
+    match value:
+        case np.ndarray() | np.generic():
+            return jsonable(value.tolist())
+        case Mapping():
+            return {str(key): jsonable(part) for key, part in value.items()}
+        case list() | tuple():
+            return [jsonable(part) for part in value]
+        case float() if not isfinite(value):
+            return str(value)
+        case str() | int() | float() | None:
+            return value
+        case _:
+            return short_repr(value)
+
+
+def pending_decision(decision: Decision) -> Message:
+    """Return a decision as JSON, for the page."""
     return {
         "agent": decision.agent,
         "number": decision.number,
@@ -55,115 +69,104 @@ def pending_decision(env: Any) -> dict[str, Any]:
     }
 
 
-def entries_of(observation: Any, labels: Any = None) -> list[tuple[str, Any]]:
-    """Return the first entries of an observation: name, and number or text."""
-    return [*_entries(labelled(observation, labels))][:64]
+def entries_of(
+    observation: Observation,
+    labels: Labels = None,
+) -> list[tuple[str, Any]]:
+    """Return the first entries of an observation, each as its name and its number or text."""
+    return [*islice(_entries(labelled(observation, labels)), MOST_ENTRIES)]
 
 
-def _entries(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the entries of an observation: name, and number or text."""
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            yield from _entries(part, f"{name} {key}".strip())
-    elif isinstance(value, (list, tuple)):
-        for place, part in enumerate(value):
-            yield from _entries(part, f"{name}[{place}]")
-    else:
-        yield name or "value", jsonable(value)
+def _entries(value: JSON, name: str = "") -> Iterator[tuple[str, JSON]]:
+    match value:
+        case Mapping():
+            for key, part in value.items():
+                yield from _entries(part, f"{name} {key}".strip())
+        case list():
+            for place, part in enumerate(value):
+                yield from _entries(part, f"{name}[{place}]")
+        case _:
+            yield name or "value", jsonable(value)
 
 
-def describe_space(space: spaces.Space[Any]) -> dict[str, Any]:
-    """Describe an action space to the page."""
-    if isinstance(space, spaces.Discrete):
-        return {"kind": "discrete", "start": int(space.start), "n": int(space.n)}
-    if isinstance(space, spaces.Box):
-        whole = space.dtype is not None and space.dtype.kind in "iu"
-        return {
-            "kind": "box",
-            "low": jsonable(space.low),
-            "high": jsonable(space.high),
-            "whole": whole,
-        }
-    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
-        return {"kind": "grid", "sizes": space.nvec.tolist(), "starts": space.start.tolist()}
-    if isinstance(space, spaces.MultiBinary) and isinstance(space.n, int):
-        return {"kind": "grid", "sizes": [2] * space.n, "starts": [0] * space.n}
-    return {"kind": "other", "text": short_repr(space)}
+def describe_space(space: Space[Any]) -> Message:
+    """Describe an action space as JSON, for the inputs of the page."""
+    match space:
+        case Discrete():
+            return {"kind": "discrete", "start": int(space.start), "n": int(space.n)}
+        case Box():
+            return {
+                "kind": "box",
+                "low": jsonable(space.low),
+                "high": jsonable(space.high),
+                "whole": space.low.dtype.kind in "iu",
+            }
+        case MultiDiscrete(shape=(_,)):
+            return {"kind": "grid", "sizes": space.nvec.tolist(), "starts": space.start.tolist()}
+        case MultiBinary(shape=(size,)):
+            return {"kind": "grid", "sizes": [2] * size, "starts": [0] * size}
+        case _:
+            return {"kind": "other", "text": short_repr(space)}
 
 
-def candidates_of(space: spaces.Space[Any], mask: Any) -> list[Any]:
-    """Return actions to try out, as JSON: the legal ones of a ``Discrete``, five of a bounded ``Box`` of one number."""
-    if isinstance(space, spaces.Discrete):
-        legal = np.arange(space.n) if mask is None else np.flatnonzero(mask)
-        return [int(space.start) + int(place) for place in legal[: MOST - 1]]
-    if isinstance(space, spaces.Box) and space.low.size == 1 and space.is_bounded():
-        found: list[Any] = np.unique(
-            np.linspace(space.low, space.high, 5).astype(space.dtype), axis=0
-        ).tolist()
-        return found
-    return []
+def candidates_of(
+    space: Space[Any],
+    mask: Sequence[int] | None,
+) -> list[Action]:
+    """Return actions to try out, as JSON.
+
+    These are the legal actions of a ``Discrete``, or five actions of a bounded ``Box`` of one
+    number. Other spaces have none.
+    """
+    match space:
+        case Discrete():
+            return legal_actions(space, mask)[: MOST_CANDIDATES - 1]
+        case Box() if space.low.size == 1 and space.is_bounded():
+            grid = np.linspace(space.low, space.high, 5)
+            actions = np.unique(grid.astype(space.dtype), axis=0)
+            return [*actions.tolist()]
+        case _:
+            return []
 
 
-def picture_of(env: Any) -> dict[str, Any] | None:
-    """Return what ``render`` returns as JSON: text, or the PNG of an array ``(height, width, 3)``, uint8."""
+def picture_of(env: SimulationAECEnv) -> Message | None:
+    """Return the rendered image as JSON: a text, or the PNG of an array ``(height, width, 3)``."""
     try:
         rendered = None if env.render_mode is None else env.render()
     except Exception as error:
         rendered = f"render has failed: {describe_error(error)}"
-    if not isinstance(rendered, np.ndarray):
-        return None if rendered is None else {"text": str(rendered)[:20_000]}
-    if (
-        rendered.ndim != 3
-        or rendered.shape[2] != 3
-        or rendered.dtype != np.uint8
-        or not rendered.size
-    ):
-        return {"text": f"an array of shape {rendered.shape}"}
-    height, width, _ = rendered.shape
-    # 0: an unfiltered line
-    lines = np.hstack([np.zeros((height, 1), np.uint8), rendered.reshape(height, -1)])
+    match rendered:
+        case None:
+            return None
+        case np.ndarray(dtype=np.uint8, shape=(_, _, 3)) if rendered.size:
+            return {"png": b64encode(_png(rendered)).decode()}
+        case np.ndarray():
+            return {"text": f"an array of shape {rendered.shape}"}
+        case _:
+            return {"text": str(rendered)[:LONGEST_TEXT]}
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    """Return the PNG of an array of shape ``(height, width, 3)``."""
+    height, width, _ = image.shape
+    filters = np.zeros((height, 1), np.uint8)  # each line is unfiltered
+    lines = np.hstack([filters, image.reshape(height, -1)])
     header = struct.pack("!IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = [b"IHDR" + header, b"IDAT" + zlib.compress(lines.tobytes()), b"IEND"]
-    parts = [
-        struct.pack("!I", len(chunk) - 4) + chunk + struct.pack("!I", zlib.crc32(chunk))
-        for chunk in chunks
-    ]
-    return {"png": b64encode(b"\x89PNG\r\n\x1a\n" + b"".join(parts)).decode()}
+    png = b"\x89PNG\r\n\x1a\n"
+    for chunk in (b"IHDR" + header, b"IDAT" + zlib.compress(lines.tobytes()), b"IEND"):
+        png += struct.pack("!I", len(chunk) - 4)  # without the type
+        png += chunk
+        png += struct.pack("!I", zlib.crc32(chunk))
+    return png
 
 
-def action_of(space: spaces.Space[Any], value: Any) -> Any:
-    """Return the action for its JSON.
+def action_of(space: Space[Any], value: Action) -> Action:
+    """Return the action for its JSON; ``RULE`` for None.
 
-    What does not fit stays as it is, and the environment refuses it.
+    A value that does not fit is returned as it is, so that the environment refuses it.
     """
-    if isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)):
-        with suppress(ValueError, OverflowError):
-            array = np.asarray(value)
-            return array.astype(space.dtype) if array.dtype.kind == "i" else value
-    if (
-        isinstance(space, spaces.Dict)
-        and isinstance(value, dict)
-        and value.keys() == space.spaces.keys()
-    ):
-        return {key: action_of(part, value[key]) for key, part in space.spaces.items()}
-    if (
-        isinstance(space, spaces.Tuple)
-        and isinstance(value, list)
-        and len(value) == len(space.spaces)
-    ):
-        return tuple(map(action_of, space.spaces, value))
+    if value is None:
+        return RULE
+    with suppress(*MISFITS):
+        return to_action(space, value)
     return value
-
-
-def write(path: Path | None, line: Mapping[str, Any]) -> str:
-    """Append a line, if there is a path; return what is wrong.
-
-    It is open only meanwhile: clones need not copy it.
-    """
-    try:
-        if path is not None:
-            with path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(jsonable(line)) + "\n")
-    except OSError as error:
-        return f"The recording {path} cannot be written: {error}"
-    return ""

@@ -1,51 +1,72 @@
-"""Recordings of what was decided on the page, and the episodes that they describe."""
-
-from __future__ import annotations
+"""Recordings of the page, and the episodes that they describe."""
 
 import json
+import os
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
-from ... import RULE, aec_env
-from ...data import collect_episodes
-from ...errors import InvalidActionError, OptionValueError, ResetNeededError, StoreError, short_repr
+from ... import aec_env
+from ...core import EpisodeOptions, Points
+from ...data import Trajectories, collect_episodes
+from ...envs import SimulationAECEnv
+from ...errors import (
+    InvalidActionError,
+    OptionValueError,
+    ResetNeededError,
+    StoreError,
+    short_repr,
+)
+from ...simulation import Action, Model
 from ..policies import digest_of
-from .forms import action_of
+from .forms import Message, action_of
+
+Episode = tuple[int, list[Message]]
+"""The seed of an episode, and the lines of its decisions."""
 
 
-def read(path: Any) -> list[tuple[int, list[dict[str, Any]]]]:
-    """Read the episodes of a recording: seeds and decisions, each of which replaces those from its turn on."""
-    episodes: list[tuple[int, list[dict[str, Any]]]] = []
+def read(path: str | os.PathLike[str]) -> list[Episode]:
+    """Read the episodes of a recording: seeds and decisions.
+
+    A decision replaces the earlier ones from its turn on, which were undone.
+    """
+    episodes: list[Episode] = []
     try:
         for text in Path(path).read_text(encoding="utf-8").splitlines():
             line = json.loads(text)
             if "seed" in line:
                 episodes.append((line["seed"], []))
             else:
-                episodes[-1][1][line["turn"] :] = [line]
+                _, decisions = episodes[-1]
+                decisions[line["turn"] :] = [line]
     except (OSError, ValueError, TypeError, LookupError) as error:
         raise StoreError(f"the recording {path} cannot be read: {error!r}") from error
     return episodes
 
 
 def replay(
-    path: Any, simulation: Any, points: Any = None, *, episode: int = -1, **options: Any
-) -> dict[str, Any]:
-    """Repeat a recorded episode, bit for bit, and return its trajectories, which ``save_dataset`` writes.
+    path: str | os.PathLike[str],
+    simulation: Model,
+    points: Points = None,
+    *,
+    episode: int = -1,
+    **options: Unpack[EpisodeOptions],
+) -> dict[str, Trajectories]:
+    """Repeat a recorded episode, bit for bit.
 
     Args:
         path: The file of ``--record``.
         simulation: The simulation that was played, as ``aec_env`` takes it.
         points: As ``aec_env`` takes them.
-        episode: Which of the file's episodes: an index. It is truncated after its last recorded
+        episode: The index of the episode in the file. It is truncated after its last recorded
             decision.
         **options: The options of ``aec_env``, as they were in the recorded episode: the page sets
             none.
 
     Returns:
-        A dict from the name of each agent to its ``Trajectories``. What people decided has
-        ``by_rule`` False.
+        A dict from the name of each agent to its ``Trajectories``, which ``save_dataset`` writes.
+        Decisions of people have ``by_rule`` False.
 
     Raises:
         StoreError: The file cannot be read.
@@ -57,36 +78,44 @@ def replay(
             f"nothing was decided in episode {episode} of the {len(episodes)} of {path}"
         )
     seed, decisions = episodes[episode]
-    actions = list[Any]()
+    actions: list[Action] = []
+    problem = f"{short_repr(simulation)} does not repeat {path}"
     try:
         with closing(aec_env(simulation, points, **options)) as env:
             env.reset(seed=seed)
             for turn, line in enumerate(decisions):
-                while env.agents and (
-                    env.terminations[env.agent_selection] or env.truncations[env.agent_selection]
-                ):
-                    env.step(None)
-                agent = env.agent_selection if env.agents else ""
+                agent = _next_agent(env)
                 if agent != line["agent"] or digest_of(env.observe(agent)) != line["seen"]:
                     raise OptionValueError(
-                        f"{short_repr(simulation)} does not repeat {path}: decision {turn} was one"
-                        f" of {line['agent']!r}, and is now one of {agent!r}, or with another"
-                        " observation"
+                        f"{problem}: decision {turn} was one of {line['agent']!r}, and is now one"
+                        f" of {agent!r}, or with another observation"
                     )
-                action = line["action"]
-                actions.append(
-                    RULE if action is None else action_of(env.action_space(agent), action)
-                )
+                actions.append(action_of(env.action_space(agent), line["action"]))
                 env.step(actions[-1])
     except (InvalidActionError, ResetNeededError) as error:
-        raise OptionValueError(
-            f"{short_repr(simulation)} does not repeat {path}: {error}"
-        ) from error
+        raise OptionValueError(f"{problem}: {error}") from error
 
-    def policy(observations: Any, infos: Any, identities: Any) -> list[Any]:
+    def policy(
+        observations: object, infos: object, identities: Sequence[tuple[int, int]]
+    ) -> list[Action]:
         return [actions[turn] for _, turn in identities]
 
-    agents = dict.fromkeys((line["agent"] for line in decisions), policy)
+    agents = {line["agent"]: policy for line in decisions}
+    options["max_steps"] = len(actions)
     return collect_episodes(
-        simulation, agents, seeds=[seed], points=points, **{**options, "max_steps": len(actions)}
+        simulation,
+        agents,
+        seeds=[seed],
+        points=points,
+        **options,
     )
+
+
+def _next_agent(env: SimulationAECEnv) -> str:
+    """Return the agent that decides next; "" at the end of the episode."""
+    while env.agents:
+        agent = env.agent_selection
+        if not (env.terminations[agent] or env.truncations[agent]):
+            return agent
+        env.step(None)
+    return ""

@@ -1,9 +1,6 @@
-"""The server: the page for each seat and for spectators, and what goes between them and the game."""
-
-from __future__ import annotations
+"""The server of the page: it connects people's browsers with the process of the game."""
 
 import asyncio
-import hmac
 import json
 import pickle
 import secrets
@@ -15,91 +12,121 @@ from contextlib import asynccontextmanager, suppress
 from ipaddress import ip_address
 from itertools import count
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from urllib.parse import quote, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.responses import PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.types import ASGIApp, Lifespan, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ...errors import OptionValueError, ProcessDiedError
+from ...simulation import Model
+from .forms import Message
 from .game import run_game
 
-PAGES: Final = 64  # that are open; one more closes that of the spectator who came first
-CONNECTIONS: Final = 200
-PATIENCE: Final = 10.0  # seconds in which a connection must ask for something
-LONGEST: Final = 65_536  # bytes of a message
-PAUSE: Final = 0.05  # seconds between two messages of a page
-OPEN: Final = 4  # messages of a page that the game may have before it
-FILES: Final = {"/page.js": "text/javascript", "/page.css": "text/css"}
+MOST_PAGES: Final = 64
+"""The largest number of open pages. One more closes the page of the oldest spectator."""
+
+MOST_CONNECTIONS: Final = 200
+"""The largest number of connections. Requests of further ones are refused."""
+
+LONGEST_MESSAGE: Final = 65_536
+"""The largest number of bytes of a message."""
+
+PAUSE: Final = 0.05
+"""The seconds between two messages of a page."""
+
+MOST_WAITING: Final = 4
+"""The largest number of messages of a page that wait for the game."""
+
+INVALID: Final = "the message is not one of this page"
+"""The answer to an invalid message."""
+
+FILES: Final = ("/page.js", "/page.css")
+"""The files of the page."""
+
 HEADERS: Final = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src data:;"
-    " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "Referrer-Policy": "no-referrer",  # the address has the key of a seat
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src data:;"
+        " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Referrer-Policy": "no-referrer",  # because the address has the key of a seat
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
 
 
 class Link:
-    """A connection to a page. Of each type of message, only the latest waits to be sent."""
+    """A connection to a page.
+
+    Of each type of message, only the latest waits to be sent, because it replaces those before.
+    """
 
     def __init__(self, websocket: WebSocket) -> None:
-        self.websocket, self.seat, self.open = websocket, "", 0
-        self.waiting: dict[str, str] = {}
-        self.ready = asyncio.Event()
+        """Make the link of an accepted websocket."""
+        self.websocket = websocket
+        self._outbox: dict[str, str] = {}
+        self._ready = asyncio.Event()
 
     def send(self, kind: str, text: str) -> None:
         """Send a message soon."""
-        self.waiting[kind] = text
-        self.ready.set()
+        self._outbox[kind] = text
+        self._ready.set()
 
     async def write(self) -> None:
-        """Send messages until the task is cancelled, or the page is gone, which the reader notices, too."""
-        with suppress(WebSocketDisconnect, RuntimeError):
-            while await self.ready.wait():
-                self.ready.clear()
-                waiting, self.waiting = self.waiting, {}
-                for text in waiting.values():
+        """Send messages until the task is cancelled, or the page is gone."""
+        with suppress(WebSocketDisconnect, RuntimeError):  # the reader notices these, too
+            while await self._ready.wait():
+                self._ready.clear()
+                texts = list(self._outbox.values())
+                self._outbox.clear()
+                for text in texts:
                     await self.websocket.send_text(text)
 
 
 class Table:
-    """Links to pages, around a connection to the game."""
+    """The links to all pages, around the connection to the game."""
 
     def __init__(
-        self, connection: Any, state: dict[str, Any], announce: Callable[[str], None]
+        self,
+        connection: Connection,
+        state: Message,
+        announce: Callable[[str], None],
     ) -> None:
-        """Take over the game's connection and its first state.
+        """Take over the game's connection.
 
-        ``announce`` is called with the path of each seat.
+        Args:
+            connection: The connection to the game.
+            state: The first state of the game.
+            announce: A function that is called with the path of each seat.
         """
-        self.connection, self.announce, self.secret = connection, announce, secrets.token_bytes(32)
         self.links: dict[int, Link] = {}
-        self.numbers = count(1)
-        self.latest: dict[str, str] = {}  # by type of message, for those who come
-        self.seats: set[str] = set()
-        # of the game; each link has few messages in it
-        self.inbox: asyncio.Queue[Any] = asyncio.Queue()
-        self.taken: Counter[str] | None = None  # seats of which the game is to be told
+        self.latest: dict[str, str] = {}  # the latest message of each type, for newcomers
+        self._connection = connection
+        self._announce = announce
+        self._keys: dict[str, str] = {}  # of the seats
+        self._seats: dict[int, str] = {}  # of the links; spectators have none
+        self._waiting: Counter[int] = Counter()  # messages of each link that wait for the game
+        self._numbers = count(1)
+        self._inbox: asyncio.Queue[bytes] = asyncio.Queue()
         self._show(state)
 
-    def key(self, seat: str) -> str:
-        """Return the key of a seat."""
-        return hmac.digest(self.secret, seat.encode(errors="replace"), "sha256").hex()[:32]
-
     async def serve(self, websocket: WebSocket) -> None:
-        """Serve a page."""
+        """Serve a page until it is gone."""
         await websocket.accept()
-        link, number = Link(websocket), next(self.numbers)
-        if len(self.links) >= PAGES:
-            oldest = next((one for one in self.links.values() if not one.seat), link)
+        link = Link(websocket)
+        number = next(self._numbers)
+        if len(self.links) >= MOST_PAGES:
+            spectators = [other for other in self.links if other not in self._seats]
+            closed = self.links[spectators[0]] if spectators else link
             with suppress(RuntimeError):
-                await oldest.websocket.close(1013)
+                await closed.websocket.close(1013)  # try again later
         self.links[number] = link
         for kind, text in self.latest.items():
             link.send(kind, text)
@@ -107,119 +134,118 @@ class Table:
         writer = asyncio.create_task(link.write())
         try:
             while (message := await websocket.receive())["type"] == "websocket.receive":
-                problem = self._take(number, link, message.get("text") or "")
+                problem = self._pass_on(number, message.get("text") or "")
                 if problem:
                     link.send("error", json.dumps({"type": "error", "text": problem}))
                 await asyncio.sleep(PAUSE)
-        except RuntimeError:  # this server has closed it
+        except RuntimeError:  # this server has closed the page
             pass
         finally:
             writer.cancel()
-            del self.links[number]
+            del self.links[number], self._waiting[number]
+            self._seats.pop(number, None)
             self._tell_people()
 
-    def _take(self, number: int, link: Link, text: str) -> str:
-        """Check a message, and pass it on to the game; return what is wrong."""
+    def _pass_on(self, number: int, text: str) -> str:
+        """Check a message, and pass it on to the game; return the problem, or ""."""
         try:
-            message = json.loads(text, parse_constant=str)
-            seat, key = str(message.pop("seat")), str(message.pop("key"))
-            parcel = pickle.dumps((number, seat, message))  # not later, because it may be too deep
-        except (ValueError, RecursionError, TypeError, LookupError, AttributeError):
-            return "the message is not one of this page"
-        if seat not in self.seats or not hmac.compare_digest(
-            self.key(seat).encode(), key.encode(errors="replace")
-        ):
+            match json.loads(text, parse_constant=str):
+                case {"seat": str(seat), "key": str(key), **message}:
+                    parcel = pickle.dumps((number, seat, message))  # it may be too deep
+                case _:
+                    return INVALID
+        except (ValueError, RecursionError):
+            return INVALID
+        expected = self._keys.get(seat, "").encode()
+        sent = key.encode(errors="replace")
+        if not expected or not secrets.compare_digest(expected, sent):
             return "the link of this page has no key of this game: ask for the link of your seat"
         if message.get("do") == "take":
-            link.seat = seat
+            self._seats[number] = seat
             self._tell_people()
-        elif link.open >= OPEN or self.inbox.qsize() > OPEN * PAGES:
+        elif self._waiting[number] >= MOST_WAITING:
             return "the game is busy; try again"
         else:
-            link.open += 1
-            self.inbox.put_nowait(parcel)
+            self._waiting[number] += 1
+            self._inbox.put_nowait(parcel)
         return ""
 
     def _tell_people(self) -> None:
-        """Tell pages and game who is there."""
-        taken = Counter(link.seat for link in self.links.values())
-        self._send_all(
-            json.dumps({"type": "people", "spectators": taken.pop("", 0), "taken": taken}), "people"
-        )
-        if self.taken is None:
-            self.inbox.put_nowait(None)
-        self.taken = taken
+        """Tell pages and game which seats people have."""
+        people = Counter(self._seats.values())
+        spectators = len(self.links) - people.total()
+        self._send_all({"type": "people", "spectators": spectators, "taken": people})
+        self._inbox.put_nowait(pickle.dumps((None, None, {"taken": people})))
 
-    def _show(self, message: dict[str, Any]) -> None:
+    def _show(self, message: Message) -> None:
         for seat in message.get("seats", ()):
-            if seat not in self.seats:
-                self.announce(f"/seat/{quote(seat, safe='')}?key={self.key(seat)}")
-            self.seats.add(seat)
-        self._send_all(json.dumps(message), message["type"])
+            if seat not in self._keys:
+                self._keys[seat] = secrets.token_hex(16)
+                self._announce(f"/seat/{quote(seat, safe='')}?key={self._keys[seat]}")
+        self._send_all(message)
 
-    def _send_all(self, text: str, kind: str) -> None:
-        self.latest[kind] = text
+    def _send_all(self, message: Message) -> None:
+        kind = message["type"]
+        text = self.latest[kind] = json.dumps(message)
         for link in self.links.values():
             link.send(kind, text)
 
     async def read_game(self) -> None:
-        """Show what the game says, until it ends."""
+        """Show the messages of the game, until it ends."""
         with suppress(EOFError, OSError):
             while True:
-                number, message = await asyncio.to_thread(self.connection.recv)
+                number, message = await asyncio.to_thread(self._connection.recv)
                 link = self.links.get(number)
                 if link is not None:
-                    link.open -= 1
-                if link is not None and message is not None:
-                    link.send("error", json.dumps(message))
-                elif number is None and message is not None:
-                    self._show(message)
+                    self._waiting[number] -= 1
+                if message is not None:
+                    if number is None:
+                        self._show(message)
+                    elif link is not None:
+                        link.send("error", json.dumps(message))
 
     async def write_game(self) -> None:
         """Pass messages on to the game."""
         with suppress(OSError):
             while True:
-                parcel = await self.inbox.get()
-                if parcel is None:
-                    parcel, self.taken = pickle.dumps((None, None, {"taken": self.taken})), None
-                await asyncio.to_thread(self.connection.send_bytes, parcel)
+                parcel = await self._inbox.get()
+                await asyncio.to_thread(self._connection.send_bytes, parcel)
 
 
-class _Protocol(H11Protocol):
-    """HTTP that closes connections which ask for nothing, or are too many."""
-
-    def connection_made(self, transport: Any) -> None:
-        super().connection_made(transport)
-        if len(self.connections) > CONNECTIONS:
-            transport.abort()
-        self.loop.call_later(
-            PATIENCE, lambda: self.cycle is None and self in self.connections and transport.abort()
-        )
+class _Server(uvicorn.Server):
+    def exit_soon(self, reader: asyncio.Task[None]) -> None:
+        """Exit, because the reader of the game has ended."""
+        self.should_exit = True
 
 
-def make_app(table: Table, host: str, lifespan: Any = None) -> Any:
-    """Make the application, which answers only to its own names, and only to its own pages."""
-    texts = {
-        path: Path(__file__).with_name(path[1:]).read_bytes() for path in ("/page.html", *FILES)
-    }
+def make_app(
+    table: Table,
+    host: str,
+    lifespan: Lifespan[Starlette],
+) -> ASGIApp:
+    """Make the application. It answers only requests to its own names and from its own pages."""
 
-    async def page(request: Any) -> Response:
+    async def page(request: Request) -> FileResponse:
         path = request.url.path
-        return Response(
-            texts.get(path, texts["/page.html"]),
-            media_type=FILES.get(path, "text/html"),
-            headers=HEADERS,
-        )
+        if path not in FILES:
+            path = "/page.html"
+        return FileResponse(Path(__file__).with_name(path[1:]), headers=HEADERS)
 
-    routes = [Route(path, page) for path in ("/", "/seat/{seat}", *FILES)]
-    app = Starlette(routes=[*routes, WebSocketRoute("/ws", table.serve)], lifespan=lifespan)
+    routes: list[BaseRoute] = [Route(path, page) for path in ("/", "/seat/{seat}", *FILES)]
+    routes.append(WebSocketRoute("/ws", table.serve))
+    app = Starlette(routes=routes, lifespan=lifespan)
     names = {"localhost", host.lower(), socket.gethostname().lower()}
 
-    async def guarded(scope: Any, receive: Any, send: Any) -> None:
+    async def guarded(
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+    ) -> None:
         headers = {name: value.decode("latin-1") for name, value in scope.get("headers", ())}
-        asked, origin = headers.get(b"host", ""), headers.get(b"origin", "")
-        same = not origin or origin.partition("//")[2] == asked
-        if scope["type"] == "lifespan" or (same and _is_own(asked, names)):
+        netloc = headers.get(b"host", "")
+        origin = headers.get(b"origin", "")
+        is_own_page = not origin or origin.partition("//")[2] == netloc
+        if scope["type"] == "lifespan" or (is_own_page and _is_own(netloc, names)):
             await app(scope, receive, send)
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
@@ -230,7 +256,10 @@ def make_app(table: Table, host: str, lifespan: Any = None) -> Any:
 
 
 def _is_own(netloc: str, names: set[str]) -> bool:
-    """Whether a Host header has a name of this server, or an address: only a name can be bound to another server."""
+    """Return whether a Host header has a name of this server, or an address.
+
+    An address is safe, because only a name can be bound to another server.
+    """
     try:
         name = (urlsplit(f"//{netloc}").hostname or "").lower()
         return name in names or bool(ip_address(name))
@@ -238,7 +267,14 @@ def _is_own(netloc: str, names: set[str]) -> bool:
         return False
 
 
-def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **options: Any) -> str:
+def play(
+    find: Callable[[], Model],
+    *,
+    seed: int | None,
+    host: str,
+    port: int,
+    **options: object,
+) -> str:
     """Play until an interrupt; return a summary.
 
     Args:
@@ -255,17 +291,20 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
     """
     if not 0 <= port < 65_536:
         raise OptionValueError(f"there is no port {port}")
-    # which inherits nothing: neither threads nor sockets reach the clones
+    # A spawned process inherits neither threads nor sockets, which clones would copy.
     context = get_context("spawn")
-    connection, there = context.Pipe()
+    connection, game_connection = context.Pipe()
     options["seed"] = secrets.randbelow(2**31) if seed is None else seed
-    process = context.Process(target=run_game, args=(there, find, options))
+    process = context.Process(
+        target=run_game,
+        args=(game_connection, find, options),
+    )
     process.start()
-    there.close()
+    game_connection.close()
 
-    def end() -> None:
+    def end_game() -> None:
         with suppress(OSError):
-            if select.select([], [connection], [], 0)[1]:  # a game that does not read is killed
+            if select.select([], [connection], [], 0)[1]:  # else it does not read, and is killed
                 connection.send((None, None, None))
         process.join(2.0)
         process.kill()
@@ -275,59 +314,72 @@ def play(find: Callable[[], Any], *, seed: int | None, host: str, port: int, **o
         _, state = connection.recv()
         if state["type"] == "failed":
             raise OptionValueError(state["text"])
-        with socket.create_server(
-            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
-        ) as listening:
-            shown = (
-                socket.gethostname()
-                if host in ("0.0.0.0", "::")
-                else f"[{host}]"
-                if ":" in host
-                else host
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.create_server((host, port), family=family) as listener:
+            base = f"http://{_shown_host(host)}:{listener.getsockname()[1]}"
+            print(f"Watch the game at {base}/ or play at the link of a seat:", flush=True)
+            table = Table(
+                connection,
+                state,
+                lambda path: print(f"  {base}{path}", flush=True),
             )
-            base = f"http://{shown}:{listening.getsockname()[1]}"
-            print(
-                f"Everybody sees the game at {base}/ and plays at the link of a seat:", flush=True
-            )
-            table = Table(connection, state, lambda path: print(f"  {base}{path}", flush=True))
-            _run(table, host, listening, end)
+            _run(table, host, listener, end_game)
     except EOFError:
         process.join()
         raise ProcessDiedError(
             f"the process of the game has ended, with exit code {process.exitcode}"
         ) from None
     except OSError as error:
-        raise OptionValueError(f"nobody can connect to {host}, port {port}: {error}") from error
+        raise OptionValueError(f"cannot listen on {host}, port {port}: {error}") from error
     finally:
-        end()
+        end_game()
     returns = json.loads(table.latest["state"])["returns"]
     return "The returns: " + ", ".join(f"{agent} {total:g}" for agent, total in returns.items())
 
 
-def _run(table: Table, host: str, listening: socket.socket, end: Callable[[], None]) -> None:
-    """Serve until an interrupt, or raise ``EOFError`` if the game ends before."""
-    died = []
+def _shown_host(host: str) -> str:
+    """Return the host of the links for an address to listen on."""
+    if host in ("0.0.0.0", "::"):
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host
+
+
+def _run(
+    table: Table,
+    host: str,
+    listener: socket.socket,
+    end_game: Callable[[], None],
+) -> None:
+    """Serve until an interrupt.
+
+    Raises:
+        EOFError: The game has ended before.
+    """
+    died = False
 
     @asynccontextmanager
-    async def lifespan(app: Any) -> AsyncIterator[None]:
-        reader, _writer = (
-            asyncio.create_task(table.read_game()),
-            asyncio.create_task(table.write_game()),
-        )
-        reader.add_done_callback(lambda task: setattr(server, "should_exit", True))
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        nonlocal died
+        reader = asyncio.create_task(table.read_game())
+        writer = asyncio.create_task(table.write_game())
+        reader.add_done_callback(server.exit_soon)
         yield
-        died.append(reader.done())
-        await asyncio.to_thread(end)
+        died = reader.done()
+        await asyncio.to_thread(end_game)
         await reader
+        writer.cancel()
 
-    config: dict[str, Any] = {
-        "http": _Protocol,
-        "ws_max_size": LONGEST,
-        "timeout_graceful_shutdown": 1,
-    }
-    quiet: dict[str, Any] = {"log_level": "error", "server_header": False, "lifespan": "on"}
-    server = uvicorn.Server(uvicorn.Config(make_app(table, host, lifespan), **config, **quiet))
+    config = uvicorn.Config(
+        make_app(table, host, lifespan),
+        lifespan="on",
+        limit_concurrency=MOST_CONNECTIONS,
+        log_level="error",
+        server_header=False,
+        timeout_graceful_shutdown=1,
+        ws_max_size=LONGEST_MESSAGE,
+    )
+    server = _Server(config)
     with suppress(KeyboardInterrupt):
-        server.run(sockets=[listening])
-    if any(died):
+        server.run(sockets=[listener])
+    if died:
         raise EOFError

@@ -112,7 +112,9 @@ def check_simulation(
         except SimEnvError:
             raise
         except (Exception, SystemExit) as error:  # of the model's constructor, for example
-            report.add_error(Run(error=error), "while the simulation was made or reset")
+            run = Run()
+            run.fail(error)
+            report.add_error(run, "while the simulation was made or reset")
     for warning in warnings:
         report.add("warned", str(warning.message)[:300])
     findings = dict.fromkeys(report.findings)  # without duplicates

@@ -8,13 +8,11 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, count, islice, product
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
@@ -56,23 +54,21 @@ def fitting_views(plan: Plan) -> list[str]:
     return views
 
 
-@dataclass
 class Report:
     """A report while it is written.
 
     Attributes:
+        findings, checked, statistics, episodes: As of the ``CheckReport``.
         names: The names of the findings.
-        errors: The class and the place of each error of the model.
     """
 
-    findings: list[Finding] = field(default_factory=list)
-    names: set[str] = field(default_factory=set)
-    checked: list[str] = field(default_factory=list)
-    statistics: list[PointStatistics] = field(default_factory=list)
-    episodes: dict[str, int] = field(
-        default_factory=lambda: {"terminated": 0, "truncated": 0, "cut": 0}
-    )
-    errors: set[tuple[str, str]] = field(default_factory=set)
+    def __init__(self) -> None:
+        self.findings: list[Finding] = []
+        self.names: set[str] = set()
+        self.checked: list[str] = []
+        self.statistics: list[PointStatistics] = []
+        self.episodes = {"terminated": 0, "truncated": 0, "cut": 0}
+        self._errors: set[tuple[str, str]] = set()  # by class and place
 
     def add(self, name: str, evidence: str = "", **words: str | int) -> None:
         """Add a finding of ``FINDINGS``; ``words`` replace the placeholders of its text."""
@@ -91,8 +87,8 @@ class Report:
         elif error is not None and not (view == "joint" and isinstance(error, AgentError)):
             kind = type(error).__name__
             key = kind, place_of(error) or error_text(error)
-            if key not in self.errors:
-                self.errors.add(key)
+            if key not in self._errors:
+                self._errors.add(key)
                 self.add("raises", f"{where}: {describe_with_place(error)}", kind=kind)
         return error is not None
 
@@ -140,14 +136,13 @@ def check_repetition(subject: Subject, report: Report) -> None:
     again = subject.run_plainly(seed)
     # Other states of the global generators show whether the model seeds them.
     other = subject.run_plainly(seed, seed + 1) if subject.draws else again
-    if isinstance(again.error or other.error, LimitReached):
+    if any(isinstance(run.error, LimitReached) for run in (again, other)):
         return
     if subject.draws:
         differs = first.difference(other) or subject.differences(first, other)
         name = "unseeded_generators" if differs else "shared_generators"
-        report.add(
-            name, subject.sources_of_chance().lstrip(), names=" and ".join(sorted(subject.draws))
-        )
+        names = " and ".join(sorted(subject.draws))
+        report.add(name, subject.sources_of_chance().lstrip(), names=names)
     parts = subject.differences(first, again)
     states = [part for part in parts if STATE in part.path]
     difference = first.difference(again) or describe_differences(states)
@@ -183,7 +178,8 @@ def check_views(subject: Subject, report: Report) -> None:
             continue
         draws = run.draws - subject.draws
         if draws:
-            report.add("unseeded_generators", f"in the {where}", names=" and ".join(sorted(draws)))
+            names = " and ".join(sorted(draws))
+            report.add("unseeded_generators", f"in the {where}", names=names)
             subject.draws.update(draws)
         difference, parts = plain.difference(run), subject.differences(plain, run)
         if difference or parts:
@@ -209,7 +205,7 @@ class Tally:
         self.number = 0
         self.rows = np.full(3, np.nan)
 
-    def add(self, value: npt.ArrayLike) -> None:
+    def add(self, value: Observation) -> None:
         """Add an array or a number; skip it if the first one had another shape."""
         array = np.array(value, float)
         low, total, high = self.rows if self.number else (array, np.zeros_like(array), array)
@@ -219,11 +215,10 @@ class Tally:
 
     def ranges(self, name: str) -> list[Range]:
         """Return the range of each element."""
+        low, total, high = self.rows
         return [
-            Range(f"{name}{list(place) or ''}", low, total / self.number, high)
-            for (place, low), total, high in zip(
-                np.ndenumerate(self.rows[0]), *self.rows[1:].reshape(2, -1).tolist(), strict=True
-            )
+            Range(f"{name}{list(place) or ''}", low[place].item(), mean.item(), high[place].item())
+            for place, mean in np.ndenumerate(total / self.number)
         ]
 
 

@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 import traceback
-import types
 import warnings
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -23,7 +22,7 @@ from dataclasses import dataclass, field
 from datetime import date, datetime
 from itertools import islice
 from textwrap import shorten
-from types import FrameType
+from types import FrameType, coroutine
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -125,14 +124,11 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
 # -- runs -----------------------------------------------------------------------------------------
 
 
-@dataclass
 class Run:
     """The record of a run.
 
     Attributes:
         simulation: The simulation; of a plain run, from its main loop on.
-        state_of: A function of the simulation whose results are compared. None: its ``state()``, or
-            else all its attributes.
         calls: The name of the decision point, or of the agent, of each step.
         steps: The decisions of the rules, or the results of ``last()``, as a fingerprint.
         results: The agents and results of ``last()`` in an episode of random actions.
@@ -146,20 +142,30 @@ class Run:
         draws: The names of the global generators from which the run has drawn.
     """
 
-    simulation: Model = None
-    state_of: Callable[[Model], Model] | None = None
-    calls: list[str] = field(default_factory=list)
-    steps: Fingerprint = field(default_factory=dict)
-    results: list[tuple[Agent, Step]] = field(default_factory=list)
-    actions: list[Action] = field(default_factory=list)
-    fingerprint: Fingerprint = field(default_factory=dict)
-    in_main_loop: bool = False
-    cut: bool = False
-    end: str = "terminated"
-    error: BaseException | None = None
-    stuck: bool = False
-    draws: set[str] = field(default_factory=set)
-    _step_began: float = field(default_factory=time.monotonic)
+    def __init__(
+        self, simulation: Model = None, state_of: Callable[[Model], Model] | None = None
+    ) -> None:
+        """Begin the record.
+
+        Args:
+            simulation: The simulation, if there is one already.
+            state_of: A function of the simulation whose results are compared. None: the ``state()``
+                of the simulation, or else all its attributes.
+        """
+        self.simulation = simulation
+        self._state_of = state_of
+        self.calls: list[str] = []
+        self.steps: Fingerprint = {}
+        self.results: list[tuple[Agent, Step]] = []
+        self.actions: list[Action] = []
+        self.fingerprint: Fingerprint = {}
+        self.in_main_loop = False
+        self.cut = False
+        self.end = "terminated"
+        self.error: BaseException | None = None
+        self.stuck = False
+        self.draws: set[str] = set()
+        self._step_began = time.monotonic()
 
     def run_main_loop(self, simulation: Model) -> None:
         """Run the main loop of a simulation, and record its end and its fingerprint."""
@@ -192,8 +198,8 @@ class Run:
         """Record the fingerprint of the simulation."""
         with outside_simulation():  # decision functions run their rule here
             state = getattr(self.simulation, "state", None)
-            if self.state_of is not None:
-                self.fingerprint = fingerprint("fingerprint", self.state_of(self.simulation))
+            if self._state_of is not None:
+                self.fingerprint = fingerprint("fingerprint", self._state_of(self.simulation))
             elif callable(state):
                 self.fingerprint = fingerprint("state()", state())
             else:
@@ -206,8 +212,8 @@ class Run:
             self.look()
         raise LimitReached
 
-    def fail(self, error: BaseException, seconds: float) -> None:
-        """Record an exception, unless it is the exit at the limit of decisions."""
+    def fail(self, error: BaseException, seconds: float = math.inf) -> None:
+        """Record an exception under a time limit, unless it is the exit at the limit of decisions."""
         if not self.cut:
             self.error = error
             self.stuck = time.monotonic() - self._step_began > seconds / 2
@@ -281,10 +287,10 @@ class Subject:
     def run_plainly(self, seed: int, global_seed: int | None = None) -> Run:
         """Run the simulation's own loop, with the plan's handlers and generators.
 
-        The run has the decisions of the rules. The global generators get the same seed, or
+        Records the decisions of the rules. The global generators get the same seed, or
         ``global_seed``.
         """
-        run = Run(state_of=self.state_of)
+        run = Run(None, self.state_of)
 
         def start() -> None:
             rng = GlobalRandom() if self.plan.options.global_rng else None
@@ -302,7 +308,7 @@ class Subject:
         return self._record(run, start, seed if global_seed is None else global_seed)
 
     def run_rules(self, env: Any, seed: int) -> Run:
-        """Run an environment of any view with ``RULE`` throughout. The run has the decisions of the rules."""
+        """Run an environment of any view with ``RULE`` throughout, and record the rules."""
         run = Run(env.simulation, self.state_of)
 
         def start() -> None:
@@ -344,11 +350,9 @@ class Subject:
                 return run.end_step(step, value)
             return wait(step, value.__await__() if hook.kind == "coroutine" else value)
 
-        @types.coroutine
-        def wait(
-            step: str, steps: Generator[Model, Model, Model]
-        ) -> Generator[Model, Model, Model]:
-            return run.end_step(step, (yield from steps))
+        @coroutine
+        def wait(step: str, rule: Generator[Model, Model, Model]) -> Generator[Model, Model, Model]:
+            return run.end_step(step, (yield from rule))
 
         return decide
 
@@ -381,22 +385,18 @@ class Subject:
 
     def sources_of_chance(self) -> str:
         """Return where a plain run uses clocks, entropy and the global generators; or nothing."""
-        places: dict[str, None] = {}
+        places: list[str] = []
 
         def profile(frame: FrameType, event: str, function: object) -> None:
             source = _CHANCE.get(function) if event == "c_call" else None
             if frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
                 source = "a random.Random is made without a seed"
-            if source is None:
-                return
-            caller: FrameType | None = frame
+            caller: FrameType | None = frame if source else None
             while caller is not None and caller.f_code.co_filename.startswith((_LIBRARY, "<")):
                 caller = caller.f_back
             if caller is not None and not caller.f_code.co_filename.startswith(_PACKAGE):
-                code = caller.f_code
-                places[f"{source} at {code.co_filename}:{caller.f_lineno}, in {code.co_name}"] = (
-                    None
-                )
+                file, name = caller.f_code.co_filename, caller.f_code.co_name
+                places.append(f"{source} at {file}:{caller.f_lineno}, in {name}")
 
         before = sys.getprofile()
         sys.setprofile(profile)
@@ -404,7 +404,8 @@ class Subject:
             self.run_plainly(self.seeds[0])
         finally:
             sys.setprofile(before)
-        return f"\nin the model, {'; '.join(list(places)[:3])}" if places else ""
+        texts = list(dict.fromkeys(places))
+        return f"\nin the model, {'; '.join(texts[:3])}" if texts else ""
 
 
 def _random_steps(run: Run, env: SimulationAECEnv, seed: int, salt: int) -> Iterator[None]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line with arguments, or with those of this process; return the exit code."""
+    """Run the command line with arguments (default: of this process); return the exit code."""
     options = vars(_parser().parse_args(arguments))
     run = options.pop("run")
     as_json = options.pop("json", False)

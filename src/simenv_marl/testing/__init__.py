@@ -1,7 +1,7 @@
 """Checks of a simulation and its decision points, to run before trusting an environment.
 
 ``check_simulation`` runs a simulation by itself and in environments, plays episodes of random
-actions, and explains what is wrong. ``inspect_simulation`` lists the decision points and their
+actions, and explains every problem. ``inspect_simulation`` lists the decision points and their
 calls. Both are also on the command line::
 
     python -m simenv_marl check package.module:Simulation
@@ -139,7 +139,7 @@ def inspect_simulation(
 ) -> Inspection:
     """List the decision points of a simulation, and the order of their calls in one plain run.
 
-    The arguments are those of ``check_simulation``. The episode is cut after ``max_steps``
+    It takes the same arguments as ``check_simulation``. The episode is cut after ``max_steps``
     decisions, or after ``time_limit`` seconds.
 
     Returns:

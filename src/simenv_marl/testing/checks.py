@@ -6,10 +6,10 @@ Each adds its findings to the report.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
-from itertools import chain, count, islice, product
+from itertools import chain, count, product
 from typing import Any, Final
 
 import numpy as np
@@ -72,9 +72,9 @@ class Report:
 
     def add(self, name: str, evidence: str = "", **words: str | int) -> None:
         """Add a finding of ``FINDINGS``; ``words`` replace the placeholders of its text."""
-        severity, title, explanation = FINDINGS[name]
-        text = " ".join(explanation.format(**words).split())
-        self.findings.append(Finding(severity, title.format(**words), text, evidence))
+        severity, *texts = FINDINGS[name]
+        title, explanation = (" ".join(text.format(**words).split()) for text in texts)
+        self.findings.append(Finding(severity, title, explanation, evidence))
         self.names.add(name)
 
     def add_error(self, run: Run, where: str, view: str = "aec") -> bool:
@@ -123,8 +123,9 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
     subject.views.extend(fitting_views(subject.plan))
     if any(run.cut for run in runs):
         report.add("cut_runs", most=subject.max_steps)
-    if len(runs) > 1 and not any(
-        runs[0].difference(run) or subject.differences(runs[0], run) for run in runs
+    first, *others = runs
+    if others and not any(
+        first.difference(run) or subject.differences(first, run) for run in others
     ):
         report.add("same_seeds", f"seeds {', '.join(map(str, subject.seeds))}")
 
@@ -181,7 +182,8 @@ def check_views(subject: Subject, report: Report) -> None:
             names = " and ".join(sorted(draws))
             report.add("unseeded_generators", f"in the {where}", names=names)
             subject.draws.update(draws)
-        difference, parts = plain.difference(run), subject.differences(plain, run)
+        difference = plain.difference(run)
+        parts = subject.differences(plain, run)
         if difference or parts:
             more = not difference and all(part.first is ABSENT for part in parts)
             evidence = f"plain run, then {where}: {difference}\n{describe_differences(parts)}"
@@ -199,27 +201,34 @@ def check_views(subject: Subject, report: Report) -> None:
 
 
 class Tally:
-    """The minimum, the sum and the maximum of arrays of one shape, and their number."""
+    """The number, the minimum, the maximum and the sum of arrays of one shape."""
 
     def __init__(self) -> None:
         self.number = 0
-        self.rows = np.full(3, np.nan)
+        self.low = self.high = np.array(np.nan)
+        self.total = np.array(0.0)
 
     def add(self, value: Observation) -> None:
         """Add an array or a number; skip it if the first one had another shape."""
         array = np.array(value, float)
-        low, total, high = self.rows if self.number else (array, np.zeros_like(array), array)
-        if array.shape == low.shape:
-            self.rows = np.stack([np.minimum(low, array), total + array, np.maximum(high, array)])
-            self.number += 1
+        if self.number == 0:
+            self.low = self.high = array
+        elif array.shape != self.low.shape:
+            return
+        self.number += 1
+        self.low = np.minimum(self.low, array)
+        self.high = np.maximum(self.high, array)
+        self.total = self.total + array
 
     def ranges(self, name: str) -> list[Range]:
         """Return the range of each element."""
-        low, total, high = self.rows
-        return [
-            Range(f"{name}{list(place) or ''}", low[place].item(), mean.item(), high[place].item())
-            for place, mean in np.ndenumerate(total / self.number)
-        ]
+        ranges = []
+        for place, mean in np.ndenumerate(self.total / self.number):
+            path = f"{name}{list(place) or ''}"
+            low = self.low[place].item()
+            high = self.high[place].item()
+            ranges.append(Range(path, low, mean.item(), high))
+        return ranges
 
 
 class PointRecord:
@@ -260,26 +269,31 @@ class PointRecord:
         elif isinstance(value, (np.ndarray, np.generic, int, float)):
             self.observations[name].add(value)
 
-    def conclude(self, report: Report, called: set[str]) -> None:
-        """Report the statistics and their findings; plain runs have ``called`` some points."""
-        point, number = self.point.hook.name, self.rewards.number
-        rewards = self.rewards.ranges("reward")[0] if number else None
+    def conclude(self, report: Report, subject: Subject) -> None:
+        """Report the statistics, and their findings."""
+        point = self.point.hook.name
+        rewards = self.rewards.ranges("reward")[0] if self.rewards.number else None
         start = int(getattr(self.point.definition.action_space, "start", 0))
-        never = (np.flatnonzero(self.masks.rows[2] == 0) + start).tolist()
-        if not self.decisions and point not in called:
+        never = (np.flatnonzero(self.masks.high == 0) + start).tolist()
+        if not self.decisions and not any(point in run.calls for run in subject.plain.values()):
             report.add("never_called", point=point)
         if self.outside:
             report.add("outside", self.outside, point=point)
         if never:
             report.add("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=point)
-        if rewards is not None and rewards.minimum == rewards.maximum and number > 1:
+        if rewards is not None and rewards.minimum == rewards.maximum and self.rewards.number > 1:
             name = "same_rewards" if rewards.minimum else "zero_rewards"
-            report.add(name, f"{number} rewards of {rewards.mean:.6g}", point=point)
-        agents = self.point.agent or "agents named by each call"
-        ranges = [tally.ranges(name) for name, tally in self.observations.items()]
-        observations = tuple(chain(*ranges))
+            report.add(name, f"{self.rewards.number} rewards of {rewards.mean:.6g}", point=point)
+        ranges = (tally.ranges(name) for name, tally in self.observations.items())
         report.statistics.append(
-            PointStatistics(point, agents, self.decisions, observations, rewards, tuple(never))
+            PointStatistics(
+                point=point,
+                agents=self.point.agent or "agents named by each call",
+                decisions=self.decisions,
+                observations=tuple(chain(*ranges)),
+                rewards=rewards,
+                never_legal=tuple(never),
+            )
         )
 
 
@@ -290,14 +304,15 @@ def check_episodes(subject: Subject, report: Report) -> None:
     first: Run | None = None
     failures = 0
     with report.opened(subject, max_steps=most) as env:
-        seeds = islice(chain(subject.seeds, count(max(subject.seeds) + 1)), subject.episodes)
-        for number, seed in enumerate(seeds, 1):
+        seeds = chain(subject.seeds, count(max(subject.seeds) + 1))
+        for number, seed in zip(range(1, subject.episodes + 1), seeds, strict=False):
             if subject.late or failures == 3:
                 break
             run = subject.run_randomly(env, seed)
             actors = set()
             for agent, step in run.results:
-                records[agent.point.hook].add(agent.name, step, rewarded=agent.name in actors)
+                record = records[agent.point.hook]
+                record.add(agent.name, step, rewarded=agent.name in actors)
                 actors.add(agent.name)
             if report.add_error(run, f"in episode {number} of random legal actions, seed {seed}"):
                 failures += 1
@@ -308,9 +323,8 @@ def check_episodes(subject: Subject, report: Report) -> None:
                 first = run
                 check_generators(report, run, env.simulation)
             report.episodes[run.end if len(run.actions) < most else "cut"] += 1
-        called = {name for run in subject.plain.values() for name in run.calls}
         for record in records.values():
-            record.conclude(report, called)
+            record.conclude(report, subject)
         episodes = sum(report.episodes.values())
         if episodes:
             report.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
@@ -353,8 +367,8 @@ def compare_episodes(subject: Subject, report: Report, used: SimulationAECEnv, f
                 report.add(name, f"seed {seed}, the same actions: {difference}{sources}")
                 return
         other = subject.run_randomly(used, seed, salt=1)
-        others = len(other.calls) > 1 and repr(first.actions) != repr(other.actions)
-        if others and not first.difference(other):
+        acts_alike = len(other.calls) <= 1 or repr(first.actions) == repr(other.actions)
+        if not acts_alike and not first.difference(other):
             report.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
     report.checked.append(
         "the same seed and actions in a new environment, in a used one, and beside another one"
@@ -364,17 +378,19 @@ def compare_episodes(subject: Subject, report: Report, used: SimulationAECEnv, f
 # -- the tests of PettingZoo and Gymnasium --------------------------------------------------------
 
 
-def _check_env(make: Callable[[], Any]) -> None:
-    check_env(make(), skip_render_check=True)
-
-
-_TESTS: Final[tuple[tuple[str, str, Callable[[Callable[[], Any]], object]], ...]] = (
+_TESTS: Final = (
     ("PettingZoo's api_test", "aec", lambda make: api_test(make(), num_cycles=50)),
     ("seed_test", "aec", lambda make: seed_test(make, num_cycles=20)),
     ("parallel_api_test", "parallel", lambda make: parallel_api_test(make(), num_cycles=50)),
     ("parallel_seed_test", "parallel", lambda make: parallel_seed_test(make, num_cycles=20)),
-    ("Gymnasium's check_env (single view)", "single", _check_env),
-    ("Gymnasium's check_env (joint view)", "joint", _check_env),
+    *(
+        (
+            f"Gymnasium's check_env ({view} view)",
+            view,
+            lambda make: check_env(make(), skip_render_check=True),
+        )
+        for view in ("single", "joint")
+    ),
 )
 """The tests and their views; each test is called with a factory of environments."""
 
@@ -400,7 +416,7 @@ def check_conformance(subject: Subject, report: Report) -> None:
         report.checked.append(", ".join(passed))
 
 
-CHECKS: Final[tuple[Callable[[Subject, Report], None], ...]] = (
+CHECKS: Final = (
     check_plain_runs,
     check_repetition,
     check_views,

@@ -41,7 +41,7 @@ Fingerprint = dict[str, Any]
 
 
 class Difference(NamedTuple):
-    """A part in which two fingerprints differ. One of its values may be ``ABSENT``."""
+    """A difference of two fingerprints: the path and values of a part, or ``ABSENT``."""
 
     path: str
     first: Model
@@ -133,17 +133,16 @@ def differences(
     if max(len(one), len(other)) >= MOST_PARTS:
         paths = [path for path in one if path in other]
     parts = [Difference(path, one.get(path, ABSENT), other.get(path, ABSENT)) for path in paths]
-    return [part for part in parts if not (_same(*part[1:]) or general(part.path) in ignored)]
+    different = [part for part in parts if _key(part.first) != _key(part.second)]
+    return [part for part in different if general(part.path) not in ignored]
 
 
-def _same(one: Model, other: Model) -> bool:
-    """Return whether two parts are the same; arrays are compared bit for bit."""
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, (np.ndarray, np.generic)):
-        alike = one.dtype == other.dtype and one.shape == other.shape
-        return bool(alike and one.tobytes() == other.tobytes())
-    return bool(one == other or (one != one and other != other))  # both are NaN
+def _key(value: Model) -> tuple[Model, ...]:
+    """Return values that are equal for equal parts; arrays are compared bit for bit."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return type(value), value.dtype, value.shape, value.tobytes()
+    is_nan = value != value
+    return type(value), None if is_nan else value
 
 
 def general(path: str) -> str:

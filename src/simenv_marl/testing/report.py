@@ -240,7 +240,7 @@ class CheckReport:
     statistics: tuple[PointStatistics, ...] = ()
     #: The number of episodes of random legal actions, by the way they ended.
     episodes: dict[str, int] = field(default_factory=dict)
-    #: The order in which the decision points were called in a plain run: ``(a b){30} c``.
+    #: The order of the calls of decision points in a plain run, as in ``(a b){30} c``.
     calls: str = ""
 
     @property
@@ -293,7 +293,7 @@ class Inspection:
     #: For each decision point, its name, its agents, its spaces, and more.
     points: tuple[dict[str, str], ...]
     views: tuple[str, ...]  #: The views that its environments may have.
-    calls: str  #: The order in which the points were called in one plain episode: ``(a b){30} c``.
+    calls: str  #: The order of their calls in one plain run, as in ``(a b){30} c``.
     counts: dict[str, int]  #: The number of calls of each point.
     ended: str  #: The end of that episode, in words.
 
@@ -330,7 +330,7 @@ def order_of(calls: Sequence[str]) -> str:
 
 
 def _fold(match: re.Match[str]) -> str:
-    """Write a repeated block as one term, in which null characters take the place of blanks."""
+    """Write a repeated block as one term, with null characters instead of blanks."""
     block = match[1].rstrip().replace(" ", "\0")
     number = len(match[0]) // len(match[1])
     return f"({block}){{{number}}} " if "\0" in block else f"{block}{{{number}}} "

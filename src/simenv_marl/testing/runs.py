@@ -139,7 +139,7 @@ class Run:
         end: "terminated" or "truncated".
         error: The exception that ended the run.
         stuck: Whether the last step began long before that exception.
-        draws: The names of the global generators from which the run has drawn.
+        draws: The global generators that the run has used, by name.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class Run:
         raise LimitReached
 
     def fail(self, error: BaseException, seconds: float = math.inf) -> None:
-        """Record an exception under a time limit, unless it is the exit at the limit of decisions."""
+        """Record an exception of a run with a time limit; ignore it at the limit of decisions."""
         if not self.cut:
             self.error = error
             self.stuck = time.monotonic() - self._step_began > seconds / 2
@@ -241,7 +241,7 @@ class Subject:
         episodes: The number of episodes of random actions.
         deadline: The end of the time limit for all checks, as ``time.monotonic()``.
         plain: The plain runs by seed.
-        draws: The names of the global generators from which the simulation draws.
+        draws: The global generators that the simulation uses, by name.
         unstable: Parts of the fingerprint that are not compared.
         views: The views that the plan allows. Empty if plain runs fail or decide nothing.
     """
@@ -264,7 +264,7 @@ class Subject:
         return time.monotonic() >= self.deadline
 
     def differences(self, run: Run, other: Run) -> list[Difference]:
-        """Return the parts in which the simulations differ after two runs."""
+        """Return the differences between the simulations after two runs."""
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
     def play(self, function: Callable[[], object], seed: int = 0, run: Run | None = None) -> Run:

@@ -77,8 +77,8 @@ def check_simulation(
     Raises:
         SimEnvError: The simulation, the points or an option is invalid. The message says which.
     """
-    seeds = list(dict.fromkeys(seeds))
-    if not seeds or not all(map(is_seed, seeds)):
+    unique_seeds = list(dict.fromkeys(seeds))
+    if not unique_seeds or not all(map(is_seed, unique_seeds)):
         raise OptionValueError(
             f"seeds must be non-negative integers, at least one, not {short_repr(seeds)}"
         )
@@ -99,7 +99,7 @@ def check_simulation(
                 max_steps=max_steps,
                 seconds=time_limit / 4,
                 state_of=fingerprint,
-                seeds=seeds,
+                seeds=list(map(int, unique_seeds)),
                 episodes=episodes,
                 deadline=time.monotonic() + time_limit,
             )
@@ -108,7 +108,7 @@ def check_simulation(
                     check(subject, report)
             if subject.late:
                 report.add("out_of_time", f"after {time_limit:g} seconds")
-            calls = order_of(subject.plain[seeds[0]].calls)
+            calls = order_of(subject.plain[subject.seeds[0]].calls)
         except SimEnvError:
             raise
         except (Exception, SystemExit) as error:  # of the model's constructor, for example

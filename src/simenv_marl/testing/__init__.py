@@ -14,6 +14,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from itertools import chain
 from typing import Unpack
 
 from ..core.options import CheckOptions
@@ -89,7 +90,11 @@ def check_simulation(
         raise OptionValueError(
             f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
         )
-    report, calls = Report(), ""
+    plain_seeds = list(map(int, unique_seeds))
+    next_seed = max(plain_seeds) + 1
+    more_seeds = range(next_seed, next_seed + episodes - len(plain_seeds))
+    report = Report()
+    calls = ""
     with quietly() as warnings:
         try:
             plan = Plan(simulation, points, options)
@@ -99,8 +104,8 @@ def check_simulation(
                 max_steps=max_steps,
                 seconds=time_limit / 4,
                 state_of=fingerprint,
-                seeds=list(map(int, unique_seeds)),
-                episodes=episodes,
+                seeds=plain_seeds,
+                episode_seeds=chain(plain_seeds[:episodes], more_seeds),
                 deadline=time.monotonic() + time_limit,
             )
             for check in CHECKS:

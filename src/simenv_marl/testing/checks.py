@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
-from itertools import chain, count, product
+from itertools import chain, product
 from typing import Any, Final
 
 import numpy as np
@@ -205,15 +205,14 @@ class Tally:
 
     def __init__(self) -> None:
         self.number = 0
-        self.low = self.high = np.array(np.nan)
+        self.low = np.array(np.inf)
+        self.high = np.array(-np.inf)
         self.total = np.array(0.0)
 
     def add(self, value: Observation) -> None:
         """Add an array or a number; skip it if the first one had another shape."""
         array = np.array(value, float)
-        if self.number == 0:
-            self.low = self.high = array
-        elif array.shape != self.low.shape:
+        if self.number and array.shape != self.total.shape:
             return
         self.number += 1
         self.low = np.minimum(self.low, array)
@@ -285,15 +284,10 @@ class PointRecord:
             name = "same_rewards" if rewards.minimum else "zero_rewards"
             report.add(name, f"{self.rewards.number} rewards of {rewards.mean:.6g}", point=point)
         ranges = (tally.ranges(name) for name, tally in self.observations.items())
+        observations = tuple(chain(*ranges))
+        agents = self.point.agent or "agents named by each call"
         report.statistics.append(
-            PointStatistics(
-                point=point,
-                agents=self.point.agent or "agents named by each call",
-                decisions=self.decisions,
-                observations=tuple(chain(*ranges)),
-                rewards=rewards,
-                never_legal=tuple(never),
-            )
+            PointStatistics(point, agents, self.decisions, observations, rewards, tuple(never))
         )
 
 
@@ -304,8 +298,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
     first: Run | None = None
     failures = 0
     with report.opened(subject, max_steps=most) as env:
-        seeds = chain(subject.seeds, count(max(subject.seeds) + 1))
-        for number, seed in zip(range(1, subject.episodes + 1), seeds, strict=False):
+        for number, seed in enumerate(subject.episode_seeds, 1):
             if subject.late or failures == 3:
                 break
             run = subject.run_randomly(env, seed)
@@ -337,8 +330,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
 
 def check_generators(report: Report, run: Run, simulation: Model) -> None:
     """Report fewer generators than entities that decide, unless there is none."""
-    agents = (agent for agent, _ in run.results if agent.point.agent is None)
-    names = list(dict.fromkeys(agent.name for agent in agents))
+    names = list({agent.name: None for agent, _ in run.results if agent.point.agent is None})
     generators = generators_of(simulation)
     number = sum(len(each) if isinstance(each, Streams) else 1 for each in generators)
     if 0 < number < len(names):

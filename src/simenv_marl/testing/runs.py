@@ -16,7 +16,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from datetime import date, datetime
@@ -238,7 +238,7 @@ class Subject:
         seconds: The time limit of a run.
         state_of: As for ``Run``.
         seeds: The seeds of plain runs.
-        episodes: The number of episodes of random actions.
+        episode_seeds: The seeds of episodes of random actions.
         deadline: The end of the time limit for all checks, as ``time.monotonic()``.
         plain: The plain runs by seed.
         draws: The global generators that the simulation uses, by name.
@@ -251,7 +251,7 @@ class Subject:
     seconds: float
     state_of: Callable[[Model], Model] | None = None
     seeds: list[int] = field(default_factory=list)
-    episodes: int = 0
+    episode_seeds: Iterable[int] = ()
     deadline: float = math.inf
     plain: dict[int, Run] = field(default_factory=dict)
     draws: set[str] = field(default_factory=set)

@@ -26,7 +26,7 @@ from ..errors import OptionValueError, SimEnvError, short_repr
 from ..simulation import Model
 from .checks import CHECKS, Report, fitting_views, make_environment
 from .report import SEVERITIES, CheckReport, Finding, Inspection, PointStatistics, Range, order_of
-from .runs import Run, Subject, describe_with_place, quietly
+from .runs import Run, Subject, describe_with_place, silence
 
 __all__ = [
     "CheckReport",
@@ -95,7 +95,7 @@ def check_simulation(
     more_seeds = range(next_seed, next_seed + episodes - len(plain_seeds))
     report = Report()
     calls = ""
-    with quietly() as warnings:
+    with silence() as warnings:
         try:
             plan = Plan(simulation, points, options)
             make_environment(plan, "aec")
@@ -111,9 +111,9 @@ def check_simulation(
             for check in CHECKS:
                 if check is CHECKS[0] or subject.views:
                     check(subject, report)
-            if subject.late:
+            if subject.is_late:
                 report.add("out_of_time", f"after {time_limit:g} seconds")
-            calls = order_of(subject.plain[subject.seeds[0]].calls)
+            calls = order_of(subject.plain_runs[subject.seeds[0]].calls)
         except SimEnvError:
             raise
         except (Exception, SystemExit) as error:  # of the model's constructor, for example
@@ -156,7 +156,7 @@ def inspect_simulation(
     """
     if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
-    with quietly():
+    with silence():
         plan = Plan(simulation, points, options)
         subject = Subject(
             plan=plan, max_steps=max_steps, seconds=time_limit, state_of=lambda simulation: None
@@ -191,7 +191,7 @@ def _describe_end(run: Run) -> str:
     """Describe the end of a plain run for an inspection."""
     if run.error is not None:
         return describe_with_place(run.error)
-    if run.cut:
+    if run.is_cut:
         return "cut"
     ends = {"truncated": "a limit of time", "terminated": "an end of the task"}
     return f"{run.end} ({ends[run.end]})"

@@ -23,7 +23,7 @@ from ..core.rng import Streams, generators_of
 from ..envs import VIEWS, SimulationAECEnv, view_class
 from ..errors import AgentError, InvalidActionError, error_text, short_repr
 from ..simulation import RULE, Model, Observation, make_simulation, takes
-from .fingerprint import ABSENT, STATE, describe_differences, general
+from .fingerprint import ABSENT, STATE, describe_differences, generalize
 from .report import FINDINGS, Finding, PointStatistics, Range
 from .runs import (
     LimitReached,
@@ -81,7 +81,7 @@ class Report:
         """Add the error of a run, once for each place; return whether the run has an error."""
         error = run.error
         if isinstance(error, LimitReached):
-            name = "stuck" if run.stuck else "out_of_time"
+            name = "stuck" if run.is_stuck else "out_of_time"
             self.add(name, f"{where}, after {len(run.calls)} steps")
         # The joint view may be unable to know all agents.
         elif error is not None and not (view == "joint" and isinstance(error, AgentError)):
@@ -93,13 +93,15 @@ class Report:
         return error is not None
 
     @contextmanager
-    def opened(self, subject: Subject, view: str = "aec", **options: Any) -> Iterator[Any]:
+    def environment(self, subject: Subject, view: str = "aec", **options: Any) -> Iterator[Any]:
         """Make an environment, and close it at the end."""
         env = make_environment(subject.plan, view, **options)
         try:
             yield env
         finally:
-            self.add_error(subject.play(env.close), "when an environment was closed in mid-episode")
+            self.add_error(
+                subject.record(env.close), "when an environment was closed in mid-episode"
+            )
 
 
 # -- the simulation by itself ---------------------------------------------------------------------
@@ -111,17 +113,17 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
         report.add("unseeded_reset")
     for seed in subject.seeds:
         run = subject.run_plainly(seed)
-        subject.plain[seed] = run
+        subject.plain_runs[seed] = run
         subject.draws.update(run.draws)
         if report.add_error(run, f"in a plain run without any environment, seed {seed}"):
             return
-    runs = list(subject.plain.values())
+    runs = list(subject.plain_runs.values())
     if not any(run.calls for run in runs):
         points = ", ".join(point.hook.name for point in subject.plan.active)
         report.add("no_decision", points=points)
         return
     subject.views.extend(fitting_views(subject.plan))
-    if any(run.cut for run in runs):
+    if any(run.is_cut for run in runs):
         report.add("cut_runs", most=subject.max_steps)
     first, *others = runs
     if others and not any(
@@ -133,7 +135,7 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
 def check_repetition(subject: Subject, report: Report) -> None:
     """Run a seed again: differences then are not due to environments."""
     seed = subject.seeds[0]
-    first = subject.plain[seed]
+    first = subject.plain_runs[seed]
     again = subject.run_plainly(seed)
     # Other states of the global generators show whether the model seeds them.
     other = subject.run_plainly(seed, seed + 1) if subject.draws else again
@@ -152,7 +154,7 @@ def check_repetition(subject: Subject, report: Report) -> None:
         report.add("unrepeatable", evidence)
     elif parts:
         report.add("unstable", describe_differences(parts))
-        subject.unstable.update(general(part.path) for part in parts)
+        subject.unstable.update(generalize(part.path) for part in parts)
 
 
 # -- environments with RULE throughout ------------------------------------------------------------
@@ -167,12 +169,12 @@ def check_views(subject: Subject, report: Report) -> None:
     # Rules take all decisions, because plain runs have no policies.
     policies = dict.fromkeys(options.policies or (), RULE) or None
     rules = {"policies": policies, "max_steps": None, "skip_forced": False}
-    for driver, view, seed in product(drivers, subject.views, subject.plain):
-        plain = subject.plain[seed]
-        if subject.late or not plain.calls:
+    for driver, view, seed in product(drivers, subject.views, subject.plain_runs):
+        plain = subject.plain_runs[seed]
+        if subject.is_late or not plain.calls:
             continue
         seed_global_generators(seed)
-        with report.opened(subject, view, driver=driver, **rules) as env:
+        with report.environment(subject, view, driver=driver, **rules) as env:
             run = subject.run_rules(env, seed)
         where = f"{view} view, driver {driver}, seed {seed}"
         if report.add_error(run, f"in the {where}, with RULE throughout", view):
@@ -189,7 +191,7 @@ def check_views(subject: Subject, report: Report) -> None:
             evidence = f"plain run, then {where}: {difference}\n{describe_differences(parts)}"
             report.add("writing_mappings" if more else "changed_model", evidence.rstrip())
             return
-    most = max(len(run.calls) for run in subject.plain.values())
+    most = max(len(run.calls) for run in subject.plain_runs.values())
     report.checked.append(
         f"plain runs against RULE throughout ({', '.join(subject.views)}; drivers"
         f" {', '.join(drivers)}; seeds {', '.join(map(str, subject.seeds))}; up to {most} decisions"
@@ -241,7 +243,7 @@ class PointRecord:
         self.observations: defaultdict[str, Tally] = defaultdict(Tally)
         self.outside = ""  # the first observation outside of its space
 
-    def add(self, agent: str, step: Step, *, rewarded: bool) -> None:
+    def add(self, agent: str, step: Step, *, with_reward: bool) -> None:
         """Add a result of ``last()``; the reward counts only if the agent has acted before."""
         observation, reward, terminated, truncated, info = step
         self.observe("observation", observation)
@@ -249,7 +251,7 @@ class PointRecord:
         if not (self.outside or space.contains(observation)):
             text = short_repr(observation)
             self.outside = f"{agent} has observed {text}; the space is {space}"
-        if rewarded:
+        if with_reward:
             self.rewards.add(reward)
         if not (terminated or truncated):
             self.decisions += 1
@@ -274,7 +276,9 @@ class PointRecord:
         rewards = self.rewards.ranges("reward")[0] if self.rewards.number else None
         start = int(getattr(self.point.definition.action_space, "start", 0))
         never = (np.flatnonzero(self.masks.high == 0) + start).tolist()
-        if not self.decisions and not any(point in run.calls for run in subject.plain.values()):
+        if not self.decisions and not any(
+            point in run.calls for run in subject.plain_runs.values()
+        ):
             report.add("never_called", point=point)
         if self.outside:
             report.add("outside", self.outside, point=point)
@@ -297,15 +301,15 @@ def check_episodes(subject: Subject, report: Report) -> None:
     most = subject.max_steps
     first: Run | None = None
     failures = 0
-    with report.opened(subject, max_steps=most) as env:
+    with report.environment(subject, max_steps=most) as env:
         for number, seed in enumerate(subject.episode_seeds, 1):
-            if subject.late or failures == 3:
+            if subject.is_late or failures == 3:
                 break
             run = subject.run_randomly(env, seed)
             actors = set()
             for agent, step in run.results:
                 record = records[agent.point.hook]
-                record.add(agent.name, step, rewarded=agent.name in actors)
+                record.add(agent.name, step, with_reward=agent.name in actors)
                 actors.add(agent.name)
             if report.add_error(run, f"in episode {number} of random legal actions, seed {seed}"):
                 failures += 1
@@ -325,7 +329,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
             report.add("cut_runs", most=most)
         if first is not None and not failures and "unrepeatable" not in report.names:
             compare_episodes(subject, report, env, first)
-        subject.play(partial(env.reset, seed=subject.seeds[0]))  # to close it in mid-episode
+        subject.record(partial(env.reset, seed=subject.seeds[0]))  # to close it in mid-episode
 
 
 def check_generators(report: Report, run: Run, simulation: Model) -> None:
@@ -341,7 +345,7 @@ def check_generators(report: Report, run: Run, simulation: Model) -> None:
 def compare_episodes(subject: Subject, report: Report, used: SimulationAECEnv, first: Run) -> None:
     """Repeat an episode in a new environment, in a used one, and beside another one."""
     seed = subject.seeds[0]
-    with report.opened(subject, max_steps=subject.max_steps) as new:
+    with report.environment(subject, max_steps=subject.max_steps) as new:
         subject.run_randomly(used, seed, most=1 + len(first.calls) // 2)
         for name, env, beside in (
             ("unrepeatable", new, None),
@@ -351,7 +355,7 @@ def compare_episodes(subject: Subject, report: Report, used: SimulationAECEnv, f
             again = subject.run_randomly(env, seed, beside=beside)
             if report.add_error(again, "after an episode that was closed in mid-episode"):
                 return
-            if subject.late or (beside and subject.draws):
+            if subject.is_late or (beside and subject.draws):
                 return
             difference = first.difference(again)
             if difference:
@@ -389,23 +393,23 @@ _TESTS: Final = (
 
 def check_conformance(subject: Subject, report: Report) -> None:
     """Run the tests of PettingZoo and Gymnasium, unless they would only repeat errors."""
-    passed = []
+    passed_tests = []
     for name, view, test in _TESTS:
         if any(finding.severity == "error" for finding in report.findings):
             break
-        if subject.late or view not in subject.views or (subject.draws and "seed" in name):
+        if subject.is_late or view not in subject.views or (subject.draws and "seed" in name):
             continue
         make = partial(make_environment, subject.plan, view, max_steps=subject.max_steps)
-        run = subject.play(partial(test, make))
+        run = subject.record(partial(test, make))
         if run.error is None:
-            passed.append(name)
+            passed_tests.append(name)
         elif isinstance(run.error, AssertionError):
             report.add("failed_test", describe_with_place(run.error), test=name)
         # The tests ignore masks, or changes of masks.
         elif not isinstance(run.error, (LimitReached, InvalidActionError)):
             report.add_error(run, f"in {name}", view)
-    if passed:
-        report.checked.append(", ".join(passed))
+    if passed_tests:
+        report.checked.append(", ".join(passed_tests))
 
 
 CHECKS: Final = (

@@ -55,7 +55,7 @@ def fingerprint(name: str, root: Model, *, follow: bool = True) -> Fingerprint:
     """
     parts: Fingerprint = {}
     # Also keeps the objects alive, because a new object could reuse the id of a dead one.
-    visited: dict[int, tuple[str, Model]] = {}
+    paths_by_id: dict[int, tuple[str, Model]] = {}
     # Breadth first, because a long history in the model would hide everything else.
     queue = deque([(name, root)])
     while queue and len(parts) < MOST_PARTS:
@@ -68,15 +68,15 @@ def fingerprint(name: str, root: Model, *, follow: bool = True) -> Fingerprint:
             parts[path] = name_of(value)
         elif isinstance(value, _GENERATORS):
             parts[f"{path} ({STATE})"] = _state_of(value)
-        elif id(value) in visited:
-            parts[path] = f"the same object as {visited[id(value)][0]}"
+        elif id(value) in paths_by_id:
+            parts[path] = f"the same object as {paths_by_id[id(value)][0]}"
         else:
             parts[path] = name_of(type(value))
             if not follow and not isinstance(value, (list, tuple, dict)):
                 continue
             # Python may share equal immutable objects between places, or not.
             if not isinstance(value, (tuple, frozenset)):
-                visited[id(value)] = path, value
+                paths_by_id[id(value)] = path, value
             try:
                 queue += [(path + end, part) for end, part in _members(value)]
             except Exception:  # open files, locks and generators raise many types
@@ -134,7 +134,7 @@ def differences(
         paths = [path for path in one if path in other]
     parts = [Difference(path, one.get(path, ABSENT), other.get(path, ABSENT)) for path in paths]
     different = [part for part in parts if _key(part.first) != _key(part.second)]
-    return [part for part in different if general(part.path) not in ignored]
+    return [part for part in different if generalize(part.path) not in ignored]
 
 
 def _key(value: Model) -> tuple[Model, ...]:
@@ -145,7 +145,7 @@ def _key(value: Model) -> tuple[Model, ...]:
     return type(value), None if is_nan else value
 
 
-def general(path: str) -> str:
+def generalize(path: str) -> str:
     """Return the general form of a path, which is the same for all members of a list or dict."""
     return re.sub(r"\[[^\]]*\]", "[]", path)
 

@@ -53,7 +53,7 @@ class LimitReached(LoopExit):
     """Ends a run that has reached its limit of decisions or of time."""
 
 
-def within(seconds: float, function: Callable[[], object]) -> None:
+def call_within(seconds: float, function: Callable[[], object]) -> None:
     """Call a function, and raise ``LimitReached`` in it after a time.
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted
@@ -101,7 +101,7 @@ def seed_global_generators(seed: int) -> None:
 
 
 @contextmanager
-def quietly() -> Iterator[list[warnings.WarningMessage]]:
+def silence() -> Iterator[list[warnings.WarningMessage]]:
     """Silence a model, and restore the global generators at the end.
 
     Yields:
@@ -111,14 +111,14 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
     with (
         outside_simulation(),
         preserve_generators(),
-        warnings.catch_warnings(record=True) as recorded,
+        warnings.catch_warnings(record=True) as records,
         redirect_stdout(output),
         redirect_stderr(output),
     ):
         warnings.simplefilter("ignore")
         for pattern in _WARNINGS:
             warnings.filterwarnings("always", f".*{pattern}")
-        yield recorded
+        yield records
 
 
 # -- runs -----------------------------------------------------------------------------------------
@@ -135,10 +135,10 @@ class Run:
         actions: Those actions.
         fingerprint: The fingerprint of the simulation at the end, or at the limit of decisions.
         in_main_loop: Whether a plain run is in the main loop of the simulation.
-        cut: Whether the run has reached the limit of decisions.
+        is_cut: Whether the run has reached the limit of decisions.
         end: "terminated" or "truncated".
         error: The exception that ended the run.
-        stuck: Whether the last step began long before that exception.
+        is_stuck: Whether the last step began long before that exception.
         draws: The global generators that the run has used, by name.
     """
 
@@ -160,10 +160,10 @@ class Run:
         self.actions: list[Action] = []
         self.fingerprint: Fingerprint = {}
         self.in_main_loop = False
-        self.cut = False
+        self.is_cut = False
         self.end = "terminated"
         self.error: BaseException | None = None
-        self.stuck = False
+        self.is_stuck = False
         self.draws: set[str] = set()
         self._step_began = time.monotonic()
 
@@ -173,7 +173,7 @@ class Run:
         self.in_main_loop = True
         self.end = "truncated" if simulation.run() is TRUNCATED else "terminated"
         self.in_main_loop = False
-        self.look()
+        self.take_fingerprint()
 
     def begin_step(self, name: str) -> str:
         """Record the call of a decision point or agent; return the name of its step."""
@@ -194,7 +194,7 @@ class Run:
         self.steps |= fingerprint(self.begin_step(agent.name), result)
         self.end = "truncated" if result[3] else "terminated"
 
-    def look(self) -> None:
+    def take_fingerprint(self) -> None:
         """Record the fingerprint of the simulation."""
         with outside_simulation():  # decision functions run their rule here
             state = getattr(self.simulation, "state", None)
@@ -207,16 +207,16 @@ class Run:
 
     def stop(self) -> NoReturn:
         """Stop the run at the limit of decisions, as often as the model swallows the exit."""
-        if not self.cut:
-            self.cut = True
-            self.look()
+        if not self.is_cut:
+            self.is_cut = True
+            self.take_fingerprint()
         raise LimitReached
 
     def fail(self, error: BaseException, seconds: float = math.inf) -> None:
         """Record an exception of a run with a time limit; ignore it at the limit of decisions."""
-        if not self.cut:
+        if not self.is_cut:
             self.error = error
-            self.stuck = time.monotonic() - self._step_began > seconds / 2
+            self.is_stuck = time.monotonic() - self._step_began > seconds / 2
 
     def difference(self, other: Run) -> str:
         """Describe the first differences from the steps of another run; empty if there are none."""
@@ -240,7 +240,7 @@ class Subject:
         seeds: The seeds of plain runs.
         episode_seeds: The seeds of episodes of random actions.
         deadline: The end of the time limit for all checks, as ``time.monotonic()``.
-        plain: The plain runs by seed.
+        plain_runs: The plain runs by seed.
         draws: The global generators that the simulation uses, by name.
         unstable: Parts of the fingerprint that are not compared.
         views: The views that the plan allows. Empty if plain runs fail or decide nothing.
@@ -253,13 +253,13 @@ class Subject:
     seeds: list[int] = field(default_factory=list)
     episode_seeds: Iterable[int] = ()
     deadline: float = math.inf
-    plain: dict[int, Run] = field(default_factory=dict)
+    plain_runs: dict[int, Run] = field(default_factory=dict)
     draws: set[str] = field(default_factory=set)
     unstable: set[str] = field(default_factory=set)
     views: list[str] = field(default_factory=list)
 
     @property
-    def late(self) -> bool:
+    def is_late(self) -> bool:
         """Whether the time is up."""
         return time.monotonic() >= self.deadline
 
@@ -267,7 +267,7 @@ class Subject:
         """Return the differences between the simulations after two runs."""
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
-    def play(self, function: Callable[[], object], seed: int = 0, run: Run | None = None) -> Run:
+    def record(self, function: Callable[[], object], seed: int = 0, run: Run | None = None) -> Run:
         """Call a function within the time limit, and record its error and draws.
 
         The global generators are seeded first.
@@ -276,7 +276,7 @@ class Subject:
         seed_global_generators(seed)
         states = global_states()
         try:
-            within(self.seconds, function)
+            call_within(self.seconds, function)
         except (Exception, SystemExit, LimitReached) as error:
             run.fail(error, self.seconds)
         for name, state in global_states().items():
@@ -305,7 +305,7 @@ class Subject:
             finally:
                 installation.uninstall()
 
-        return self._record(run, start, seed if global_seed is None else global_seed)
+        return self._record_rules(run, start, seed if global_seed is None else global_seed)
 
     def run_rules(self, env: Any, seed: int) -> Run:
         """Run an environment of any view with ``RULE`` throughout, and record the rules."""
@@ -319,17 +319,17 @@ class Subject:
             else:
                 while not any(env.step(RULE)[2:4]):
                     pass
-            run.look()
+            run.take_fingerprint()
 
-        return self._record(run, start, seed)
+        return self._record_rules(run, start, seed)
 
-    def _record(self, run: Run, start: Callable[[], None], seed: int) -> Run:
+    def _record_rules(self, run: Run, start: Callable[[], None], seed: int) -> Run:
         """Play a run, and record the decisions of the rules."""
         hooks = {point.hook for point in self.plan.points}
         for hook in hooks:
             hook.replace_rule(self._recording_rule(hook, run))
         try:
-            return self.play(start, seed, run)
+            return self.record(start, seed, run)
         finally:
             for hook in hooks:
                 hook.replace_rule()
@@ -381,7 +381,7 @@ class Subject:
             for _ in islice(_random_steps(run, env, seed, salt), most):
                 next(other, None)
 
-        return self.play(start, seed, run)
+        return self.record(start, seed, run)
 
     def sources_of_chance(self) -> str:
         """Return where a plain run uses clocks, entropy and the global generators; or nothing."""

@@ -24,9 +24,27 @@ from ..core.points import Points
 from ..core.rng import is_seed
 from ..errors import OptionValueError, SimEnvError, short_repr
 from ..simulation import Model
-from .checks import CHECKS, Report, fitting_views, make_environment
-from .report import SEVERITIES, CheckReport, Finding, Inspection, PointStatistics, Range, order_of
-from .runs import Run, Subject, describe_with_place, silence
+from .checks import (
+    CHECKS,
+    Report,
+    fitting_views,
+    make_environment,
+)
+from .report import (
+    SEVERITIES,
+    CheckReport,
+    Finding,
+    Inspection,
+    PointStatistics,
+    Range,
+    order_of,
+)
+from .runs import (
+    Run,
+    Subject,
+    describe_with_place,
+    silence,
+)
 
 __all__ = [
     "CheckReport",

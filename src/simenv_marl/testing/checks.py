@@ -14,17 +14,43 @@ from typing import Any, Final
 
 import numpy as np
 from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from pettingzoo.test import (
+    api_test,
+    parallel_api_test,
+    parallel_seed_test,
+    seed_test,
+)
 
 from ..core.actions import MASK
 from ..core.plan import Plan
 from ..core.point import Point
 from ..core.rng import Streams, generators_of
 from ..envs import VIEWS, SimulationAECEnv, view_class
-from ..errors import AgentError, InvalidActionError, error_text, short_repr
-from ..simulation import RULE, Model, Observation, make_simulation, takes
-from .fingerprint import ABSENT, STATE, describe_differences, generalize
-from .report import FINDINGS, Finding, PointStatistics, Range
+from ..errors import (
+    AgentError,
+    InvalidActionError,
+    error_text,
+    short_repr,
+)
+from ..simulation import (
+    RULE,
+    Model,
+    Observation,
+    make_simulation,
+    takes,
+)
+from .fingerprint import (
+    ABSENT,
+    STATE,
+    describe_differences,
+    generalize,
+)
+from .report import (
+    FINDINGS,
+    Finding,
+    PointStatistics,
+    Range,
+)
 from .runs import (
     LimitReached,
     Run,
@@ -70,14 +96,24 @@ class Report:
         self.episodes = {"terminated": 0, "truncated": 0, "cut": 0}
         self._errors: set[tuple[str, str]] = set()  # by class and place
 
-    def add(self, name: str, evidence: str = "", **words: str | int) -> None:
+    def add(
+        self,
+        name: str,
+        evidence: str = "",
+        **words: str | int,
+    ) -> None:
         """Add a finding of ``FINDINGS``; ``words`` replace the placeholders of its text."""
         severity, *texts = FINDINGS[name]
         title, explanation = (" ".join(text.format(**words).split()) for text in texts)
         self.findings.append(Finding(severity, title, explanation, evidence))
         self.names.add(name)
 
-    def add_error(self, run: Run, where: str, view: str = "aec") -> bool:
+    def add_error(
+        self,
+        run: Run,
+        where: str,
+        view: str = "aec",
+    ) -> bool:
         """Add the error of a run, once for each place; return whether the run has an error."""
         error = run.error
         if isinstance(error, LimitReached):
@@ -93,7 +129,12 @@ class Report:
         return error is not None
 
     @contextmanager
-    def environment(self, subject: Subject, view: str = "aec", **options: Any) -> Iterator[Any]:
+    def environment(
+        self,
+        subject: Subject,
+        view: str = "aec",
+        **options: Any,
+    ) -> Iterator[Any]:
         """Make an environment, and close it at the end."""
         env = make_environment(subject.plan, view, **options)
         try:
@@ -243,7 +284,13 @@ class PointRecord:
         self.observations: defaultdict[str, Tally] = defaultdict(Tally)
         self.outside = ""  # the first observation outside of its space
 
-    def add(self, agent: str, step: Step, *, with_reward: bool) -> None:
+    def add(
+        self,
+        agent: str,
+        step: Step,
+        *,
+        with_reward: bool,
+    ) -> None:
         """Add a result of ``last()``; the reward counts only if the agent has acted before."""
         observation, reward, terminated, truncated, info = step
         self.observe("observation", observation)
@@ -342,7 +389,12 @@ def check_generators(report: Report, run: Run, simulation: Model) -> None:
         report.add("few_generators", evidence)
 
 
-def compare_episodes(subject: Subject, report: Report, used: SimulationAECEnv, first: Run) -> None:
+def compare_episodes(
+    subject: Subject,
+    report: Report,
+    used: SimulationAECEnv,
+    first: Run,
+) -> None:
     """Repeat an episode in a new environment, in a used one, and beside another one."""
     seed = subject.seeds[0]
     with report.environment(subject, max_steps=subject.max_steps) as new:

@@ -13,7 +13,12 @@ from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from enum import Enum
 from functools import cached_property
-from types import BuiltinFunctionType, EllipsisType, FunctionType, ModuleType
+from types import (
+    BuiltinFunctionType,
+    EllipsisType,
+    FunctionType,
+    ModuleType,
+)
 from typing import Any, Final, NamedTuple
 
 import numpy as np

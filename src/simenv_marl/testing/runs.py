@@ -16,7 +16,12 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import (
+    Callable,
+    Generator,
+    Iterable,
+    Iterator,
+)
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from datetime import date, datetime
@@ -39,8 +44,22 @@ from ..errors import describe_error, error_notes
 from ..hooks.handlers import Installation
 from ..hooks.hook import Hook
 from ..hooks.stacks import outside_simulation, stack_of
-from ..simulation import RULE, TRUNCATED, Action, Model, Observation, make_simulation, resetter
-from .fingerprint import Difference, Fingerprint, describe_differences, differences, fingerprint
+from ..simulation import (
+    RULE,
+    TRUNCATED,
+    Action,
+    Model,
+    Observation,
+    make_simulation,
+    resetter,
+)
+from .fingerprint import (
+    Difference,
+    Fingerprint,
+    describe_differences,
+    differences,
+    fingerprint,
+)
 
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 """The result of ``last()``: observation, reward, terminated, truncated, info."""
@@ -267,7 +286,12 @@ class Subject:
         """Return the differences between the simulations after two runs."""
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
-    def record(self, function: Callable[[], object], seed: int = 0, run: Run | None = None) -> Run:
+    def record(
+        self,
+        function: Callable[[], object],
+        seed: int = 0,
+        run: Run | None = None,
+    ) -> Run:
         """Call a function within the time limit, and record its error and draws.
 
         The global generators are seeded first.
@@ -323,7 +347,12 @@ class Subject:
 
         return self._record_rules(run, start, seed)
 
-    def _record_rules(self, run: Run, start: Callable[[], None], seed: int) -> Run:
+    def _record_rules(
+        self,
+        run: Run,
+        start: Callable[[], None],
+        seed: int,
+    ) -> Run:
         """Play a run, and record the decisions of the rules."""
         hooks = {point.hook for point in self.plan.points}
         for hook in hooks:
@@ -408,7 +437,12 @@ class Subject:
         return f"\nin the model, {'; '.join(texts[:3])}" if texts else ""
 
 
-def _random_steps(run: Run, env: SimulationAECEnv, seed: int, salt: int) -> Iterator[None]:
+def _random_steps(
+    run: Run,
+    env: SimulationAECEnv,
+    seed: int,
+    salt: int,
+) -> Iterator[None]:
     """Play an episode, record it, and yield before each step."""
     env.reset(seed=seed)
     for name in env.agent_iter():

@@ -74,7 +74,8 @@ def fitting_views(plan: Plan) -> list[str]:
     """Return the views that a plan allows."""
     views = []
     for view in VIEWS:
-        with suppress(Exception):  # of the plan, or of the model if the view resets it
+        # The view may refuse the plan, or reset the model, which may raise anything.
+        with suppress(Exception):
             make_environment(plan, view).close()
             views.append(view)
     return views
@@ -84,7 +85,7 @@ class Report:
     """A report while it is written.
 
     Attributes:
-        findings, checked, statistics, episodes: As of the ``CheckReport``.
+        findings, checked, statistics, episodes: As in ``CheckReport``, but mutable.
         names: The names of the findings.
     """
 
@@ -174,7 +175,7 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
 
 
 def check_repetition(subject: Subject, report: Report) -> None:
-    """Run a seed again: differences then are not due to environments."""
+    """Repeat a plain run: if it differs, differences of environments mean nothing."""
     seed = subject.seeds[0]
     first = subject.plain_runs[seed]
     again = subject.run_plainly(seed)
@@ -291,7 +292,7 @@ class PointRecord:
         *,
         with_reward: bool,
     ) -> None:
-        """Add a result of ``last()``; the reward counts only if the agent has acted before."""
+        """Add a result of ``last()``, with its reward if the agent has acted in the episode."""
         observation, reward, terminated, truncated, info = step
         self.observe("observation", observation)
         space = self.point.definition.observation_space
@@ -363,7 +364,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
                 if isinstance(run.error, LimitReached):
                     break
                 continue
-            if first is None:
+            if number == 1:
                 first = run
                 check_generators(report, run, env.simulation)
             report.episodes[run.end if len(run.actions) < most else "cut"] += 1
@@ -380,7 +381,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
 
 
 def check_generators(report: Report, run: Run, simulation: Model) -> None:
-    """Report fewer generators than entities that decide, unless there is none."""
+    """Report that entities share generators, unless the model has no generator."""
     names = list({agent.name: None for agent, _ in run.results if agent.point.agent is None})
     generators = generators_of(simulation)
     number = sum(len(each) if isinstance(each, Streams) else 1 for each in generators)

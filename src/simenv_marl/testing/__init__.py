@@ -14,7 +14,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from itertools import chain
+from itertools import chain, count, islice
 from typing import Unpack
 
 from ..core.options import CheckOptions
@@ -109,8 +109,7 @@ def check_simulation(
             f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
         )
     plain_seeds = list(map(int, unique_seeds))
-    next_seed = max(plain_seeds) + 1
-    more_seeds = range(next_seed, next_seed + episodes - len(plain_seeds))
+    all_seeds = chain(plain_seeds, count(max(plain_seeds) + 1))
     report = Report()
     calls = ""
     with silence() as warnings:
@@ -123,7 +122,7 @@ def check_simulation(
                 seconds=time_limit / 4,
                 state_of=fingerprint,
                 seeds=plain_seeds,
-                episode_seeds=chain(plain_seeds[:episodes], more_seeds),
+                episode_seeds=islice(all_seeds, episodes),
                 deadline=time.monotonic() + time_limit,
             )
             for check in CHECKS:

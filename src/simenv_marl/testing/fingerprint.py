@@ -35,8 +35,17 @@ ABSENT: Final = Sentinel("nothing")
 STATE: Final = "state of the generator"
 
 _ATOMS: Final = (
-    *(int, float, complex, str, bytes, bool, range),
-    *(type(None), EllipsisType, Enum, np.generic),
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    bool,
+    range,
+    type(None),
+    EllipsisType,
+    Enum,
+    np.generic,
 )
 _NAMED: Final = (type, FunctionType, BuiltinFunctionType, ModuleType)
 _GENERATORS: Final = (random.Random, np.random.Generator, np.random.RandomState)

@@ -463,8 +463,12 @@ def _random_steps(
 _PACKAGE: Final = __file__.rpartition("testing")[0]
 _LIBRARY: Final = random.__file__.rpartition("random.py")[0]
 _CLOCKS: Final = (
-    *(time.time, time.time_ns, time.monotonic, time.perf_counter),
-    *(datetime.now, date.today),
+    time.time,
+    time.time_ns,
+    time.monotonic,
+    time.perf_counter,
+    datetime.now,
+    date.today,
 )
 _CHANCE: Final[dict[object, str]] = {
     **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},

@@ -142,7 +142,7 @@ def train(candidates: int, meadows: int) -> Any:
 if __name__ == "__main__":
     quick = "--quick" in sys.argv  # to try whether everything runs
     policy = train(5, 1) if quick else train(20, 2)
-    policies: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: policy}}
+    policies = {"rule": {}, "trained": {Rabbit.choose_cell: policy}}
     seeds = range(100_000, 100_005 if quick else 100_030)  # other meadows than in training
     evaluation = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
     print("What all rabbits have eaten; differences are paired by seed, with 95 % intervals:")

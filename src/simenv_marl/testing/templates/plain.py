@@ -136,7 +136,7 @@ def train(steps: int) -> Any:
 
 if __name__ == "__main__":
     quick = "--quick" in sys.argv  # to try whether everything runs
-    policies: dict[str, Any] = {
+    policies = {
         "rule": {},
         "trained": {"battery_0": train(1500 if quick else 100_000)},
     }

@@ -139,7 +139,7 @@ def train(candidates: int, days: int) -> Any:
 if __name__ == "__main__":
     quick = "--quick" in sys.argv  # to try whether everything runs
     policy = train(5, 2) if quick else train(40, 20)
-    policies: dict[str, Any] = {"rule": {}, "trained": {"dispatcher_0": policy}}
+    policies = {"rule": {}, "trained": {"dispatcher_0": policy}}
     seeds = range(100_000, 100_010 if quick else 100_050)  # other days than in training
     evaluation = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
     print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")

@@ -48,10 +48,16 @@ from .plans.policies import (
 )
 from .plans.provenance import as_json, describe, provenance
 from .switching.awaiting import Answer, Answers
-from .switching.context import GlobalRandom, environment_context
+from .switching.context import GlobalRandom, environment_context, preserve_generators
 from .switching.driver import WAIT, Driver
 from .switching.exits import LoopExit
-from .switching.generators import Streams, generators_of, is_seed, reseed_generators
+from .switching.generators import (
+    Streams,
+    generators_of,
+    global_states,
+    is_seed,
+    reseed_generators,
+)
 from .switching.resources import acquire, release, reuse_resources
 from .values.actions import ILLEGAL, MASK, action_check
 from .values.spaces import blank, duplicate, observation_cast, same
@@ -78,6 +84,7 @@ __all__ = [
     "duplicate", "explain_arguments", "joined", "observation_cast", "rows", "same", "source_name",
     "stack_masks", "stacker", "taken",
     # Chance, and the user's side.
-    "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "is_seed",
+    "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of",
+    "global_states", "is_seed", "preserve_generators",
     "reseed_generators",
 ]  # fmt: skip

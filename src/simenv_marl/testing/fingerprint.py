@@ -1,8 +1,8 @@
-"""Fingerprints: everything that a simulation holds after a run, to compare two runs.
+"""Fingerprints: the contents of a simulation after a run, to compare two runs.
 
-Models need not be comparable. Therefore their attributes are followed down to numbers, strings,
-arrays and the states of random generators. Each of these *parts* has a path, which a difference
-reports. What cannot be followed (open files, generators, locks) is compared by its class.
+Models need not be comparable. Therefore a fingerprint follows their attributes down to numbers,
+strings, arrays and the states of random generators. Each of these *parts* has a path, which
+reports show. Objects that cannot be followed (open files, generators, locks) are compared by class.
 """
 
 from __future__ import annotations
@@ -10,19 +10,28 @@ from __future__ import annotations
 import random
 import re
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from enum import Enum
 from functools import cached_property
-from types import BuiltinFunctionType, FunctionType, ModuleType
-from typing import Any, Final
+from types import (
+    BuiltinFunctionType,
+    EllipsisType,
+    FunctionType,
+    ModuleType,
+)
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from ..errors import name_of, short_repr
-from ..simulation import Sentinel
+from ..simulation import Model, Sentinel
 
-MOST_PARTS: Final = 50_000  # larger models are compared by the parts that both fingerprints have
-ABSENT: Final = Sentinel("nothing")  # in differences, the value of a part that does not exist
+MOST_PARTS: Final = 50_000
+"""The limit of parts. Larger models are compared by the parts that both fingerprints have."""
+
+ABSENT: Final = Sentinel("nothing")
+"""In a difference, the value of a part that one of the fingerprints does not have."""
+
 STATE: Final = "state of the generator"
 
 _ATOMS: Final = (
@@ -32,30 +41,36 @@ _ATOMS: Final = (
     str,
     bytes,
     bool,
-    type(None),
     range,
-    type(Ellipsis),
+    type(None),
+    EllipsisType,
     Enum,
     np.generic,
 )
 _NAMED: Final = (type, FunctionType, BuiltinFunctionType, ModuleType)
+_GENERATORS: Final = (random.Random, np.random.Generator, np.random.RandomState)
 
 Fingerprint = dict[str, Any]
 """The parts of an object, by path."""
 
-Difference = tuple[str, Any, Any]
-"""A path, the value here and the value there, of which one may be ``ABSENT``."""
+
+class Difference(NamedTuple):
+    """A difference of two fingerprints: the path and values of a part, or ``ABSENT``."""
+
+    path: str
+    first: Model
+    second: Model
 
 
-def fingerprint(name: str, root: Any, *, follow: bool = True) -> Fingerprint:
+def fingerprint(name: str, root: Model, *, follow: bool = True) -> Fingerprint:
     """Return the fingerprint of any object; all paths begin with its name.
 
     Without ``follow``, only lists, tuples and dicts are followed.
     """
     parts: Fingerprint = {}
-    # paths of objects, which are referred to so that no id is used again
-    found: dict[int, tuple[str, Any]] = {}
-    # breadth first, so that a long history in the model does not hide the rest
+    # Also keeps the objects alive, because a new object could reuse the id of a dead one.
+    paths_by_id: dict[int, tuple[str, Model]] = {}
+    # Breadth first, because a long history in the model would hide everything else.
     queue = deque([(name, root)])
     while queue and len(parts) < MOST_PARTS:
         path, value = queue.popleft()
@@ -65,106 +80,94 @@ def fingerprint(name: str, root: Any, *, follow: bool = True) -> Fingerprint:
             parts[path] = value.copy()
         elif isinstance(value, _NAMED):
             parts[path] = name_of(value)
-        elif isinstance(value, (random.Random, np.random.Generator, np.random.RandomState)):
+        elif isinstance(value, _GENERATORS):
             parts[f"{path} ({STATE})"] = _state_of(value)
-        elif id(value) in found:
-            parts[path] = f"the same object as {found[id(value)][0]}"
+        elif id(value) in paths_by_id:
+            parts[path] = f"the same object as {paths_by_id[id(value)][0]}"
         else:
             parts[path] = name_of(type(value))
             if not follow and not isinstance(value, (list, tuple, dict)):
                 continue
-            # equal ones may or may not be the same object
+            # Python may share equal immutable objects between places, or not.
             if not isinstance(value, (tuple, frozenset)):
-                found[id(value)] = path, value
+                paths_by_id[id(value)] = path, value
             try:
                 queue += [(path + end, part) for end, part in _members(value)]
-            except Exception:  # an open file, a lock, a generator, for whatever reason
+            except Exception:  # open files, locks and generators raise many types
                 continue
     return parts
 
 
-def _state_of(generator: Any) -> str:
+def _state_of(generator: Model) -> str:
     """Return the state of a random generator as a text."""
+    if isinstance(generator, random.Random):
+        return str(generator.getstate())
     if isinstance(generator, np.random.Generator):
         return str(generator.bit_generator.state)
-    return str(
-        generator.getstate()
-        if isinstance(generator, random.Random)
-        else generator.get_state(legacy=False)
-    )
+    return str(generator.get_state(legacy=False))
 
 
-def _members(value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield what a value holds, by the end of its path. Raises an exception if that is unknown."""
+def _members(value: Model) -> Iterator[tuple[str, Model]]:
+    """Yield the attributes and items of an object, each with the last part of its path.
+
+    Raises:
+        Exception: The object does not show its contents.
+    """
     attributes = object.__getstate__(value)
     for state in attributes if isinstance(attributes, tuple) else (attributes,):
         for name, part in (state or {}).items():
-            # computed when it is first read
+            # A cached property appears when it is first read, which does not change the model.
             if not isinstance(getattr(type(value), str(name), None), cached_property):
                 yield f".{name}", part
-    if isinstance(value, (set, frozenset)):  # it has no order: of other objects, only the classes
-        yield (
-            " (members)",
-            sorted(
-                repr(item) if isinstance(item, _ATOMS) else name_of(type(item)) for item in value
-            ),
-        )
+    if isinstance(value, (set, frozenset)):
+        # A set has no order, so other objects than atoms cannot be matched.
+        texts = [repr(item) if isinstance(item, _ATOMS) else name_of(type(item)) for item in value]
+        yield " (members)", sorted(texts)
     elif isinstance(value, (list, tuple, deque, np.ndarray)):
-        items = value.ravel() if isinstance(value, np.ndarray) else value
-        yield from ((f"[{number}]", item) for number, item in enumerate(items))
+        for number, item in enumerate(value.flat if isinstance(value, np.ndarray) else value):
+            yield f"[{number}]", item
     elif isinstance(value, Mapping):
         for number, (key, item) in enumerate(list(value.items())):
-            simple = all(
-                isinstance(part, _ATOMS) for part in (key if isinstance(key, tuple) else (key,))
-            )
-            yield f"[{key!r}]" if simple else f"[key {number}]", item
-            if not simple:
+            if all(isinstance(part, _ATOMS) for part in (key if isinstance(key, tuple) else [key])):
+                yield f"[{key!r}]", item
+            else:
+                yield f"[key {number}]", item
                 yield f" (key {number})", key
-    # an iterator or a counter, for example
     elif attributes is None and not hasattr(value, "__dict__"):
-        reduced = value.__reduce_ex__(4)
-        yield (
-            " (itself)",
-            [list(part) if isinstance(part, Iterator) else part for part in reduced[1:]],
-        )
+        # An iterator or a counter, for example: its pickle holds its position.
+        state = value.__reduce_ex__(4)[1:]
+        yield " (itself)", [list(part) if isinstance(part, Iterator) else part for part in state]
 
 
 def differences(
-    one: Fingerprint, other: Fingerprint, ignored: frozenset[str] = frozenset()
+    one: Fingerprint, other: Fingerprint, ignored: Collection[str] = ()
 ) -> list[Difference]:
-    """Return the differences in all parts but those whose paths, as ``general`` writes them, are ignored."""
-    cut = max(len(one), len(other)) >= MOST_PARTS
-    found = []
-    for path in dict.fromkeys([*one, *other]):
-        here, there = one.get(path, ABSENT), other.get(path, ABSENT)
-        comparable = not cut or (path in one and path in other)
-        if comparable and not _same(here, there) and general(path) not in ignored:
-            found.append((path, here, there))
-    return found
+    """Return the parts that differ, unless ``ignored`` has the general form of their path."""
+    paths = list(dict.fromkeys([*one, *other]))
+    if max(len(one), len(other)) >= MOST_PARTS:
+        paths = [path for path in one if path in other]
+    parts = [Difference(path, one.get(path, ABSENT), other.get(path, ABSENT)) for path in paths]
+    different = [part for part in parts if _key(part.first) != _key(part.second)]
+    return [part for part in different if generalize(part.path) not in ignored]
 
 
-def _same(one: Any, other: Any) -> bool:
-    """Return whether two parts are the same, bit for bit."""
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, (np.ndarray, np.generic)):
-        return bool(
-            one.dtype == other.dtype
-            and one.shape == other.shape
-            and one.tobytes() == other.tobytes()
-        )
-    return bool(one == other or (one != one and other != other))
+def _key(value: Model) -> tuple[Model, ...]:
+    """Return values that are equal for equal parts; arrays are compared bit for bit."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return type(value), value.dtype, value.shape, value.tobytes()
+    is_nan = value != value
+    return type(value), None if is_nan else value
 
 
-def general(path: str) -> str:
-    """Return a path that is the same for all members of a list or dict."""
+def generalize(path: str) -> str:
+    """Return the general form of a path, which is the same for all members of a list or dict."""
     return re.sub(r"\[[^\]]*\]", "[]", path)
 
 
 def describe_differences(parts: list[Difference]) -> str:
     """Describe the differences of two fingerprints."""
     texts = [
-        f"{path} is first {short_repr(one, 60)}, then {short_repr(other, 60)}"
-        for path, one, other in parts
+        f"{path} is first {short_repr(first, 60)}, then {short_repr(second, 60)}"
+        for path, first, second in parts[:3]
     ]
-    return "; ".join(texts[:3]) + (f"; {len(texts) - 3} more" if len(texts) > 3 else "")
+    return "; ".join(texts + [f"{len(parts) - 3} more"] * (len(parts) > 3))

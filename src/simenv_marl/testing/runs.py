@@ -1,8 +1,7 @@
-"""Recorded runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
+"""Runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
 
-Every run has an end, whatever the model does. At its limit of decisions, an exit is raised at the
-next decision. When its time is up, an exit is raised in whatever Python code the model is
-executing.
+Every run has an end. At the limit of decisions, the next decision raises an exit. At the time
+limit, the Python code that is running raises one.
 """
 
 from __future__ import annotations
@@ -16,43 +15,75 @@ import sys
 import threading
 import time
 import traceback
-import types
 import warnings
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import (
+    Callable,
+    Generator,
+    Iterable,
+    Iterator,
+)
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from datetime import date, datetime
 from itertools import islice
-from pickle import dumps
 from textwrap import shorten
-from typing import Any, Final
+from types import FrameType, coroutine
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from greenlet import getcurrent
 
-from ..core import MASK, GlobalRandom, LoopExit, Plan, environment_context
-from ..decision import DecisionPoint
+from ..core import (
+    MASK,
+    Agent,
+    GlobalRandom,
+    LoopExit,
+    Plan,
+    environment_context,
+    global_states,
+    preserve_generators,
+)
+from ..envs import SimulationAECEnv
 from ..errors import describe_error, error_notes
 from ..hooks.handlers import Installation
+from ..hooks.hook import Hook
 from ..hooks.stacks import outside_simulation, stack_of
-from ..simulation import RULE, make_simulation, resetter
-from .fingerprint import Difference, Fingerprint, describe_differences, differences, fingerprint
+from ..simulation import (
+    RULE,
+    TRUNCATED,
+    Action,
+    Model,
+    Observation,
+    make_simulation,
+    resetter,
+)
+from .fingerprint import (
+    Difference,
+    Fingerprint,
+    describe_differences,
+    differences,
+    fingerprint,
+)
+
+Step = tuple[Observation, float, bool, bool, dict[str, Any]]
+"""The result of ``last()``: observation, reward, terminated, truncated, info."""
 
 _WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appear in the episode")
-"""Texts in the warnings of environments that are findings."""
+"""Texts of the warnings that are findings."""
 
 
 class LimitReached(LoopExit):
-    """Raised in a run that has reached its limit of decisions or of time."""
+    """Ends a run that has reached its limit of decisions or of time."""
 
 
-def within(seconds: float, function: Callable[[], Any]) -> None:
-    """Call a function, and raise ``LimitReached`` in it when the time is up.
+def call_within(seconds: float, function: Callable[[], object]) -> None:
+    """Call a function, and raise ``LimitReached`` in it after a time.
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted
     when it returns.
     """
-    thread, over = threading.get_ident(), threading.Event()
+    thread = threading.get_ident()
+    over = threading.Event()
 
     def watch() -> None:
         pause = seconds
@@ -60,15 +91,15 @@ def within(seconds: float, function: Callable[[], Any]) -> None:
             ctypes.pythonapi.PyThreadState_SetAsyncExc(
                 ctypes.c_ulong(thread), ctypes.py_object(LimitReached)
             )
-            pause = 0.5  # raise it again in a model that swallows it
+            pause = 0.5  # then again, because the model may swallow it
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
     try:
         watcher.start()
         function()
     finally:
-        # It may still be raised until the watcher has ended, and is then delivered at once. (It is
-        # not revoked: in CPython that would leave the interpreter checking for it forever.)
+        # The watcher may still raise until it has ended, and Python delivers that soon after. (It
+        # is not revoked, because in CPython the interpreter would check for it forever.)
         while True:
             try:
                 over.set()
@@ -82,74 +113,133 @@ def within(seconds: float, function: Callable[[], Any]) -> None:
 
 # -- global generators ----------------------------------------------------------------------------
 
+_GENERATORS: Final = {"random": "Python's random", "numpy.random": "numpy.random"}
+"""The names of global generators in findings."""
+
 
 def seed_global_generators(seed: int) -> None:
-    """Seed Python's and NumPy's global generators, so that runs of a model that draws from them can be compared."""
+    """Seed Python's and NumPy's global generators, to compare runs that draw from them."""
     random.seed(seed)
     np.random.seed(seed % 2**32)
 
 
-def global_generators() -> dict[str, Any]:
-    """Return the states of both."""
-    return {"Python's random": random.getstate(), "numpy.random": np.random.get_state(legacy=False)}
-
-
 @contextmanager
-def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Ignore what a model prints and warns.
+def silence() -> Iterator[list[warnings.WarningMessage]]:
+    """Silence a model, and restore the global generators at the end.
 
-    Restore the global generators; yield warnings that are findings.
+    Yields:
+        The warnings that are findings, a list that grows.
     """
-    states, silenced = global_generators(), io.StringIO()
-    try:
-        with (
-            outside_simulation(),
-            warnings.catch_warnings(record=True) as caught,
-            redirect_stdout(silenced),
-            redirect_stderr(silenced),
-        ):
-            warnings.simplefilter("ignore")
-            for pattern in _WARNINGS:
-                warnings.filterwarnings("always", f".*{pattern}")
-            yield caught
-    finally:
-        random.setstate(states["Python's random"])
-        np.random.set_state(states["numpy.random"])
+    output = io.StringIO()
+    with (
+        outside_simulation(),
+        preserve_generators(),
+        warnings.catch_warnings(record=True) as records,
+        redirect_stdout(output),
+        redirect_stderr(output),
+    ):
+        warnings.simplefilter("ignore")
+        for pattern in _WARNINGS:
+            warnings.filterwarnings("always", f".*{pattern}")
+        yield records
 
 
 # -- runs -----------------------------------------------------------------------------------------
 
 
-@dataclass
 class Run:
-    """What is recorded of a run."""
+    """The record of a run.
 
-    # the names of the points that were called, or of the agents
-    calls: list[str] = field(default_factory=list)
-    steps: Fingerprint = field(default_factory=dict)  # the decisions, or the results of ``last()``
-    actions: list[Any] = field(default_factory=list)  # the random ones
-    simulation: Any = None
-    in_main_loop: bool = False  # whether a plain run is in the simulation's main loop
-    # of the simulation at its end, or when it was cut
-    fingerprint: Fingerprint = field(default_factory=dict)
-    cut: bool = False  # whether it has reached its limit of decisions
-    error: BaseException | None = None
-    # what run() returned in a plain run, or how an episode of random actions ended
-    result: Any = None
-    drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
-    latest: float = field(default_factory=time.monotonic)  # the time of the latest call
-    stuck: bool = False  # whether its time was up long after the latest call
+    Attributes:
+        simulation: The simulation; of a plain run, from its main loop on.
+        calls: The name of the decision point, or of the agent, of each step.
+        steps: The decisions of the rules, or the results of ``last()``, as a fingerprint.
+        results: The agents and results of ``last()`` in an episode of random actions.
+        actions: Those actions.
+        fingerprint: The fingerprint of the simulation at the end, or at the limit of decisions.
+        in_main_loop: Whether a plain run is in the main loop of the simulation.
+        is_cut: Whether the run has reached the limit of decisions.
+        end: "terminated" or "truncated".
+        error: The exception that ended the run.
+        is_stuck: Whether the last step began long before that exception.
+        draws: The global generators that the run has used, by name.
+    """
+
+    def __init__(
+        self, simulation: Model = None, state_of: Callable[[Model], Model] | None = None
+    ) -> None:
+        """Begin the record.
+
+        Args:
+            simulation: The simulation, if there is one already.
+            state_of: A function of the simulation whose results are compared. None: the ``state()``
+                of the simulation, or else all its attributes.
+        """
+        self.simulation = simulation
+        self._state_of = state_of
+        self.calls: list[str] = []
+        self.steps: Fingerprint = {}
+        self.results: list[tuple[Agent, Step]] = []
+        self.actions: list[Action] = []
+        self.fingerprint: Fingerprint = {}
+        self.in_main_loop = False
+        self.is_cut = False
+        self.end = "terminated"
+        self.error: BaseException | None = None
+        self.is_stuck = False
+        self.draws: set[str] = set()
+        self._step_began = time.monotonic()
+
+    def run_main_loop(self, simulation: Model) -> None:
+        """Run the main loop of a simulation, and record its end and its fingerprint."""
+        self.simulation = simulation
+        self.in_main_loop = True
+        self.end = "truncated" if simulation.run() is TRUNCATED else "terminated"
+        self.in_main_loop = False
+        self.take_fingerprint()
 
     def begin_step(self, name: str) -> str:
-        """Record that a point was called or an agent asked.
-
-        Return the name of this step in ``steps``.
-        """
+        """Record the call of a decision point or agent; return the name of its step."""
         self.calls.append(name)
-        self.latest = time.monotonic()
+        self._step_began = time.monotonic()
         step = f"in step {len(self.calls)}, {name}"
         self.steps[step] = "without a result"
         return step
+
+    def end_step(self, step: str, value: Model) -> Model:
+        """Record the result of a step, and return it."""
+        self.steps |= fingerprint(step, value, follow=False)
+        return value
+
+    def add_result(self, agent: Agent, result: Step) -> None:
+        """Record a step of an agent with its result of ``last()``."""
+        self.results.append((agent, result))
+        self.steps |= fingerprint(self.begin_step(agent.name), result)
+        self.end = "truncated" if result[3] else "terminated"
+
+    def take_fingerprint(self) -> None:
+        """Record the fingerprint of the simulation."""
+        with outside_simulation():  # decision functions run their rule here
+            state = getattr(self.simulation, "state", None)
+            if self._state_of is not None:
+                self.fingerprint = fingerprint("fingerprint", self._state_of(self.simulation))
+            elif callable(state):
+                self.fingerprint = fingerprint("state()", state())
+            else:
+                self.fingerprint = fingerprint("simulation", self.simulation)
+
+    def stop(self) -> NoReturn:
+        """Stop the run at the limit of decisions, as often as the model swallows the exit."""
+        if not self.is_cut:
+            self.is_cut = True
+            self.take_fingerprint()
+        raise LimitReached
+
+    def fail(self, error: BaseException, seconds: float = math.inf) -> None:
+        """Record an exception of a run with a time limit; ignore it at the limit of decisions."""
+        if not self.is_cut:
+            self.error = error
+            self.is_stuck = time.monotonic() - self._step_began > seconds / 2
 
     def difference(self, other: Run) -> str:
         """Describe the first differences from the steps of another run; empty if there are none."""
@@ -163,194 +253,183 @@ class Run:
 
 @dataclass(kw_only=True)
 class Subject:
-    """A simulation with its decision points and options, the limits of its runs, and what is known so far."""
+    """A simulation with its decision points, the limits of its runs, and the results so far.
+
+    Attributes:
+        plan: The simulation with its decision points and options.
+        max_steps: The limit of decisions in a run.
+        seconds: The time limit of a run.
+        state_of: As for ``Run``.
+        seeds: The seeds of plain runs.
+        episode_seeds: The seeds of episodes of random actions.
+        deadline: The end of the time limit for all checks, as ``time.monotonic()``.
+        plain_runs: The plain runs by seed.
+        draws: The global generators that the simulation uses, by name.
+        unstable: Parts of the fingerprint that are not compared.
+        views: The views that the plan allows. Empty if plain runs fail or decide nothing.
+    """
 
     plan: Plan
     max_steps: int
-    seconds: float  # the time limit of a single run
-    own: Callable[[Any], Any] | None = None  # the user's callable by which simulations are compared
-    seeds: tuple[int, ...] = ()
-    episodes: int = 0
-    end: float = math.inf  # of the time limit for all checks, as time.monotonic()
-    plain: dict[int, Run] = field(default_factory=dict)  # plain runs, by seed
-    repeats: bool = True  # whether the same seed gives the same plain run
-    drawn: set[str] = field(default_factory=set)  # the global generators that it draws from
-    unstable: frozenset[str] = frozenset()  # parts that are not compared
-    # that the plan allows; none if the plain runs fail or decide nothing
-    views: tuple[str, ...] = ()
+    seconds: float
+    state_of: Callable[[Model], Model] | None = None
+    seeds: list[int] = field(default_factory=list)
+    episode_seeds: Iterable[int] = ()
+    deadline: float = math.inf
+    plain_runs: dict[int, Run] = field(default_factory=dict)
+    draws: set[str] = field(default_factory=set)
+    unstable: set[str] = field(default_factory=set)
+    views: list[str] = field(default_factory=list)
 
     @property
-    def late(self) -> bool:
+    def is_late(self) -> bool:
         """Whether the time is up."""
-        return time.monotonic() >= self.end
-
-    def look(self, simulation: Any) -> Fingerprint:
-        """Return the fingerprint of a simulation: of the user's callable, of its ``state()``, or of its attributes."""
-        with outside_simulation():  # decision functions called there run their rule
-            if self.own is not None:
-                return fingerprint("fingerprint", self.own(simulation))
-            state = getattr(simulation, "state", None)
-            return (
-                fingerprint("state()", state())
-                if callable(state)
-                else fingerprint("simulation", simulation)
-            )
+        return time.monotonic() >= self.deadline
 
     def differences(self, run: Run, other: Run) -> list[Difference]:
-        """Return the parts in which the simulations differ after two runs."""
+        """Return the differences between the simulations after two runs."""
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
-    def play(self, function: Callable[[], Any], run: Run | None = None, *, seed: int = 0) -> Run:
-        """Seed the global generators, call a function within the time limit, and record its error and its draws."""
-        run = Run() if run is None else run
+    def record(
+        self,
+        function: Callable[[], object],
+        seed: int = 0,
+        run: Run | None = None,
+    ) -> Run:
+        """Call a function within the time limit, and record its error and draws.
+
+        The global generators are seeded first.
+        """
+        run = run or Run()
         seed_global_generators(seed)
-        states = global_generators()
+        states = global_states()
         try:
-            within(self.seconds, function)
+            call_within(self.seconds, function)
         except (Exception, SystemExit, LimitReached) as error:
-            run.error = None if run.cut else error
-            run.stuck = time.monotonic() - run.latest > self.seconds / 2
-        run.drawn = {
-            name
-            for name, state in global_generators().items()
-            if dumps(state) != dumps(states[name])
-        }
+            run.fail(error, self.seconds)
+        for name, state in global_states().items():
+            if state != states[name]:
+                run.draws.add(_GENERATORS[name])
         return run
 
-    def run_plainly(self, seed: int, *, shared_seed: int | None = None) -> Run:
+    def run_plainly(self, seed: int, global_seed: int | None = None) -> Run:
         """Run the simulation's own loop, with the plan's handlers and generators.
 
-        Record the results of its rules.
-
-        The global generators get the same seed, or a ``shared_seed``.
+        Records the decisions of the rules. The global generators get the same seed, or
+        ``global_seed``.
         """
-        run = Run()
+        run = Run(None, self.state_of)
 
         def start() -> None:
             rng = GlobalRandom() if self.plan.options.global_rng else None
             installation = Installation(self.plan.patches)
             try:
                 with environment_context(self.plan.plugins, rng):
-                    run.simulation = make_simulation(self.plan.subject.source)
+                    simulation = make_simulation(self.plan.subject.source)
                     if rng is not None:
                         rng.begin(seed)
-                    resetter(run.simulation)(seed, None)
-                    run.in_main_loop = True
-                    run.result = run.simulation.run()
-                    run.in_main_loop = False
-                    run.fingerprint = self.look(run.simulation)
+                    resetter(simulation)(seed, None)
+                    run.run_main_loop(simulation)
             finally:
                 installation.uninstall()
 
-        return self._record(run, start, seed if shared_seed is None else shared_seed)
+        return self._record_rules(run, start, seed if global_seed is None else global_seed)
 
     def run_rules(self, env: Any, seed: int) -> Run:
-        """Run an environment of any view with ``RULE`` throughout.
-
-        The results of rules are recorded.
-        """
-        run = Run(simulation=env.simulation)
+        """Run an environment of any view with ``RULE`` throughout, and record the rules."""
+        run = Run(env.simulation, self.state_of)
 
         def start() -> None:
             env.reset(seed=seed)
-            if not hasattr(env, "agents"):
+            if hasattr(env, "agents"):
+                while env.agents:
+                    env.step(RULE)
+            else:
                 while not any(env.step(RULE)[2:4]):
                     pass
-            while getattr(env, "agents", ()):
-                over = (
-                    hasattr(env, "agent_selection")
-                    and (env.terminations | env.truncations)[env.agent_selection]
-                )
-                env.step(None if over else RULE)
-            run.fingerprint = self.look(run.simulation)
+            run.take_fingerprint()
 
-        return self._record(run, start, seed)
+        return self._record_rules(run, start, seed)
 
-    def _record(self, run: Run, start: Callable[[], None], seed: int) -> Run:
-        """Play a run in which the decisions of the rules are recorded."""
-        points = list(dict.fromkeys(bound.hook for bound in self.plan.points))
-        for point in points:
-            point.replace_rule(self._recording_rule(run, point))
+    def _record_rules(
+        self,
+        run: Run,
+        start: Callable[[], None],
+        seed: int,
+    ) -> Run:
+        """Play a run, and record the decisions of the rules."""
+        hooks = {point.hook for point in self.plan.points}
+        for hook in hooks:
+            hook.replace_rule(self._recording_rule(hook, run))
         try:
-            return self.play(start, run, seed=seed)
+            return self.record(start, seed, run)
         finally:
-            for point in points:
-                point.replace_rule()
+            for hook in hooks:
+                hook.replace_rule()
 
-    def _recording_rule(self, run: Run, point: DecisionPoint) -> Callable[..., Any]:
-        """Return a rule that records each of its decisions, and cuts the run at the limit."""
-        name, rule = point.name, point.function
+    def _recording_rule(self, hook: Hook, run: Run) -> Callable[..., Model]:
+        """Return a rule that records its decisions, and stops the run at the limit."""
 
-        def decide(*args: Any, **kwargs: Any) -> Any:
+        def decide(*args: Model, **kwargs: Model) -> Model:
             stack = stack_of(getcurrent())
-            # In a reset or a mapping, rules do not count as decisions.
+            # Calls in a reset or a mapping are no decisions.
             if not (run.in_main_loop if stack is None else stack.events):
-                return rule(*args, **kwargs)
+                return hook.function(*args, **kwargs)
             if len(run.calls) >= self.max_steps:
-                if not run.cut:
-                    run.cut, run.fingerprint = True, self.look(run.simulation)
-                raise LimitReached
-            step = run.begin_step(name)
-            value = rule(*args, **kwargs)
-            return end(step, value) if point.kind == "function" else wait(step, value)
+                run.stop()
+            step = run.begin_step(hook.name)
+            value = hook.function(*args, **kwargs)
+            if hook.kind == "function":
+                return run.end_step(step, value)
+            return wait(step, value.__await__() if hook.kind == "coroutine" else value)
 
-        def end(step: str, value: Any) -> Any:
-            run.steps |= fingerprint(step, value, follow=False)
-            return value
-
-        @types.coroutine
-        def wait(step: str, running: Any) -> Generator[Any, Any, Any]:
-            awaited = running.__await__() if point.kind == "coroutine" else running
-            return end(step, (yield from awaited))
+        @coroutine
+        def wait(step: str, rule: Generator[Model, Model, Model]) -> Generator[Model, Model, Model]:
+            return run.end_step(step, (yield from rule))
 
         return decide
 
     def run_randomly(
         self,
-        env: Any,
+        env: SimulationAECEnv,
         seed: int,
         *,
         salt: int = 0,
         most: int | None = None,
-        beside: Any = None,
-        collect: Any = None,
+        beside: SimulationAECEnv | None = None,
     ) -> Run:
-        """Play an episode with random legal actions in an AEC environment.
+        """Play an episode with random legal actions.
 
-        A salt gives others with the same seed.
-
-        The episode is broken off after ``most`` steps. The environment ``beside`` is stepped in
-        turns with this one. ``collect`` is called with the environment, the agent and the result of
-        ``last()`` at each step.
+        Args:
+            env: The environment.
+            seed: The seed of the episode and its actions.
+            salt: Another salt gives other actions with the same seed.
+            most: The number of steps after which the episode is broken off.
+            beside: Another environment, which is stepped in turns with this one.
         """
         run = Run()
 
         def start() -> None:
             other = iter(()) if beside is None else _random_steps(Run(), beside, seed + 1, salt)
-            for agent, step in islice(_random_steps(run, env, seed, salt), most):
-                if collect is not None:
-                    collect(env, agent, step)
+            for _ in islice(_random_steps(run, env, seed, salt), most):
                 next(other, None)
 
-        return self.play(start, run, seed=seed)
+        return self.record(start, seed, run)
 
     def sources_of_chance(self) -> str:
-        """Run the simulation, and say where it uses clocks, entropy and Python's global generator, if it does."""
-        found: dict[str, None] = {}
+        """Return where a plain run uses clocks, entropy and the global generators; or nothing."""
+        places: list[str] = []
 
-        def profile(frame: Any, event: str, argument: Any) -> None:
-            source = _CHANCE.get(argument) if event == "c_call" else None
+        def profile(frame: FrameType, event: str, function: object) -> None:
+            source = _CHANCE.get(function) if event == "c_call" else None
             if frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
                 source = "a random.Random is made without a seed"
-            while (
-                source
-                and frame is not None
-                and frame.f_code.co_filename.startswith((_LIBRARY, "<"))
-            ):
-                frame = frame.f_back
-            if source and frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
-                code = frame.f_code
-                found[f"{source} at {code.co_filename}:{frame.f_lineno}, in {code.co_name}"] = None
+            caller: FrameType | None = frame if source else None
+            while caller is not None and caller.f_code.co_filename.startswith((_LIBRARY, "<")):
+                caller = caller.f_back
+            if caller is not None and not caller.f_code.co_filename.startswith(_PACKAGE):
+                file, name = caller.f_code.co_filename, caller.f_code.co_name
+                places.append(f"{source} at {file}:{caller.f_lineno}, in {name}")
 
         before = sys.getprofile()
         sys.setprofile(profile)
@@ -358,21 +437,28 @@ class Subject:
             self.run_plainly(self.seeds[0])
         finally:
             sys.setprofile(before)
-        return f"\nin the model, {'; '.join(list(found)[:3])}" if found else ""
+        texts = list(dict.fromkeys(places))
+        return f"\nin the model, {'; '.join(texts[:3])}" if texts else ""
 
 
-def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[str, Any]]:
-    """Play one step at a time, record it, and yield the agent and the result of ``last()``."""
+def _random_steps(
+    run: Run,
+    env: SimulationAECEnv,
+    seed: int,
+    salt: int,
+) -> Iterator[None]:
+    """Play an episode, record it, and yield before each step."""
     env.reset(seed=seed)
-    for agent in env.agent_iter():
-        step, action = env.last(), None
-        run.steps |= fingerprint(run.begin_step(agent), step)
-        run.result = "truncated" if step[3] else "terminated"
-        if not (step[2] or step[3]):
-            for _ in range(1 + salt):  # the space is seeded by the reset
-                action = env.action_space(agent).sample(step[4].get(MASK))
+    for name in env.agent_iter():
+        step = env.last()
+        _, _, terminated, truncated, info = step
+        run.add_result(env.episode.agents.get(name) or env.episode.ended[name], step)
+        action = None
+        if not (terminated or truncated):
+            for _ in range(1 + salt):  # the reset has seeded the space
+                action = env.action_space(name).sample(info.get(MASK))
             run.actions.append(action)
-        yield agent, step
+        yield
         env.step(action)
 
 
@@ -388,7 +474,7 @@ _CLOCKS: Final = (
     datetime.now,
     date.today,
 )
-_CHANCE: Final[dict[Any, str]] = {
+_CHANCE: Final[dict[object, str]] = {
     **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},
     **dict.fromkeys((random.random, random.getrandbits), "Python's global generator is used"),
     os.urandom: "the operating system is asked for random bits (as by a generator without a seed)",
@@ -397,10 +483,7 @@ _CHANCE: Final[dict[Any, str]] = {
 
 
 def place_of(error: BaseException) -> str:
-    """Return where an error was raised, outside of this library: file, line and function.
-
-    Empty if nowhere.
-    """
+    """Return the place in the user's code that raised an error; empty if there is none."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename:
             return f"{frame.filename}:{frame.lineno}, in {frame.name}"
@@ -408,7 +491,8 @@ def place_of(error: BaseException) -> str:
 
 
 def describe_with_place(error: BaseException) -> str:
-    """Describe an error: its class, the beginning of its text, where it was raised, and this library's notes."""
-    text, place = shorten(describe_error(error), 400, placeholder=" ..."), place_of(error)
+    """Describe an error by its class, the beginning of its text, its place, and our notes."""
+    text = shorten(describe_error(error), 400, placeholder=" ...")
+    place = place_of(error)
     notes = "".join(f"\n{note.removeprefix('simenv_marl: ')}" for note in error_notes(error)[:2])
-    return text + (f" ({place})" if place else "") + notes
+    return f"{text} ({place}){notes}" if place else text + notes

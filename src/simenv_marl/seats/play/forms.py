@@ -3,7 +3,7 @@
 import struct
 import zlib
 from base64 import b64encode
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
 from math import isfinite
@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
 from numpy.typing import NDArray
 
-from ...core import Decision, Labels
+from ...core import Decision, Labels, Mask
 from ...envs import SimulationAECEnv
 from ...errors import describe_error, short_repr
 from ...simulation import RULE, Action, Observation
@@ -111,7 +111,7 @@ def describe_space(space: Space[Any]) -> Message:
 
 def candidates_of(
     space: Space[Any],
-    mask: Sequence[int] | None,
+    mask: Mask | None,
 ) -> list[Action]:
     """Return actions to try out, as JSON.
 

@@ -1,4 +1,4 @@
-"""MyModel: rabbits in Mesa that are born and starve, and one policy, shared by all of them. Replace the model by yours.
+"""MyModel: rabbits in Mesa are born, starve, and share a policy. Replace the model with yours.
 
 ``python -m simenv_marl.testing.templates.mesa`` trains the policy and compares it with the model's
 own rule.
@@ -10,7 +10,7 @@ from typing import Any
 import mesa
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-from mesa.discrete_space import CellAgent, OrthogonalVonNeumannGrid
+from mesa.discrete_space import Cell, CellAgent, OrthogonalVonNeumannGrid
 
 from simenv_marl import (
     SteppedSimulation,
@@ -21,33 +21,35 @@ from simenv_marl import (
     make_step,
     reseed_generators,
 )
+from simenv_marl.envs import SimulationAECEnv
 
-# -- 1. The model: Mesa's agents, and a rule of their own -----------------------------------------
+# -- 1. The model: Mesa's agents, and their own rule ----------------------------------------------
 
 
 class Rabbit(CellAgent):
-    """Goes, eats, has young, and starves."""
+    """Moves, eats, has young, and starves."""
 
-    def __init__(self, model: Any, cell: Any, energy: float) -> None:
+    def __init__(self, model: "MyModel", cell: Cell, energy: float) -> None:
         super().__init__(model)
-        self.cell, self.energy, self.eaten = cell, energy, 0.0
-        # its own, which no other rabbit changes
+        self.cell = cell
+        self.energy = energy
+        self.eaten = 0.0
+        # Its own generator, so that other rabbits do not change its draws.
         self.chance = model.streams[f"rabbit_{self.unique_id}"]
 
-    def places(self) -> list[Any]:
-        """List the cells that it can be in next: its own, and the four beside it."""
+    def places(self) -> list[Cell]:
+        """Return the cells that it can reach: its own, and its four neighbours."""
         return [self.cell, *self.cell.connections.values()]
 
-    def anywhere(self) -> Any:
-        """Choose one of the places at random."""
-        return self.places()[self.chance.integers(len(self.places()))]
-
-    def choose_cell(self) -> Any:
+    def choose_cell(self) -> Cell:
         """The rule: stay while there is something to eat, then go anywhere."""
-        return self.cell if self.model.grass[self.cell.coordinate] > 0.5 else self.anywhere()
+        if self.model.grass[self.cell.coordinate] > 0.5:
+            return self.cell
+        places = self.places()
+        return places[self.chance.integers(len(places))]
 
     def step(self) -> None:
-        """Do what a rabbit does in a day."""
+        """Live for a day."""
         self.cell = self.choose_cell()
         bite = self.model.grass[self.cell.coordinate]
         self.model.grass[self.cell.coordinate] = 0.0
@@ -61,10 +63,10 @@ class Rabbit(CellAgent):
 
 
 class MyModel(mesa.Model):
-    """A meadow on which grass grows, and rabbits."""
+    """A meadow with growing grass and rabbits."""
 
     def __init__(self, rng: int | None = None) -> None:
-        super().__init__(rng=rng)  # the model's own generators: the same seed brings the same run
+        super().__init__(rng=rng)  # Mesa's generators, so that a seed repeats a run
         self.streams = Streams(rng)
         self.grid = OrthogonalVonNeumannGrid((12, 12), torus=True, random=self.random)
         self.grass = self.rng.random((12, 12))
@@ -78,36 +80,35 @@ class MyModel(mesa.Model):
         self.running = len(self.agents) > 0
 
 
-# -- 2. The decision: what each agent sees, what it can do, and what it is rewarded for -----------
+# -- 2. The decision: each agent's observation, actions and reward --------------------------------
 
 
 def observe(rabbit: Rabbit) -> list[list[float]]:
-    """See a row for each place that it can be in next: the grass, and the other rabbits there."""
-    places = rabbit.places()
-    others = [min(len(place.agents) - (place is rabbit.cell), 5) for place in places]
-    return [
-        [rabbit.model.grass[place.coordinate], number]
-        for place, number in zip(places, others, strict=True)
-    ]
+    """Return a row for each cell in reach: the grass, and the number of other rabbits there."""
+    rows = []
+    for place in rabbit.places():
+        others = len(place.agents) - (place is rabbit.cell)
+        rows.append([rabbit.model.grass[place.coordinate], min(others, 5)])
+    return rows
 
 
 move = make_step(
     observation_space=Box(0, 5, (5, 2), np.float32),
     observation_space_mapping=observe,  # gets the arguments of the decision call
     action_space=Discrete(5),
-    choices=lambda rabbit: rabbit.places(),  # the action is an index
+    choices=Rabbit.places,  # the action is an index
     reward_mapping=difference(lambda rabbit: rabbit.eaten),  # since its last decision
     agent=lambda rabbit: f"rabbit_{rabbit.unique_id}",  # from its birth ...
     removed_by="mesa.agent.Agent.remove",  # ... to its death
 )
 
-# -- 3. The simulation: what an episode is --------------------------------------------------------
+# -- 3. The simulation: an episode ----------------------------------------------------------------
 
 
 class MySimulation(SteppedSimulation):
     """Fifty days: each reset makes a model with its seed, and run steps it."""
 
-    points = {Rabbit.choose_cell: move}  # the model's classes stay as they are
+    points = {Rabbit.choose_cell: move}  # the classes of the model do not change
 
     def __init__(self) -> None:
         super().__init__(MyModel, 50)
@@ -117,45 +118,32 @@ class MySimulation(SteppedSimulation):
         reseed_generators(self, seed)
 
 
-# -- 4. The environment, training, and what it is worth -------------------------------------------
+# -- 4. The environment, the training, and its value ----------------------------------------------
 
 
-def env() -> Any:
-    """Make the environment: a ``pettingzoo.AECEnv``."""
+def env() -> SimulationAECEnv:
+    """Make the environment, a ``pettingzoo.AECEnv``."""
     return aec_env(MySimulation)
 
 
-def policy_of(weights: Any) -> Any:
-    """Make a policy that gives points to each place, and takes the place with the most.
-
-    For one rabbit or many.
-    """
-    return lambda seen: (seen @ np.asarray(weights)).argmax(-1)
+def score_places(weights: Any) -> Any:
+    """Make a policy for one observation or many: it takes the place with the highest score."""
+    return lambda rows: (rows @ weights).argmax(-1)
 
 
 def train(candidates: int, meadows: int) -> Any:
-    """Train one policy for all rabbits by random search: all candidates meet the same meadows, and the best wins."""
-    policies = [
-        policy_of(weights) for weights in np.random.default_rng(1).normal(size=(candidates, 2))
-    ]
-    contenders: dict[str, Any] = {
-        str(number): {Rabbit.choose_cell: policy} for number, policy in enumerate(policies)
-    }
-    found = evaluate(MySimulation, contenders, seeds=range(meadows), batched=True)
-    return policies[int(found.summary()["mean"].idxmax())]
+    """Train a policy for all rabbits by random search: candidates meet the same meadows."""
+    weights = np.random.default_rng(1).normal(size=(candidates, 2))
+    contenders = {str(n): {Rabbit.choose_cell: score_places(w)} for n, w in enumerate(weights)}
+    evaluation = evaluate(MySimulation, contenders, seeds=range(meadows), batched=True)
+    return contenders[evaluation.summary()["mean"].idxmax()][Rabbit.choose_cell]
 
 
 if __name__ == "__main__":
-    quick = "--quick" in sys.argv  # only to see that everything runs
-    policies: dict[str, Any] = {
-        "rule": {},
-        "trained": {Rabbit.choose_cell: train(*(5, 1) if quick else (20, 2))},
-    }
-    seeds = range(100_000, 100_005 if quick else 100_030)  # meadows that it was not trained on
+    quick = "--quick" in sys.argv  # to try whether everything runs
+    policy = train(5, 1) if quick else train(20, 2)
+    policies = {"rule": {}, "trained": {Rabbit.choose_cell: policy}}
+    seeds = range(100_000, 100_005 if quick else 100_030)  # other meadows than in training
+    evaluation = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
     print("What all rabbits have eaten; differences are paired by seed, with 95 % intervals:")
-    print(
-        evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
-        .summary()
-        .round(1)
-        .to_string()
-    )
+    print(evaluation.summary().round(1).to_string())

@@ -1,4 +1,4 @@
-"""MyModel: a home battery, and an agent that learns when to charge it. Replace the model by yours, section by section.
+"""MyModel: a home battery, and an agent that learns to charge it. Replace the model with yours.
 
 ``python -m simenv_marl.testing.templates.plain`` trains the agent and compares it with the model's
 own rule.
@@ -13,8 +13,9 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 
 from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, make_step, single_env
+from simenv_marl.envs import SimulationEnv
 
-# -- 1. The model: plain Python, with a main loop and a rule of its own ---------------------------
+# -- 1. The model: plain Python, with its own main loop and rule ----------------------------------
 
 
 class MyModel:
@@ -23,48 +24,48 @@ class MyModel:
     Each hour, the rule decides how much flows into the battery.
     """
 
-    capacity, power, losses = 10.0, 3.0, 0.1  # kWh, kWh in an hour, share of what is charged
+    capacity = 10.0  # kWh
+    power = 3.0  # kWh in an hour
+    losses = 0.1  # share of the charge
+    # By hour of the day: the price of a kWh, and the average use of the house in kWh.
+    prices = [0.12] * 6 + [0.28] * 11 + [0.45] * 5 + [0.28] * 2
+    uses = [0.7] * 17 + [1.8] * 5 + [0.7] * 2
 
     def __init__(self, seed: int | None = None) -> None:
-        # the model's own generator: the same seed brings the same run
-        self.random = random.Random(seed)
-        self.hour, self.charge, self.cost = 0, 5.0, 0.0
+        self.random = random.Random(seed)  # its own generator, so that a seed repeats a run
+        self.hour = 0
+        self.charge = 5.0
+        self.cost = 0.0
         self.begin_hour()
 
     def begin_hour(self) -> None:
-        """Draw what the sun brings, what the house uses, and what a kWh costs in this hour."""
+        """Draw the solar power, the use of the house and the price of a kWh in this hour."""
         clock = self.hour % 24
         daylight = max(0.0, math.sin((clock - 6) / 12 * math.pi))
         self.sun = 3.5 * daylight * self.random.uniform(0.2, 1.0)
-        self.use = (1.8 if 17 <= clock < 22 else 0.7) * self.random.uniform(0.7, 1.3)
-        self.price = (
-            0.45 if 17 <= clock < 22 else 0.12 if clock < 6 else 0.28
-        ) * self.random.uniform(0.9, 1.1)
+        self.use = self.uses[clock] * self.random.uniform(0.7, 1.3)
+        self.price = self.prices[clock] * self.random.uniform(0.9, 1.1)
 
     def choose_flow(self) -> float:
-        """The rule, as sold with most batteries: store what the sun leaves over, and give what the house lacks."""
+        """The rule of most batteries: store the surplus of the sun, and cover the lack."""
         return self.sun - self.use
 
     def end_hour(self) -> None:
         """Let one hour go by."""
-        flow = min(
-            max(self.choose_flow(), -self.power, -self.charge),
-            self.power,
-            self.capacity - self.charge,
-        )
+        flow = max(self.choose_flow(), -self.power, -self.charge)
+        flow = min(flow, self.power, self.capacity - self.charge)
         self.charge += flow * (1 - self.losses) if flow > 0 else flow
         bought = self.use - self.sun + flow
-        # what is fed into the grid earns little
-        self.cost += bought * (self.price if bought > 0 else 0.05)
+        self.cost += bought * (self.price if bought > 0 else 0.05)  # the grid pays little
         self.hour += 1
         self.begin_hour()
 
 
-# -- 2. The decision: what the agent sees, what it can do, and what it is rewarded for ------------
+# -- 2. The decision: the agent's observation, its actions and its reward -------------------------
 
 
 def observe(model: MyModel) -> list[float]:
-    """See the time of day on a circle, and the hour's numbers, each of them between -1 and 1 or so."""
+    """Return the time of day on a circle, and the numbers of the hour, all near -1 to 1."""
     angle = model.hour % 24 / 24 * 2 * math.pi
     return [
         math.sin(angle),
@@ -86,58 +87,60 @@ flow = make_step(
     agent="battery_0",
 )
 
-# -- 3. The simulation: what an episode is --------------------------------------------------------
+# -- 3. The simulation: an episode ----------------------------------------------------------------
 
 
 class MySimulation(SimulationInterface):
     """A week."""
 
-    points = {MyModel.choose_flow: flow}  # the model's class stays as it is
+    points = {MyModel.choose_flow: flow}  # the class of the model does not change
 
     def reset(self, seed: int | None = None) -> None:
         """Begin a week."""
         self.model = MyModel(seed)
 
-    def run(self) -> Any:
-        """Run the model's own loop.
-
-        It is suspended at each decision; nothing here has to be stepped.
-        """
+    def run(self) -> object:
+        """Run the model's own loop, which is suspended at each decision."""
         while self.model.hour < 7 * 24:
             self.model.end_hour()
-        return TRUNCATED  # time is up, but the house goes on: no end of the task
+        return TRUNCATED  # a time limit, not an end of the task: the house remains
 
 
-# -- 4. The environment, training, and what it is worth -------------------------------------------
+# -- 4. The environment, the training, and its value ----------------------------------------------
 
 
-def env() -> Any:
-    """Make the environment: a ``gymnasium.Env``."""
+def env() -> SimulationEnv:
+    """Make the environment, a ``gymnasium.Env``."""
     return single_env(MySimulation)
 
 
 def train(steps: int) -> Any:
-    """Train by PPO, and return a policy: a callable of the observation that returns an action."""
+    """Train by PPO; return the policy, a function from observation to action."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 
-    learner = PPO("MlpPolicy", make_vec_env(env, n_envs=8, seed=1), n_steps=168, batch_size=168, n_epochs=5,
-        gamma=0.97, learning_rate=2e-3, seed=1, device="cpu")  # fmt: skip
+    learner = PPO(
+        "MlpPolicy",
+        make_vec_env(env, n_envs=8, seed=1),
+        n_steps=168,
+        batch_size=168,
+        n_epochs=5,
+        gamma=0.97,
+        learning_rate=2e-3,
+        seed=1,
+        device="cpu",
+    )
     learner.learn(steps)
     return lambda observation: int(learner.predict(observation, deterministic=True)[0])
 
 
 if __name__ == "__main__":
-    quick = "--quick" in sys.argv  # only to see that everything runs
-    policies: dict[str, Any] = {
+    quick = "--quick" in sys.argv  # to try whether everything runs
+    policies = {
         "rule": {},
         "trained": {"battery_0": train(1500 if quick else 100_000)},
     }
-    seeds = range(100_000, 100_005 if quick else 100_030)  # weeks that it was not trained on
+    seeds = range(100_000, 100_005 if quick else 100_030)  # other weeks than in training
+    evaluation = evaluate(MySimulation, policies, seeds=seeds, baseline="rule")
     print("Minus the costs of a week; differences are paired by seed, with 95 % intervals:")
-    print(
-        evaluate(MySimulation, policies, seeds=seeds, baseline="rule")
-        .summary()
-        .round(2)
-        .to_string()
-    )
+    print(evaluation.summary().round(2).to_string())

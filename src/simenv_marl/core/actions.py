@@ -131,7 +131,8 @@ def _box_check(space: spaces.Box, clips: bool) -> Check:
             # as integers of Python, because NumPy has no type for both int64 and uint64
             if kinds == "iu":
                 array, *bounds = (part.astype(object) for part in (array, *bounds))
-            array = np.clip(array, *bounds)
+            # of a single integer, NumPy returns no array
+            array = np.asarray(np.clip(array, *bounds))
         # before the cast, because the cast may wrap integers around
         if kinds == "iu" and not legal(array):
             return ILLEGAL

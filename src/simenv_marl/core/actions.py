@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Space, Tuple
@@ -20,7 +20,7 @@ ILLEGAL: Final = Sentinel("ILLEGAL")
 Check = Callable[[Action], Action]
 """Takes an action. Returns it in the form that its mapping receives, or ``ILLEGAL``."""
 
-Mask: TypeAlias = NDArray[np.int8] | tuple["Mask", ...]
+Mask = NDArray[np.int8] | tuple["Mask", ...]
 """The legal actions: of a ``Discrete`` an array ``(n,)`` of 0 and 1, of a ``MultiDiscrete`` a tuple
 with such an array for each component.
 """
@@ -43,12 +43,13 @@ def action_check(space: Space[Any], *, clips: bool = False) -> Check:
     copied, for a ``Box`` in its dtype. If it ``clips``, it clips the parts of actions that belong
     to a ``Box``.
     """
-    if isinstance(space, Discrete):
-        return _discrete_check(space)
-    if isinstance(space, Box):
-        return _box_check(space, clips)
-    if isinstance(space, (Dict, Tuple)):
-        return _parts_check(space, clips)
+    match space:
+        case Discrete():
+            return _discrete_check(space)
+        case Box():
+            return _box_check(space, clips)
+        case Dict() | Tuple():
+            return _parts_check(space, clips)
 
     def check(action: Action) -> Action:
         try:
@@ -235,16 +236,15 @@ def only_choice(space: Space[Any], mask: Mask | None) -> Action:
 
     ``mask`` is a mask of ``mask_cast``. None: all actions are legal.
     """
-    if isinstance(space, MultiDiscrete):
-        parts = open_mask(space) if mask is None else mask
-        if any(np.count_nonzero(part) != 1 for part in parts):
-            return None
-        choices = np.array([np.argmax(part) for part in parts]).reshape(space.shape)
-        return (choices + space.start).astype(space.dtype)
-    if not isinstance(space, Discrete):
-        return None
-    if mask is None:
-        return int(space.start) if space.n == 1 else None
-    if np.count_nonzero(mask) != 1:
-        return None
-    return int(space.start + np.argmax(mask))
+    match space:
+        case Discrete():
+            if mask is None and space.n == 1:
+                return int(space.start)
+            if mask is not None and np.count_nonzero(mask) == 1:
+                return int(space.start + np.argmax(mask))
+        case MultiDiscrete():
+            parts = open_mask(space) if mask is None else mask
+            if all(np.count_nonzero(part) == 1 for part in parts):
+                choices = np.array([np.argmax(part) for part in parts]).reshape(space.shape)
+                return (choices + space.start).astype(space.dtype)
+    return None

@@ -9,7 +9,7 @@ from inspect import cleandoc
 from math import inf
 from numbers import Integral, Real
 from textwrap import indent
-from typing import Any, Final, Literal, TypedDict, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 from gymnasium.spaces import Space
 
@@ -74,7 +74,7 @@ def _is_number(value: object, kind: type) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool)
 
 
-_VALID: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
+_VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
     "driver": (
         lambda driver: driver in ("greenlet", "thread"),
         '"greenlet" or "thread"',
@@ -95,9 +95,18 @@ _VALID: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
         lambda rate: _is_number(rate, Real) and 0 <= rate < inf,
         "a finite number that is not negative, or None",
     ),
-    "clip_actions": (_is_bool, "True or False"),
-    "global_rng": (_is_bool, "True or False"),
-    "skip_forced": (_is_bool, "True or False"),
+    "clip_actions": (
+        _is_bool,
+        "True or False",
+    ),
+    "global_rng": (
+        _is_bool,
+        "True or False",
+    ),
+    "skip_forced": (
+        _is_bool,
+        "True or False",
+    ),
     "state_space": (
         lambda space: isinstance(space, Space) or space == "observations",
         'a gymnasium space or "observations"',
@@ -114,7 +123,10 @@ _VALID: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
         lambda policies: isinstance(policies, Mapping),
         "a dict from agents or points to callables",
     ),
-    "plugins": (_is_list, "a list of (handler, target, position)"),
+    "plugins": (
+        _is_list,
+        "a list of (handler, target, position)",
+    ),
 }
 """For each option whether a value other than the default is valid, and the valid ones in words."""
 
@@ -225,7 +237,7 @@ def explain_arguments(function: Function) -> Function:
     explanations of ``Options`` and the errors.
     """
     if function.__doc__ and Options.__doc__:  # neither is there under ``python -OO``
-        _, _, attributes = cleandoc(Options.__doc__).partition("Attributes:\n")
+        attributes = cleandoc(Options.__doc__).partition("Attributes:\n")[2]
         items = re.sub(r"^    (\w+):", r"- ``\1``:", attributes, flags=re.MULTILINE)
         listing = indent(items.replace("\n        ", "\n  "), " " * 8)
         options = f"**options: Any of these:\n\n{listing}\n\n{_RAISES}"

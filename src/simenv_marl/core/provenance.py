@@ -78,7 +78,7 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     return {
         "simulation": name,
         "packages": {package: _version(package) for package in packages},
-        "variant": None if variant is None else variant.name,
+        "variant": getattr(variant, "name", None),
         "parameters": {} if variant is None else as_json(variant.parameters),
         "points": points,
         "plugins": [
@@ -100,18 +100,19 @@ def as_json(value: object) -> Json:
     """
     if isinstance(value, np.generic):
         value = value.item()
-    if value is None or isinstance(value, (str, int, float)):
-        return value
-    if isinstance(value, np.ndarray):
-        return as_json(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(as_json(key)): as_json(part) for key, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [as_json(part) for part in value]
-    if isinstance(value, Set):
-        return as_json(sorted(map(repr, value)))
-    if isinstance(value, partial):
-        return as_json({"partial": value.func, "args": value.args, "keywords": value.keywords})
+    match value:
+        case str() | int() | float() | None:
+            return value
+        case np.ndarray():
+            return as_json(value.tolist())
+        case Mapping():
+            return {str(as_json(key)): as_json(part) for key, part in value.items()}
+        case list() | tuple():
+            return [as_json(part) for part in value]
+        case Set():
+            return as_json(sorted(map(repr, value)))
+        case partial():
+            return as_json({"partial": value.func, "args": value.args, "keywords": value.keywords})
     name = getattr(value, "__qualname__", None)
     if name is None:
         return repr(value)

@@ -169,8 +169,19 @@ _GENERATORS: Final = (
     BitGenerator,
 )
 
-_SKIPPED: Final = (type, ModuleType, CodeType, np.ndarray, str, int, float, random.SystemRandom)
-"""Classes whose objects are not searched: these lead to the whole process, or to nothing."""
+_SKIPPED: Final = (
+    # They lead to the whole process.
+    type,
+    ModuleType,
+    CodeType,
+    # They lead to no generator with a seed.
+    np.ndarray,
+    str,
+    int,
+    float,
+    random.SystemRandom,
+)
+"""Classes whose objects are not searched."""
 
 
 def seed_globals(seed: int, owner: int) -> None:
@@ -228,14 +239,17 @@ def reseed_generators(simulation: Model, seed: int) -> int:
             " simulation's reseed"
         )
     for generator, stream in zip(generators, key.spawn(len(generators)), strict=True):
-        if isinstance(generator, Streams):
-            generator.reseed(_integer(stream))
-        elif isinstance(generator, random.Random):
-            generator.seed(_integer(stream))
-        elif isinstance(generator, RandomState):
-            generator.set_state(RandomState(MT19937(stream)).get_state())
-        else:
-            _seed_bits(getattr(generator, "bit_generator", generator), stream)
+        match generator:
+            case Streams():
+                generator.reseed(_integer(stream))
+            case random.Random():
+                generator.seed(_integer(stream))
+            case RandomState():
+                generator.set_state(RandomState(MT19937(stream)).get_state())
+            case Generator():
+                _seed_bits(generator.bit_generator, stream)
+            case BitGenerator():
+                _seed_bits(generator, stream)
     return len(generators)
 
 

@@ -35,12 +35,13 @@ def observation_cast(space: Space[Any]) -> Cast:
 
     It raises ``ObservationError`` for an observation that does not fit the space.
     """
-    if isinstance(space, ArraySpace):
-        return _array_cast(space)
-    if isinstance(space, Discrete):
-        return _discrete_cast(space)
-    if isinstance(space, (Dict, Tuple)):
-        return _parts_cast(space)
+    match space:
+        case Box() | MultiBinary() | MultiDiscrete():
+            return _array_cast(space)
+        case Discrete():
+            return _discrete_cast(space)
+        case Dict() | Tuple():
+            return _parts_cast(space)
 
     def cast(value: Observation) -> Observation:
         if not space.contains(value):
@@ -189,16 +190,17 @@ def duplicate(observation: Observation) -> Observation:
 
 def same(one: Observation, other: Observation) -> bool:
     """Return whether two observations are equal, number for number. NaN equals NaN."""
-    if isinstance(one, Mapping):
-        if not isinstance(other, Mapping) or one.keys() != other.keys():
-            return False
-        return all(same(one[key], other[key]) for key in one)
-    if isinstance(one, (tuple, list)):
-        if not isinstance(other, (tuple, list)) or len(one) != len(other):
-            return False
-        return all(map(same, one, other))
-    if isinstance(one, ndarray):
-        return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    match one:
+        case Mapping():
+            if not isinstance(other, Mapping) or one.keys() != other.keys():
+                return False
+            return all(same(one[key], other[key]) for key in one)
+        case tuple() | list():
+            if not isinstance(other, (tuple, list)) or len(one) != len(other):
+                return False
+            return all(map(same, one, other))
+        case ndarray():
+            return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
     return bool(one == other)
 
 
@@ -208,17 +210,19 @@ def blank(space: Space[Any]) -> Observation:
     It is zero, clipped into the space. For a space without a zero (text, graphs, ...) it is a fixed
     sample.
     """
-    if isinstance(space, Box):
-        return np.zeros(space.shape, space.dtype).clip(space.low, space.high)
-    if isinstance(space, (Discrete, MultiDiscrete)):
-        size = space.n if isinstance(space, Discrete) else space.nvec
-        return np.clip(0, space.start, space.start + size - 1).astype(space.dtype)
-    if isinstance(space, MultiBinary):
-        return np.zeros(space.shape, space.dtype)
-    if isinstance(space, Dict):
-        return {key: blank(part) for key, part in space.items()}
-    if isinstance(space, Tuple):
-        return tuple(map(blank, space))
+    match space:
+        case Box():
+            return np.zeros(space.shape, space.dtype).clip(space.low, space.high)
+        case Discrete():
+            return np.clip(0, space.start, space.start + space.n - 1).astype(space.dtype)
+        case MultiDiscrete():
+            return np.clip(0, space.start, space.start + space.nvec - 1).astype(space.dtype)
+        case MultiBinary():
+            return np.zeros(space.shape, space.dtype)
+        case Dict():
+            return {key: blank(part) for key, part in space.items()}
+        case Tuple():
+            return tuple(map(blank, space))
     unseeded = deepcopy(space)  # the user may have seeded the space itself
     unseeded.seed(0)
     return unseeded.sample()

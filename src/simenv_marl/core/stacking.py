@@ -53,7 +53,7 @@ def stacker(space: Space[Any], *, cast: bool = False) -> Stacker:
 
         def stack_objects(items: Sequence[Observation], out: Any = None) -> Any:
             if out is None:
-                return np.fromiter(items, object, len(items))
+                return np.fromiter(items, object)
             return concatenate(space, items, out)
 
         return stack_objects
@@ -105,11 +105,11 @@ def joined(stacks: Sequence[Any]) -> Any:
 
 def _map(function: Callable[[Sequence[NDArray[Any]]], Any], stacks: Sequence[Any]) -> Any:
     """Call a function with the arrays at the same place of several stacks, for each place."""
-    first = stacks[0]
-    if isinstance(first, Mapping):
-        return {key: _map(function, [stack[key] for stack in stacks]) for key in first}
-    if isinstance(first, tuple):
-        return tuple(_map(function, parts) for parts in zip(*stacks, strict=True))
+    match stacks[0]:
+        case Mapping() as first:
+            return {key: _map(function, [stack[key] for stack in stacks]) for key in first}
+        case tuple():
+            return tuple(_map(function, parts) for parts in zip(*stacks, strict=True))
     return function(stacks)
 
 
@@ -123,21 +123,24 @@ def rows(stack: Action, *, integers: bool) -> list[Action] | None:
     Returns:
         The actions; None if the answer cannot be split.
     """
-    if isinstance(stack, Mapping):
-        columns = [rows(part, integers=False) or [] for part in stack.values()]
-        try:
-            table = list(zip(*columns, strict=True))
-        except ValueError:  # the parts have different lengths
+    match stack:
+        case Mapping():
+            columns = [rows(part, integers=False) or [] for part in stack.values()]
+            try:
+                table = list(zip(*columns, strict=True))
+            except ValueError:  # the parts have different lengths
+                return None
+            return [dict(zip(stack, row, strict=True)) for row in table] or None
+        case str() | bytes():
             return None
-        return [dict(zip(stack, row, strict=True)) for row in table] or None
-    if hasattr(stack, "__array__"):
-        array = np.asarray(stack)
-        if array.ndim == 0:
-            return None
-        if integers and array.ndim == 1 and array.dtype.kind in "iu":
-            # Python integers, because their check is the fastest.
-            return array.tolist()  # type: ignore[no-any-return]
-        return list(array)
-    if isinstance(stack, Iterable) and not isinstance(stack, (str, bytes)):
-        return list(stack)
+        case _ if hasattr(stack, "__array__"):
+            array = np.asarray(stack)
+            if array.ndim == 0:
+                return None
+            if integers and array.ndim == 1 and array.dtype.kind in "iu":
+                # Python integers, because their check is the fastest.
+                return array.tolist()  # type: ignore[no-any-return]
+            return list(array)
+        case Iterable():
+            return list(stack)
     return None

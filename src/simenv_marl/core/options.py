@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from inspect import cleandoc
 from math import inf
 from numbers import Integral, Real
@@ -67,11 +67,15 @@ def _is_bool(value: object) -> bool:
 
 
 def _is_list(value: object) -> bool:
-    return isinstance(value, Iterable) and not isinstance(value, (str, Mapping))
+    if isinstance(value, (str, Mapping)):
+        return False
+    return isinstance(value, Iterable)
 
 
 def _is_number(value: object, kind: type) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool)
+    if isinstance(value, bool):
+        return False
+    return isinstance(value, kind)
 
 
 _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
@@ -128,7 +132,7 @@ _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
         "a list of (handler, target, position)",
     ),
 }
-"""For each option whether a value other than the default is valid, and the valid ones in words."""
+"""The check of each option's value, unless it is the default, and the valid values in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,16 +215,18 @@ class Options:
     @property
     def shows(self) -> bool:
         """Whether each reset and step renders: for people, or to collect pictures."""
-        return self.picture_mode == "human" or self.picture_mode != self.render_mode
+        if self.picture_mode == "human":
+            return True
+        return self.picture_mode != self.render_mode
 
     def amended(self, options: Mapping[str, Any]) -> Options:
-        """Return these options with some replaced.
+        """Return these options with other values for some.
 
         Raises:
-            UnknownOptionError: There is no option of a name.
+            UnknownOptionError: There is no option with a given name.
             OptionValueError: A value is invalid.
         """
-        known = [field.name for field in fields(self)]
+        known = vars(self)
         for name in options:
             if name not in known:
                 hint = did_you_mean(name, known)
@@ -236,11 +242,11 @@ def explain_arguments(function: Function) -> Function:
     ``{arguments}`` becomes the arguments that all these functions have, and ``{options}`` the
     explanations of ``Options`` and the errors.
     """
-    if function.__doc__ and Options.__doc__:  # neither is there under ``python -OO``
+    if function.__doc__ and Options.__doc__:  # ``python -OO`` removes both
         attributes = cleandoc(Options.__doc__).partition("Attributes:\n")[2]
         items = re.sub(r"^    (\w+):", r"- ``\1``:", attributes, flags=re.MULTILINE)
         listing = indent(items.replace("\n        ", "\n  "), " " * 8)
         options = f"**options: Any of these:\n\n{listing}\n\n{_RAISES}"
         text = cleandoc(function.__doc__).replace("{arguments}", _ARGUMENTS)
-        function.__doc__ = text.replace("{options}", options)  # for ``help``
+        function.__doc__ = text.replace("{options}", options)
     return function

@@ -39,7 +39,9 @@ LEGACY: Final[Any] = np.random  # NumPy's type stubs lack some of its functions
 
 def is_seed(value: object) -> bool:
     """Return whether a value is a non-negative integer."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        return False
+    return int(value) >= 0
 
 
 # -- simulations that draw from the generators of the process --------------------------------------

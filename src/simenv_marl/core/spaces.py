@@ -69,7 +69,9 @@ def _references_to_fresh_argument() -> int:
 
     array = np.zeros(1)
     fresh = count(np.zeros(1))
-    return fresh if fresh < count(array) else -1
+    if fresh < count(array):
+        return fresh
+    return -1
 
 
 _FRESH: Final = _references_to_fresh_argument()
@@ -145,7 +147,9 @@ def _discrete_cast(space: Discrete) -> Cast:
 
 def parts_of(space: Dict | Tuple[Any]) -> dict[Any, Space[Any]]:
     """Return the spaces of the parts of a space, by key or by place."""
-    return dict(space.items() if isinstance(space, Dict) else enumerate(space))
+    if isinstance(space, Dict):
+        return dict(space)
+    return dict(enumerate(space))
 
 
 def _parts_cast(space: Dict | Tuple[Any]) -> Cast:
@@ -192,11 +196,15 @@ def same(one: Observation, other: Observation) -> bool:
     """Return whether two observations are equal, number for number. NaN equals NaN."""
     match one:
         case Mapping():
-            if not isinstance(other, Mapping) or one.keys() != other.keys():
+            if not isinstance(other, Mapping):
+                return False
+            if one.keys() != other.keys():
                 return False
             return all(same(one[key], other[key]) for key in one)
         case tuple() | list():
-            if not isinstance(other, (tuple, list)) or len(one) != len(other):
+            if not isinstance(other, (tuple, list)):
+                return False
+            if len(one) != len(other):
                 return False
             return all(map(same, one, other))
         case ndarray():

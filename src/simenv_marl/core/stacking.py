@@ -113,7 +113,7 @@ def _map(function: Callable[[Sequence[NDArray[Any]]], Any], stacks: Sequence[Any
     return function(stacks)
 
 
-def rows(stack: Action, *, integers: bool) -> list[Action] | None:
+def split_batch(stack: Action, *, integers: bool) -> list[Action] | None:
     """Split the answer of a batched policy into one action for each decision.
 
     Args:
@@ -125,14 +125,12 @@ def rows(stack: Action, *, integers: bool) -> list[Action] | None:
     """
     match stack:
         case Mapping():
-            columns = [rows(part, integers=False) or [] for part in stack.values()]
+            columns = [split_batch(part, integers=False) or [] for part in stack.values()]
             try:
                 table = list(zip(*columns, strict=True))
             except ValueError:  # the parts have different lengths
                 return None
             return [dict(zip(stack, row, strict=True)) for row in table] or None
-        case str() | bytes():
-            return None
         case _ if hasattr(stack, "__array__"):
             array = np.asarray(stack)
             if array.ndim == 0:
@@ -141,6 +139,8 @@ def rows(stack: Action, *, integers: bool) -> list[Action] | None:
                 # Python integers, because their check is the fastest.
                 return array.tolist()  # type: ignore[no-any-return]
             return list(array)
+        case str() | bytes():
+            return None
         case Iterable():
             return list(stack)
     return None

@@ -33,7 +33,7 @@ from ..core.point import Point
 from ..core.policies import AskingPolicy, DeferredPolicy, is_asked_alone, two_arguments, waits
 from ..core.session import Session, close_all
 from ..core.spaces import duplicate
-from ..core.stacking import rows, stacker
+from ..core.stacking import split_batch, stacker
 from ..decision import DecisionPoint
 from ..errors import InvalidActionError, annotate, short_repr
 from ..hooks.stacks import EVALUATING, outside_simulation
@@ -200,7 +200,7 @@ def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = Fal
     extras: Mapping[str, Any] = {}
     if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
         answers, extras = answers
-    actions = [RULE] * number if answers is RULE else rows(answers, integers=integers)
+    actions = [RULE] * number if answers is RULE else split_batch(answers, integers=integers)
     if actions is None or len(actions) != number:
         returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
         raise InvalidActionError(

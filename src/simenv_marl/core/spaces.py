@@ -164,10 +164,10 @@ def _parts_cast(space: Dict | Tuple[Any]) -> Cast:
                 return tuple(parts.values()) if is_tuple else parts
         except (TypeError, KeyError):
             pass
-        kind = "parts" if is_tuple else "keys"
+        expected = f"{number} parts" if is_tuple else f"keys {short_repr(list(casts))}"
         raise ObservationError(
-            f"the observation {short_repr(value)} must have exactly the {number} {kind}"
-            f" {short_repr(list(casts))} of {short_repr(space)}"
+            f"the observation {short_repr(value)} must have exactly the {expected} of"
+            f" {short_repr(space)}"
         )
 
     return cast

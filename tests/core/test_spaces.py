@@ -200,6 +200,13 @@ def test_integers_are_clipped_without_wrapping_around(shape):
         assert_alike(check(np.full(shape, given)), np.full(shape, clipped))
 
 
+@pytest.mark.parametrize("shape", [(), (1,)])
+@pytest.mark.parametrize(("given", "clipped"), [(5, 3), (np.int64(-5), 0), (np.array(2), 2)])
+def test_a_single_integer_is_clipped(shape, given, clipped):
+    check = action_check(spaces.Box(0, 3, shape, np.int64), clips=True)
+    assert check(given) == clipped
+
+
 def test_parts_of_actions_are_checked_like_actions():
     given = {"pair": [np.int8(6), {"bits": np.array([1, 0, 1], np.int8)}], "box": [0.5, 1]}
     found = action_check(TREE)(given)

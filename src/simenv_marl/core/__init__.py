@@ -26,7 +26,7 @@ from .episodes.state import EpisodeState, Outcome, State, UnmatchedNames
 from .plans.mappings import adapt
 from .plans.options import CheckOptions, EpisodeOptions, Options, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name
-from .plans.point import Labels, Mask, Point, Policy, Space
+from .plans.point import Labels, Point, Policy, Space
 from .plans.points import Points, declared_agents, portable
 from .plans.policies import (
     COUNTS,
@@ -59,9 +59,9 @@ from .switching.generators import (
     reseed_generators,
 )
 from .switching.resources import acquire, release, reuse_resources
-from .values.actions import ILLEGAL, MASK, action_check
+from .values.actions import ILLEGAL, MASK, Mask, action_check
 from .values.spaces import blank, duplicate, observation_cast, same
-from .values.stacking import Stacker, joined, rows, stack_masks, stacker, taken
+from .values.stacking import Stacker, joined, split_batch, stack_masks, stacker, taken
 
 __all__ = [
     # What an environment is made of, and what happens in it.
@@ -81,7 +81,7 @@ __all__ = [
     "pending_view", "portable", "release", "reuse_resources", "serve", "unpack", "unpack_outcome",
     # Values.
     "ILLEGAL", "MASK", "WAIT", "action_check", "adapt", "as_json", "blank", "declared_agents",
-    "duplicate", "explain_arguments", "joined", "observation_cast", "rows", "same", "source_name",
+    "duplicate", "explain_arguments", "joined", "observation_cast", "same", "source_name", "split_batch",
     "stack_masks", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of",

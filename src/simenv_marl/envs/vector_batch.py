@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import concatenate, create_empty_array
+from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
 from ..core import Episode, Session, UnmatchedNames, close_all, stacker
@@ -79,7 +79,7 @@ class SimulationBatch:
         self._mode, self._part = mode, part
         self._agent = str(self.plan.one_agent)
         self._shows = self.plan.options.shows
-        self._stack = stacker(self.observation_space, cast=True, other=concatenate)
+        self._stack = stacker(self.observation_space, cast=True)
         self._observations = create_empty_array(self.observation_space, len(part))
         self._observed: list[Any] = [None] * len(part)
         self._episodes: list[Any] = []  # the episodes of ``_agents``, in the single view

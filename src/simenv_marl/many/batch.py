@@ -37,7 +37,7 @@ from ..core import (
     duplicate,
     is_asked_alone,
     reuse_resources,
-    rows,
+    split_batch,
     stacker,
     two_arguments,
     waits,
@@ -207,7 +207,7 @@ def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = Fal
     extras: Mapping[str, Any] = {}
     if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
         answers, extras = answers
-    actions = [RULE] * number if answers is RULE else rows(answers, integers=integers)
+    actions = [RULE] * number if answers is RULE else split_batch(answers, integers=integers)
     if actions is None or len(actions) != number:
         returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
         raise InvalidActionError(

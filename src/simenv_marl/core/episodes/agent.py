@@ -13,10 +13,10 @@ from ...errors import AgentError, MaskError, RewardError, short_repr
 from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
 from ...simulation import RULE, Action, Model, Observation
-from ..plans.point import Args, Kwargs, Mask, Policy
+from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import AskingPolicy, DeferredPolicy, EpisodePolicy, Info, Where
 from ..switching.driver import WAIT, AnyHandler
-from ..values.actions import MASK, only_choice
+from ..values.actions import MASK, Mask, only_choice
 from ..values.spaces import duplicate
 from .arguments import Arguments, Recalled, weaken
 from .clock import Clock

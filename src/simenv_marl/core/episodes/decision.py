@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ...simulation import Action, Model, Observation
-from ..plans.point import Labels, Mask, Space
+from ..plans.point import Labels, Space
 from ..plans.policies import Where
+from ..values.actions import Mask
 from ..values.spaces import duplicate
 
 if TYPE_CHECKING:

@@ -29,12 +29,12 @@ from ...errors import (
 from ...hooks.handlers import Installation
 from ...simulation import Action, Model, Observation, closer, make_simulation, resetter
 from ..plans.plan import DRIVERS, Plan
-from ..plans.point import Mask
 from ..plans.policies import Where
 from ..switching.context import ExclusiveLock, GlobalRandom, environment_context
 from ..switching.driver import Driver
 from ..switching.generators import ENVIRONMENT, draws_check, is_seed, seed_globals
 from ..switching.resources import reuse_resources
+from ..values.actions import Mask
 from ..values.spaces import same
 from .clock import Clock
 from .episode import LONGEST_TAPE, Episode, Replay

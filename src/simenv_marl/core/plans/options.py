@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from inspect import cleandoc
 from math import inf
+from numbers import Integral, Real
 from textwrap import indent
 from typing import Any, Literal, TypedDict, TypeVar
 
-import numpy as np
-from gymnasium import spaces
+from gymnasium.spaces import Space
 
 from ...errors import OptionValueError, UnknownOptionError, did_you_mean, short_repr
 from ...simulation import RULE
@@ -19,12 +19,14 @@ from ...simulation import RULE
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _ARGUMENTS = """Args:
-    simulation: A simulation (which every environment copies), its class, a zero-argument factory, or a ``Variant``.
-    points: The active decision points: a dotted name, a decision function, a list of these, or a dict from dotted name
-        or function to its definition. With a dict, the model needs no decorators. None: the simulation's attribute
-        ``points``, else all decorated points, which must then belong to one package."""
+    simulation: A simulation (which every environment copies), its class, a zero-argument factory,
+        or a ``Variant``.
+    points: The active decision points: a dotted name, a decision function, a list of these, or a
+        dict from dotted name or function to its definition. With a dict, the model needs no
+        decorators. None: the simulation's attribute ``points``, else all decorated points, which
+        must then belong to one package."""
 _RAISES = """Raises:
-    SimEnvError: Something cannot work. The subclass tells what."""
+    SimEnvError: An argument is invalid. The message says which."""
 
 
 class _CommonOptions(TypedDict, total=False):
@@ -40,7 +42,7 @@ class _CommonOptions(TypedDict, total=False):
     plugins: Iterable[Any]
     global_rng: bool
     flatten: bool
-    state_space: spaces.Space[Any] | Literal["observations"] | None
+    state_space: Space[Any] | Literal["observations"] | None
     render_mode: str | None
 
 
@@ -51,15 +53,86 @@ class EpisodeOptions(_CommonOptions, total=False):
 
 
 class CheckOptions(_CommonOptions, total=False):
-    """The options of functions that check a simulation and have a ``max_steps`` of their own."""
+    """The options of functions that check a simulation and have their own ``max_steps``."""
 
     policies: Mapping[Any, Any] | None
 
 
-class ViewOptions(EpisodeOptions, total=False):
+class ViewOptions(EpisodeOptions, CheckOptions, total=False):
     """The options of functions that make environments."""
 
-    policies: Mapping[Any, Any] | None
+
+def _is_bool(value: object) -> bool:
+    return isinstance(value, bool)
+
+
+def _is_list(value: object) -> bool:
+    if isinstance(value, (str, Mapping)):
+        return False
+    return isinstance(value, Iterable)
+
+
+def _is_number(value: object, kind: type) -> bool:
+    if isinstance(value, bool):
+        return False
+    return isinstance(value, kind)
+
+
+_VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "driver": (
+        lambda driver: driver in ("greenlet", "thread"),
+        '"greenlet" or "thread"',
+    ),
+    "possible_agents": (
+        lambda names: all(map(_is_list, names.values() if isinstance(names, Mapping) else [names])),
+        "a list of names, or a dict from points to lists of names",
+    ),
+    "undeclared": (
+        lambda reaction: reaction in ("error", "rule"),
+        '"error" or "rule"',
+    ),
+    "agent": (
+        lambda name: isinstance(name, str) and name != "",
+        "the name of an agent or None",
+    ),
+    "discount_rate": (
+        lambda rate: _is_number(rate, Real) and 0 <= rate < inf,
+        "a finite number that is not negative, or None",
+    ),
+    "clip_actions": (
+        _is_bool,
+        "True or False",
+    ),
+    "global_rng": (
+        _is_bool,
+        "True or False",
+    ),
+    "skip_forced": (
+        _is_bool,
+        "True or False",
+    ),
+    "state_space": (
+        lambda space: isinstance(space, Space) or space == "observations",
+        'a gymnasium space or "observations"',
+    ),
+    "render_mode": (
+        lambda mode: isinstance(mode, str),
+        "a string or None",
+    ),
+    "max_steps": (
+        lambda steps: _is_number(steps, Integral) and steps >= 1,
+        "a positive integer or None",
+    ),
+    "policies": (
+        lambda policies: isinstance(policies, Mapping),
+        "a dict from agents or points to callables",
+    ),
+    "plugins": (
+        _is_list,
+        "a list of (handler, target, position)",
+    ),
+}
+"""The check of each option's value, unless it is the default, and the valid values in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +145,7 @@ class Options:
             threads use.
         possible_agents: The names of all agents, where a callable names them: a list, or a dict
             from decision point to names. These agents are in ``agents`` from ``reset`` on.
-        undeclared: What to do when an agent decides that is not in ``possible_agents``: "error"
+        undeclared: How to treat an agent that decides and is not in ``possible_agents``: "error"
             raises, "rule" lets the model's own rule decide.
         agent: The agent of a single view. All other agents are left to their policies or their
             rule. None: the only agent of the only active decision point.
@@ -92,10 +165,11 @@ class Options:
         global_rng: Whether the simulation gets its own state of the global generators of ``random``
             and ``numpy.random``. Each reset seeds them with the seed of the episode.
         flatten: Whether the joint view has vectors instead of dicts.
-        state_space: The space whose shape and dtype ``state()`` has. None: ``state()`` returns what
-            the simulation's own ``state()`` returns. "observations": the state is the observations
-            of all possible agents in one vector, and the simulation needs no ``state()``.
-        render_mode: What ``render`` returns: one of the simulation's ``render_modes``.
+        state_space: The space whose shape and dtype ``state()`` has. None: ``state()`` returns the
+            value of the simulation's ``state()`` as it is. "observations": the state is the
+            observations of all possible agents in one vector, and the simulation needs no
+            ``state()``.
+        render_mode: The form of the result of ``render``: one of the simulation's ``render_modes``.
     """
 
     driver: str = "greenlet"
@@ -110,96 +184,49 @@ class Options:
     plugins: Iterable[Any] = ()
     global_rng: bool = False
     flatten: bool = False
-    state_space: spaces.Space[Any] | str | None = None
+    state_space: Space[Any] | str | None = None
     render_mode: str | None = None
 
     def __post_init__(self) -> None:
-        agents, agent, space, steps = (
-            self.possible_agents,
-            self.agent,
-            self.state_space,
-            self.max_steps,
-        )
-        rate: Any = self.discount_rate
-        groups = (
-            agents.values() if isinstance(agents, Mapping) else () if agents is None else (agents,)
-        )
-        is_space = space is None or isinstance(space, spaces.Space) or space == "observations"
-        is_count = (
-            isinstance(steps, (int, np.integer)) and not isinstance(steps, bool) and steps >= 1
-        )
-        is_rate = (
-            isinstance(rate, (int, float, np.number))
-            and not isinstance(rate, bool)
-            and 0 <= rate < inf
-        )
-        policies = {} if self.policies is None else self.policies
-        for name, is_allowed, expected in (
-            ("driver", self.driver in ("greenlet", "thread"), '"greenlet" or "thread"'),
-            (
-                "possible_agents",
-                all(map(_is_list, groups)),
-                "a list of names, or a dict from points to lists of names",
-            ),
-            ("undeclared", self.undeclared in ("error", "rule"), '"error" or "rule"'),
-            (
-                "agent",
-                agent is None or (isinstance(agent, str) and agent),
-                "the name of an agent or None",
-            ),
-            (
-                "discount_rate",
-                rate is None or is_rate,
-                "a finite number that is not negative, or None",
-            ),
-            ("clip_actions", isinstance(self.clip_actions, bool), "True or False"),
-            ("global_rng", isinstance(self.global_rng, bool), "True or False"),
-            ("skip_forced", isinstance(self.skip_forced, bool), "True or False"),
-            ("state_space", is_space, 'a gymnasium space or "observations"'),
-            ("render_mode", isinstance(self.render_mode, str | None), "a string or None"),
-            ("max_steps", steps is None or is_count, "a positive integer or None"),
-            (
-                "policies",
-                isinstance(policies, Mapping),
-                "a dict from agents or points to callables",
-            ),
-            ("plugins", _is_list(self.plugins), "a list of (handler, target, position)"),
-        ):
-            if not is_allowed:
-                raise OptionValueError(
-                    f"{name} must be {expected}, not {short_repr(getattr(self, name))}"
-                )
-        for key, policy in policies.items():
+        for name, (is_valid, expected) in _VALID.items():
+            value = getattr(self, name)
+            if value is not getattr(Options, name) and not is_valid(value):
+                raise OptionValueError(f"{name} must be {expected}, not {short_repr(value)}")
+        for key, policy in (self.policies or {}).items():
             if policy is not RULE and not callable(policy):
                 raise OptionValueError(
                     f"the policy of {short_repr(key)} must be a callable or RULE, not"
                     f" {short_repr(policy)}"
                 )
-        # They may be iterators, and every environment reads them.
+        # Copy iterators, because each environment reads these again.
+        agents = self.possible_agents
         if isinstance(agents, Mapping):
-            object.__setattr__(
-                self, "possible_agents", {key: list(names) for key, names in agents.items()}
-            )
+            agents = {key: list(names) for key, names in agents.items()}
         elif agents is not None:
-            object.__setattr__(self, "possible_agents", list(agents))
+            agents = list(agents)
+        object.__setattr__(self, "possible_agents", agents)
         object.__setattr__(self, "plugins", tuple(self.plugins))
 
     @property
     def picture_mode(self) -> str | None:
-        """The mode in which the simulation renders: ``render_mode`` without the ``_list`` of collected pictures."""
+        """The mode of the simulation: ``render_mode`` without ``_list`` for collected pictures."""
         return self.render_mode and self.render_mode.removesuffix("_list")
 
     @property
     def shows(self) -> bool:
         """Whether each reset and step renders: for people, or to collect pictures."""
-        return self.picture_mode == "human" or self.picture_mode != self.render_mode
+        if self.picture_mode == "human":
+            return True
+        return self.picture_mode != self.render_mode
 
     def amended(self, options: Mapping[str, Any]) -> Options:
-        """The same options, but for those that are given.
+        """Return these options with other values for some.
 
-        Raise an error for an unknown name or a wrong value.
+        Raises:
+            UnknownOptionError: There is no option with a given name.
+            OptionValueError: A value is invalid.
         """
-        known = [field.name for field in fields(self)]
+        known = vars(self)
         for name in options:
             if name not in known:
                 hint = did_you_mean(name, known)
@@ -215,19 +242,11 @@ def explain_arguments(function: Function) -> Function:
     ``{arguments}`` becomes the arguments that all these functions have, and ``{options}`` the
     explanations of ``Options`` and the errors.
     """
-    if function.__doc__ and Options.__doc__:  # neither is there under ``python -OO``
-        _, _, attributes = cleandoc(Options.__doc__).partition("Attributes:\n")
-        listed = re.sub(r"^    (\w+):", r"- ``\1``:", attributes, flags=re.MULTILINE).replace(
-            "\n        ", "\n  "
-        )
-        options = f"**options: Any of these:\n\n{indent(listed, ' ' * 8)}\n\n{_RAISES}"
-        function.__doc__ = (
-            cleandoc(function.__doc__)
-            .replace("{arguments}", _ARGUMENTS)
-            .replace("{options}", options)
-        )
+    if function.__doc__ and Options.__doc__:  # ``python -OO`` removes both
+        attributes = cleandoc(Options.__doc__).partition("Attributes:\n")[2]
+        items = re.sub(r"^    (\w+):", r"- ``\1``:", attributes, flags=re.MULTILINE)
+        listing = indent(items.replace("\n        ", "\n  "), " " * 8)
+        options = f"**options: Any of these:\n\n{listing}\n\n{_RAISES}"
+        text = cleandoc(function.__doc__).replace("{arguments}", _ARGUMENTS)
+        function.__doc__ = text.replace("{options}", options)
     return function
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, Iterable) and not isinstance(value, (str, Mapping))

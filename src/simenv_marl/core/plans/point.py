@@ -11,7 +11,6 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from gymnasium import spaces as gym_spaces
-from numpy.typing import NDArray
 
 from ...decision import DecisionPoint, Definition, fit_labels, inverse
 from ...errors import (
@@ -25,13 +24,12 @@ from ...errors import (
 from ...hooks.hook import BOUND
 from ...simulation import Action, Model, Observation, asks_for
 from ..values import actions, spaces
-from ..values.actions import ILLEGAL, MASK
+from ..values.actions import ILLEGAL, MASK, Mask
 from .mappings import Mapped, adapt, number_of_places, union_of_keys
 
 Space: TypeAlias = gym_spaces.Space[Any]
 Args = tuple[Model, ...]
 Kwargs = dict[str, Model]
-Mask: TypeAlias = "NDArray[np.int8] | tuple[NDArray[np.int8], ...]"
 
 Labels = Mapping[Any, str] | Sequence[str] | None
 """Texts: for a ``Discrete`` or ``Dict`` a dict, for a one-dimensional space a sequence."""

@@ -1,32 +1,38 @@
 """The provenance of an environment, in a form that can be written to a results file."""
 
-import importlib.metadata
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import fields
 from functools import cache, partial
-from typing import Any, Unpack
+from importlib.metadata import packages_distributions, version
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 
+from ...simulation import Model
 from .options import Options, ViewOptions
 from .plan import Plan, make_plan, source_name
 from .points import Points
 
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+"""JSON data."""
+
 DEPENDENCIES = ("greenlet", "gymnasium", "numpy", "pettingzoo", "simenv_marl")
-_distributions = cache(importlib.metadata.packages_distributions)
-_distribution_version = cache(importlib.metadata.version)
+_distributions = cache(packages_distributions)
+_distribution_version = cache(version)
 
 
 def provenance(
-    simulation: Any,
+    simulation: Model,
     points: Points = None,
     *,
     seed: int | None = None,
     **options: Unpack[ViewOptions],
 ) -> dict[str, Any]:
-    """Return the provenance of an environment with these arguments, as ``env.unwrapped.provenance()`` does.
+    """Return the provenance of an environment with these arguments.
+
+    It equals ``env.unwrapped.provenance()`` of that environment.
 
     Args:
         simulation: A simulation, its class, a factory, or a ``Variant``.
@@ -52,7 +58,7 @@ def provenance(
         Functions and classes are given by their dotted names, other objects by their ``repr``.
 
     Raises:
-        SimEnvError: No environment can be made of these arguments. The subclass tells why.
+        SimEnvError: An argument is invalid. The message says which.
     """
     return describe(make_plan(simulation, points, options), seed)
 
@@ -61,23 +67,23 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     """Return the provenance of an environment of a plan, as ``provenance`` does."""
     name = source_name(plan.subject.source)
     variant = plan.subject.variant
-    options = {
-        option.name: as_json(getattr(plan.options, option.name))
-        for option in fields(Options)
-        if option.name not in ("plugins", "policies")
-        and getattr(plan.options, option.name) != option.default
-    }
     points = {point.hook.name: point.agent for point in plan.active}
     packages = sorted({dotted.partition(".")[0] for dotted in (name, *points)})
+    plugins = [] if plan.plugins is None else plan.plugins.entries
+    options = {}
+    for option in fields(Options):
+        value = getattr(plan.options, option.name)
+        if option.name not in ("plugins", "policies") and value != option.default:
+            options[option.name] = as_json(value)
     return {
         "simulation": name,
         "packages": {package: _version(package) for package in packages},
-        "variant": None if variant is None else variant.name,
+        "variant": getattr(variant, "name", None),
         "parameters": {} if variant is None else as_json(variant.parameters),
         "points": points,
         "plugins": [
             {"handler": as_json(handler), "target": target, "position": position}
-            for handler, target, position in ([] if plan.plugins is None else plan.plugins.entries)
+            for handler, target, position in plugins
         ],
         "policies": as_json(plan.options.policies or {}),
         "options": options,
@@ -87,38 +93,37 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     }
 
 
-def as_json(value: Any) -> Any:
-    """Return a value as JSON data."""
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    if isinstance(value, (np.generic, np.ndarray)):
-        plain = value.tolist()
-        return repr(plain) if isinstance(plain, np.generic) else as_json(plain)
-    if isinstance(value, Mapping):
-        return {
-            key if isinstance(key, str) else str(as_json(key)): as_json(part)
-            for key, part in value.items()
-        }
-    if isinstance(value, (list, tuple)):
-        return [as_json(part) for part in value]
-    if isinstance(value, (set, frozenset)):
-        return sorted(map(repr, value))
-    if isinstance(value, partial):
-        return {
-            "partial": as_json(value.func),
-            "args": as_json(value.args),
-            "keywords": as_json(value.keywords),
-        }
-    return (
-        f"{value.__module__}.{value.__qualname__}"
-        if hasattr(value, "__qualname__")
-        else repr(value)
-    )
+def as_json(value: object) -> Json:
+    """Return a value as JSON data.
+
+    Functions and classes become their dotted names, other objects their ``repr``.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    match value:
+        case str() | int() | float() | None:
+            return value
+        case np.ndarray():
+            return as_json(value.tolist())
+        case Mapping():
+            return {str(as_json(key)): as_json(part) for key, part in value.items()}
+        case list() | tuple():
+            return [as_json(part) for part in value]
+        case Set():
+            return as_json(sorted(map(repr, value)))
+        case partial():
+            return as_json({"partial": value.func, "args": value.args, "keywords": value.keywords})
+    name = getattr(value, "__qualname__", None)
+    if name is None:
+        return repr(value)
+    return f"{value.__module__}.{name}"
 
 
 def _version(package: str) -> str | None:
-    """Return the version of an importable package: that of its distribution, or its own."""
+    """Return the version of an importable package, of its distribution if it has one."""
     for distribution in _distributions().get(package, ()):
         return _distribution_version(distribution)
-    version = getattr(sys.modules.get(package), "__version__", None)
-    return version if isinstance(version, str) else None
+    number = getattr(sys.modules.get(package), "__version__", None)
+    if isinstance(number, str):
+        return number
+    return None

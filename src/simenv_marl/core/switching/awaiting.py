@@ -1,20 +1,22 @@
-"""Coroutines of policies. They run in one thread with one event loop, for as long as the process.
+"""Coroutines of policies. They run in one thread with one event loop, as long as the process lives.
 
 Simulations stay in their own threads, because greenlets cannot change threads. The loop lasts, so
-that clients keep their connections. A forked process makes a loop for itself.
+that clients keep their connections. A forked process makes another loop.
 """
 
 from __future__ import annotations
 
 import asyncio
-import inspect
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
+from concurrent.futures import Future
+from inspect import isawaitable
 from queue import Empty, SimpleQueue
 from threading import Thread, current_thread
 from typing import Any, Final
 
 from ...errors import ReentrancyError, short_repr, warn_user
+from ...simulation import Action
 
 SECONDS_TO_CANCEL: Final = 10.0
 """The seconds that coroutines may take to end after they were cancelled."""
@@ -23,20 +25,19 @@ THREAD: Final = "simenv_marl policies"
 """The name of the thread."""
 
 _loops: Final[dict[int, asyncio.AbstractEventLoop]] = {}
-"""The loop, by the process that it belongs to."""
+"""The event loops, by process. A forked process inherits the entry of its parent."""
 
 
 def _loop() -> asyncio.AbstractEventLoop:
-    """Return the loop of this process."""
-    loop = _loops.get(os.getpid())
-    if loop is None:
-        made = asyncio.new_event_loop()
-        loop = _loops.setdefault(os.getpid(), made)
-        if loop is made:
+    """Return the event loop of this process."""
+    process = os.getpid()
+    if process not in _loops:
+        loop = asyncio.new_event_loop()
+        if _loops.setdefault(process, loop) is loop:
             Thread(target=loop.run_forever, name=THREAD, daemon=True).start()
         else:  # another thread was faster
-            made.close()
-    return loop
+            loop.close()
+    return _loops[process]
 
 
 def policy_loops() -> list[asyncio.AbstractEventLoop]:
@@ -45,61 +46,58 @@ def policy_loops() -> list[asyncio.AbstractEventLoop]:
 
 
 class Answer:
-    """An answer that is on its way. ``value`` and ``error`` hold it when it has been reported."""
+    """The answer of a policy. It may be on its way."""
 
-    def __init__(self, value: Any, report: Callable[[Answer], None]) -> None:
-        """Report a value at once; something awaitable in the loop's thread, when it has ended."""
-        self.value: Any = value
-        self.error: BaseException | None = None
-        if not inspect.isawaitable(value):
-            report(self)
-            return
-        self._loop = loop = _loop()
-        self._task: asyncio.Task[None] | None = None
+    def __init__(self, value: Action, report: Callable[[Answer], None]) -> None:
+        """Await an answer in the thread of the event loop.
 
-        def begin() -> None:
-            self._task = loop.create_task(self._await(value))
-            self._task.add_done_callback(end)
-
-        def end(task: asyncio.Task[None]) -> None:
-            if task.cancelled():
-                self.error = asyncio.CancelledError()
-                getattr(value, "close", int)()  # a coroutine that was cancelled before it began
+        Args:
+            value: The answer, or an awaitable of it.
+            report: Called with this object when the answer has come, in that thread; at once for an
+                answer that is not awaitable.
+        """
+        self._value = value
+        self._error: BaseException | None = None
+        self._report = report
+        self._future: Future[None] | None = None
+        if isawaitable(value):
+            self._future = asyncio.run_coroutine_threadsafe(self._await(), _loop())
+        else:
             report(self)
 
-        loop.call_soon_threadsafe(begin)
-
-    async def _await(self, awaitable: Awaitable[Any]) -> None:
+    async def _await(self) -> None:
         try:
-            self.value = await awaitable
-        except asyncio.CancelledError:
-            raise
-        except BaseException as error:  # an exit, too: it would end the loop
-            self.error = error
+            self._value = await self._value
+        except BaseException as error:  # also an exit, because it would end the loop
+            self._error = error
+        self._report(self)
 
     def cancel(self) -> None:
-        """Cancel it. It is reported when it has ended."""
-        self._loop.call_soon_threadsafe(lambda: self._task is None or self._task.cancel())
+        """Cancel an answer that is on its way. It is reported when its coroutine has ended."""
+        if self._future is not None:
+            # The loop cancels in its next round, because a task that has not begun never reports.
+            loop = _loop()
+            loop.call_soon_threadsafe(loop.call_soon, self._future.cancel)
 
-    def result(self) -> Any:
+    def result(self) -> Action:
         """Return the answer that was reported, or raise its error."""
-        if self.error is not None:
+        if self._error is not None:
             try:
-                raise self.error
+                raise self._error
             finally:
-                self.error = None  # its traceback refers to this object
-        return self.value
+                self._error = None  # its traceback refers to this object
+        return self._value
 
 
 class Answers:
     """Answers that are on their way, each with a key.
 
-    Not thread-safe: one thread asks for them and takes them.
+    Not thread-safe: one thread adds and takes them.
     """
 
     def __init__(self) -> None:
         self._keys: dict[Answer, Any] = {}
-        self._ended: SimpleQueue[Answer] = SimpleQueue()
+        self._reported: SimpleQueue[Answer] = SimpleQueue()
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -107,48 +105,47 @@ class Answers:
     @property
     def ready(self) -> bool:
         """Whether an answer has come."""
-        return not self._ended.empty()
+        return not self._reported.empty()
 
-    def add(self, key: Any, value: Any) -> None:
-        """Await something. What is not awaitable is an answer.
+    def add(self, key: Any, value: Action) -> None:
+        """Add an answer, or an awaitable of it.
 
         Raises:
             ReentrancyError: This is a coroutine of a policy itself: it would wait for its own
                 thread.
         """
-        if inspect.isawaitable(value) and current_thread().name == THREAD:
+        if isawaitable(value) and current_thread().name == THREAD:
             getattr(value, "close", int)()
             raise ReentrancyError(
                 "a coroutine of a policy runs simulations whose policies are coroutines; run them"
                 " in another thread: await asyncio.to_thread(simulate, ...)"
             )
-        self._keys[Answer(value, self._ended.put)] = key
+        self._keys[Answer(value, self._reported.put)] = key
 
     def take(self) -> tuple[Any, Answer]:
         """Wait for the next answer, and return its key and the answer."""
-        answer = self._ended.get()
+        answer = self._reported.get()
         return self._keys.pop(answer), answer
 
     def cancel(self) -> None:
-        """Cancel those that are on their way, and wait until they have ended."""
+        """Cancel all answers that are on their way, and wait until their coroutines have ended."""
         for answer in self._keys:
             answer.cancel()
         while self._keys:
             try:
-                self._keys.pop(self._ended.get(timeout=SECONDS_TO_CANCEL))
+                self._keys.pop(self._reported.get(timeout=SECONDS_TO_CANCEL))
             except Empty:
                 warn_user(
                     f"{len(self._keys)} coroutines of policies have not ended {SECONDS_TO_CANCEL}"
-                    " s after they were"
-                    f" cancelled: {short_repr(list(self._keys.values()))}",
+                    f" s after they were cancelled: {short_repr(list(self._keys.values()))}",
                     ResourceWarning,
                 )
                 return
 
 
-def wait_for(answer: Any) -> Any:
-    """Return an answer; one that is awaitable when it has come. An interrupt cancels it first."""
-    if not inspect.isawaitable(answer):
+def wait_for(answer: Action) -> Action:
+    """Return an answer, after waiting for it if it is awaitable. An interrupt cancels it first."""
+    if not isawaitable(answer):
         return answer
     answers = Answers()
     try:

@@ -1,11 +1,11 @@
-"""Random generators: those that all code in the process shares, and those of a simulation.
-
-New seeds for futures.
-"""
+"""Random generators: the global ones of the process, a simulation's own, and seeds for futures."""
 
 import random
+from collections import deque
 from collections.abc import Callable, Iterator
+from functools import cache
 from gc import get_referents
+from numbers import Integral
 from sys import modules
 from threading import current_thread
 from threading import enumerate as enumerate_threads
@@ -15,9 +15,18 @@ from typing import Any, Final
 from weakref import WeakSet
 
 import numpy as np
+from numpy.random import (
+    MT19937,
+    BitGenerator,
+    Generator,
+    RandomState,
+    SeedSequence,
+    default_rng,
+)
 
 from ...errors import OptionValueError, SimulationError, short_repr, warn_user
 from ...hooks.stacks import SIMULATION
+from ...simulation import Model
 
 PYTHON: Final[Any] = random.seed.__self__  # type: ignore[attr-defined]
 """The generator behind the functions of ``random``."""
@@ -28,9 +37,11 @@ NUMPY: Final[Any] = np.random.mtrand._rand
 LEGACY: Final[Any] = np.random  # NumPy's type stubs lack some of its functions
 
 
-def is_seed(value: Any) -> bool:
-    """Whether a value is a non-negative integer."""
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 0)
+def is_seed(value: object) -> bool:
+    """Return whether a value is a non-negative integer."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        return False
+    return int(value) >= 0
 
 
 # -- simulations that draw from the generators of the process --------------------------------------
@@ -45,26 +56,31 @@ Another thread that wakes up and draws runs for longer; the clocks differ by les
 """
 
 
-def draws_check(simulation: Any, *, in_thread: bool) -> Callable[[], None] | None:
-    """Begin to check whether a simulation draws from the global generators, unless its class was checked before.
+def draws_check(simulation: Model, *, in_thread: bool) -> Callable[[], None] | None:
+    """Begin to check whether a simulation draws from the global generators.
 
-    Return a function that ends the check, and warns. Beside one that runs ``in_thread``, the user's
-    threads may run.
+    Args:
+        simulation: The simulation, before it runs.
+        in_thread: Whether it runs in a thread beside which threads of the user may run.
+
+    Returns:
+        The function that ends the check, and warns. None if its class was checked before.
     """
     kind = type(simulation)
     if kind in _CHECKED:
         return None
-    states, time = global_states(), process_time_ns() - thread_time_ns()
+    states = global_states()
+    time_before = _time_of_other_threads()
 
     def warn_of_draws() -> None:
         _CHECKED.add(kind)
         names = [name for name, state in global_states().items() if state != states[name]]
-        alone = all(
+        is_alone = all(
             thread is current_thread() or thread.name == SIMULATION
             for thread in enumerate_threads()
         )
-        time_of_others = process_time_ns() - thread_time_ns() - time
-        if names and (alone or (not in_thread and time_of_others < _SHORT)):
+        is_idle = not in_thread and _time_of_other_threads() - time_before < _SHORT
+        if names and (is_alone or is_idle):
             warn_user(
                 f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which"
                 " all code in the process shares: its environments influence each other, and a"
@@ -74,8 +90,13 @@ def draws_check(simulation: Any, *, in_thread: bool) -> Callable[[], None] | Non
     return warn_of_draws
 
 
-def global_states() -> dict[str, Any]:
-    """Return values that change when a number is drawn from Python's or NumPy's global generator."""
+def _time_of_other_threads() -> int:
+    """Return the processor time of the other threads, in nanoseconds."""
+    return process_time_ns() - thread_time_ns()
+
+
+def global_states() -> dict[str, object]:
+    """Return values that change when Python's or NumPy's global generator draws a number."""
     return {"random": random.getstate(), "numpy.random": repr(LEGACY.get_bit_generator().state)}
 
 
@@ -90,58 +111,9 @@ A model that uses the same seed, or spawns from it, never gets this key.
 ENVIRONMENT: Final = 0
 PROCESS: Final = 1
 _SIMULATION: Final = 2
-"""Whose generators are seeded: the three have separate streams. A base policy that draws from the generators of the
-process must not get the same numbers as the simulation."""
-
-
-class Streams(dict[str, np.random.Generator]):
-    """The random generators of a model, by name: one for each entity or process, made when it is first asked for.
-
-    ::
-
-        self.streams = Streams(seed)
-        self.failures = self.streams[f"failures of {self.name}"]
-
-    What a generator draws depends on the seed and its name alone. So further entities, and their
-    actions, change no other entity's chance. This makes runs that differ in one action, or in one
-    entity, comparable with few seeds.
-    """
-
-    def __init__(self, seed: int | None = None) -> None:
-        """Begin with no generators.
-
-        ``seed``: a non-negative integer; None: one that the system draws.
-        """
-        super().__init__()
-        self._key = np.random.SeedSequence(None if seed is None else _checked(seed))
-
-    def __missing__(self, name: str) -> np.random.Generator:
-        self[name] = generator = np.random.default_rng(self._stream(name))
-        return generator
-
-    def reseed(self, seed: int) -> None:
-        """Seed all generators in place, and those that are asked for later: for a simulation's ``reseed``.
-
-        Raises:
-            OptionValueError: The seed is not a non-negative integer.
-        """
-        self._key = np.random.SeedSequence(_checked(seed), spawn_key=(_FUTURES, _SIMULATION))
-        for name, generator in self.items():
-            _seed_bits(generator.bit_generator, self._stream(name))
-
-    def _stream(self, name: str) -> np.random.SeedSequence:
-        return np.random.SeedSequence(
-            self._key.entropy, spawn_key=(*self._key.spawn_key, _NAMES, *name.encode())
-        )
-
-
-_GENERATORS: Final = (
-    Streams,
-    random.Random,
-    np.random.Generator,
-    np.random.RandomState,
-    np.random.BitGenerator,
-)
+"""The owners of generators. Each has separate streams, because a base policy that draws from the
+generators of the process must not get the same numbers as the simulation.
+"""
 
 _NAMES: Final = 2**32 - 2
 """The spawn key before the name of a stream.
@@ -149,25 +121,84 @@ _NAMES: Final = 2**32 - 2
 A model that spawns from the same seed never gets this key.
 """
 
-_ELSEWHERE: Final = (type, ModuleType, CodeType, np.ndarray, str, int, float, random.SystemRandom)
-"""Classes that are not searched: they lead to everything in the process, or to nothing.
 
-Nor are functions.
-"""
+class Streams(dict[str, Generator]):
+    """The random generators of a model, by name: one for each entity or process.
+
+    ::
+
+        self.streams = Streams(seed)
+        self.failures = self.streams[f"failures of {self.name}"]
+
+    A generator is made when it is first used. Its numbers depend on the seed and its name alone. So
+    further entities, and their actions, change no other entity's chance. This makes runs that
+    differ in one action, or in one entity, comparable with few seeds.
+    """
+
+    def __init__(self, seed: int | None = None) -> None:
+        """Begin with no generators.
+
+        Args:
+            seed: A non-negative integer. None: the system draws it.
+        """
+        super().__init__()
+        self._key = SeedSequence(None if seed is None else _validate(seed))
+
+    def __missing__(self, name: str) -> Generator:
+        return self.setdefault(name, default_rng(self._stream(name)))
+
+    def reseed(self, seed: int) -> None:
+        """Seed all generators in place, also the later ones: for a simulation's ``reseed``.
+
+        Raises:
+            OptionValueError: The seed is not a non-negative integer.
+        """
+        self._key = SeedSequence(_validate(seed), spawn_key=(_FUTURES, _SIMULATION))
+        for name, generator in self.items():
+            _seed_bits(generator.bit_generator, self._stream(name))
+
+    def _stream(self, name: str) -> SeedSequence:
+        return SeedSequence(
+            self._key.entropy, spawn_key=(*self._key.spawn_key, _NAMES, *name.encode())
+        )
 
 
-def seed_globals(seed: int, whose: int) -> None:
+_GENERATORS: Final = (
+    Streams,
+    random.Random,
+    Generator,
+    RandomState,
+    BitGenerator,
+)
+
+_SKIPPED: Final = (
+    # They lead to the whole process.
+    type,
+    ModuleType,
+    CodeType,
+    # They lead to no generator with a seed.
+    np.ndarray,
+    str,
+    int,
+    float,
+    random.SystemRandom,
+)
+"""Classes whose objects are not searched."""
+
+
+def seed_globals(seed: int, owner: int) -> None:
     """Seed Python's and NumPy's global generators for a future.
 
-    For the process also torch's, if it is imported.
+    For the owner ``PROCESS`` also torch's, if torch is imported.
     """
-    python, numpy, third = np.random.SeedSequence(int(seed), spawn_key=(_FUTURES, whose)).spawn(3)
-    PYTHON.seed(_integer(python))
-    # leaves the old bit generator as it is
-    LEGACY.set_bit_generator(type(LEGACY.get_bit_generator())(numpy))
-    torchs = generator_of_torch()
-    if whose == PROCESS and torchs is not None:
-        torchs.manual_seed(_integer(third))
+    key = SeedSequence(int(seed), spawn_key=(_FUTURES, owner))
+    of_python, of_numpy, of_torch = key.spawn(3)
+    PYTHON.seed(_integer(of_python))
+    # A new bit generator, because other code may hold the old one.
+    LEGACY.set_bit_generator(type(LEGACY.get_bit_generator())(of_numpy))
+    torch = generator_of_torch()
+    if owner == PROCESS and torch is not None:
+        torch.manual_seed(_integer(of_torch))
 
 
 def generator_of_torch() -> Any:
@@ -175,14 +206,14 @@ def generator_of_torch() -> Any:
     return getattr(modules.get("torch"), "default_generator", None)
 
 
-def reseed_generators(simulation: Any, seed: int) -> int:
-    """Seed all random generators of a simulation, each with a stream of its own.
+def reseed_generators(simulation: Model, seed: int) -> int:
+    """Seed all random generators of a simulation, each with another stream.
 
-    The generators are found in its attributes, in the attributes of these, and so on:
+    It looks for generators in the attributes, in the attributes of these, and so on:
     ``random.Random``, NumPy's ``Generator``, ``RandomState`` and ``BitGenerator``, and ``Streams``.
     In a Mesa model these are ``random`` and ``rng``, which all of its agents share. Each generator
     is seeded in place, so that all references to it stay valid. The same seed gives the same
-    states, whatever was drawn before. Several generators in one ``set`` get their streams in the
+    states, regardless of earlier draws. Several generators in one ``set`` get their streams in the
     order of the set.
 
     Modules, classes, functions and arrays are not searched. The global generators of Python and
@@ -200,69 +231,70 @@ def reseed_generators(simulation: Any, seed: int) -> int:
         SimulationError: There are no generators.
         OptionValueError: The seed is not a non-negative integer.
     """
-    key = np.random.SeedSequence(_checked(seed), spawn_key=(_FUTURES, _SIMULATION))
-    found = list(generators_of(simulation))
-    if not found:
+    key = SeedSequence(_validate(seed), spawn_key=(_FUTURES, _SIMULATION))
+    generators = list(generators_of(simulation))
+    if not generators:
         raise SimulationError(
             f"{short_repr(simulation)} holds no random generator to seed: keep a random.Random or"
             " numpy.random.Generator in an attribute; make the environment with global_rng=True if"
             " the model draws from random or numpy.random; seed other libraries' generators in the"
             " simulation's reseed"
         )
-    for generator, stream in zip(found, key.spawn(len(found)), strict=True):
-        if isinstance(generator, (Streams, random.Random)):
-            (generator.reseed if isinstance(generator, Streams) else generator.seed)(
-                _integer(stream)
-            )
-            continue
-        legacy = isinstance(generator, np.random.RandomState)
-        bits = getattr(generator, "_bit_generator" if legacy else "bit_generator", generator)
-        _seed_bits(bits, stream)
-        if legacy:
-            generator.set_state(bits.state)  # this drops the second normally distributed number
-    return len(found)
+    for generator, stream in zip(generators, key.spawn(len(generators)), strict=True):
+        match generator:
+            case Streams():
+                generator.reseed(_integer(stream))
+            case random.Random():
+                generator.seed(_integer(stream))
+            case RandomState():
+                generator.set_state(RandomState(MT19937(stream)).get_state())
+            case Generator():
+                _seed_bits(generator.bit_generator, stream)
+            case BitGenerator():
+                _seed_bits(generator, stream)
+    return len(generators)
 
 
-def generators_of(simulation: Any) -> Iterator[Any]:
+def generators_of(simulation: Model) -> Iterator[Model]:
     """Yield the generators that an object holds, the nearest first, each of them once.
 
     ``Streams`` count as one.
     """
+
+    @cache
+    def classify(kind: type) -> bool | None:
+        """Return whether objects of a class are generators. None: they are not searched."""
+        if hasattr(kind, "__globals__") or issubclass(kind, _SKIPPED):  # functions have globals
+            return None
+        return issubclass(kind, _GENERATORS)
+
     known = {id(PYTHON), id(NUMPY)}
-    # whether objects of a class are generators; None: they are not searched
-    kinds: dict[type, bool | None] = {}
-    level = [simulation]
-    while level:
-        following = []
-        for thing in level:
-            kind = type(thing)
-            if kind not in kinds:
-                # as functions have
-                elsewhere = issubclass(kind, _ELSEWHERE) or hasattr(kind, "__globals__")
-                kinds[kind] = None if elsewhere else issubclass(kind, _GENERATORS)
-            if kinds[kind] is None or id(thing) in known:
-                continue
-            known.add(id(thing))
-            if kinds[kind]:
-                yield thing
-                if isinstance(thing, Streams):
-                    known.update(map(id, thing.values()))
-            else:
-                following.append(thing)
-        level = get_referents(*following)
+    queue = deque([simulation])
+    while queue:
+        thing = queue.popleft()
+        is_generator = classify(type(thing))  # type: ignore[arg-type] # mypy doubts its hash
+        if is_generator is None or id(thing) in known:
+            continue
+        known.add(id(thing))
+        if not is_generator:
+            queue.extend(get_referents(thing))
+            continue
+        yield thing
+        if isinstance(thing, Streams):
+            known.update(map(id, thing.values()))
 
 
-def _seed_bits(bits: Any, stream: np.random.SeedSequence) -> None:
-    """Seed a bit generator in place."""
-    # new NumPy: the seed sequence for ``spawn``, too
-    bits.__setstate__(type(bits)(stream).__getstate__())
+def _seed_bits(bits: BitGenerator, stream: SeedSequence) -> None:
+    """Seed a bit generator in place, in new NumPy also its seed sequence for ``spawn``."""
+    bits.__setstate__(type(bits)(stream).__getstate__())  # type: ignore[attr-defined]
 
 
-def _checked(seed: Any) -> int:
+def _validate(seed: int) -> int:
+    """Return a seed as a Python integer."""
     if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
     return int(seed)
 
 
-def _integer(stream: np.random.SeedSequence) -> int:
+def _integer(stream: SeedSequence) -> int:
     return int(stream.generate_state(1, np.uint64)[0])

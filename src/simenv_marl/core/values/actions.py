@@ -6,30 +6,36 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
-from numpy.typing import NDArray
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Space, Tuple
+from numpy import ndarray
+from numpy.typing import ArrayLike, NDArray
 
 from ...errors import MaskError, short_repr
-from ...simulation import Sentinel
-from .spaces import duplicate
+from ...simulation import Action, Sentinel
+from .spaces import duplicate, parts_of
 
 ILLEGAL: Final = Sentinel("ILLEGAL")
 """An action check returns this for an action outside its space."""
 
-Check = Callable[[Any], Any]
+Check = Callable[[Action], Action]
 """Takes an action. Returns it in the form that its mapping receives, or ``ILLEGAL``."""
 
+Mask = NDArray[np.int8] | tuple["Mask", ...]
+"""The legal actions: of a ``Discrete`` an array ``(n,)`` of 0 and 1, of a ``MultiDiscrete`` a tuple
+with such an array for each component.
+"""
+
 MASK: Final = "action_mask"
-"""The key of the action mask in infos and in observations, by the convention of PettingZoo and Gymnasium."""
+"""The key of the action mask in infos and in observations, as in PettingZoo and Gymnasium."""
 
 _ONE_BYTE = "?bB"  # dtypes with one byte per number
-_SMALL = 16  # up to this many elements, comparing Python floats is faster than four calls of NumPy
+_SMALL = 16  # up to this many elements, comparing Python floats is faster than NumPy
 
 
 # -- checks ----------------------------------------------------------------------------------------
 
 
-def action_check(space: spaces.Space[Any], *, clips: bool = False) -> Check:
+def action_check(space: Space[Any], *, clips: bool = False) -> Check:
     """Make the function that checks actions against a space.
 
     The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action
@@ -37,50 +43,58 @@ def action_check(space: spaces.Space[Any], *, clips: bool = False) -> Check:
     copied, for a ``Box`` in its dtype. If it ``clips``, it clips the parts of actions that belong
     to a ``Box``.
     """
-    if isinstance(space, spaces.Discrete):
-        return _discrete_check(space)
-    if isinstance(space, spaces.Box):
-        return _box_check(space, clips)
-    if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        return _parts_check(space, clips)
+    match space:
+        case Discrete():
+            return _discrete_check(space)
+        case Box():
+            return _box_check(space, clips)
+        case Dict() | Tuple():
+            return _parts_check(space, clips)
 
-    def check(action: Any) -> Any:
+    def check(action: Action) -> Action:
         try:
-            return duplicate(action) if space.contains(action) else ILLEGAL
-        except Exception:  # some spaces raise for a value that is not in them
-            return ILLEGAL
+            if space.contains(action):
+                return duplicate(action)
+        except Exception:  # some spaces raise for a value outside
+            pass
+        return ILLEGAL
 
     return check
 
 
-def _parts_check(space: spaces.Dict | spaces.Tuple[Any], clips: bool) -> Check:
-    named = isinstance(space, spaces.Dict)
-    parts: Any = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-    checks: dict[Any, Check] = {key: action_check(part, clips=clips) for key, part in parts}
+def _parts_check(space: Dict | Tuple[Any], clips: bool) -> Check:
+    is_dict = isinstance(space, Dict)
+    checks = {key: action_check(part, clips=clips) for key, part in parts_of(space).items()}
 
-    def check(action: Any) -> Any:
-        if not isinstance(action, Mapping if named else (tuple, list)) or len(action) != len(
-            checks
-        ):
+    def check(action: Action) -> Action:
+        if not isinstance(action, Mapping if is_dict else (tuple, list)):
             return ILLEGAL
-        try:
-            found = {key: check_part(action[key]) for key, check_part in checks.items()}
-        except KeyError:
+        if len(action) != len(checks):
             return ILLEGAL
-        if any(part is ILLEGAL for part in found.values()):
-            return ILLEGAL
-        return found if named else tuple(found.values())
+        checked = {}
+        for key, check_part in checks.items():
+            try:
+                part = check_part(action[key])
+            except KeyError:
+                return ILLEGAL
+            if part is ILLEGAL:
+                return ILLEGAL
+            checked[key] = part
+        if is_dict:
+            return checked
+        return tuple(checked.values())
 
     return check
 
 
-def _discrete_check(space: spaces.Discrete) -> Check:
-    low, high = int(space.start), int(space.start + space.n)
+def _discrete_check(space: Discrete) -> Check:
+    low = int(space.start)
+    high = low + int(space.n)
     integers = (int, np.integer, np.bool_)
 
-    def check(action: Any) -> Any:
+    def check(action: Action) -> Action:
         if type(action) is not int:
-            if isinstance(action, np.ndarray) and action.shape == ():
+            if isinstance(action, ndarray) and action.shape == ():
                 action = action[()]
             if not isinstance(action, integers):
                 return ILLEGAL
@@ -92,57 +106,61 @@ def _discrete_check(space: spaces.Discrete) -> Check:
     return check
 
 
-def _box_check(space: spaces.Box, clips: bool) -> Check:
-    shape, dtype = space.shape, space.dtype
-    lows, highs = space.low.ravel().tolist(), space.high.ravel().tolist()
-    scalar, small = len(lows) == 1, len(lows) <= _SMALL
-    kinds = "iu" if dtype.kind in "iu" else "iuf"
+def _box_check(space: Box, clips: bool) -> Check:
+    # Local variables and Python numbers, because the check runs at each decision.
+    shape = space.shape
+    dtype = space.dtype
+    lows = space.low.ravel().tolist()
+    highs = space.high.ravel().tolist()
+    is_scalar = len(lows) == 1
+    is_small = len(lows) <= _SMALL
+    is_integer = dtype.kind in "iu"
+    takes_float = is_scalar and not is_integer
+    low = lows[0] if is_scalar else 0.0
+    high = highs[0] if is_scalar else 0.0
+    kinds = "iu" if is_integer else "iuf"
 
-    ndarray, first_low, first_high = (
-        np.ndarray,
-        lows[0] if scalar else 0.0,
-        highs[0] if scalar else -1.0,
-    )
-
-    def legal(array: NDArray[Any]) -> bool:
-        if not small:
+    def is_legal(array: NDArray[Any]) -> bool:
+        if not is_small:
             return bool(((array >= space.low) & (array <= space.high)).all())
         return all(
-            low <= value <= high
-            for low, value, high in zip(lows, array.ravel().tolist(), highs, strict=True)
+            least <= value <= most
+            for least, value, most in zip(lows, array.ravel().tolist(), highs, strict=True)
         )
 
-    def check(action: Any) -> Any:
+    def check(action: Action) -> Action:
         if type(action) is ndarray and action.dtype is dtype and action.shape == shape:
-            if first_low <= action.item() <= first_high if scalar else legal(action):
+            if low <= action.item() <= high if is_scalar else is_legal(action):
                 return action.copy()
-        elif type(action) is float and kinds == "iuf" and first_low <= action <= first_high:
+        elif takes_float and type(action) is float and low <= action <= high:
             return action
         try:
-            given = array = np.asarray(action)
+            array = np.asarray(action)
         except (ValueError, TypeError):
             return ILLEGAL
-        if array.dtype.kind not in kinds or (
-            array.shape != shape and not (scalar and array.shape == ())
-        ):
+        if array.dtype.kind not in kinds:
             return ILLEGAL
+        if array.shape != shape and not (is_scalar and array.shape == ()):
+            return ILLEGAL
+        numbers = array
         if clips:
-            bounds = [bound.reshape(array.shape) for bound in (space.low, space.high)]
-            # as integers of Python, because NumPy has no type for both int64 and uint64
-            if kinds == "iu":
-                array, *bounds = (part.astype(object) for part in (array, *bounds))
-            array = np.clip(array, *bounds)
-        # before the cast, because the cast may wrap integers around
-        if kinds == "iu" and not legal(array):
-            return ILLEGAL
+            numbers = array.reshape(shape)
+            if is_integer:
+                # Python integers, because NumPy has no type for both int64 and uint64.
+                numbers = numbers.astype(object)
+            # An array again, because ``clip`` returns a Python integer without dimensions.
+            numbers = np.asarray(np.clip(numbers, space.low, space.high))
         with np.errstate(over="ignore"):
-            cast = array.astype(dtype, copy=True)
-        # after the cast, so that a bound is legal in every precision
-        if kinds != "iu" and not legal(cast):
+            cast = numbers.astype(dtype)
+        # The cast may wrap integers around, so they are compared before it. Floats are compared
+        # after it, so that a bound is legal in every precision.
+        if not is_legal(numbers if is_integer else cast):
             return ILLEGAL
         if array.shape == shape:
             return cast
-        return action if array == given else cast.item()
+        if numbers == array:
+            return action
+        return cast.item()
 
     return check
 
@@ -150,33 +168,29 @@ def _box_check(space: spaces.Box, clips: bool) -> Check:
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def mask_cast(space: Any) -> Callable[[Any], Any]:
+def mask_cast(space: Space[Any]) -> Callable[[ArrayLike], Mask]:
     """Make the function that casts a mask of the legal actions to np.int8.
 
-    That of a ``MultiDiscrete`` is a tuple.
-
     It raises ``MaskError`` for another shape, for values other than 0 and 1, and if no action is
-    legal.
+    legal. A mask of a ``MultiDiscrete`` is a tuple or a list of masks.
     """
-    if isinstance(space, spaces.MultiDiscrete):
-        parts = [_mask_of(int(number), space) for number in space.nvec.ravel()]
+    if isinstance(space, MultiDiscrete):
+        casts = [mask_cast(Discrete(size)) for size in space.nvec.ravel()]
 
-        def cast(value: Any) -> Any:
-            if not isinstance(value, (tuple, list)) or len(value) != len(parts):
+        def cast_parts(value: ArrayLike) -> Mask:
+            if not isinstance(value, (tuple, list)) or len(value) != len(casts):
                 raise MaskError(
-                    f"the mask {short_repr(value)} must have the {len(parts)} parts of"
+                    f"the mask {short_repr(value)} must have the {len(casts)} parts of"
                     f" {short_repr(space)}"
                 )
-            return tuple(part(item) for part, item in zip(parts, value, strict=True))
+            return tuple(part(item) for part, item in zip(casts, value, strict=True))
 
-        return cast
-    return _mask_of(int(space.n), space)
+        return cast_parts
+    assert isinstance(space, Discrete)
+    shape = (int(space.n),)
+    int8 = np.dtype(np.int8)
 
-
-def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[np.int8]]:
-    shape, int8 = (number,), np.dtype(np.int8)
-
-    def cast(value: Any) -> NDArray[np.int8]:
+    def cast(value: ArrayLike) -> Mask:
         mask = np.asarray(value)
         if mask.shape != shape:
             raise MaskError(
@@ -184,8 +198,9 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
                 f" {shape}"
             )
         if mask.dtype.char not in _ONE_BYTE:
-            given, mask = mask, mask.astype(bool)
-            if not (mask == given).all():
+            numbers = mask
+            mask = numbers.astype(bool)
+            if not (mask == numbers).all():
                 raise MaskError(f"the mask {short_repr(value)} has values other than 0 and 1")
         marks = mask.tobytes()  # comparing bytes is faster than three calls of NumPy
         if marks.strip(b"\0\1"):
@@ -199,35 +214,37 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
     return cast
 
 
-def open_mask(space: Any) -> Any:
+def open_mask(space: Space[Any]) -> Mask:
     """Make the mask of an action space that allows every action."""
-    if isinstance(space, spaces.MultiDiscrete):
-        return tuple(np.ones(int(number), np.int8) for number in space.nvec.ravel())
-    return np.ones(int(space.n), np.int8)
+    if isinstance(space, Discrete):
+        return np.ones(space.n, np.int8)
+    assert isinstance(space, MultiDiscrete)
+    return tuple(np.ones(size, np.int8) for size in space.nvec.ravel())
 
 
-def mask_allows(space: Any, mask: Any, action: Any) -> bool:
-    """Whether a mask that ``mask_cast`` returned allows an action of the space."""
-    if isinstance(space, spaces.MultiDiscrete):
-        choices = (action - space.start).ravel()
-        return all(part[choice] for part, choice in zip(mask, choices, strict=True))
-    return bool(mask[action - int(space.start)])
+def mask_allows(space: Space[Any], mask: Mask, action: Action) -> bool:
+    """Return whether a mask that ``mask_cast`` returned allows an action of the space."""
+    if isinstance(space, Discrete):
+        return bool(mask[action - int(space.start)])
+    assert isinstance(space, MultiDiscrete)
+    choices = (action - space.start).ravel().tolist()
+    return all(part[choice] for part, choice in zip(mask, choices, strict=True))
 
 
-def only_choice(space: spaces.Space[Any], mask: Any) -> Any:
-    """The only action that a mask of ``mask_cast`` allows (None: all are legal).
+def only_choice(space: Space[Any], mask: Mask | None) -> Action:
+    """Return the only legal action of a space; None if there are several.
 
-    None if there are several.
+    ``mask`` is a mask of ``mask_cast``. None: all actions are legal.
     """
-    if isinstance(space, spaces.MultiDiscrete):
-        parts = open_mask(space) if mask is None else mask
-        if any(np.count_nonzero(part) != 1 for part in parts):
-            return None
-        chosen = np.array([np.argmax(part) for part in parts], space.dtype).reshape(space.shape)
-        return (chosen + space.start).astype(space.dtype)
-    if (
-        not isinstance(space, spaces.Discrete)
-        or (int(space.n) if mask is None else np.count_nonzero(mask)) != 1
-    ):
-        return None
-    return int(space.start) + (0 if mask is None else int(np.argmax(mask)))
+    match space:
+        case Discrete():
+            if mask is None and space.n == 1:
+                return int(space.start)
+            if mask is not None and np.count_nonzero(mask) == 1:
+                return int(space.start + np.argmax(mask))
+        case MultiDiscrete():
+            parts = open_mask(space) if mask is None else mask
+            if all(np.count_nonzero(part) == 1 for part in parts):
+                choices = np.array([np.argmax(part) for part in parts]).reshape(space.shape)
+                return (choices + space.start).astype(space.dtype)
+    return None

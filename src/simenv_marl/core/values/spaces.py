@@ -1,57 +1,91 @@
 """Observations: casts to their space, copies, comparisons, and blank observations.
 
-Each space is analysed once, when an environment is made. The functions that run at each decision
+An environment analyses each space once, when it is made. The functions that run at each decision
 are closures over the result.
 """
 
 from __future__ import annotations
 
-import copy
 import sys
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from sys import getrefcount
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from numpy import ndarray
 from numpy.typing import NDArray
 
 from ...errors import ObservationError, short_repr
-from ...simulation import Sentinel
+from ...simulation import Observation, Sentinel
 
-Cast = Callable[[Any], Any]
+Cast = Callable[[Observation], Observation]
 """Takes an observation. Returns it cast to its space's dtype, with no memory shared."""
 
+ArraySpace = Box | MultiBinary | MultiDiscrete
+"""Spaces whose elements are arrays."""
 
-def observation_cast(space: spaces.Space[Any]) -> Cast:
-    """Make the function that casts observations to a space, or raises ``ObservationError`` if they do not fit."""
-    if isinstance(space, (spaces.Box, spaces.MultiBinary, spaces.MultiDiscrete)):
-        return _array_cast(space)
-    if isinstance(space, spaces.Discrete):
-        return _discrete_cast(space)
-    if isinstance(space, spaces.Dict):
-        return _dict_cast(space)
-    if isinstance(space, spaces.Tuple):
-        return _tuple_cast(space)
 
-    def cast(value: Any) -> Any:
+# -- casts ----------------------------------------------------------------------------------------
+
+
+def observation_cast(space: Space[Any]) -> Cast:
+    """Make the function that casts observations to a space.
+
+    It raises ``ObservationError`` for an observation that does not fit the space.
+    """
+    match space:
+        case Box() | MultiBinary() | MultiDiscrete():
+            return _array_cast(space)
+        case Discrete():
+            return _discrete_cast(space)
+        case Dict() | Tuple():
+            return _parts_cast(space)
+
+    def cast(value: Observation) -> Observation:
         if not space.contains(value):
             raise ObservationError(
                 f"the observation {short_repr(value)} is not in {short_repr(space)}"
             )
-        return copy.deepcopy(value)
+        return deepcopy(value)
 
     return cast
 
 
-def _array_cast(space: spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete) -> Cast:
-    ndarray, dtype, shape = np.ndarray, space.dtype, space.shape
-    fresh = _FRESH
+def _references_to_fresh_argument() -> int:
+    """Count the references to an array that only the called function refers to.
 
-    def cast(value: Any) -> NDArray[Any]:
+    The number differs between versions of Python, so a function with the form of ``cast`` measures
+    it. The result is -1, which makes ``cast`` copy every array, if the number does not tell a fresh
+    array from another one. Without the global interpreter lock it never does, because another
+    thread may take a reference at any time.
+    """
+    if not getattr(sys, "_is_gil_enabled", lambda: True)():
+        return -1
+
+    def count(value: NDArray[Any]) -> int:
+        return getrefcount(value)
+
+    array = np.zeros(1)
+    fresh = count(np.zeros(1))
+    if fresh < count(array):
+        return fresh
+    return -1
+
+
+_FRESH: Final = _references_to_fresh_argument()
+
+
+def _array_cast(space: ArraySpace) -> Cast:
+    # Local variables and comparisons by identity, because the cast runs at each decision.
+    dtype = space.dtype
+    shape = space.shape
+
+    def cast(value: Observation) -> NDArray[Any]:
         if type(value) is ndarray and value.dtype is dtype and value.shape == shape:
             # An array without any other reference needs no copy.
-            if value.base is None and getrefcount(value) <= fresh:
+            if value.base is None and getrefcount(value) <= _FRESH:
                 return value
             return value.copy()
         return _convert(value, space)
@@ -59,7 +93,9 @@ def _array_cast(space: spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete) -
     return cast
 
 
-def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
+def _convert(value: Observation, space: ArraySpace) -> NDArray[Any]:
+    """Convert an observation that is not yet an array of a space's dtype and shape."""
+    dtype: np.dtype[Any] = space.dtype
     try:
         array = np.asarray(value)
     except ValueError as error:
@@ -75,30 +111,29 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
         raise ObservationError(
             f"the observation {short_repr(value)} has dtype {array.dtype}, which is not numeric"
         )
-    assert space.dtype is not None
-    if space.dtype.kind in "iu" and array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ObservationError(
-            f"the observation {short_repr(value)} is not finite, and {space.dtype} holds only"
-            " finite numbers"
-        )
-    if space.dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, space.dtype):
-        limits = np.iinfo(space.dtype)
+    if dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, dtype):
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ObservationError(
+                f"the observation {short_repr(value)} is not finite, and {dtype} holds only finite"
+                " numbers"
+            )
+        limits = np.iinfo(dtype)
         if array.min() < limits.min or array.max() > limits.max:
             raise ObservationError(
-                f"the observation {short_repr(value)} has numbers that {space.dtype} cannot hold"
+                f"the observation {short_repr(value)} has numbers that {dtype} cannot hold"
             )
-    return array.astype(space.dtype, copy=True)
+    return array.astype(dtype)
 
 
-def _discrete_cast(space: spaces.Discrete) -> Cast:
-    kind = space.dtype.type
+def _discrete_cast(space: Discrete) -> Cast:
+    integer = space.dtype.type
 
-    def cast(value: Any) -> Any:
-        if type(value) is kind:
+    def cast(value: Observation) -> Observation:
+        if type(value) is integer:
             return value
         if np.ndim(value) == 0:
             try:
-                number = kind(value)
+                number = integer(value)
                 if number == value:
                     return number
             except (TypeError, ValueError, OverflowError):
@@ -110,115 +145,92 @@ def _discrete_cast(space: spaces.Discrete) -> Cast:
     return cast
 
 
-def _dict_cast(space: spaces.Dict) -> Cast:
-    casts = {key: observation_cast(part) for key, part in space.spaces.items()}
+def parts_of(space: Dict | Tuple[Any]) -> dict[Any, Space[Any]]:
+    """Return the spaces of the parts of a space, by key or by place."""
+    if isinstance(space, Dict):
+        return dict(space)
+    return dict(enumerate(space))
 
-    def cast(value: Any) -> dict[str, Any]:
+
+def _parts_cast(space: Dict | Tuple[Any]) -> Cast:
+    is_tuple = isinstance(space, Tuple)
+    casts = {key: observation_cast(part) for key, part in parts_of(space).items()}
+    number = len(casts)
+
+    def cast(value: Observation) -> Observation:
         try:
-            if len(value) == len(casts):
-                return {key: part(value[key]) for key, part in casts.items()}
+            if len(value) == number and (not is_tuple or isinstance(value, (tuple, list))):
+                parts = {key: part(value[key]) for key, part in casts.items()}
+                return tuple(parts.values()) if is_tuple else parts
         except (TypeError, KeyError):
             pass
+        expected = f"{number} parts" if is_tuple else f"keys {short_repr(list(casts))}"
         raise ObservationError(
-            f"the observation {short_repr(value)} must have exactly the keys"
-            f" {short_repr(sorted(casts))} of {short_repr(space)}"
+            f"the observation {short_repr(value)} must have exactly the {expected} of"
+            f" {short_repr(space)}"
         )
 
     return cast
 
 
-def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
-    casts = tuple(observation_cast(part) for part in space.spaces)
+# -- copies, comparisons, blanks ------------------------------------------------------------------
 
-    def cast(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, (tuple, list)) or len(value) != len(casts):
-            raise ObservationError(
-                f"the observation {short_repr(value)} must have the {len(casts)} parts of"
-                f" {short_repr(space)}"
-            )
-        return tuple(part(item) for part, item in zip(casts, value, strict=True))
-
-    return cast
+_IMMUTABLE: Final = (np.generic, int, float, str, Sentinel)
 
 
-_UNCHANGING: Final = (np.generic, int, float, str, Sentinel)
-
-
-def duplicate(observation: Any) -> Any:
+def duplicate(observation: Observation) -> Observation:
     """Copy an observation, so that the receiver may change it."""
-    if type(observation) is np.ndarray:
+    # The frequent types come first, because this runs at each decision.
+    if type(observation) is ndarray:
         return observation.copy()
-    if isinstance(observation, _UNCHANGING):
+    if isinstance(observation, _IMMUTABLE):
         return observation
     if type(observation) is dict:
         return {key: duplicate(value) for key, value in observation.items()}
     if type(observation) is tuple:
-        return tuple(duplicate(value) for value in observation)
-    return copy.deepcopy(observation)
+        return tuple(map(duplicate, observation))
+    return deepcopy(observation)
 
 
-def same(one: Any, other: Any) -> bool:
-    """Whether two observations are equal, number for number."""
-    if isinstance(one, Mapping):
-        return (
-            isinstance(other, Mapping)
-            and one.keys() == other.keys()
-            and all(same(one[k], other[k]) for k in one)
-        )
-    if isinstance(one, (tuple, list)):
-        return (
-            isinstance(other, (tuple, list))
-            and len(one) == len(other)
-            and all(map(same, one, other))
-        )
-    if isinstance(one, np.ndarray):
-        return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+def same(one: Observation, other: Observation) -> bool:
+    """Return whether two observations are equal, number for number. NaN equals NaN."""
+    match one:
+        case Mapping():
+            if not isinstance(other, Mapping):
+                return False
+            if one.keys() != other.keys():
+                return False
+            return all(same(one[key], other[key]) for key in one)
+        case tuple() | list():
+            if not isinstance(other, (tuple, list)):
+                return False
+            if len(one) != len(other):
+                return False
+            return all(map(same, one, other))
+        case ndarray():
+            return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
     return bool(one == other)
 
 
-def blank(space: spaces.Space[Any]) -> Any:
-    """Make the blank observation of an agent that was not observed yet: zero, clipped into the space.
+def blank(space: Space[Any]) -> Observation:
+    """Make the blank observation of an agent that was not observed yet.
 
-    For spaces without a zero (text, graphs, ...) it is a fixed sample.
+    It is zero, clipped into the space. For a space without a zero (text, graphs, ...) it is a fixed
+    sample.
     """
-    if isinstance(space, spaces.Box):
-        return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high).astype(
-            space.dtype
-        )
-    if isinstance(space, spaces.Discrete):
-        return space.dtype.type(np.clip(0, space.start, space.start + space.n - 1))
-    if isinstance(space, spaces.MultiDiscrete):
-        return np.clip(0, space.start, space.start + space.nvec - 1).astype(space.dtype)
-    if isinstance(space, spaces.MultiBinary):
-        return np.zeros(space.shape, space.dtype)
-    if isinstance(space, spaces.Dict):
-        return {key: blank(part) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(blank(part) for part in space.spaces)
-    sampled = copy.deepcopy(space)
-    sampled.seed(0)
-    return sampled.sample()
-
-
-def _calibrate() -> int:
-    """Count the references to an array that only the running ``cast`` holds.
-
-    The number differs between versions of Python, so it is measured with a function of the same
-    form. Without the global interpreter lock another thread may take a reference at any time, and
-    so every array is copied.
-    """
-    if not getattr(sys, "_is_gil_enabled", lambda: True)():
-        return -1
-    seen: list[int] = []
-
-    def cast(value: Any) -> Any:
-        seen.append(getrefcount(value))
-        return value
-
-    cast(np.zeros(1))
-    held = np.zeros(1)
-    cast(held)
-    return seen[0] if seen[0] < seen[1] else -1
-
-
-_FRESH = _calibrate()
+    match space:
+        case Box():
+            return np.zeros(space.shape, space.dtype).clip(space.low, space.high)
+        case Discrete():
+            return np.clip(0, space.start, space.start + space.n - 1).astype(space.dtype)
+        case MultiDiscrete():
+            return np.clip(0, space.start, space.start + space.nvec - 1).astype(space.dtype)
+        case MultiBinary():
+            return np.zeros(space.shape, space.dtype)
+        case Dict():
+            return {key: blank(part) for key, part in space.items()}
+        case Tuple():
+            return tuple(map(blank, space))
+    unseeded = deepcopy(space)  # the user may have seeded the space itself
+    unseeded.seed(0)
+    return unseeded.sample()

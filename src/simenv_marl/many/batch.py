@@ -465,7 +465,7 @@ def step_all(
             return
         replies: list[Any] = []
         for number, episode in enumerate(episodes):
-            replies.append(episode.answer_turn(agents[number], actions[number]))
+            replies.append(episode.answer(agents[number], actions[number]))
         for number, episode in enumerate(episodes):
             events.append(episode.resume(replies[number]))
         del replies

@@ -10,6 +10,7 @@ import numpy as np
 from greenlet import getcurrent
 
 from ...errors import AgentError, MaskError, RewardError, short_repr
+from ...hooks.hook import BOUND
 from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
 from ...simulation import RULE, Action, Model, Observation
@@ -162,7 +163,7 @@ class Agent:
             if is_rewarded:
                 self.carry_reward(forced is not None or not self.asked)
             if forced is not None:
-                return episode.answer_forced(self, forced)
+                return self.answer(forced, forced=True)
         self.asked = True
         if isinstance(policy, AskingPolicy):
             self.keep(episode, args, kwargs)
@@ -171,7 +172,7 @@ class Agent:
         action = episode.consult(self, policy)
         if action is WAIT:
             return WAIT
-        return episode.answer(self, action if action is RULE else self.validate(action))
+        return self.answer(action if action is RULE else self.validate(action))
 
     def answer_by_policy(self, episode: Episode) -> Action:
         """Ask the policy itself for an action."""
@@ -188,22 +189,35 @@ class Agent:
         """Return the only legal action of the pending decision. None if there are several."""
         return only_choice(self.point.definition.action_space, self.mask)
 
-    def mark_answered(self, *, forced: bool = False) -> None:
-        """Note that the pending decision is answered. Forced moves leave the time as it is."""
-        if not forced or self.answered_at is None:
-            self.answered_at = self.now
+    def answer(self, action: Action, forced: bool = False) -> Model:
+        """Turn a checked action, or ``RULE``, into the reply to the pending decision.
+
+        ``forced``: it is the only legal action, so elapsed times add up to the next decision.
+        """
+        point = self.point
+        reply: Model = action
+        if self.choices is not None:
+            reply = self._take_choice(action, self.choices)
+        elif action is not RULE:
+            reply = point.convert(action)
         self.answered += 1
+        if not forced:
+            self.acted = True
+            self.answered_at = self.now
+        elif self.answered_at is None:
+            self.answered_at = self.now
+        return (self, reply) if point.applies and reply is not RULE else reply
 
-    def take_choice(self, action: Action) -> Model:
+    def _take_choice(self, action: Action, choices: list[Model]) -> Model:
         """Return the choice of an action in a list, and forget the others."""
-        choices, self.choices = self.choices, None
-        if self.point.reports_rule and choices is not None:
+        self.choices = None
+        if self.point.reports_rule:
             self.offered = [weaken(choice) for choice in choices]
-        return [choices[action]] if action is not RULE and choices is not None else action
+        return action if action is RULE else [choices[action]]
 
-    def mark_acted(self, acted: bool) -> None:
-        """Note whether a round has used an action for the agent."""
-        self.acted = acted
+    def begin_round(self) -> None:
+        """Note that the round has used no action for the agent yet."""
+        self.acted = False
 
     def mark_asked(self) -> None:
         """Note that somebody is asked for an action."""
@@ -355,17 +369,19 @@ class Agent:
         observation stays.
         """
         arguments = self.arguments
+        if arguments.is_single and self._is_quick:  # this spares most agents of a round a call
+            entity = arguments.first()
+            if entity is not None and reward:
+                self.update((entity,), BOUND)
+                return
         if arguments.is_empty:
             self.clear_observation()
             return
         call = arguments.recall()
         if call.is_whole:
-            if reward and not last:
-                self.update(call.args, call.kwargs)
-            else:
-                self.update_fully(call.args, call.kwargs, reward=reward, last=last)
-            return
-        self._refresh_in_part(call, reward, last)
+            self.update_fully(call.args, call.kwargs, reward=reward, last=last)
+        else:
+            self._refresh_in_part(call, reward, last)
 
     def _refresh_in_part(self, call: Recalled, reward: bool, last: bool) -> None:
         point = self.point

@@ -203,7 +203,8 @@ class Episode(EpisodeState):
                 if legal is ILLEGAL or agent.mask is not None:
                     legal = agent.validate(action)
                 action = legal
-            self.advance(self.answer_turn(agent, action))
+            reply = self.answer(agent, action)
+            self.advance(reply)
         except BaseException as error:
             if self.pending is None:
                 self.fail(error)
@@ -231,12 +232,13 @@ class Episode(EpisodeState):
         checked = checked_actions(self, actions)
         self.pending = None
         try:
-            self.record({name: _copied(action) for name, action in checked.items()})
+            if len(self.tape) < self._tape_size:
+                self.tape.append({name: _copied(action) for name, action in checked.items()})
             self.turns += bool(checked)
             is_last = bool(checked) and self.turns == self._most_steps
             played.begin(checked)
             for agent in (*self.agents.values(), *self.just_ended):
-                agent.mark_acted(False)
+                agent.begin_round()
             if self.unreported_end:
                 self.unreported_end = False
             else:
@@ -245,7 +247,8 @@ class Episode(EpisodeState):
             moved = not self.has_to_wait(reply)
             if moved:
                 self.advance(reply)
-            played.count_unused(self.skips)
+            if not self.skips:  # else forced moves have used none
+                played.count_unused()
             if not self.over and self.consulted is None:  # it is set where a replay ends
                 self.update_all(truncated=is_last)
         except BaseException as error:
@@ -290,7 +293,8 @@ class Episode(EpisodeState):
         """Handle a decision where more than an update is due. Return the agent or the reply."""
         self.latest = agent
         if self.round is not None:
-            agent.observe_again(args, kwargs)
+            if agent.point.legal is not None or agent.clock is not None:
+                agent.observe_again(args, kwargs)
             return self._use_action(self.round, agent)
         if self.turns >= self._most_steps:  # the user has taken the last step
             self.finish(truncated=True)
@@ -300,7 +304,7 @@ class Episode(EpisodeState):
             forced = agent.only_action()
             agent.carry_reward(forced is not None or not agent.asked)
             if forced is not None:
-                return self.answer_forced(agent, forced)
+                return agent.answer(forced, forced=True)
             agent.mark_asked()
         return agent
 
@@ -310,23 +314,23 @@ class Episode(EpisodeState):
         action = played.take(agent) if forced is None else forced
         if action is WAIT:
             return agent
-        if forced is None:
-            agent.mark_acted(True)
         self.latest = agent
         if not agent.decided:  # it acts before it was ever updated
             call = agent.arguments.recall()
             agent.update_fully(call.args, call.kwargs, observe=False)
-        return self.answer(agent, action)
+        return agent.answer(action, forced is not None)
 
-    def answer_turn(self, agent: Agent, action: Action) -> Model:
+    def answer(self, agent: Agent, action: Action) -> Model:
         """Turn the user's checked action, or ``RULE``, into the reply to the pending decision.
 
         If a mapping raises, the decision stays pending.
         """
         try:
             self.pending = None  # so that an action from inside a mapping is refused
-            recorded = _copied(action)  # before a mapping can change it
-            reply = self.answer(agent, action)
+            recorded = action
+            if type(action) is not int and action is not RULE:
+                recorded = duplicate(action)  # before a mapping can change it
+            reply = agent.answer(action)
         except BaseException:
             self.pending = agent
             raise
@@ -336,21 +340,6 @@ class Episode(EpisodeState):
         if turns == self._most_steps:
             self.is_plain = False
         return reply
-
-    def answer_forced(self, agent: Agent, action: Action) -> Model:
-        """Answer with the only legal action. Elapsed times add up to the next decision asked."""
-        return self.answer(agent, action, forced=True)
-
-    def answer(self, agent: Agent, action: Action, *, forced: bool = False) -> Model:
-        """Turn the checked action of an agent, or ``RULE``, into the reply for ``resume``."""
-        point = agent.point
-        reply: Model = action
-        if agent.choices is not None:
-            reply = agent.take_choice(action)
-        elif action is not RULE:
-            reply = point.convert(action)
-        agent.mark_answered(forced=forced)
-        return (agent, reply) if point.applies and reply is not RULE else reply
 
     def consult(self, agent: Agent, policy: Policy) -> Action:
         """Ask the policy of an agent. ``WAIT`` where a replay ends."""
@@ -468,10 +457,12 @@ class Episode(EpisodeState):
         ``truncated``: the episode ends here.
         """
         pending, self.pending = self.pending, None  # so that an action from a mapping is refused
-        in_rounds = self.in_rounds
-        for agent, (args, kwargs) in self._announced().items():
-            if agent is not pending and (in_rounds or not agent.decided):
-                agent.keep(self, args, kwargs)
+        in_rounds = self.round is not None
+        expected_calls = getattr(self.simulation, "expected_calls", None)
+        if expected_calls is not None:
+            for agent, (args, kwargs) in self._announced(expected_calls).items():
+                if agent is not pending and (in_rounds or not agent.decided):
+                    agent.keep(self, args, kwargs)
         if truncated:
             self.finish(truncated=True)
             return
@@ -487,12 +478,11 @@ class Episode(EpisodeState):
                 agent.forget_choices()  # ``legal`` returns them again when it decides
         self.pending = pending
 
-    def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
+    def _announced(
+        self, expected_calls: Callable[[str], Iterable[Args]]
+    ) -> dict[Agent, tuple[Args, Kwargs]]:
         """Return the agents that ``expected_calls`` announces, with the arguments of their call."""
-        expected_calls = getattr(self.simulation, "expected_calls", None)
         announced: dict[Agent, tuple[Args, Kwargs]] = {}
-        if expected_calls is None:
-            return announced
         for plan_point in self.plan.active:
             handler = self._handlers.by_point[plan_point]
             point = handler.point

@@ -22,34 +22,41 @@ class Round:
     """The present round of an episode. It uses each action once, up to a decision without one.
 
     Attributes:
-        given: The number of actions in the episode, other than ``RULE``.
-        unused: The number of these that no decision has used.
+        used: The number of actions in the episode, other than ``RULE``, that decisions have used.
+        unused: The number of actions that no decision has used.
     """
 
-    __slots__ = ("_actions", "_stalled", "given", "unused")
+    __slots__ = ("_actions", "_stalled", "unused", "used")
 
     def __init__(self) -> None:
         self._actions: dict[str, Action] = {}
         self._stalled = 0  # rounds without an action for the pending agent
-        self.given = 0
+        self.used = 0
         self.unused = 0
+
+    @property
+    def given(self) -> int:
+        """The number of actions in the episode, other than ``RULE``."""
+        return self.used + self.unused
 
     def begin(self, actions: dict[str, Action]) -> None:
         """Begin a round with checked actions."""
         self._actions = actions
-        self.given += sum(action is not RULE for action in actions.values())
 
     def take(self, agent: Agent) -> Action:
         """Return the action for a decision. ``WAIT`` if there is none, or if it is illegal by now."""
         action = self._actions.pop(agent.name, WAIT)
-        if action is WAIT or action is RULE or agent.mask is None:
+        if action is WAIT or action is RULE:
             return action
-        return action if agent.point.allows(agent.mask, action) else WAIT
+        if agent.mask is not None and not agent.point.allows(agent.mask, action):
+            return WAIT
+        self.used += 1
+        return action
 
-    def count_unused(self, skips: bool) -> None:
-        """Count the actions that the round has not used, unless forced moves were not asked for."""
-        if not skips:
-            self.unused += sum(action is not RULE for action in self._actions.values())
+    def count_unused(self) -> None:
+        """Count the actions that the round has not used."""
+        for action in self._actions.values():
+            self.unused += action is not RULE
 
     def warn_if_stalled(self, pending: Agent, moved: bool) -> None:
         """Warn if the simulation has not moved for many rounds."""

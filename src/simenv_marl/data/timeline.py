@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionValueError, UnknownAgentError, did_you_mean, short_repr
 from .plots import ABSENT, COLOURS, INK, PALE, by_key, style, title_of, write_beside
-from .trajectories import Trajectories, leaves
+from .trajectories import Trajectories, action_arrays
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -173,7 +173,7 @@ def _components(key: Any, found: Trajectories, action_names: Any) -> dict[str, _
         else dict(enumerate(action_names or (), start))
     )
     components = {}
-    for part, array in leaves(found.actions):
+    for part, array in action_arrays(found.actions):
         names = given
         if array.dtype == object:  # values without a shape are distinguished by their text
             texts, array = np.unique([str(action) for action in array], return_inverse=True)

@@ -21,7 +21,19 @@ from ..many.batch import BatchPolicy, PolicyKey, policy_keys, read_answers, run
 from ..many.parallel import progress_bar, spread
 from ..many.simulate import check_options, checked_policies, checked_seeds
 from ..simulation import RULE, Action, Model, Observation, Sentinel
-from .trajectories import Recorder, Records, Trajectories, action_arrays, combine, points_of
+from .trajectories import (
+    Bools,
+    Floats,
+    Recorder,
+    Records,
+    Trajectories,
+    action_arrays,
+    combine,
+    points_of,
+)
+
+Policy = Callable[..., Action] | Sentinel
+"""A policy that answers many decisions at once, or ``RULE``."""
 
 Infos = Sequence[dict[str, Any]]
 """The infos of the agents of many decisions."""
@@ -106,7 +118,7 @@ def collect_episodes(
 class LeftToRule:
     """A policy that leaves decisions to the rule, whose actions must be known."""
 
-    policy: Callable[..., Action] | Sentinel
+    policy: Policy
 
 
 def learners_plan(
@@ -212,8 +224,8 @@ class Mixture:
             _check_part(policy, weight)
         if not any(weights):
             raise OptionValueError("at least one weight of a mixture must be positive")
-        self.policies: tuple[Callable[..., Action] | Sentinel, ...] = policies
-        self.weights: NDArray[np.float64] = np.array(weights, np.float64) / sum(weights)
+        self.policies: tuple[Policy, ...] = policies
+        self.weights: Floats = np.array(weights, np.float64) / sum(weights)
         self._bounds = np.cumsum(self.weights)[:-1]
         self._parts = [
             _BatchedPolicy(_follow_rule if policy is RULE else policy) for policy in policies
@@ -323,7 +335,7 @@ class Comparison:
 
     trajectories: Trajectories
     policy_actions: Action
-    agreements: NDArray[np.bool_]
+    agreements: Bools
 
     @property
     def agreement(self) -> float:
@@ -447,26 +459,26 @@ def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
     return Comparison(trajectories, policy_actions, agreements)
 
 
-def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> Bools:
     """Return in which rows two arrays agree."""
     if one.dtype == object:
         return np.array(list(map(same, one, other)))
     equal = one == other
     if one.dtype.kind == "f":
         equal = np.abs(one - other) <= tolerance
-    agree: NDArray[np.bool_] = equal.reshape(len(one), -1).all(axis=1)
+    agree: Bools = equal.reshape(len(one), -1).all(axis=1)
     return agree
 
 
 # -- properties of policies -----------------------------------------------------------------------
 
 
-def policy_name(policy: Callable[..., Action] | Sentinel) -> str:
+def policy_name(policy: Policy) -> str:
     """Return the name of a policy."""
     return "rule" if policy is RULE else name_of(policy)
 
 
-def follows_rule(policy: Callable[..., Action] | Sentinel) -> bool:
+def follows_rule(policy: Policy) -> bool:
     """Return whether a policy certainly leaves decisions to the rule."""
     if isinstance(policy, Mixture):
         parts = zip(policy.policies, policy.weights, strict=True)

@@ -5,7 +5,7 @@ answers. Learners get the same rows sorted by policy, episode, agent and step, i
 order.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
@@ -26,20 +26,26 @@ from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Answers, Group, PolicyKey
 from ..simulation import RULE, Action, Observation
 
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 Masks = NDArray[np.int8] | tuple[NDArray[np.int8], ...]
 """The masks of N decisions: ``(N, n)``, for a ``MultiDiscrete`` a tuple of such arrays."""
 
 TRAJECTORY: Final = np.dtype(
     [
-        ("length", np.int64),
-        ("episode", np.int64),
-        ("agent", object),
-        ("last_turn", np.int64),
-        ("terminated", np.bool_),
-        ("truncated", np.bool_),
+        ("length", "i8"),
+        ("episode", "i8"),
+        ("agent", "O"),
+        ("last_turn", "i8"),
+        ("terminated", "?"),
+        ("truncated", "?"),
     ]
 )
 """The dtype of the records of trajectories."""
+
+End = tuple[Observation, int, bool, bool]
+"""The end of an agent: the observation, the turn, and whether it terminated and was truncated."""
 
 # -- trajectories for learners --------------------------------------------------------------------
 
@@ -99,23 +105,23 @@ class Trajectories:
     _: KW_ONLY
     observations: Observation
     actions: Action
-    rewards: NDArray[np.float64]
-    terminations: NDArray[np.bool_]
-    truncations: NDArray[np.bool_]
+    rewards: Floats
+    terminations: Bools
+    truncations: Bools
     last_observations: Observation
-    last_turns: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    episodes: NDArray[np.int64]
+    last_turns: Integers
+    starts: Integers
+    episodes: Integers
     seeds: tuple[int, ...]
-    agents: NDArray[np.int64]
+    agents: Integers
     names: tuple[str, ...]
-    steps: NDArray[np.int64]
-    turns: NDArray[np.int64]
-    by_rule: NDArray[np.bool_]
-    known: NDArray[np.bool_]
+    steps: Integers
+    turns: Integers
+    by_rule: Bools
+    known: Bools
     action_masks: Masks | None = None
-    times: NDArray[np.float64] | None = None
-    elapsed: NDArray[np.float64] | None = None
+    times: Floats | None = None
+    elapsed: Floats | None = None
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     observation_space: spaces.Space[Any] | None = None
     action_space: spaces.Space[Any] | None = None
@@ -133,12 +139,12 @@ class Trajectories:
         )
 
     @cached_property
-    def lengths(self) -> NDArray[np.int64]:
+    def lengths(self) -> Integers:
         """``(M,)`` int64: the number of decisions in each trajectory."""
         return np.diff(self.starts, append=len(self))
 
     @cached_property
-    def returns(self) -> NDArray[np.float64]:
+    def returns(self) -> Floats:
         """``(M,)`` float64: the undiscounted return of each trajectory, the sum of its rewards."""
         return np.add.reduceat(self.rewards, self.starts) if len(self) else np.zeros(0)
 
@@ -262,8 +268,10 @@ class _DecisionLog:
         self.elapsed: list[float] = []
         # By row; only the known ones.
         self.rule_actions: dict[int, Action] = {}
-        # By the place of their policy.
-        self.trajectories: defaultdict[int, list[_TrajectoryLog]] = defaultdict(list)
+        # By row of the last decision.
+        self.ends: dict[int, End] = {}
+        # The rows of each trajectory, by place of its policy, and by episode and agent.
+        self.trajectories: dict[int, dict[tuple[int, str], list[int]]] = {}
 
     def add(
         self,
@@ -279,7 +287,6 @@ class _DecisionLog:
         self.observations.append(group.stack(observations))
         if group.point.legal is not None:
             self.masks.append(stack_masks([agent.mask for agent in agents]))
-        by_rule = [action is RULE for action in actions]
         self.actions.append(
             self.stack_actions(
                 [self.unknown_action if action is RULE else action for action in actions]
@@ -295,7 +302,7 @@ class _DecisionLog:
                     f" {number} decisions; the length of its first axis must be their number"
                 )
         self.extras.append(arrays)
-        self.by_rule += by_rule
+        self.by_rule += [action is RULE for action in actions]
         self.turns += [episode.turns for episode in episodes]
         if episodes[0].clock is not None:
             # Not from the infos, because the policy may have changed them.
@@ -303,13 +310,15 @@ class _DecisionLog:
         self.rewards += [0.0] * number
         self.elapsed += [nan] * number
 
-    def pay(self, row: int, agent: Agent) -> None:
-        """Record the reward of a decision, and the rule's action if the rule decided."""
+    def pay(self, row: int, agent: Agent, end: End | None) -> None:
+        """Record the reward of a decision, the rule's action if it decided, and an end."""
         self.rewards[row] = agent.reward
         self.elapsed[row] = agent.info.get("elapsed", nan)
         if agent.rule_action is not None:
             self.rule_actions[row] = agent.rule_action
             agent.rule_action = None  # otherwise a rule that is cut short would report it again
+        if end is not None:
+            self.ends[row] = end
 
     @cached_property
     def columns(self) -> dict[str, Any]:
@@ -341,42 +350,21 @@ class _DecisionLog:
 
     def records(self, place: int) -> Records:
         """Return the records of the policy at a place, sorted by episode, agent and step."""
-        logs = sorted(self.trajectories[place], key=lambda log: (log.episode, log.rows[0]))
-        rows = np.array([row for log in logs for row in log.rows], np.int64)
+        rows: list[int] = []
+        records = []
+        last_observations = []
+        trajectories = self.trajectories.get(place, {}).items()
+        for (episode, agent), own in sorted(trajectories, key=lambda item: (item[0][0], item[1])):
+            last_observation, *end = self.ends[own[-1]]
+            rows += own
+            records.append((len(own), episode, agent, *end))
+            last_observations.append(last_observation)
         return Records(
-            decisions=taken(self.columns, rows),
-            trajectories=np.array([log.record for log in logs], TRAJECTORY),
-            last_observations=self.stack_observations([log.last_observation for log in logs]),
+            decisions=taken(self.columns, np.array(rows, np.int64)),
+            trajectories=np.array(records, TRAJECTORY),
+            last_observations=self.stack_observations(last_observations),
             point=self.point,
         )
-
-
-@dataclass(slots=True)
-class _TrajectoryLog:
-    """The log of one trajectory.
-
-    Attributes:
-        decisions: The log of the agent's decisions.
-        rows: The rows of the decisions in that log.
-        record: An item of ``TRAJECTORY``, from the agent's end on.
-    """
-
-    decisions: _DecisionLog
-    episode: int
-    rows: list[int] = field(default_factory=list)
-    last_observation: Observation = None
-    record: tuple[int, int, str, int, bool, bool] | None = None
-
-    def pay(self, agent: Agent) -> None:
-        """Record the reward of the agent's latest decision."""
-        self.decisions.pay(self.rows[-1], agent)
-
-    def end(self, agent: Agent, turns: int, terminated: bool, truncated: bool) -> None:
-        """Record the last reward and the end of the agent, after some turns of the episode."""
-        self.pay(agent)
-        self.last_observation = agent.observation
-        number = len(self.rows)
-        self.record = (number, self.episode, agent.name, turns, terminated, truncated)
 
 
 class Recorder:
@@ -385,8 +373,8 @@ class Recorder:
     def __init__(self, first_episode: int) -> None:
         self._first_episode = first_episode
         self._logs: dict[Group, _DecisionLog] = {}
-        # Of the agents that have not ended.
-        self._trajectories: dict[Agent, _TrajectoryLog] = {}
+        # The latest decision of each agent that has not ended: its log and its row.
+        self._decisions: dict[Agent, tuple[_DecisionLog, int]] = {}
         # The number of recorded ends in each running episode, which lists all of them.
         self._ends: Counter[Episode] = Counter()
 
@@ -402,36 +390,36 @@ class Recorder:
         if group not in self._logs:
             self._logs[group] = _DecisionLog(group.point)
         log = self._logs[group]
-        row = len(log.rewards)
+        first = len(log.rewards)
         agents = [agent for episode in waiting if (agent := episode.pending) is not None]
         log.add(group, waiting, agents, observations, answers)
-        for place, agent in zip(places, agents, strict=True):
-            trajectory = self._trajectories.get(agent)
-            if trajectory is None:
-                trajectory = _TrajectoryLog(log, self._first_episode + place)
-                self._trajectories[agent] = trajectory
-                log.trajectories[agent.policy.place].append(trajectory)
-            trajectory.rows.append(row)
-            row += 1
+        for row, (place, agent) in enumerate(zip(places, agents, strict=True), first):
+            trajectories = log.trajectories.setdefault(agent.policy.place, {})
+            key = (self._first_episode + place, agent.name)
+            trajectories.setdefault(key, []).append(row)
+            self._decisions[agent] = (log, row)
 
     def pay(self, episode: Episode) -> None:
         """Record the rewards and the ends of agents: see ``Watcher``."""
-        agent = episode.pending
-        if agent is not None and agent in self._trajectories:
-            self._trajectories[agent].pay(agent)
+        if episode.pending is not None:
+            self._pay(episode.pending)
         ended = episode.just_ended[self._ends[episode] :]
         self._ends[episode] += len(ended)
         for agent in ended:
-            self._end(agent, episode, True, False)
+            self._pay(agent, (agent.observation, episode.turns, True, False))
         if episode.over:
             del self._ends[episode]
+            end = (episode.turns, episode.terminated, episode.truncated)
             for agent in episode.agents.values():
-                self._end(agent, episode, episode.terminated, episode.truncated)
+                self._pay(agent, (agent.observation, *end))
 
-    def _end(self, agent: Agent, episode: Episode, terminated: bool, truncated: bool) -> None:
-        trajectory = self._trajectories.pop(agent, None)
-        if trajectory is not None:
-            trajectory.end(agent, episode.turns, terminated, truncated)
+    def _pay(self, agent: Agent, end: End | None = None) -> None:
+        """Record the reward of an agent's latest decision, and the agent's end."""
+        if agent in self._decisions:
+            log, row = self._decisions[agent]
+            log.pay(row, agent, end)
+            if end is not None:
+                del self._decisions[agent]
 
     def records(self, plan: Plan, keys: Iterable[Any]) -> list[Records]:
         """Return the records of each policy, by the order of their keys."""

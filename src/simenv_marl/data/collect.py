@@ -8,7 +8,6 @@ from math import inf, nan
 from typing import Any, Final, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
@@ -22,6 +21,7 @@ from ..many.parallel import progress_bar, spread
 from ..many.simulate import check_options, checked_policies, checked_seeds
 from ..simulation import RULE, Action, Model, Observation, Sentinel
 from .trajectories import (
+    Array,
     Bools,
     Floats,
     Recorder,
@@ -35,6 +35,9 @@ from .trajectories import (
 Policy = Callable[..., Action] | Sentinel
 """A policy that answers many decisions at once, or ``RULE``."""
 
+Policies = Mapping[Any, Any]
+"""Policies by agent or decision point, as ``simulate_many`` takes them."""
+
 Infos = Sequence[dict[str, Any]]
 """The infos of the agents of many decisions."""
 
@@ -47,7 +50,7 @@ SHADOW: Final = "shadow action"
 
 def collect_episodes(
     simulation: Model,
-    policies: Mapping[Any, Any],
+    policies: Policies,
     *,
     seeds: Iterable[int],
     points: Points = None,
@@ -123,7 +126,7 @@ class LeftToRule:
 
 def learners_plan(
     simulation: Model,
-    policies: Mapping[Any, Any],
+    policies: Policies,
     points: Points,
     options: Mapping[str, Any],
     *,
@@ -137,9 +140,9 @@ def learners_plan(
     """
     callables = {}
     for key, policy in policies.items():
-        callables[key] = policy.policy if isinstance(policy, LeftToRule) else policy
-        if callables[key] is RULE:
-            callables[key] = _follow_rule
+        if isinstance(policy, LeftToRule):
+            policy = policy.policy
+        callables[key] = _follow_rule if policy is RULE else policy
     options = {**options, "policies": policy_keys(callables, rewarded=True, alone=alone)}
     others = None
     if all_points:
@@ -299,15 +302,15 @@ class _BatchedPolicy:
         return actions
 
 
-def _random_numbers(identities: Identities) -> NDArray[Any]:
+def _random_numbers(identities: Identities) -> Array:
     """Return a number in [0, 1) for each decision, which depends on its identity alone: float64."""
     # SplitMix64, twice: to make a generator for each decision would take longer than the decision.
-    seeds = np.array([seed % 2**64 for seed, _ in identities], np.uint64)
-    turns = np.array([turn for _, turn in identities], np.uint64)
+    pairs = [(seed % 2**64, turn) for seed, turn in identities]
+    seeds, turns = np.array(pairs, np.uint64).reshape(-1, 2).T
     return (_splitmix(_splitmix(seeds) + turns) >> 11) * 2.0**-53
 
 
-def _splitmix(state: NDArray[Any]) -> NDArray[Any]:
+def _splitmix(state: Array) -> Array:
     """Return the output of SplitMix64 for each uint64 state."""
     state = state + 0x9E3779B97F4A7C15
     state ^= state >> 30
@@ -348,11 +351,11 @@ class Comparison:
 
 def compare_with_rule(
     simulation: Model,
-    policies: Mapping[Any, Any],
+    policies: Policies,
     *,
     seeds: Iterable[int],
     points: Points = None,
-    others: Mapping[Any, Any] | None = None,
+    others: Policies | None = None,
     tolerance: float = 0.0,
     **options: Unpack[EpisodeOptions],
 ) -> dict[Any, Comparison]:
@@ -386,7 +389,7 @@ def compare_with_rule(
             "policies must be a dict from agents or points to callables, not"
             f" {short_repr(policies)}"
         )
-    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
+    if not isinstance(tolerance, (int, float)) or not tolerance >= 0:
         raise OptionValueError(
             f"tolerance must be a number that is not negative, not {short_repr(tolerance)}"
         )
@@ -459,7 +462,7 @@ def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
     return Comparison(trajectories, policy_actions, agreements)
 
 
-def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> Bools:
+def _agreements(one: Array, other: Array, tolerance: float) -> Bools:
     """Return in which rows two arrays agree."""
     if one.dtype == object:
         return np.array(list(map(same, one, other)))

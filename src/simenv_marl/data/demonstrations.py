@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.options import EpisodeOptions
 from ..core.points import Points
@@ -21,8 +20,8 @@ from ..core.provenance import provenance
 from ..core.stacking import joined, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
 from ..simulation import Model
-from .collect import LeftToRule, check_known, collect_episodes, follows_rule, policy_name
-from .trajectories import Integers, Trajectories
+from .collect import LeftToRule, Policies, check_known, collect_episodes, follows_rule, policy_name
+from .trajectories import Array, Integers, Trajectories
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 def record_dataset(
     dataset_id: str | Mapping[Any, str],
     simulation: Model,
-    policies: Mapping[Any, Any],
+    policies: Policies,
     *,
     seeds: Iterable[int],
     points: Points = None,
@@ -106,7 +105,7 @@ def record_dataset(
 
 def _dataset_ids(
     dataset_id: str | Mapping[Any, str],
-    policies: Mapping[Any, Any],
+    policies: Policies,
 ) -> Mapping[Any, str]:
     """Return the name of each data set, by the key of its policy."""
     names = dataset_id
@@ -271,6 +270,6 @@ def _infos(trajectories: Trajectories, rows: Integers) -> dict[str, Any]:
     return infos
 
 
-def _extend(values: NDArray[Any], filler: int) -> NDArray[Any]:
+def _extend(values: Array, filler: int) -> Array:
     """Append a row that consists of a filler."""
     return np.concatenate([values, np.full_like(values[:1], filler)])

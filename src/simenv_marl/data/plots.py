@@ -16,16 +16,18 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import OptionValueError, short_repr
 from ..many.parallel import import_extra
-from .trajectories import Floats, Trajectories
+from .trajectories import Array, Floats, Trajectories
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.transforms import Transform
+
+Collection = Trajectories | Mapping[Any, Trajectories]
+"""The result of ``collect_episodes``, or its value for one key."""
 
 MOST_ROWS: Final = 60
 """The largest number of rows of returns."""
@@ -100,9 +102,7 @@ def style(feature: str) -> Iterator[Callable[[float, float], Figure]]:
         yield new_figure
 
 
-def by_key(
-    trajectories: Trajectories | Mapping[Any, Trajectories],
-) -> Mapping[Any, Trajectories]:
+def by_key(trajectories: Collection) -> Mapping[Any, Trajectories]:
     """Return the trajectories to draw, by the key of their policy."""
     if isinstance(trajectories, Trajectories):
         return {None: trajectories}
@@ -141,7 +141,7 @@ def write_beside(axes: Axes, text: str, height: float, transform: Transform) -> 
 # -- intervals ------------------------------------------------------------------------------------
 
 
-def is_proportion(values: NDArray[Any]) -> bool:
+def is_proportion(values: Array) -> bool:
     """Return whether values are bools, or zeros and ones with at least one of both.
 
     None and nan do not count.
@@ -182,7 +182,7 @@ def interval(
 
 
 def plot_returns(
-    collected: Trajectories | Mapping[Any, Trajectories | Mapping[Any, Trajectories]],
+    collected: Collection | Mapping[Any, Collection],
     *,
     per: Literal["policy", "agent", "team"] = "policy",
     ax: Axes | None = None,
@@ -253,7 +253,7 @@ def plot_returns(
 
 
 def _returns(
-    collected: Trajectories | Mapping[Any, Trajectories | Mapping[Any, Trajectories]],
+    collected: Collection | Mapping[Any, Collection],
     per: str,
 ) -> dict[str, dict[str, Floats]]:
     """Return the returns of episodes, by policy or agent, and by the label of their collection."""
@@ -294,8 +294,7 @@ def _draw_returns(
     axes.barh(height, high - low, left=low, height=0.62, color=colour, alpha=0.16)
     # Spread evenly, in irregular order.
     heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)
-    size = float(np.clip(900 / number, 2, 12))
-    axes.scatter(returns, heights, size, color=colour, alpha=0.45, linewidths=0)
+    axes.scatter(returns, heights, 6, color=colour, alpha=0.45, linewidths=0)
     axes.vlines(median, height - 0.31, height + 0.31, color=colour, linewidth=1.4)
     below, above, note = interval(returns, 0.95, proportion=proportion)
     text = f"{mean:.4g}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections import defaultdict
+from collections import ChainMap
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
@@ -11,11 +11,20 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from gymnasium.spaces import Discrete
-from numpy.typing import NDArray
 
 from ..errors import OptionValueError, UnknownAgentError, did_you_mean, short_repr
-from .plots import ABSENT, COLOURS, INK, PALE, by_key, style, title_of, write_beside
-from .trajectories import Bools, Floats, Trajectories, action_arrays
+from .plots import (
+    ABSENT,
+    COLOURS,
+    INK,
+    PALE,
+    Collection,
+    by_key,
+    style,
+    title_of,
+    write_beside,
+)
+from .trajectories import Array, Bools, Floats, Trajectories, action_arrays
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,9 +37,6 @@ if TYPE_CHECKING:
 MOST_CHARTS: Final = 6
 """The largest number of agents that have charts. More agents have a row of colours each."""
 
-MOST_LINES: Final = 4
-"""The largest number of charts for an action, and of lines in a chart."""
-
 MOST_COLOURS: Final = 12
 """The largest number of different actions that have a colour each.
 
@@ -40,9 +46,21 @@ More actions share a colour scale.
 UNKNOWN: Final = "#BDBDBD"
 """The colour of decisions whose action is unknown."""
 
-TERMINATED: Final = "x"
-TRUNCATED: Final = "|"
-"""The marks of terminations and truncations."""
+MARKS: Final[dict[str, dict[str, Any]]] = {
+    "policy": {"marker": "o", "color": COLOURS[0], "linewidth": 0, "markersize": 4},
+    "rule": {
+        "marker": "o",
+        "color": COLOURS[0],
+        "markerfacecolor": "white",
+        "linewidth": 0,
+        "markersize": 4,
+    },
+    "by rule": {"color": INK, "linewidth": 2},
+    "by rule, action unknown": {"color": UNKNOWN, "linewidth": 2},
+    "terminated": {"marker": "x", "color": INK, "linewidth": 0, "markersize": 6},
+    "truncated": {"marker": "|", "color": INK, "linewidth": 0, "markersize": 6},
+}
+"""The marks of decisions in charts, of decisions in rows of colours, and of ends."""
 
 BESIDE: Final[dict[str, Any]] = {
     "loc": "upper left",
@@ -72,7 +90,7 @@ class _Component:
     """
 
     part: str
-    values: NDArray[Any]
+    values: Array
     labels: dict[int, str]
 
 
@@ -84,25 +102,27 @@ class TimelineRow:
         key: The key of its policy.
         actions: The components of the policy's actions, by name.
         rows: The agent's rows of the policy's decisions.
+        has_clock: Whether the times are the simulation's, and not numbers of decisions.
         times: ``(n,)``: the times of the agent's decisions.
         end: The time of its end.
-        mark: The mark of its end.
+        ending: "terminated" or "truncated".
     """
 
     key: Hashable
     agent: str
     actions: dict[str, _Component]
     rows: slice
-    times: NDArray[Any]
+    has_clock: bool
+    times: Array
     rewards: Floats
     known: Bools
     by_rule: Bools
     end: float
-    mark: str
+    ending: str
 
 
 def plot_timeline(
-    trajectories: Trajectories | Mapping[Any, Trajectories],
+    trajectories: Collection,
     episode: int = 0,
     *,
     agents: Sequence[str] | None = None,
@@ -154,16 +174,16 @@ def plot_timeline(
             f"episode must be the number of one of the {len(seeds)} episodes, counted from 0, not"
             f" {short_repr(episode)}"
         ) from None
-    deciding = {key: found for key, found in by_policy.items() if number in found.episodes}
-    if not deciding:
+    rows: list[TimelineRow] = []
+    for key, found in by_policy.items():
+        if number in found.episodes:
+            actions = _components(found, _action_labels(key, found, action_names))
+            rows += _rows(key, found, actions, number)
+    if not rows:
         raise OptionValueError(
             f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has"
             " decided in it"
         )
-    rows: list[TimelineRow] = []
-    for key, found in deciding.items():
-        actions = _components(found, _action_labels(key, found, action_names))
-        rows += _rows(key, found, actions, number)
     if agents is not None:
         rows = _choose(rows, agents, number)
     begin = min(row.times[0] for row in rows)
@@ -175,7 +195,7 @@ def plot_timeline(
             grid = _draw_charts(rows, make, begin, end)
         else:
             grid = _draw_panels(rows, make, component)
-        has_clock = all(found.times is not None for found in deciding.values())
+        has_clock = all(row.has_clock for row in rows)
         margin = 0.015 * (end - begin or 1.0)
         for axes in grid[-1]:
             axes.set_xlabel("time" if has_clock else "decision number in the episode")
@@ -239,7 +259,7 @@ def _rows(
     for place in np.flatnonzero(found.episodes[found.starts] == episode):
         start = found.starts[place]
         rows = slice(start, start + found.lengths[place])
-        times: NDArray[Any] = found.turns[rows]
+        times: Array = found.turns[rows]
         end = float(found.last_turns[place])
         if found.times is not None and found.elapsed is not None:
             times = found.times[rows]
@@ -249,12 +269,13 @@ def _rows(
             agent=found.names[found.agents[start]],
             actions=actions,
             rows=rows,
+            has_clock=found.times is not None,
             times=times,
             rewards=found.rewards[rows],
             known=found.known[rows],
             by_rule=found.by_rule[rows],
             end=end,
-            mark=TERMINATED if found.terminations[rows][-1] else TRUNCATED,
+            ending="terminated" if found.terminations[rows][-1] else "truncated",
         )
 
 
@@ -263,13 +284,13 @@ def _choose(rows: Sequence[TimelineRow], agents: Sequence[str], episode: int) ->
     if isinstance(agents, str) or not agents:
         raise OptionValueError(f"agents must be a sequence of names, not {short_repr(agents)}")
     by_name = {row.agent: row for row in rows}
-    for name in agents:
-        if name not in by_name:
-            raise UnknownAgentError(
-                f"{short_repr(name)} did not decide in episode {episode}; these agents did:"
-                f" {short_repr(list(by_name))}"
-            )
-    return [by_name[name] for name in dict.fromkeys(agents)]
+    try:
+        return [by_name[name] for name in dict.fromkeys(agents)]
+    except KeyError as error:
+        raise UnknownAgentError(
+            f"the agent {error} did not decide in episode {episode}; these agents did:"
+            f" {short_repr(list(by_name))}"
+        ) from None
 
 
 def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> None:
@@ -277,27 +298,14 @@ def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> No
     from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
-    by_rule = any(row.by_rule.any() for row in rows)
-    unknown = not all(row.known.all() for row in rows)
-    marks: dict[str, dict[str, Any]] = {}
-    if by_rule and charts:
-        dot = {"marker": "o", "linewidth": 0, "markersize": 4, "color": COLOURS[0]}
-        marks["policy"] = dot
-        marks["rule"] = {**dot, "markerfacecolor": "white"}
-        if unknown:
-            marks["rule"]["color"] = UNKNOWN
-    elif by_rule:
-        marks["by rule"] = {"color": INK, "linewidth": 2}
-        if unknown:
-            marks["by rule, action unknown"] = {"color": UNKNOWN, "linewidth": 2}
-    ends = {row.mark for row in rows}
-    end = {"color": INK, "linewidth": 0, "markersize": 6}
-    if TERMINATED in ends:
-        marks["terminated"] = {**end, "marker": TERMINATED}
-    if TRUNCATED in ends:
-        marks["truncated"] = {**end, "marker": TRUNCATED}
-    handles = [Line2D([], [], **mark) for mark in marks.values()]
-    axes.add_artist(Legend(axes, handles, list(marks), **ABOVE))
+    labels = []
+    if any(row.by_rule.any() for row in rows):
+        labels += ["policy", "rule"] if charts else ["by rule"]
+        if not charts and not all(row.known.all() for row in rows):
+            labels.append("by rule, action unknown")
+    labels += sorted({row.ending for row in rows})
+    handles = [Line2D([], [], **MARKS[label]) for label in labels]
+    axes.add_artist(Legend(axes, handles, labels, **ABOVE))
 
 
 # -- few agents: charts ---------------------------------------------------------------------------
@@ -308,29 +316,34 @@ def _draw_charts(
     make: NewFigure,
     begin: float,
     end: float,
-) -> NDArray[Any]:
+) -> Array:
     """Draw charts of the actions and one of the rewards for each agent.
 
     Return the axes, ``(charts, 1)``.
     """
-    charts: list[tuple[TimelineRow, str | None]] = []
+    charts: list[tuple[TimelineRow, str | None, str]] = []
     for row in rows:
-        parts = dict.fromkeys(component.part for component in row.actions.values())
-        charts += [(row, part) for part in list(parts)[:MOST_LINES]]
-        charts.append((row, None))  # the rewards
-    heights = [0.6 if part is None else 1.0 for _, part in charts]
+        title = title_of(row.key)
+        title = row.agent if title in ("", row.agent) else f"{row.agent}  ({title})"
+        for part in dict.fromkeys(component.part for component in row.actions.values()):
+            charts.append((row, part, title))
+            title = ""  # the first chart of an agent has the title
+        charts.append((row, None, ""))
+    heights = [0.6 if part is None else 1.0 for _, part, _ in charts]
     figure = make(9.5, 0.9 + 0.18 * len(rows) + 0.95 * sum(heights))
-    grid = figure.subplots(len(charts), 1, sharex=True, squeeze=False, height_ratios=heights)
-    titled = None
-    for (row, part), axes in zip(charts, grid[:, 0], strict=True):
-        if part is None:
+    grid: Array = figure.subplots(
+        len(charts),
+        1,
+        sharex=True,
+        squeeze=False,
+        height_ratios=heights,
+    )
+    for axes, (row, name, title) in zip(grid[:, 0], charts, strict=True):
+        axes.set_title(title)
+        if name is None:
             _chart_rewards(axes, row)
         else:
-            _chart_actions(axes, row, part)
-        if row is not titled:
-            title = title_of(row.key)
-            axes.set_title(row.agent if title in ("", row.agent) else f"{row.agent}  ({title})")
-            titled = row
+            _chart_actions(axes, row, name)
         _shade_absence(axes, row, begin, end)
     figure.align_ylabels()
     return grid
@@ -339,37 +352,29 @@ def _draw_charts(
 def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
     """Draw a line for each component of a part of the actions, with a dot for each decision."""
     components = {name: own for name, own in row.actions.items() if own.part == part}
-    size = float(np.clip(2000 / len(row.times), 5, 14))
-    for (name, component), colour in zip(components.items(), COLOURS[:MOST_LINES], strict=False):
+    for (name, component), colour in zip(components.items(), COLOURS, strict=False):
         values = component.values[row.rows]
         line = np.where(row.known, values, np.nan)
         axes.step(row.times, line, where="post", color=colour, linewidth=0.8, alpha=0.5)
         heights = np.where(row.known, values, values.min())
         edges = [colour if known else UNKNOWN for known in row.known[row.by_rule]]
-        axes.scatter(
-            row.times[~row.by_rule],
-            heights[~row.by_rule],
-            size,
-            color=colour,
-            zorder=3,
-            label=name,
-        )
-        axes.scatter(
-            row.times[row.by_rule],
-            heights[row.by_rule],
-            size,
-            color="white",
-            edgecolors=edges,
-            zorder=3,
-        )
+        for chosen, fill in ((~row.by_rule, colour), (row.by_rule, "white")):
+            axes.scatter(
+                row.times[chosen],
+                heights[chosen],
+                12,
+                color=fill,
+                edgecolors=edges,
+                zorder=3,
+                label=name if fill == colour else None,
+            )
     axes.set_ylabel(part or "action")
     labels = next(iter(components.values())).labels  # all of them have the same labels
     if labels:
         axes.set_yticks(list(labels), list(labels.values()))
         axes.set_ylim(min(labels) - 0.5, max(labels) + 0.5)
     if len(components) > 1:
-        more = len(components) - MOST_LINES
-        axes.legend(title=f"and {more} more" if more > 0 else None, **BESIDE)
+        axes.legend(**BESIDE)
 
 
 def _chart_rewards(axes: Axes, row: TimelineRow) -> None:
@@ -388,9 +393,7 @@ def _shade_absence(axes: Axes, row: TimelineRow, begin: float, end: float) -> No
     axes.plot(
         [row.end],
         [0.0],
-        row.mark,
-        color=INK,
-        markersize=7,
+        **MARKS[row.ending],
         zorder=4,
         transform=axes.get_xaxis_transform(),
         clip_on=False,
@@ -404,7 +407,7 @@ def _draw_panels(
     rows: list[TimelineRow],
     make: NewFigure,
     component: str | None,
-) -> NDArray[Any]:
+) -> Array:
     """Draw a row for each agent, coloured by its actions and by its rewards.
 
     Return the axes, ``(panels, 2)``.
@@ -416,9 +419,9 @@ def _draw_panels(
             f"no action has a component {short_repr(component)}; there are"
             f" {', '.join(map(repr, names))}{did_you_mean(component, names)}"
         )
-    heights = [min(max(0.16 * len(panel), 1.2), 6.0) for panel in panels]
+    heights = [min(max(0.16 * len(panel), 1.2), 6.0) for panel in panels.values()]
     figure = make(11.0, 1.0 + 0.3 * len(panels) + sum(heights))
-    grid = figure.subplots(
+    grid: Array = figure.subplots(
         len(panels),
         2,
         sharex=True,
@@ -426,28 +429,28 @@ def _draw_panels(
         squeeze=False,
         height_ratios=heights,
     )
-    for (left, right), panel in zip(grid, panels, strict=True):
-        _draw_panel(left, right, panel, component)
+    for (left, right), (key, panel) in zip(grid, panels.items(), strict=True):
+        _draw_panel(left, right, key, panel, component)
     return grid
 
 
-def _panels(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
-    """Return the rows of each panel.
+def _panels(rows: list[TimelineRow]) -> dict[Hashable, list[TimelineRow]]:
+    """Return the rows of each panel, by the key of its policy.
 
-    Each policy has a panel, but many policies with similar actions share one.
+    Many policies with similar actions share one panel, whose key is None.
     """
-    panels: defaultdict[Hashable, list[TimelineRow]] = defaultdict(list)
+    panels: dict[Hashable, list[TimelineRow]] = {}
     for row in rows:
-        panels[row.key].append(row)
-    kinds = {tuple((name, not own.labels) for name, own in row.actions.items()) for row in rows}
-    if len(panels) > MOST_CHARTS and len(kinds) == 1:
-        return [sorted(rows, key=lambda row: row.times[0])]
-    return list(panels.values())
+        panels.setdefault(row.key, []).append(row)
+    if len(panels) > MOST_CHARTS and len({tuple(row.actions) for row in rows}) == 1:
+        return {None: sorted(rows, key=lambda row: row.times[0])}
+    return panels
 
 
 def _draw_panel(
     left: Axes,
     right: Axes,
+    key: Hashable,
     rows: list[TimelineRow],
     component: str | None,
 ) -> None:
@@ -459,25 +462,17 @@ def _draw_panel(
     points = 72 * left.get_window_extent().height / left.figure.dpi / len(rows)
     for axes in (left, right):
         axes.set_facecolor(ABSENT)
-        for mark in (TERMINATED, TRUNCATED):
-            ends = {place: row.end for place, row in enumerate(rows) if row.mark == mark}
-            axes.plot(
-                list(ends.values()),
-                list(ends),
-                mark,
-                color=INK,
-                markersize=min(points, 6.0),
-                zorder=4,
-            )
+        for ending in ("terminated", "truncated"):
+            ends = {place: row.end for place, row in enumerate(rows) if row.ending == ending}
+            mark = {**MARKS[ending], "markersize": min(points, 6.0)}
+            axes.plot(list(ends.values()), list(ends), zorder=4, **mark)
     step = ceil(9.0 / points)
     left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
     left.set_ylim(len(rows) - 0.4, -0.6)
-    title = f"{len(rows)} agents: action"
+    title = f"{title_of(key)}, {len(rows)} agents: action"
     if len(names) > 1:
         title += f" {name}, one of {len(names)}"
-    if all(row.key == rows[0].key for row in rows) and title_of(rows[0].key):
-        title = f"{title_of(rows[0].key)}, {title}"
-    left.set_title(title)
+    left.set_title(title.removeprefix(", "))
     right.set_title("reward")
 
 
@@ -497,9 +492,9 @@ def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> Floats:
         if slim:
             half[row.by_rule] *= 0.45
         left, right = edges[:-1], edges[1:]
-        x = np.stack([left, right, right, left], axis=1)
-        y = np.stack([place - half, place - half, place + half, place + half], axis=1)
-        cells.append(np.stack([x, y], axis=2))
+        low, high = place - half, place + half
+        corners = [[left, low], [right, low], [right, high], [left, high]]
+        cells.append(np.transpose(corners, (2, 0, 1)))
     return np.concatenate(cells)
 
 
@@ -516,17 +511,14 @@ def _colour(axes: Axes, cells: Floats, **colours: Any) -> PolyCollection:
 def _colour_by_scale(
     axes: Axes,
     cells: Floats,
-    values: NDArray[Any],
+    values: Array,
     scale: str | Colormap,
-    limits: tuple[float, float] | None = None,
-) -> None:
+) -> PolyCollection:
     """Draw cells in the colours of their values, and the scale beside the axes."""
     collection = _colour(axes, cells, array=values, cmap=scale)
-    if limits is not None:
-        collection.set_clim(*limits)
-    extend = "neither" if limits is None else "both"
-    bar = axes.figure.colorbar(collection, ax=axes, extend=extend, fraction=0.04, aspect=30)
+    bar = axes.figure.colorbar(collection, ax=axes, fraction=0.04, aspect=30)
     bar.outline.set_visible(False)
+    return collection
 
 
 def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
@@ -538,10 +530,9 @@ def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
     _colour(axes, _cells(rows, slim=False), facecolors="white")  # white while the agent lives
     cells = _cells(rows, slim=True)
     _colour(axes, cells[~known], facecolors=UNKNOWN)
-    labels: dict[int, str] = {}
-    for row in rows:
-        labels |= row.actions[name].labels
-    if not 0 < len(labels) <= MOST_COLOURS:
+    labels_of_rows = [row.actions[name].labels for row in rows]
+    labels = dict(ChainMap(*labels_of_rows))
+    if not all(labels_of_rows) or len(labels) > MOST_COLOURS:
         _colour_by_scale(axes, cells[known], values, "viridis")
         return
     actions = sorted(labels)
@@ -564,4 +555,4 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     colours = LinearSegmentedColormap.from_list(
         "reward", ["#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B"]
     )
-    _colour_by_scale(axes, _cells(rows, slim=False), rewards, colours, (-most, most))
+    _colour_by_scale(axes, _cells(rows, slim=False), rewards, colours).set_clim(-most, most)

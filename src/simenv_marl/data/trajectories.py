@@ -26,6 +26,7 @@ from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Answers, Group, PolicyKey
 from ..simulation import RULE, Action, Observation
 
+Array = NDArray[Any]
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -122,7 +123,7 @@ class Trajectories:
     action_masks: Masks | None = None
     times: Floats | None = None
     elapsed: Floats | None = None
-    extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    extras: Mapping[str, Array] = field(default_factory=dict)
     observation_space: spaces.Space[Any] | None = None
     action_space: spaces.Space[Any] | None = None
     action_labels: Sequence[str] | Mapping[Any, str] | None = None
@@ -158,7 +159,7 @@ class Trajectories:
         return taken(observations, next_rows)
 
 
-def action_arrays(actions: Action, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+def action_arrays(actions: Action, name: str = "") -> Iterator[tuple[str, Array]]:
     """Yield the arrays of stacked actions, each with its name.
 
     The name is ``[1]`` in a tuple, ``litres`` or ``[1]['litres']`` in a dict; empty for one array.
@@ -206,7 +207,7 @@ def combine(
     lengths = trajectories["length"]
     starts = np.cumsum(lengths) - lengths
 
-    def per_decision(values: NDArray[Any]) -> NDArray[Any]:
+    def per_decision(values: Array) -> Array:
         return np.repeat(values, lengths)
 
     codes: dict[str, int] = {}
@@ -259,7 +260,7 @@ class _DecisionLog:
         self.observations: list[Observation] = []
         self.actions: list[Action] = []
         self.masks: list[Masks] = []
-        self.extras: list[dict[str, NDArray[Any]]] = []
+        self.extras: list[dict[str, Array]] = []
         # One entry for each decision.
         self.turns: list[int] = []
         self.by_rule: list[bool] = []
@@ -425,17 +426,19 @@ class Recorder:
         """Return the records of each policy, by the order of their keys."""
         records = []
         for place, key in enumerate(keys):
-            groups = [group for group, log in self._logs.items() if place in log.trajectories]
-            if len(groups) > 1:
+            logs = {
+                group.point.hook.name: log
+                for group, log in self._logs.items()
+                if place in log.trajectories
+            }
+            if len(logs) > 1:
                 raise AgentError(
-                    f"{short_repr(key)} has decided at"
-                    f" {' and at '.join(group.point.hook.name for group in groups)}, whose spaces"
+                    f"{short_repr(key)} has decided at {' and at '.join(logs)}, whose spaces"
                     " differ; give its policy under the names of the points"
                 )
-            if groups:
-                log = self._logs[groups[0]]
-            else:
-                log = _DecisionLog(next(points_of(plan, place), None))
+            if not logs:
+                logs[""] = _DecisionLog(next(points_of(plan, place), None))
+            (log,) = logs.values()
             records.append(log.records(place))
         return records
 

@@ -384,7 +384,8 @@ def compare_with_rule(
         OptionValueError: An argument has an invalid value.
         BaseException: All other errors are those of ``collect_episodes``.
     """
-    if not isinstance(policies, Mapping) or not all(map(callable, policies.values())):
+    policies = checked_policies(policies)
+    if not all(map(callable, policies.values())):
         raise OptionValueError(
             "policies must be a dict from agents or points to callables, not"
             f" {short_repr(policies)}"

@@ -19,6 +19,7 @@ from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
+from ..many.simulate import checked_policies
 from ..simulation import Model
 from .collect import LeftToRule, Policies, check_known, collect_episodes, follows_rule, policy_name
 from .trajectories import Array, Integers, Trajectories
@@ -72,10 +73,7 @@ def record_dataset(
         BaseException: Any error of ``collect_episodes`` or ``save_dataset``. Errors in the
             arguments are raised before anything runs, where possible.
     """
-    if not isinstance(policies, Mapping) or not policies:
-        raise OptionValueError(
-            f"policies must be a dict from agents or points to policies, not {short_repr(policies)}"
-        )
+    policies = checked_policies(policies)
     names = _dataset_ids(dataset_id, policies)
     paths = [_free_path(name) for name in names.values()]
     left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
@@ -109,16 +107,17 @@ def _dataset_ids(
 ) -> Mapping[Any, str]:
     """Return the name of each data set, by the key of its policy."""
     names = dataset_id
-    if isinstance(dataset_id, str) and len(policies) == 1:
+    if isinstance(dataset_id, str):
         names = dict.fromkeys(policies, dataset_id)
     if (
         not isinstance(names, Mapping)
         or not names
         or not all(isinstance(name, str) for name in names.values())
+        or len(set(names.values())) < len(names)
     ):
         raise OptionValueError(
-            f"dataset_id must be a name, or for {len(policies)} policies a dict from their keys to"
-            f" names, not {short_repr(dataset_id)}"
+            f"dataset_id must be a name, or for {len(policies)} policies a dict that gives each its"
+            f" own name, not {short_repr(dataset_id)}"
         )
     for key in names:
         if key not in policies:
@@ -126,10 +125,6 @@ def _dataset_ids(
                 f"dataset_id names {short_repr(key)}, which has no policy"
                 f"{did_you_mean(key, map(str, policies))}"
             )
-    if len(set(names.values())) < len(names):
-        raise OptionValueError(
-            f"each policy needs its own data set, and two have the same name: {short_repr(names)}"
-        )
     return names
 
 

@@ -294,7 +294,7 @@ def _draw_returns(
     axes.barh(height, high - low, left=low, height=0.62, color=colour, alpha=0.16)
     # Spread evenly, in irregular order.
     heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)
-    axes.scatter(returns, heights, 6, color=colour, alpha=0.45, linewidths=0)
+    axes.scatter(returns, heights, 10, color=colour, alpha=0.45, linewidths=0)
     axes.vlines(median, height - 0.31, height + 0.31, color=colour, linewidth=1.4)
     below, above, note = interval(returns, 0.95, proportion=proportion)
     text = f"{mean:.4g}"

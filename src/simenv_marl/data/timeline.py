@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from gymnasium.spaces import Discrete
 
-from ..errors import OptionValueError, UnknownAgentError, did_you_mean, short_repr
+from ..errors import OptionValueError, UnknownAgentError, short_repr
 from .plots import (
     ABSENT,
     COLOURS,
@@ -29,7 +29,6 @@ from .trajectories import Array, Bools, Floats, Trajectories, action_arrays
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import PolyCollection
-    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure, SubFigure
 
     NewFigure = Callable[[float, float], Any]
@@ -102,8 +101,8 @@ class TimelineRow:
         key: The key of its policy.
         actions: The components of the policy's actions, by name.
         rows: The agent's rows of the policy's decisions.
-        has_clock: Whether the times are the simulation's, and not numbers of decisions.
-        times: ``(n,)``: the times of the agent's decisions.
+        times: ``(n,)``: the float times of the agent's decisions, or without a clock their int
+            numbers.
         end: The time of its end.
         ending: "terminated" or "truncated".
     """
@@ -112,7 +111,6 @@ class TimelineRow:
     agent: str
     actions: dict[str, _Component]
     rows: slice
-    has_clock: bool
     times: Array
     rewards: Floats
     known: Bools
@@ -188,20 +186,19 @@ def plot_timeline(
         rows = _choose(rows, agents, number)
     begin = min(row.times[0] for row in rows)
     end = max(row.end for row in rows)
-    charts = len(rows) <= MOST_CHARTS
+    margin = 0.015 * (end - begin or 1.0)
     with style("plot_timeline") as new_figure:
         make = new_figure if figure is None else lambda width, height: figure
-        if charts:
+        if len(rows) <= MOST_CHARTS:
             grid = _draw_charts(rows, make, begin, end)
         else:
             grid = _draw_panels(rows, make, component)
-        has_clock = all(row.has_clock for row in rows)
-        margin = 0.015 * (end - begin or 1.0)
         for axes in grid[-1]:
-            axes.set_xlabel("time" if has_clock else "decision number in the episode")
+            axes.set_xlabel(
+                "time" if isinstance(begin, float) else "decision number in the episode"
+            )
             axes.set_xlim(begin - margin, end + margin)
         corner: Axes = grid[0, -1]
-        _mark_legend(corner, rows, charts=charts)
         corner.figure.suptitle(f"Episode {number}, seed {seeds[number]}", x=0.01, ha="left")
     return corner.figure
 
@@ -269,7 +266,6 @@ def _rows(
             agent=found.names[found.agents[start]],
             actions=actions,
             rows=rows,
-            has_clock=found.times is not None,
             times=times,
             rewards=found.rewards[rows],
             known=found.known[rows],
@@ -293,17 +289,17 @@ def _choose(rows: Sequence[TimelineRow], agents: Sequence[str], episode: int) ->
         ) from None
 
 
-def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> None:
-    """Explain the marks that occur, above axes that may have another legend."""
+def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], by_rule: Sequence[str]) -> None:
+    """Explain the marks that occur, above axes that may have another legend.
+
+    ``by_rule`` are the marks to explain where the rule has decided.
+    """
     from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
-    labels = []
+    labels = sorted({row.ending for row in rows})
     if any(row.by_rule.any() for row in rows):
-        labels += ["policy", "rule"] if charts else ["by rule"]
-        if not charts and not all(row.known.all() for row in rows):
-            labels.append("by rule, action unknown")
-    labels += sorted({row.ending for row in rows})
+        labels = [*by_rule, *labels]
     handles = [Line2D([], [], **MARKS[label]) for label in labels]
     axes.add_artist(Legend(axes, handles, labels, **ABOVE))
 
@@ -346,6 +342,7 @@ def _draw_charts(
             _chart_actions(axes, row, name)
         _shade_absence(axes, row, begin, end)
     figure.align_ylabels()
+    _mark_legend(grid[0, 0], rows, ["policy", "rule"])
     return grid
 
 
@@ -355,19 +352,28 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
     for (name, component), colour in zip(components.items(), COLOURS, strict=False):
         values = component.values[row.rows]
         line = np.where(row.known, values, np.nan)
-        axes.step(row.times, line, where="post", color=colour, linewidth=0.8, alpha=0.5)
-        heights = np.where(row.known, values, values.min())
-        edges = [colour if known else UNKNOWN for known in row.known[row.by_rule]]
-        for chosen, fill in ((~row.by_rule, colour), (row.by_rule, "white")):
+        axes.step(row.times, line, where="post", color=colour, linewidth=0.8, label=name)
+        by_policy = row.known & ~row.by_rule
+        by_rule = row.known & row.by_rule
+        for chosen, fill in ((by_policy, colour), (by_rule, "white")):
             axes.scatter(
                 row.times[chosen],
-                heights[chosen],
-                12,
+                values[chosen],
+                14,
                 color=fill,
-                edgecolors=edges,
+                edgecolors=colour,
                 zorder=3,
-                label=name if fill == colour else None,
             )
+    unknown = row.times[~row.known]
+    axes.scatter(
+        unknown,
+        np.full(len(unknown), 0.04),
+        14,
+        color="white",
+        edgecolors=UNKNOWN,
+        zorder=3,
+        transform=axes.get_xaxis_transform(),
+    )
     axes.set_ylabel(part or "action")
     labels = next(iter(components.values())).labels  # all of them have the same labels
     if labels:
@@ -417,7 +423,7 @@ def _draw_panels(
     if component is not None and component not in names:
         raise OptionValueError(
             f"no action has a component {short_repr(component)}; there are"
-            f" {', '.join(map(repr, names))}{did_you_mean(component, names)}"
+            f" {', '.join(map(repr, names))}"
         )
     heights = [min(max(0.16 * len(panel), 1.2), 6.0) for panel in panels.values()]
     figure = make(11.0, 1.0 + 0.3 * len(panels) + sum(heights))
@@ -431,6 +437,7 @@ def _draw_panels(
     )
     for (left, right), (key, panel) in zip(grid, panels.items(), strict=True):
         _draw_panel(left, right, key, panel, component)
+    _mark_legend(grid[0, 1], rows, ["by rule", "by rule, action unknown"])
     return grid
 
 
@@ -512,11 +519,11 @@ def _colour_by_scale(
     axes: Axes,
     cells: Floats,
     values: Array,
-    scale: str | Colormap,
+    scale: str,
 ) -> PolyCollection:
     """Draw cells in the colours of their values, and the scale beside the axes."""
     collection = _colour(axes, cells, array=values, cmap=scale)
-    bar = axes.figure.colorbar(collection, ax=axes, fraction=0.04, aspect=30)
+    bar = axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)
     bar.outline.set_visible(False)
     return collection
 
@@ -546,13 +553,8 @@ def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
 
 
 def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
-    """Colour the decisions by their rewards; zero is white."""
-    from matplotlib.colors import LinearSegmentedColormap
-
+    """Colour the decisions by their rewards; zero is nearly white."""
     rewards = np.concatenate([row.rewards for row in rows])
     # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
-    colours = LinearSegmentedColormap.from_list(
-        "reward", ["#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B"]
-    )
-    _colour_by_scale(axes, _cells(rows, slim=False), rewards, colours).set_clim(-most, most)
+    _colour_by_scale(axes, _cells(rows, slim=False), rewards, "PuOr").set_clim(-most, most)

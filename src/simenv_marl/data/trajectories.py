@@ -30,8 +30,8 @@ Array = NDArray[Any]
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Masks = NDArray[np.int8] | tuple[NDArray[np.int8], ...]
-"""The masks of N decisions: ``(N, n)``, for a ``MultiDiscrete`` a tuple of such arrays."""
+Masks = Array | tuple[Array, ...]
+"""The int8 masks of N decisions: ``(N, n)``, for a ``MultiDiscrete`` a tuple of such arrays."""
 
 TRAJECTORY: Final = np.dtype(
     [
@@ -45,8 +45,8 @@ TRAJECTORY: Final = np.dtype(
 )
 """The dtype of the records of trajectories."""
 
-End = tuple[Observation, int, bool, bool]
-"""The end of an agent: the observation, the turn, and whether it terminated and was truncated."""
+End = tuple[int, bool, bool]
+"""The end of an agent: the turn, and whether the agent terminated and was truncated."""
 
 # -- trajectories for learners --------------------------------------------------------------------
 
@@ -270,7 +270,7 @@ class _DecisionLog:
         # By row; only the known ones.
         self.rule_actions: dict[int, Action] = {}
         # By row of the last decision.
-        self.ends: dict[int, End] = {}
+        self.ends: dict[int, tuple[Observation, *End]] = {}
         # The rows of each trajectory, by place of its policy, and by episode and agent.
         self.trajectories: dict[int, dict[tuple[int, str], list[int]]] = {}
 
@@ -319,7 +319,7 @@ class _DecisionLog:
             self.rule_actions[row] = agent.rule_action
             agent.rule_action = None  # otherwise a rule that is cut short would report it again
         if end is not None:
-            self.ends[row] = end
+            self.ends[row] = (agent.observation, *end)
 
     @cached_property
     def columns(self) -> dict[str, Any]:
@@ -407,12 +407,12 @@ class Recorder:
         ended = episode.just_ended[self._ends[episode] :]
         self._ends[episode] += len(ended)
         for agent in ended:
-            self._pay(agent, (agent.observation, episode.turns, True, False))
+            self._pay(agent, (episode.turns, True, False))
         if episode.over:
             del self._ends[episode]
             end = (episode.turns, episode.terminated, episode.truncated)
             for agent in episode.agents.values():
-                self._pay(agent, (agent.observation, *end))
+                self._pay(agent, end)
 
     def _pay(self, agent: Agent, end: End | None = None) -> None:
         """Record the reward of an agent's latest decision, and the agent's end."""

@@ -6,7 +6,6 @@ opens, and a figure is freed when its user drops it.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
@@ -83,8 +82,8 @@ def style(feature: str) -> Iterator[Callable[[float, float], Figure]]:
 
     Yield a function that makes a new figure from its width and height in inches.
     """
-    rc_context = import_extra("matplotlib", feature).rc_context
     make = import_extra("matplotlib.figure", feature).Figure
+    from matplotlib import rc_context
 
     def new_figure(width: float, height: float) -> Any:
         figure: Any = make(figsize=(width, height), layout="constrained")
@@ -106,21 +105,21 @@ def by_key(trajectories: Collection) -> Mapping[Any, Trajectories]:
     """Return the trajectories to draw, by the key of their policy."""
     if isinstance(trajectories, Trajectories):
         return {None: trajectories}
-    if not isinstance(trajectories, Mapping) or not all(
-        isinstance(value, Trajectories) for value in trajectories.values()
+    if (
+        not isinstance(trajectories, Mapping)
+        or not trajectories
+        or not all(isinstance(value, Trajectories) for value in trajectories.values())
     ):
         raise OptionValueError(
-            "only the dict of Trajectories that collect_episodes returned can be drawn, not"
-            f" {short_repr(trajectories)}"
+            "only the dict of Trajectories that collect_episodes returned for some policies can be"
+            f" drawn, not {short_repr(trajectories)}"
         )
-    if not trajectories:
-        raise OptionValueError("there is nothing to draw: no policy has answered any decision")
     return trajectories
 
 
 def title_of(key: Hashable) -> str:
     """Return the title for a policy's key: the last two parts of a dotted name."""
-    name = "" if key is None else str(getattr(key, "__qualname__", key))
+    name = str(getattr(key, "__qualname__", key or ""))
     return ".".join(name.split(".")[-2:])
 
 
@@ -211,10 +210,10 @@ def plot_returns(
             be more than 60 rows, as with hundreds of agents.
         MissingExtraError: Matplotlib or SciPy is missing.
     """
-    if per not in AGGREGATES:
+    if per not in tuple(AGGREGATES):
         raise OptionValueError(f'per must be "policy", "agent" or "team", not {short_repr(per)}')
     groups = _returns(collected, per)
-    number = sum(len(rows) for rows in groups.values())
+    number = sum(map(len, groups.values()))
     if not number:
         raise OptionValueError("there is nothing to draw: no agent has decided in any episode")
     if number > MOST_ROWS:
@@ -262,20 +261,20 @@ def _returns(
         isinstance(value, Mapping) for value in collected.values()
     ):
         collections = {str(label): value for label, value in collected.items()}
-    groups: defaultdict[str, dict[str, Floats]] = defaultdict(dict)
+    groups: dict[str, dict[str, Floats]] = {}
     for label, trajectories in collections.items():
-        by_title: defaultdict[str, defaultdict[int, list[float]]]
-        by_title = defaultdict(lambda: defaultdict(list))
+        by_title: dict[str, dict[int, list[float]]] = {}
         for key, found in by_key(trajectories).items():
             title = title_of(key) if per == "policy" else ""
             for start, value in zip(found.starts, found.returns.tolist(), strict=True):
                 if per == "agent":
                     title = found.names[found.agents[start]]
-                by_title[title][int(found.episodes[start])].append(value)
+                by_episode = by_title.setdefault(title, {})
+                by_episode.setdefault(int(found.episodes[start]), []).append(value)
         combine = fmean if per == "policy" else sum
         for title, by_episode in by_title.items():
             returns = [combine(by_episode[episode]) for episode in sorted(by_episode)]
-            groups[title][label] = np.array(returns, np.float64)
+            groups.setdefault(title, {})[label] = np.array(returns, np.float64)
     return groups
 
 

@@ -193,10 +193,9 @@ def plot_timeline(
             grid = _draw_charts(rows, make, begin, end)
         else:
             grid = _draw_panels(rows, make, component)
+        unit = "time" if isinstance(begin, float) else "decision number in the episode"
         for axes in grid[-1]:
-            axes.set_xlabel(
-                "time" if isinstance(begin, float) else "decision number in the episode"
-            )
+            axes.set_xlabel(unit)
             axes.set_xlim(begin - margin, end + margin)
         corner: Axes = grid[0, -1]
         corner.figure.suptitle(f"Episode {number}, seed {seeds[number]}", x=0.01, ha="left")
@@ -235,13 +234,13 @@ def _components(found: Trajectories, action_labels: Mapping[Any, Any]) -> dict[s
         if array.dtype == object:  # values without a shape are told apart by their text
             texts, array = np.unique([str(action) for action in array], return_inverse=True)
             names = {code: f"{text:.20}" for code, text in enumerate(texts)}
-        columns = array.reshape(len(array), -1)
-        distinct = np.unique(columns[found.known]).tolist()
+        columns = array.reshape(len(array), -1).T
+        distinct = np.unique(columns[:, found.known]).tolist()
         labels = {}
         if array.dtype.kind in "iub" and len(distinct) <= MOST_COLOURS:
             labels = {int(value): str(names.get(value, int(value))) for value in distinct}
-        for place, values in enumerate(columns.T):
-            name = part if columns.shape[1] == 1 else f"{part}[{place}]"
+        for place, values in enumerate(columns):
+            name = part if len(columns) == 1 else f"{part}[{place}]"
             components[name] = _Component(part, values, labels)
     return components
 
@@ -400,7 +399,6 @@ def _shade_absence(axes: Axes, row: TimelineRow, begin: float, end: float) -> No
         [row.end],
         [0.0],
         **MARKS[row.ending],
-        zorder=4,
         transform=axes.get_xaxis_transform(),
         clip_on=False,
     )
@@ -437,7 +435,10 @@ def _draw_panels(
     )
     for (left, right), (key, panel) in zip(grid, panels.items(), strict=True):
         _draw_panel(left, right, key, panel, component)
-    _mark_legend(grid[0, 1], rows, ["by rule", "by rule, action unknown"])
+    by_rule = ["by rule"]
+    if not all(row.known.all() for row in rows):
+        by_rule.append("by rule, action unknown")
+    _mark_legend(grid[0, 1], rows, by_rule)
     return grid
 
 
@@ -472,7 +473,7 @@ def _draw_panel(
         for ending in ("terminated", "truncated"):
             ends = {place: row.end for place, row in enumerate(rows) if row.ending == ending}
             mark = {**MARKS[ending], "markersize": min(points, 6.0)}
-            axes.plot(list(ends.values()), list(ends), zorder=4, **mark)
+            axes.plot(list(ends.values()), list(ends), **mark)
     step = ceil(9.0 / points)
     left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
     left.set_ylim(len(rows) - 0.4, -0.6)
@@ -515,17 +516,11 @@ def _colour(axes: Axes, cells: Floats, **colours: Any) -> PolyCollection:
     return collection
 
 
-def _colour_by_scale(
-    axes: Axes,
-    cells: Floats,
-    values: Array,
-    scale: str,
-) -> PolyCollection:
+def _colour_by_scale(axes: Axes, cells: Floats, values: Array, **colours: Any) -> None:
     """Draw cells in the colours of their values, and the scale beside the axes."""
-    collection = _colour(axes, cells, array=values, cmap=scale)
+    collection = _colour(axes, cells, array=values, **colours)
     bar = axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)
     bar.outline.set_visible(False)
-    return collection
 
 
 def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
@@ -540,7 +535,7 @@ def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
     labels_of_rows = [row.actions[name].labels for row in rows]
     labels = dict(ChainMap(*labels_of_rows))
     if not all(labels_of_rows) or len(labels) > MOST_COLOURS:
-        _colour_by_scale(axes, cells[known], values, "viridis")
+        _colour_by_scale(axes, cells[known], values, cmap="viridis")
         return
     actions = sorted(labels)
     if actions[0] >= 0 and actions[-1] < len(COLOURS):
@@ -557,4 +552,4 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     rewards = np.concatenate([row.rewards for row in rows])
     # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
-    _colour_by_scale(axes, _cells(rows, slim=False), rewards, "PuOr").set_clim(-most, most)
+    _colour_by_scale(axes, _cells(rows, slim=False), rewards, cmap="PuOr", clim=(-most, most))

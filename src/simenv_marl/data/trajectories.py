@@ -154,8 +154,8 @@ class Trajectories:
         """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
         observations = joined([self.observations, self.last_observations])
         next_rows = np.arange(1, len(self) + 1)
-        number = len(self.starts)
-        next_rows[self.starts + self.lengths - 1] = np.arange(len(self), len(self) + number)
+        last_rows = self.starts + self.lengths - 1
+        next_rows[last_rows] = len(self) + np.arange(len(last_rows))
         return taken(observations, next_rows)
 
 
@@ -186,7 +186,7 @@ class Records:
     """
 
     decisions: dict[str, Any]
-    trajectories: NDArray[np.void]
+    trajectories: Array
     last_observations: Observation
     point: dict[str, Any]
 
@@ -446,9 +446,7 @@ class Recorder:
 def points_of(plan: Plan, place: int) -> Iterator[Point]:
     """Yield the decision points that are known to be answered by the policy at a place."""
     for point in plan.points:
-        policy = point.policy
-        if point.agent is not None:
-            policy = plan.policies.get(point.agent, policy)
+        policy = plan.policies.get(point.agent or "", point.policy)
         if isinstance(policy, PolicyKey) and policy.place == place:
             yield point
 

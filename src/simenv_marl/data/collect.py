@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
-from math import inf, nan
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -185,8 +184,7 @@ def _play(
             collected[place] = collect(simulation)
         bar.update()
 
-    seeds = [seed for _, seed in episodes]
-    run(plan, seeds, batch_size, finish, recorder, concurrency)
+    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder, concurrency)
     return recorder.records(plan, keys), collected
 
 
@@ -276,7 +274,7 @@ def _check_part(policy: Any, weight: Any) -> None:
             f"{short_repr(policy)} answers one decision at a time, and a mixture asks in batches"
         )
     is_number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
-    if not is_number or not 0 <= weight < inf:
+    if not is_number or not 0 <= weight < float("inf"):
         raise OptionValueError(
             f"the weight of {short_repr(policy)} must be a number that is not negative, not"
             f" {short_repr(weight)}"
@@ -298,8 +296,7 @@ class _BatchedPolicy:
     ) -> list[Action]:
         """Ask the policy for one action for each decision, and drop its extras."""
         answers = self._batch_policy.answers(observations, infos, identities)
-        actions, _ = read_answers(answers, self._policy, len(identities))
-        return actions
+        return read_answers(answers, self._policy, len(identities))[0]
 
 
 def _random_numbers(identities: Identities) -> Array:
@@ -343,7 +340,7 @@ class Comparison:
     @property
     def agreement(self) -> float:
         """The share of decisions in which both agree, 0 to 1; nan if there are no decisions."""
-        return float(self.agreements.mean()) if len(self.agreements) else nan
+        return float(self.agreements.mean()) if len(self.agreements) else float("nan")
 
     def __repr__(self) -> str:
         return f"<Comparison: agreement {self.agreement:.3f} in {len(self.agreements)} decisions>"
@@ -447,7 +444,7 @@ def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
     recorded = extras.pop(SHADOW, ())
     trajectories = replace(trajectories, extras=extras)
     rule_actions = trajectories.actions
-    if trajectories.action_space is None or not len(trajectories):
+    if trajectories.action_space is None:
         return Comparison(trajectories, rule_actions, np.zeros(0, np.bool_))
     check_known(trajectories)
     policy_actions = stacker(trajectories.action_space)(
@@ -465,12 +462,12 @@ def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
 
 def _agreements(one: Array, other: Array, tolerance: float) -> Bools:
     """Return in which rows two arrays agree."""
-    if one.dtype == object:
-        return np.array(list(map(same, one, other)))
     equal = one == other
-    if one.dtype.kind == "f":
+    if one.dtype == object:
+        equal = np.array(list(map(same, one, other)))
+    elif one.dtype.kind == "f":
         equal = np.abs(one - other) <= tolerance
-    agree: Bools = equal.reshape(len(one), -1).all(axis=1)
+    agree: Bools = equal.all(axis=tuple(range(1, one.ndim)))
     return agree
 
 

@@ -91,8 +91,11 @@ def record_dataset(
     written = {}
     try:
         for key, name in names.items():
-            described = {"algorithm_name": policy_name(policies[key]), **(metadata or {})}
-            written[key] = save_dataset(name, collected[key], **described)
+            written[key] = save_dataset(
+                name,
+                collected[key],
+                **{"algorithm_name": policy_name(policies[key]), **(metadata or {})},
+            )
             written[key].storage.update_metadata({"provenance": origin})
     except BaseException:
         for path in paths:
@@ -226,17 +229,13 @@ def _episodes(trajectories: Trajectories) -> Iterator[EpisodeBuffer]:
     """Make a Minari episode of each trajectory."""
     from minari.data_collector import EpisodeBuffer
 
-    last_observations = trajectories.last_observations
     for place, start in enumerate(trajectories.starts):
         rows = np.arange(start, start + trajectories.lengths[place])
         seed = trajectories.seeds[trajectories.episodes[start]]
-        observations = [
-            taken(trajectories.observations, rows),
-            taken(last_observations, np.array([place])),
-        ]
+        last_observation = taken(trajectories.last_observations, np.array([place]))
         yield EpisodeBuffer(
             seed=seed if seed < 2**63 else str(seed),  # Minari reads the string as an integer
-            observations=joined(observations),
+            observations=joined([taken(trajectories.observations, rows), last_observation]),
             actions=taken(trajectories.actions, rows),
             rewards=trajectories.rewards[rows],
             terminations=trajectories.terminations[rows],
@@ -255,8 +254,9 @@ def _infos(trajectories: Trajectories, rows: Integers) -> dict[str, Any]:
     infos["by_rule"] = _extend(trajectories.by_rule[rows], False)
     masks = trajectories.action_masks
     if isinstance(masks, tuple):
-        parts = enumerate(masks)
-        infos["action_mask"] = {str(place): _extend(mask[rows], 1) for place, mask in parts}
+        infos["action_mask"] = {
+            str(place): _extend(mask[rows], 1) for place, mask in enumerate(masks)
+        }
     elif masks is not None:
         infos["action_mask"] = _extend(masks[rows], 1)
     if trajectories.times is not None and trajectories.elapsed is not None:

@@ -86,7 +86,7 @@ def style(feature: str) -> Iterator[Callable[[float, float], Figure]]:
     from matplotlib import rc_context
 
     def new_figure(width: float, height: float) -> Any:
-        figure: Any = make(figsize=(width, height), layout="constrained")
+        figure = make(figsize=(width, height), layout="constrained")
 
         def image() -> bytes:
             buffer = BytesIO()
@@ -221,8 +221,9 @@ def plot_returns(
             f"per={per!r} would draw {number} rows, more than {MOST_ROWS}; per='policy' draws fewer"
         )
     labels = list(dict.fromkeys(chain.from_iterable(groups.values())))
-    returns_of_all = [returns for rows in groups.values() for returns in rows.values()]
-    proportion = is_proportion(np.concatenate(returns_of_all))
+    proportion = is_proportion(
+        np.concatenate([returns for rows in groups.values() for returns in rows.values()])
+    )
     with style("plot_returns") as new_figure:
         if ax is None:
             ax = new_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
@@ -287,12 +288,11 @@ def _draw_returns(
     proportion: bool,
 ) -> None:
     """Draw the episodes of a row, their quartiles and median, and their mean with its interval."""
-    number = len(returns)
-    mean = float(returns.mean())
+    mean = returns.mean()
     low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
     axes.barh(height, high - low, left=low, height=0.62, color=colour, alpha=0.16)
     # Spread evenly, in irregular order.
-    heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)
+    heights = height + 0.26 * (2 * (np.arange(len(returns)) * 0.618034 % 1) - 1)
     axes.scatter(returns, heights, 10, color=colour, alpha=0.45, linewidths=0)
     axes.vlines(median, height - 0.31, height + 0.31, color=colour, linewidth=1.4)
     below, above, note = interval(returns, 0.95, proportion=proportion)

@@ -17,7 +17,6 @@ from .plots import (
     ABSENT,
     COLOURS,
     INK,
-    PALE,
     Collection,
     by_key,
     style,
@@ -32,6 +31,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
     NewFigure = Callable[[float, float], Any]
+
+ActionNames = Sequence[Any] | Mapping[Any, Any] | None
+"""The names of discrete actions: see ``plot_timeline``."""
 
 MOST_CHARTS: Final = 6
 """The largest number of agents that have charts. More agents have a row of colours each."""
@@ -124,7 +126,7 @@ def plot_timeline(
     episode: int = 0,
     *,
     agents: Sequence[str] | None = None,
-    action_names: Sequence[Any] | Mapping[Any, Any] | None = None,
+    action_names: ActionNames = None,
     component: str | None = None,
     figure: Figure | SubFigure | None = None,
 ) -> Figure | SubFigure:
@@ -208,13 +210,13 @@ def plot_timeline(
 def _action_labels(
     key: Hashable,
     found: Trajectories,
-    action_names: Sequence[Any] | Mapping[Any, Any] | None,
+    action_names: ActionNames,
 ) -> Mapping[Any, Any]:
     """Return the names of the discrete actions of a policy, by action; some may have none."""
     start = 0
     if action_names is None and isinstance(found.action_space, Discrete):
         action_names = found.action_labels
-        start = int(found.action_space.start)
+        start = found.action_space.start
     if isinstance(action_names, Mapping):
         action_names = action_names.get(key, action_names)
     if isinstance(action_names, Mapping):
@@ -238,7 +240,7 @@ def _components(found: Trajectories, action_labels: Mapping[Any, Any]) -> dict[s
         distinct = np.unique(columns[:, found.known]).tolist()
         labels = {}
         if array.dtype.kind in "iub" and len(distinct) <= MOST_COLOURS:
-            labels = {int(value): str(names.get(value, int(value))) for value in distinct}
+            labels = {value: str(names.get(value, value)) for value in distinct}
         for place, values in enumerate(columns):
             name = part if len(columns) == 1 else f"{part}[{place}]"
             components[name] = _Component(part, values, labels)
@@ -256,7 +258,7 @@ def _rows(
         start = found.starts[place]
         rows = slice(start, start + found.lengths[place])
         times: Array = found.turns[rows]
-        end = float(found.last_turns[place])
+        end = found.last_turns[place]
         if found.times is not None and found.elapsed is not None:
             times = found.times[rows]
             end = times[-1] + found.elapsed[rows][-1]
@@ -288,17 +290,25 @@ def _choose(rows: Sequence[TimelineRow], agents: Sequence[str], episode: int) ->
         ) from None
 
 
-def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], by_rule: Sequence[str]) -> None:
+def _mark_legend(
+    axes: Axes,
+    rows: Sequence[TimelineRow],
+    by_rule: list[str],
+    unknown: list[str],
+) -> None:
     """Explain the marks that occur, above axes that may have another legend.
 
-    ``by_rule`` are the marks to explain where the rule has decided.
+    ``by_rule`` and ``unknown`` are the marks to explain where the rule has decided, and where its
+    action is unknown.
     """
     from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
     labels = sorted({row.ending for row in rows})
+    if not all(row.known.all() for row in rows):
+        labels = unknown + labels
     if any(row.by_rule.any() for row in rows):
-        labels = [*by_rule, *labels]
+        labels = by_rule + labels
     handles = [Line2D([], [], **MARKS[label]) for label in labels]
     axes.add_artist(Legend(axes, handles, labels, **ABOVE))
 
@@ -341,7 +351,7 @@ def _draw_charts(
             _chart_actions(axes, row, name)
         _shade_absence(axes, row, begin, end)
     figure.align_ylabels()
-    _mark_legend(grid[0, 0], rows, ["policy", "rule"])
+    _mark_legend(grid[0, 0], rows, ["policy", "rule"], [])
     return grid
 
 
@@ -352,9 +362,8 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
         values = component.values[row.rows]
         line = np.where(row.known, values, np.nan)
         axes.step(row.times, line, where="post", color=colour, linewidth=0.8, label=name)
-        by_policy = row.known & ~row.by_rule
         by_rule = row.known & row.by_rule
-        for chosen, fill in ((by_policy, colour), (by_rule, "white")):
+        for chosen, fill in ((~row.by_rule, colour), (by_rule, "white")):
             axes.scatter(
                 row.times[chosen],
                 values[chosen],
@@ -384,7 +393,6 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
 
 def _chart_rewards(axes: Axes, row: TimelineRow) -> None:
     """Draw a stem for the reward of each decision."""
-    axes.axhline(0.0, color=PALE, linewidth=0.8)
     axes.vlines(row.times, 0.0, row.rewards, color=INK, linewidth=1.0)
     axes.set_ylabel("reward")
     write_beside(axes, f"sum {row.rewards.sum():.4g}", 0.5, axes.transAxes)
@@ -394,7 +402,7 @@ def _shade_absence(axes: Axes, row: TimelineRow, begin: float, end: float) -> No
     """Shade the times when an agent does not live, and mark its end."""
     for left, right in ((begin, row.times[0]), (row.end, end)):
         if right > left:
-            axes.axvspan(left, right, color=ABSENT, linewidth=0, zorder=0)
+            axes.axvspan(left, right, color=ABSENT, zorder=0)
     axes.plot(
         [row.end],
         [0.0],
@@ -418,7 +426,7 @@ def _draw_panels(
     """
     panels = _panels(rows)
     names = dict.fromkeys(name for row in rows for name in row.actions)
-    if component is not None and component not in names:
+    if component not in (None, *names):
         raise OptionValueError(
             f"no action has a component {short_repr(component)}; there are"
             f" {', '.join(map(repr, names))}"
@@ -435,10 +443,7 @@ def _draw_panels(
     )
     for (left, right), (key, panel) in zip(grid, panels.items(), strict=True):
         _draw_panel(left, right, key, panel, component)
-    by_rule = ["by rule"]
-    if not all(row.known.all() for row in rows):
-        by_rule.append("by rule, action unknown")
-    _mark_legend(grid[0, 1], rows, by_rule)
+    _mark_legend(grid[0, 1], rows, ["by rule"], ["by rule, action unknown"])
     return grid
 
 
@@ -519,8 +524,7 @@ def _colour(axes: Axes, cells: Floats, **colours: Any) -> PolyCollection:
 def _colour_by_scale(axes: Axes, cells: Floats, values: Array, **colours: Any) -> None:
     """Draw cells in the colours of their values, and the scale beside the axes."""
     collection = _colour(axes, cells, array=values, **colours)
-    bar = axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)
-    bar.outline.set_visible(False)
+    axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)
 
 
 def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
@@ -537,19 +541,18 @@ def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
     if not all(labels_of_rows) or len(labels) > MOST_COLOURS:
         _colour_by_scale(axes, cells[known], values, cmap="viridis")
         return
-    actions = sorted(labels)
-    if actions[0] >= 0 and actions[-1] < len(COLOURS):
-        colours = {action: COLOURS[action] for action in actions}
-    else:
-        colours = dict(zip(actions, COLOURS, strict=False))
-    _colour(axes, cells[known], facecolors=[colours[value] for value in values.tolist()])
-    patches = [Patch(color=colour, label=labels[action]) for action, colour in colours.items()]
+    palette = dict(enumerate(COLOURS))
+    if not labels.keys() <= palette.keys():
+        palette = dict(zip(sorted(labels), COLOURS, strict=False))
+    _colour(axes, cells[known], facecolors=[palette[value] for value in values.tolist()])
+    patches = [Patch(color=palette[action], label=labels[action]) for action in sorted(labels)]
     axes.legend(handles=patches, **BESIDE)
 
 
 def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     """Colour the decisions by their rewards; zero is nearly white."""
     rewards = np.concatenate([row.rewards for row in rows])
-    # So that a few large rewards do not make all others pale.
-    most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
+    sizes = np.abs(rewards)
+    # A quantile, so that a few large rewards do not make all others pale.
+    most = np.quantile(sizes, 0.99) or sizes.max() or 1.0
     _colour_by_scale(axes, _cells(rows, slim=False), rewards, cmap="PuOr", clim=(-most, most))

@@ -152,11 +152,10 @@ class Trajectories:
     @cached_property
     def next_observations(self) -> Observation:
         """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
-        observations = joined([self.observations, self.last_observations])
         next_rows = np.arange(1, len(self) + 1)
         last_rows = self.starts + self.lengths - 1
         next_rows[last_rows] = len(self) + np.arange(len(last_rows))
-        return taken(observations, next_rows)
+        return taken(joined([self.observations, self.last_observations]), next_rows)
 
 
 def action_arrays(actions: Action, name: str = "") -> Iterator[tuple[str, Array]]:
@@ -220,7 +219,7 @@ def combine(
         terminations=is_last & per_decision(trajectories["terminated"]),
         truncations=is_last & per_decision(trajectories["truncated"]),
         last_observations=joined([part.last_observations for part in filled]),
-        last_turns=trajectories["last_turn"].copy(),
+        last_turns=trajectories["last_turn"],
         starts=starts,
         episodes=per_decision(trajectories["episode"]),
         seeds=seeds,

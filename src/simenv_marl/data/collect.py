@@ -1,6 +1,11 @@
 """Trajectories of many simulations for learning, mixtures of policies, and comparisons."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Iterable,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -14,11 +19,28 @@ from ..core.points import Points
 from ..core.policies import PolicyWrapper, is_asked_alone, when_answered
 from ..core.spaces import same
 from ..core.stacking import stacker, taken
-from ..errors import DefinitionError, OptionValueError, name_of, short_repr
-from ..many.batch import BatchPolicy, PolicyKey, policy_keys, read_answers, run
+from ..errors import (
+    DefinitionError,
+    OptionValueError,
+    name_of,
+    short_repr,
+)
+from ..many.batch import (
+    BatchPolicy,
+    PolicyKey,
+    policy_keys,
+    read_answers,
+    run,
+)
 from ..many.parallel import progress_bar, spread
 from ..many.simulate import check_options, checked_policies, checked_seeds
-from ..simulation import RULE, Action, Model, Observation, Sentinel
+from ..simulation import (
+    RULE,
+    Action,
+    Model,
+    Observation,
+    Sentinel,
+)
 from .trajectories import (
     Array,
     Bools,
@@ -95,7 +117,13 @@ def collect_episodes(
     policies = checked_policies(policies)
     checked = checked_seeds(seeds)
     check_options(batch_size, workers, collect, concurrency)
-    make_plan = partial(learners_plan, simulation, policies, points, options)
+    make_plan = partial(
+        learners_plan,
+        simulation,
+        policies,
+        points,
+        options,
+    )
     plan = make_plan()  # errors show up before any work starts
     arguments = (
         make_plan,
@@ -106,7 +134,14 @@ def collect_episodes(
         concurrency,
     )
     with progress_bar(len(checked), progress) as bar:
-        parts = spread(_play, arguments, list(enumerate(checked)), workers, batch_size, bar)
+        parts = spread(
+            _play,
+            arguments,
+            list(enumerate(checked)),
+            workers,
+            batch_size,
+            bar,
+        )
     collected = None
     if collect is not None:
         collected = tuple(chain.from_iterable(values for _, values in parts))
@@ -146,7 +181,14 @@ def learners_plan(
     others = None
     if all_points:
         others = PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone))
-    plan = Plan(simulation, points, options, unattended=True, rewarded=True, others=others)
+    plan = Plan(
+        simulation,
+        points,
+        options,
+        unattended=True,
+        rewarded=True,
+        others=others,
+    )
     for place, policy in enumerate(policies.values()):
         for point in points_of(plan, place) if isinstance(policy, LeftToRule) else ():
             if point.report is None:
@@ -184,7 +226,14 @@ def _play(
             collected[place] = collect(simulation)
         bar.update()
 
-    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder, concurrency)
+    run(
+        plan,
+        [seed for _, seed in episodes],
+        batch_size,
+        finish,
+        recorder,
+        concurrency,
+    )
     return recorder.records(plan, keys), collected
 
 
@@ -460,7 +509,11 @@ def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
     return Comparison(trajectories, policy_actions, agreements)
 
 
-def _agreements(one: Array, other: Array, tolerance: float) -> Bools:
+def _agreements(
+    one: Array,
+    other: Array,
+    tolerance: float,
+) -> Bools:
     """Return in which rows two arrays agree."""
     equal = one == other
     if one.dtype == object:

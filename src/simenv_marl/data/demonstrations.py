@@ -18,10 +18,22 @@ from ..core.options import EpisodeOptions
 from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
-from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
+from ..errors import (
+    MissingExtraError,
+    OptionValueError,
+    did_you_mean,
+    short_repr,
+)
 from ..many.simulate import checked_policies
 from ..simulation import Model
-from .collect import LeftToRule, Policies, check_known, collect_episodes, follows_rule, policy_name
+from .collect import (
+    LeftToRule,
+    Policies,
+    check_known,
+    collect_episodes,
+    follows_rule,
+    policy_name,
+)
 from .trajectories import Array, Integers, Trajectories
 
 if TYPE_CHECKING:

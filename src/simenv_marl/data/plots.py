@@ -6,13 +6,23 @@ opens, and a figure is freed when its user drops it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import (
+    Callable,
+    Hashable,
+    Iterator,
+    Mapping,
+)
 from contextlib import contextmanager
 from io import BytesIO
 from itertools import chain
 from math import nan
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Literal,
+)
 
 import numpy as np
 
@@ -123,7 +133,12 @@ def title_of(key: Hashable) -> str:
     return ".".join(name.split(".")[-2:])
 
 
-def write_beside(axes: Axes, text: str, height: float, transform: Transform) -> None:
+def write_beside(
+    axes: Axes,
+    text: str,
+    height: float,
+    transform: Transform,
+) -> None:
     """Write text to the right of axes, at a height in the coordinates of a transform."""
     axes.annotate(
         text,
@@ -236,7 +251,13 @@ def plot_returns(
                 height += 0.8
             for label, returns in rows.items():
                 colour = COLOURS[labels.index(label) % len(COLOURS)]
-                _draw_returns(ax, height, returns, colour, proportion=proportion)
+                _draw_returns(
+                    ax,
+                    height,
+                    returns,
+                    colour,
+                    proportion=proportion,
+                )
                 ticks.append((height, label or title, "normal"))
                 height += 1.0
         heights, texts, weights = zip(*ticks, strict=True)
@@ -290,15 +311,47 @@ def _draw_returns(
     """Draw the episodes of a row, their quartiles and median, and their mean with its interval."""
     mean = returns.mean()
     low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
-    axes.barh(height, high - low, left=low, height=0.62, color=colour, alpha=0.16)
+    axes.barh(
+        height,
+        high - low,
+        left=low,
+        height=0.62,
+        color=colour,
+        alpha=0.16,
+    )
     # Spread evenly, in irregular order.
     heights = height + 0.26 * (2 * (np.arange(len(returns)) * 0.618034 % 1) - 1)
-    axes.scatter(returns, heights, 10, color=colour, alpha=0.45, linewidths=0)
-    axes.vlines(median, height - 0.31, height + 0.31, color=colour, linewidth=1.4)
+    axes.scatter(
+        returns,
+        heights,
+        10,
+        color=colour,
+        alpha=0.45,
+        linewidths=0,
+    )
+    axes.vlines(
+        median,
+        height - 0.31,
+        height + 0.31,
+        color=colour,
+        linewidth=1.4,
+    )
     below, above, note = interval(returns, 0.95, proportion=proportion)
     text = f"{mean:.4g}"
     if not note:
         text += f"  [{below:.4g}, {above:.4g}]"
-        axes.hlines(height, below, above, color=INK, linewidth=1.6)
-    axes.plot([mean], [height], "o", color=INK, markersize=4)
+        axes.hlines(
+            height,
+            below,
+            above,
+            color=INK,
+            linewidth=1.6,
+        )
+    axes.plot(
+        [mean],
+        [height],
+        "o",
+        color=INK,
+        markersize=4,
+    )
     write_beside(axes, text, height, axes.get_yaxis_transform())

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import operator
 from collections import ChainMap
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Hashable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass
 from math import ceil
 from typing import TYPE_CHECKING, Any, Final
@@ -23,7 +29,13 @@ from .plots import (
     title_of,
     write_beside,
 )
-from .trajectories import Array, Bools, Floats, Trajectories, action_arrays
+from .trajectories import (
+    Array,
+    Bools,
+    Floats,
+    Trajectories,
+    action_arrays,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -361,7 +373,14 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
     for (name, component), colour in zip(components.items(), COLOURS, strict=False):
         values = component.values[row.rows]
         line = np.where(row.known, values, np.nan)
-        axes.step(row.times, line, where="post", color=colour, linewidth=0.8, label=name)
+        axes.step(
+            row.times,
+            line,
+            where="post",
+            color=colour,
+            linewidth=0.8,
+            label=name,
+        )
         by_rule = row.known & row.by_rule
         for chosen, fill in ((~row.by_rule, colour), (by_rule, "white")):
             axes.scatter(
@@ -398,7 +417,12 @@ def _chart_rewards(axes: Axes, row: TimelineRow) -> None:
     write_beside(axes, f"sum {row.rewards.sum():.4g}", 0.5, axes.transAxes)
 
 
-def _shade_absence(axes: Axes, row: TimelineRow, begin: float, end: float) -> None:
+def _shade_absence(
+    axes: Axes,
+    row: TimelineRow,
+    begin: float,
+    end: float,
+) -> None:
     """Shade the times when an agent does not live, and mark its end."""
     for left, right in ((begin, row.times[0]), (row.end, end)):
         if right > left:
@@ -511,7 +535,11 @@ def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> Floats:
     return np.concatenate(cells)
 
 
-def _colour(axes: Axes, cells: Floats, **colours: Any) -> PolyCollection:
+def _colour(
+    axes: Axes,
+    cells: Floats,
+    **colours: Any,
+) -> PolyCollection:
     """Draw cells in their colours."""
     from matplotlib.collections import PolyCollection
 
@@ -521,13 +549,22 @@ def _colour(axes: Axes, cells: Floats, **colours: Any) -> PolyCollection:
     return collection
 
 
-def _colour_by_scale(axes: Axes, cells: Floats, values: Array, **colours: Any) -> None:
+def _colour_by_scale(
+    axes: Axes,
+    cells: Floats,
+    values: Array,
+    **colours: Any,
+) -> None:
     """Draw cells in the colours of their values, and the scale beside the axes."""
     collection = _colour(axes, cells, array=values, **colours)
     axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)
 
 
-def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
+def _colour_actions(
+    axes: Axes,
+    rows: Sequence[TimelineRow],
+    name: str,
+) -> None:
     """Colour the decisions by a component of their actions."""
     from matplotlib.patches import Patch
 

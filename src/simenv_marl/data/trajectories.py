@@ -6,7 +6,12 @@ order.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from math import nan
@@ -21,7 +26,13 @@ from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import Point
 from ..core.spaces import blank
-from ..core.stacking import Stacker, joined, stack_masks, stacker, taken
+from ..core.stacking import (
+    Stacker,
+    joined,
+    stack_masks,
+    stacker,
+    taken,
+)
 from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Answers, Group, PolicyKey
 from ..simulation import RULE, Action, Observation
@@ -310,7 +321,12 @@ class _DecisionLog:
         self.rewards += [0.0] * number
         self.elapsed += [nan] * number
 
-    def pay(self, row: int, agent: Agent, end: End | None) -> None:
+    def pay(
+        self,
+        row: int,
+        agent: Agent,
+        end: End | None,
+    ) -> None:
         """Record the reward of a decision, the rule's action if it decided, and an end."""
         self.rewards[row] = agent.reward
         self.elapsed[row] = agent.info.get("elapsed", nan)
@@ -392,7 +408,13 @@ class Recorder:
         log = self._logs[group]
         first = len(log.rewards)
         agents = [agent for episode in waiting if (agent := episode.pending) is not None]
-        log.add(group, waiting, agents, observations, answers)
+        log.add(
+            group,
+            waiting,
+            agents,
+            observations,
+            answers,
+        )
         for row, (place, agent) in enumerate(zip(places, agents, strict=True), first):
             trajectories = log.trajectories.setdefault(agent.policy.place, {})
             key = (self._first_episode + place, agent.name)
@@ -413,7 +435,11 @@ class Recorder:
             for agent in episode.agents.values():
                 self._pay(agent, end)
 
-    def _pay(self, agent: Agent, end: End | None = None) -> None:
+    def _pay(
+        self,
+        agent: Agent,
+        end: End | None = None,
+    ) -> None:
         """Record the reward of an agent's latest decision, and the agent's end."""
         if agent in self._decisions:
             log, row = self._decisions[agent]
@@ -421,7 +447,11 @@ class Recorder:
             if end is not None:
                 del self._decisions[agent]
 
-    def records(self, plan: Plan, keys: Iterable[Any]) -> list[Records]:
+    def records(
+        self,
+        plan: Plan,
+        keys: Iterable[Any],
+    ) -> list[Records]:
         """Return the records of each policy, by the order of their keys."""
         records = []
         for place, key in enumerate(keys):

@@ -66,7 +66,7 @@ Identities = Sequence[tuple[int, int]]
 """For each of many decisions, the seed of its episode and the number of its turn."""
 
 SHADOW: Final = "shadow action"
-"""The extra in which the actions of the compared policies are recorded."""
+"""The extra with the actions of the compared policies."""
 
 
 def collect_episodes(
@@ -75,7 +75,7 @@ def collect_episodes(
     *,
     seeds: Iterable[int],
     points: Points = None,
-    collect: Callable[[Any], Any] | None = None,
+    collect: Callable[[Model], Any] | None = None,
     batch_size: int = 1024,
     concurrency: int = 64,
     workers: int = 0,
@@ -105,17 +105,17 @@ def collect_episodes(
         workers: As ``simulate_many`` takes them.
         progress: As ``simulate_many`` takes it.
         **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that
-            has a policy counts as declared, whatever ``possible_agents`` says.
+            has a policy counts as declared, even if ``possible_agents`` omits it.
 
     Returns:
         A dict from each key of ``policies`` to the trajectories of the agents of its policy.
 
     Raises:
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
-        BaseException: All other errors are those of ``simulate_many``.
+        BaseException: Any other error of ``simulate_many``.
     """
     policies = checked_policies(policies)
-    checked = checked_seeds(seeds)
+    seed_list = checked_seeds(seeds)
     check_options(batch_size, workers, collect, concurrency)
     make_plan = partial(
         learners_plan,
@@ -133,11 +133,11 @@ def collect_episodes(
         batch_size,
         concurrency,
     )
-    with progress_bar(len(checked), progress) as bar:
+    with progress_bar(len(seed_list), progress) as bar:
         parts = spread(
             _play,
             arguments,
-            list(enumerate(checked)),
+            list(enumerate(seed_list)),
             workers,
             batch_size,
             bar,
@@ -146,14 +146,14 @@ def collect_episodes(
     if collect is not None:
         collected = tuple(chain.from_iterable(values for _, values in parts))
     return {
-        key: combine([records[place] for records, _ in parts], tuple(checked), collected)
+        key: combine([records[place] for records, _ in parts], tuple(seed_list), collected)
         for place, key in enumerate(policies)
     }
 
 
 @dataclass(frozen=True)
 class LeftToRule:
-    """A policy that leaves decisions to the rule, whose actions must be known."""
+    """A policy that leaves decisions to the rule. The rule's actions must be known."""
 
     policy: Policy
 
@@ -167,10 +167,10 @@ def learners_plan(
     all_points: bool = False,
     alone: bool = False,
 ) -> Plan:
-    """Return the plan of the episodes, in which a ``PolicyKey`` has the place of each policy.
+    """Return the plan of the episodes. Its ``PolicyKey``s have the places of the policies.
 
-    With ``all_points``, entities without a policy are agents as well, whose decisions follow the
-    rule. ``alone``: each policy answers one decision at a time.
+    With ``all_points``, entities without a policy are agents as well, and follow the rule. With
+    ``alone``, each policy answers one decision at a time.
     """
     callables = {}
     for key, policy in policies.items():
@@ -207,13 +207,13 @@ def _play(
     make_plan: Callable[[], Plan],
     plan: Plan | None,
     keys: list[Any],
-    collect: Callable[[Any], Any] | None,
+    collect: Callable[[Model], Any] | None,
     batch_size: int,
     concurrency: int,
     episodes: list[tuple[int, int]],
     bar: Any,
 ) -> tuple[list[Records], list[Any]]:
-    """Play episodes, which are pairs of number and seed.
+    """Play episodes, given as pairs of number and seed.
 
     Return the records of each policy, and the result of ``collect`` for each episode.
     """
@@ -349,7 +349,7 @@ class _BatchedPolicy:
 
 
 def _random_numbers(identities: Identities) -> Array:
-    """Return a number in [0, 1) for each decision, which depends on its identity alone: float64."""
+    """Return a float64 number in [0, 1) for each decision, by its identity alone."""
     # SplitMix64, twice: to make a generator for each decision would take longer than the decision.
     pairs = [(seed % 2**64, turn) for seed, turn in identities]
     seeds, turns = np.array(pairs, np.uint64).reshape(-1, 2).T
@@ -372,7 +372,7 @@ def _splitmix(state: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The decisions of the model's own rule beside those of a policy, from ``compare_with_rule``.
+    """The decisions of the model's own rule beside a policy's, from ``compare_with_rule``.
 
     Attributes:
         trajectories: The trajectories of the rule.
@@ -388,7 +388,7 @@ class Comparison:
 
     @property
     def agreement(self) -> float:
-        """The share of decisions in which both agree, 0 to 1; nan if there are no decisions."""
+        """The share of agreements among the decisions, 0 to 1; nan without decisions."""
         return float(self.agreements.mean()) if len(self.agreements) else float("nan")
 
     def __repr__(self) -> str:
@@ -408,7 +408,7 @@ def compare_with_rule(
     """Let the model's own rule decide, and record the actions of policies beside it.
 
     At each decision the policy gets the same arguments as if it decided; then the rule decides. So
-    the episodes equal those of the plain model, unless ``others`` names policies that decide.
+    the plain model would run the same episodes, unless ``others`` names policies that decide.
 
     Args:
         simulation: As ``simulate_many`` takes it.
@@ -428,7 +428,7 @@ def compare_with_rule(
     Raises:
         DefinitionError: The actions that correspond to the rule's decisions are unknown.
         OptionValueError: An argument has an invalid value.
-        BaseException: All other errors are those of ``collect_episodes``.
+        BaseException: Any other error of ``collect_episodes``.
     """
     policies = checked_policies(policies)
     if not all(map(callable, policies.values())):
@@ -450,9 +450,9 @@ def compare_with_rule(
     for policy in policies.values():
         shadow = _Shadow if is_asked_alone(policy) else _BatchedShadow
         shadows[id(policy)] = LeftToRule(shadow(policy))
-    deciding = {key: shadows[id(policy)] for key, policy in policies.items()}
+    shadows_by_key = {key: shadows[id(policy)] for key, policy in policies.items()}
     collected = collect_episodes(
-        simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options
+        simulation, {**shadows_by_key, **(others or {})}, seeds=seeds, points=points, **options
     )
     return {key: _compare(collected[key], tolerance) for key in policies}
 
@@ -477,20 +477,20 @@ class _Shadow(PolicyWrapper):
         self,
         observation: Observation,
         info: dict[str, Any],
-        **asked: Any,
+        **context: Any,
     ) -> Any:
-        return when_answered(self.ask(observation, info, asked), self._record)
+        return when_answered(self.ask(observation, info, context), self._record)
 
     def _record(self, action: Action) -> Any:
-        recorded = np.empty((), object)
-        recorded[()] = action
-        return RULE, {SHADOW: recorded}
+        shadow_actions = np.empty((), object)
+        shadow_actions[()] = action
+        return RULE, {SHADOW: shadow_actions}
 
 
 def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
     """Compare the rule's actions with the actions that a shadow has recorded."""
     extras = dict(trajectories.extras)
-    recorded = extras.pop(SHADOW, ())
+    shadow_actions = extras.pop(SHADOW, ())
     trajectories = replace(trajectories, extras=extras)
     rule_actions = trajectories.actions
     if trajectories.action_space is None:
@@ -499,7 +499,7 @@ def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
     policy_actions = stacker(trajectories.action_space)(
         [
             taken(rule_actions, row) if action is RULE else action
-            for row, action in enumerate(recorded)
+            for row, action in enumerate(shadow_actions)
         ]
     )
     agreements = np.ones(len(trajectories), np.bool_)
@@ -514,7 +514,7 @@ def _agreements(
     other: Array,
     tolerance: float,
 ) -> Bools:
-    """Return in which rows two arrays agree."""
+    """Return ``(N,)``: whether two arrays agree, for each row."""
     equal = one == other
     if one.dtype == object:
         equal = np.array(list(map(same, one, other)))

@@ -88,10 +88,10 @@ def record_dataset(
     policies = checked_policies(policies)
     names = _dataset_ids(dataset_id, policies)
     paths = [_free_path(name) for name in names.values()]
-    left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
+    to_rule = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
     collected = collect_episodes(
         simulation,
-        {**policies, **left},
+        {**policies, **to_rule},
         seeds=seeds,
         points=points,
         batch_size=batch_size,
@@ -100,20 +100,20 @@ def record_dataset(
         **options,
     )
     origin = provenance(simulation, points, **options)
-    written = {}
+    datasets = {}
     try:
         for key, name in names.items():
-            written[key] = save_dataset(
+            datasets[key] = save_dataset(
                 name,
                 collected[key],
                 **{"algorithm_name": policy_name(policies[key]), **(metadata or {})},
             )
-            written[key].storage.update_metadata({"provenance": origin})
+            datasets[key].storage.update_metadata({"provenance": origin})
     except BaseException:
         for path in paths:
             shutil.rmtree(path, ignore_errors=True)  # all of them or none
         raise
-    return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
+    return datasets if isinstance(dataset_id, Mapping) else next(iter(datasets.values()))
 
 
 def _dataset_ids(
@@ -161,7 +161,7 @@ def save_dataset(
         dataset_id: The name of the data set, by Minari's rules: ``"(namespace/)name-v0"``.
         trajectories: The trajectories that ``collect_episodes`` returned under one key.
         **metadata: As ``minari.create_dataset_from_buffers`` takes it: ``author``, ``description``,
-            ``env`` or ``eval_env`` (from which readers recover the environment),
+            ``env`` or ``eval_env`` (to recover the environment),
             ``algorithm_name``, ``data_format``, ... Images are stored as they are, unless
             ``jpeg_encoding=True``.
 
@@ -214,7 +214,7 @@ def save_dataset(
 
 
 def _free_path(name: str) -> Path:
-    """Return the path of a data set, which must not exist yet."""
+    """Return the path of a data set that does not exist yet."""
     try:
         from minari.dataset.minari_dataset import parse_dataset_id
         from minari.storage.datasets_root_dir import get_dataset_path

@@ -54,7 +54,7 @@ COLOURS: Final = (
 )  # fmt: skip
 """The colours of actions.
 
-The first ones are those of Okabe and Ito, which colour-blind people can tell apart.
+The first ones are by Okabe and Ito, for colour-blind people.
 """
 
 INK = "#333333"
@@ -286,13 +286,13 @@ def _returns(
     groups: dict[str, dict[str, Floats]] = {}
     for label, trajectories in collections.items():
         by_title: dict[str, dict[int, list[float]]] = {}
-        for key, found in by_key(trajectories).items():
+        for key, group in by_key(trajectories).items():
             title = title_of(key) if per == "policy" else ""
-            for start, value in zip(found.starts, found.returns.tolist(), strict=True):
+            for start, value in zip(group.starts, group.returns.tolist(), strict=True):
                 if per == "agent":
-                    title = found.names[found.agents[start]]
+                    title = group.names[group.agents[start]]
                 by_episode = by_title.setdefault(title, {})
-                by_episode.setdefault(int(found.episodes[start]), []).append(value)
+                by_episode.setdefault(int(group.episodes[start]), []).append(value)
         combine = fmean if per == "policy" else sum
         for title, by_episode in by_title.items():
             returns = [combine(by_episode[episode]) for episode in sorted(by_episode)]

@@ -147,7 +147,7 @@ def plot_timeline(
     The horizontal axis is the simulation's time or, without a clock, the number of the decision
     among all decisions that policies answered in the episode.
 
-    Up to six agents have charts of their own: dots at the height of the action, stems at the height
+    Up to six agents have separate charts: dots at the height of the action, stems at the height
     of its reward. A dot is hollow where the decision was left to the model's rule. More agents have
     one row each, in the order of their births, once coloured by action and once by reward. A colour
     lasts until the agent's next decision. It is a slim bar where the rule decided, and grey where
@@ -161,8 +161,8 @@ def plot_timeline(
         action_names: The names of discrete actions: a sequence of names, or a dict from action to
             name; where policies differ in them, a dict from their keys to these. None: the
             ``action_labels`` of ``make_step``, else the numbers of the actions.
-        component: The component of the action by which rows are coloured, where actions have
-            several components. The name of a component is its index: ``"[1]"`` in a vector,
+        component: The component of the action that colours the rows, where actions have several
+            components. The name of a component is its index: ``"[1]"`` in a vector,
             ``"litres"`` in a ``Dict``, ``"litres[1]"`` in a vector of the dict. None: the first
             component.
         figure: The figure or subfigure to draw in; its size does not change. None: a new figure.
@@ -187,10 +187,10 @@ def plot_timeline(
             f" {short_repr(episode)}"
         ) from None
     rows: list[TimelineRow] = []
-    for key, found in by_policy.items():
-        if number in found.episodes:
-            actions = _components(found, _action_labels(key, found, action_names))
-            rows += _rows(key, found, actions, number)
+    for key, group in by_policy.items():
+        if number in group.episodes:
+            actions = _components(group, _action_labels(key, group, action_names))
+            rows += _rows(key, group, actions, number)
     if not rows:
         raise OptionValueError(
             f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has"
@@ -221,14 +221,14 @@ def plot_timeline(
 
 def _action_labels(
     key: Hashable,
-    found: Trajectories,
+    trajectories: Trajectories,
     action_names: ActionNames,
 ) -> Mapping[Any, Any]:
     """Return the names of the discrete actions of a policy, by action; some may have none."""
     start = 0
-    if action_names is None and isinstance(found.action_space, Discrete):
-        action_names = found.action_labels
-        start = found.action_space.start
+    if action_names is None and isinstance(trajectories.action_space, Discrete):
+        action_names = trajectories.action_labels
+        start = trajectories.action_space.start
     if isinstance(action_names, Mapping):
         action_names = action_names.get(key, action_names)
     if isinstance(action_names, Mapping):
@@ -240,16 +240,19 @@ def _action_labels(
     return dict(enumerate(action_names or (), start))
 
 
-def _components(found: Trajectories, action_labels: Mapping[Any, Any]) -> dict[str, _Component]:
+def _components(
+    trajectories: Trajectories,
+    action_labels: Mapping[Any, Any],
+) -> dict[str, _Component]:
     """Split the actions of a policy into their components, by name."""
     components = {}
-    for part, array in action_arrays(found.actions):
+    for part, array in action_arrays(trajectories.actions):
         names = action_labels
         if array.dtype == object:  # values without a shape are told apart by their text
             texts, array = np.unique([str(action) for action in array], return_inverse=True)
             names = {code: f"{text:.20}" for code, text in enumerate(texts)}
         columns = array.reshape(len(array), -1).T
-        distinct = np.unique(columns[:, found.known]).tolist()
+        distinct = np.unique(columns[:, trajectories.known]).tolist()
         labels = {}
         if array.dtype.kind in "iub" and len(distinct) <= MOST_COLOURS:
             labels = {value: str(names.get(value, value)) for value in distinct}
@@ -261,30 +264,30 @@ def _components(found: Trajectories, action_labels: Mapping[Any, Any]) -> dict[s
 
 def _rows(
     key: Hashable,
-    found: Trajectories,
+    trajectories: Trajectories,
     actions: dict[str, _Component],
     episode: int,
 ) -> Iterator[TimelineRow]:
     """Yield the row of each agent of a policy that decided in the episode."""
-    for place in np.flatnonzero(found.episodes[found.starts] == episode):
-        start = found.starts[place]
-        rows = slice(start, start + found.lengths[place])
-        times: Array = found.turns[rows]
-        end = found.last_turns[place]
-        if found.times is not None and found.elapsed is not None:
-            times = found.times[rows]
-            end = times[-1] + found.elapsed[rows][-1]
+    for place in np.flatnonzero(trajectories.episodes[trajectories.starts] == episode):
+        start = trajectories.starts[place]
+        rows = slice(start, start + trajectories.lengths[place])
+        times: Array = trajectories.turns[rows]
+        end = trajectories.last_turns[place]
+        if trajectories.times is not None and trajectories.elapsed is not None:
+            times = trajectories.times[rows]
+            end = times[-1] + trajectories.elapsed[rows][-1]
         yield TimelineRow(
             key=key,
-            agent=found.names[found.agents[start]],
+            agent=trajectories.names[trajectories.agents[start]],
             actions=actions,
             rows=rows,
             times=times,
-            rewards=found.rewards[rows],
-            known=found.known[rows],
-            by_rule=found.by_rule[rows],
+            rewards=trajectories.rewards[rows],
+            known=trajectories.known[rows],
+            by_rule=trajectories.by_rule[rows],
             end=end,
-            ending="terminated" if found.terminations[rows][-1] else "truncated",
+            ending="terminated" if trajectories.terminations[rows][-1] else "truncated",
         )
 
 
@@ -369,7 +372,9 @@ def _draw_charts(
 
 def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
     """Draw a line for each component of a part of the actions, with a dot for each decision."""
-    components = {name: own for name, own in row.actions.items() if own.part == part}
+    components = {
+        name: component for name, component in row.actions.items() if component.part == part
+    }
     for (name, component), colour in zip(components.items(), COLOURS, strict=False):
         values = component.values[row.rows]
         line = np.where(row.known, values, np.nan)
@@ -382,10 +387,10 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
             label=name,
         )
         by_rule = row.known & row.by_rule
-        for chosen, fill in ((~row.by_rule, colour), (by_rule, "white")):
+        for mask, fill in ((~row.by_rule, colour), (by_rule, "white")):
             axes.scatter(
-                row.times[chosen],
-                values[chosen],
+                row.times[mask],
+                values[mask],
                 14,
                 color=fill,
                 edgecolors=colour,

@@ -37,6 +37,7 @@ from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Answers, Group, PolicyKey
 from ..simulation import RULE, Action, Observation
 
+# Types of arrays.
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -66,11 +67,11 @@ End = tuple[int, bool, bool]
 class Trajectories:
     """The trajectories of all agents that share a policy, in one or many episodes. Immutable.
 
-    There are N rows, one for each decision, and M trajectories, one for each agent in each episode
-    in which it decided. The rows of a trajectory are consecutive, in the order of its decisions.
-    Trajectories are sorted by episode and, within an episode, by their first decision. For ``Dict``
-    and ``Tuple`` spaces, an attribute is a dict or a tuple of arrays instead of one array. For
-    spaces without a shape (text, graphs, ...), it is an array of objects.
+    There are N rows, one for each decision, and M trajectories. A trajectory has the decisions of
+    one agent in one episode, in consecutive rows. Trajectories are sorted by episode and, within an
+    episode, by their first decision. For ``Dict`` and ``Tuple`` spaces, an attribute is a dict or a
+    tuple of arrays instead of one array. For spaces without a shape (text, graphs, ...), it is an
+    array of objects.
 
     Attributes:
         observations: ``(N, *shape)``, in the dtype of the observation space: the observations at
@@ -95,8 +96,8 @@ class Trajectories:
         agents: ``(N,)`` int64: the deciding agent, as an index into ``names``.
         names: The names of the agents, in order of appearance.
         steps: ``(N,)`` int64: the number of the decision in its trajectory, from 0.
-        turns: ``(N,)`` int64: the number of the decision among those of all agents of all policies
-            in the episode, from 0.
+        turns: ``(N,)`` int64: the number of the decision among the decisions of all agents of all
+            policies in the episode, from 0.
         by_rule: ``(N,)`` bool: whether the policy left the decision to the model's rule.
         known: ``(N,)`` bool: whether ``actions`` has the action that was taken.
         action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such arrays: the legal
@@ -210,10 +211,10 @@ def combine(
 
     ``seeds`` and ``collected`` have an item for each episode of all parts.
     """
-    filled = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
-    _check_extras([part.decisions["extras"] for part in filled])
-    decisions = joined([part.decisions for part in filled])
-    trajectories = np.concatenate([part.trajectories for part in filled])
+    nonempty = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
+    _check_extras([part.decisions["extras"] for part in nonempty])
+    decisions = joined([part.decisions for part in nonempty])
+    trajectories = np.concatenate([part.trajectories for part in nonempty])
     lengths = trajectories["length"]
     starts = np.cumsum(lengths) - lengths
 
@@ -226,10 +227,10 @@ def combine(
     is_last = steps == per_decision(lengths) - 1
     return Trajectories(
         **decisions,
-        **filled[0].point,
+        **nonempty[0].point,
         terminations=is_last & per_decision(trajectories["terminated"]),
         truncations=is_last & per_decision(trajectories["truncated"]),
-        last_observations=joined([part.last_observations for part in filled]),
+        last_observations=joined([part.last_observations for part in nonempty]),
         last_turns=trajectories["last_turn"],
         starts=starts,
         episodes=per_decision(trajectories["episode"]),
@@ -247,7 +248,7 @@ def combine(
 class _DecisionLog:
     """The decisions of one group, in the order of the answers.
 
-    ``point`` is one of the points at which the group decides. None if no point is known; such a log
+    ``point`` is one of the group's decision points. It is None if no point is known; such a log
     stays empty.
     """
 
@@ -342,7 +343,7 @@ class _DecisionLog:
         _check_extras(self.extras)
         by_rule = np.array(self.by_rule, np.bool_)
         rule_rows = list(self.rule_actions)
-        # The actions of the rule follow those of the policy.
+        # The rule's actions come after the policy's.
         actions = joined([*self.actions, self.stack_actions(list(self.rule_actions.values()))])
         action_rows = np.arange(len(by_rule))
         action_rows[rule_rows] = len(by_rule) + np.arange(len(rule_rows))
@@ -369,11 +370,13 @@ class _DecisionLog:
         rows: list[int] = []
         records = []
         last_observations = []
-        trajectories = self.trajectories.get(place, {}).items()
-        for (episode, agent), own in sorted(trajectories, key=lambda item: (item[0][0], item[1])):
-            last_observation, *end = self.ends[own[-1]]
-            rows += own
-            records.append((len(own), episode, agent, *end))
+        for (episode, agent), agent_rows in sorted(
+            self.trajectories.get(place, {}).items(),
+            key=lambda item: (item[0][0], item[1]),
+        ):
+            last_observation, *end = self.ends[agent_rows[-1]]
+            rows += agent_rows
+            records.append((len(agent_rows), episode, agent, *end))
             last_observations.append(last_observation)
         return Records(
             decisions=taken(self.columns, np.array(rows, np.int64)),
@@ -391,7 +394,7 @@ class Recorder:
         self._logs: dict[Group, _DecisionLog] = {}
         # The latest decision of each agent that has not ended: its log and its row.
         self._decisions: dict[Agent, tuple[_DecisionLog, int]] = {}
-        # The number of recorded ends in each running episode, which lists all of them.
+        # The number of recorded ends in each running episode.
         self._ends: Counter[Episode] = Counter()
 
     def record(
@@ -425,9 +428,9 @@ class Recorder:
         """Record the rewards and the ends of agents: see ``Watcher``."""
         if episode.pending is not None:
             self._pay(episode.pending)
-        ended = episode.just_ended[self._ends[episode] :]
-        self._ends[episode] += len(ended)
-        for agent in ended:
+        new_ends = episode.just_ended[self._ends[episode] :]
+        self._ends[episode] += len(new_ends)
+        for agent in new_ends:
             self._pay(agent, (episode.turns, True, False))
         if episode.over:
             del self._ends[episode]

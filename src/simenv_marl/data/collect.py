@@ -430,8 +430,7 @@ def compare_with_rule(
         OptionValueError: An argument has an invalid value.
         BaseException: Any other error of ``collect_episodes``.
     """
-    policies = checked_policies(policies)
-    if not all(map(callable, policies.values())):
+    if not isinstance(policies, Mapping) or not all(map(callable, policies.values())):
         raise OptionValueError(
             "policies must be a dict from agents or points to callables, not"
             f" {short_repr(policies)}"

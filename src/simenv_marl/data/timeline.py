@@ -375,6 +375,7 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
     components = {
         name: component for name, component in row.actions.items() if component.part == part
     }
+    # Not strict: there are at most as many lines as colours.
     for (name, component), colour in zip(components.items(), COLOURS, strict=False):
         values = component.values[row.rows]
         line = np.where(row.known, values, np.nan)
@@ -554,12 +555,7 @@ def _colour(
     return collection
 
 
-def _colour_by_scale(
-    axes: Axes,
-    cells: Floats,
-    values: Array,
-    **colours: Any,
-) -> None:
+def _colour_by_scale(axes: Axes, cells: Floats, values: Array, **colours: Any) -> None:
     """Draw cells in the colours of their values, and the scale beside the axes."""
     collection = _colour(axes, cells, array=values, **colours)
     axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)

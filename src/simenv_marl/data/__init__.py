@@ -1,6 +1,11 @@
 """Trajectories of many episodes, data sets, comparisons with the rule, and plots."""
 
-from .collect import Comparison, Mixture, collect_episodes, compare_with_rule
+from .collect import (
+    Comparison,
+    Mixture,
+    collect_episodes,
+    compare_with_rule,
+)
 from .demonstrations import record_dataset, save_dataset
 from .plots import plot_returns
 from .timeline import plot_timeline

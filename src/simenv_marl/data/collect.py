@@ -1,13 +1,17 @@
-"""Episodes of many simulations at once: their trajectories for learning, mixtures of policies, and comparisons."""
+"""Trajectories of many simulations for learning, mixtures of policies, and comparisons."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Iterable,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass, replace
 from functools import partial
-from math import isfinite
+from itertools import chain
 from typing import Any, Final, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core import (
     EpisodeOptions,
@@ -22,31 +26,72 @@ from ..core import (
     when_answered,
 )
 from ..envs.single import plan_of
-from ..errors import DefinitionError, OptionValueError, short_repr
-from ..many.batch import BatchPolicy, PolicyKey, policy_keys, read_answers, run
+from ..errors import (
+    DefinitionError,
+    OptionValueError,
+    name_of,
+    short_repr,
+)
+from ..many.batch import (
+    BatchPolicy,
+    PolicyKey,
+    policy_keys,
+    read_answers,
+    run,
+)
 from ..many.parallel import progress_bar, spread
 from ..runs import check_options, checked_policies, checked_seeds
-from ..simulation import RULE
-from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by, leaves
+from ..simulation import (
+    RULE,
+    Action,
+    Model,
+    Observation,
+    Sentinel,
+)
+from .trajectories import (
+    Array,
+    Bools,
+    Floats,
+    Recorder,
+    Records,
+    Trajectories,
+    action_arrays,
+    combine,
+    points_of,
+)
+
+Policy = Callable[..., Action] | Sentinel
+"""A policy that answers many decisions at once, or ``RULE``."""
+
+Policies = Mapping[Any, Any]
+"""Policies by agent or decision point, as ``simulate_many`` takes them."""
+
+Infos = Sequence[dict[str, Any]]
+"""The infos of the agents of many decisions."""
+
+Identities = Sequence[tuple[int, int]]
+"""For each of many decisions, the seed of its episode and the number of its turn."""
 
 SHADOW: Final = "shadow action"
-"""The extra in which the actions of the compared policies are recorded."""
+"""The extra with the actions of the compared policies."""
 
 
 def collect_episodes(
-    simulation: Any,
-    policies: Mapping[Any, Any],
+    simulation: Model,
+    policies: Policies,
     *,
     seeds: Iterable[int],
     points: Points = None,
-    collect: Callable[[Any], Any] | None = None,
+    collect: Callable[[Model], Any] | None = None,
     batch_size: int = 1024,
     concurrency: int = 64,
     workers: int = 0,
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
 ) -> dict[Any, Trajectories]:
-    """Play one episode per seed with policies that answer in batches, and return the trajectories for learning.
+    """Play one episode per seed, and return the trajectories for learning.
+
+    Policies answer the decisions of many simulations in batches.
 
     Agents that have a policy are rewarded and end as in an AEC environment that is played with the
     same policies. All other agents follow their rule. An episode without decisions yields no
@@ -60,79 +105,93 @@ def collect_episodes(
             must always have the same keys.
         seeds: As ``simulate_many`` takes them.
         points: As ``simulate_many`` takes them.
-        collect: A callable of a simulation that has just ended. What it returns is in
+        collect: A callable of a simulation that has just ended. Its results are in
             ``collected``.
         batch_size: As ``simulate_many`` takes it.
         concurrency: As ``simulate_many`` takes it.
         workers: As ``simulate_many`` takes them.
         progress: As ``simulate_many`` takes it.
         **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that
-            has a policy counts as declared, whatever ``possible_agents`` says.
+            has a policy counts as declared, even if ``possible_agents`` omits it.
 
     Returns:
-        A dict from each key of ``policies`` to the trajectories of the agents that its policy
-        answered for.
+        A dict from each key of ``policies`` to the trajectories of the agents of its policy.
 
     Raises:
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
-        BaseException: All other errors are those of ``simulate_many``.
+        BaseException: Any other error of ``simulate_many``.
     """
-    policies, episodes = checked_policies(policies), list(enumerate(checked_seeds(seeds)))
+    policies = checked_policies(policies)
+    seed_list = checked_seeds(seeds)
     check_options(batch_size, workers, collect, concurrency)
-    plan = learners_plan(simulation, policies, points, options)
+    make_plan = partial(
+        learners_plan,
+        simulation,
+        policies,
+        points,
+        options,
+    )
+    plan = make_plan()  # errors show up before any work starts
     arguments = (
-        (simulation, policies, points, options),
+        make_plan,
         None if workers else plan,
+        list(policies),
         collect,
         batch_size,
         concurrency,
     )
-    with progress_bar(len(episodes), progress) as bar:
-        parts = spread(_play, arguments, episodes, workers, batch_size, bar)
-    all_seeds = tuple(seed for _, seed in episodes)
-    collected = None if collect is None else tuple(value for _, values in parts for value in values)
+    with progress_bar(len(seed_list), progress) as bar:
+        parts = spread(
+            _play,
+            arguments,
+            list(enumerate(seed_list)),
+            workers,
+            batch_size,
+            bar,
+        )
+    collected = None
+    if collect is not None:
+        collected = tuple(chain.from_iterable(values for _, values in parts))
     return {
-        key: combine([records[place] for records, _ in parts], all_seeds, collected)
+        key: combine([records[place] for records, _ in parts], tuple(seed_list), collected)
         for place, key in enumerate(policies)
     }
 
 
 @dataclass(frozen=True)
 class LeftToRule:
-    """A policy that leaves decisions to the rule, whose actions must be known."""
+    """A policy that leaves decisions to the rule. The rule's actions must be known."""
 
-    policy: Any
+    policy: Policy
 
 
 def learners_plan(
-    simulation: Any,
-    policies: Mapping[Any, Any],
-    points: Any,
+    simulation: Model,
+    policies: Policies,
+    points: Points,
     options: Mapping[str, Any],
     *,
     all_points: bool = False,
     alone: bool = False,
 ) -> Plan:
-    """Return the plan of the episodes, in which a ``PolicyKey`` has the place of each policy.
+    """Return the plan of the episodes. Its ``PolicyKey``s have the places of the policies.
 
-    With ``all_points``, entities without a policy are agents as well, whose decisions follow the
-    rule. ``alone``: each policy answers one decision at a time.
+    With ``all_points``, entities without a policy are agents as well, and follow the rule. With
+    ``alone``, each policy answers one decision at a time.
     """
-    callables = {
-        key: policy.policy if isinstance(policy, LeftToRule) else policy
-        for key, policy in policies.items()
-    }
-    callables = {
-        key: _follow_rule if policy is RULE else policy for key, policy in callables.items()
-    }
+    callables = {}
+    for key, policy in policies.items():
+        if isinstance(policy, LeftToRule):
+            policy = policy.policy
+        callables[key] = _follow_rule if policy is RULE else policy
     options = {**options, "policies": policy_keys(callables, rewarded=True, alone=alone)}
-    others = (
-        PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone)) if all_points else None
-    )
+    others = None
+    if all_points:
+        others = PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone))
     plan = plan_of(simulation, points, options, mode=Mode.COLLECT, default_policy=others)
     for place, policy in enumerate(policies.values()):
-        for point in plan.points if isinstance(policy, LeftToRule) else ():
-            if not point.reports_rule and is_answered_by(plan, point, place):
+        for point in points_of(plan, place) if isinstance(policy, LeftToRule) else ():
+            if not point.reports_rule:
                 raise DefinitionError(
                     f"the actions of the rule of {point.hook.name} are not known; give its"
                     " make_step a rule_action_mapping, which maps the rule's decision to an action"
@@ -140,42 +199,49 @@ def learners_plan(
     return plan
 
 
-def _follow_rule(observations: Any) -> Any:
+def _follow_rule(observations: Observation) -> Action:
     return RULE
 
 
 def _play(
-    arguments: tuple[Any, ...],
+    make_plan: Callable[[], Plan],
     plan: Plan | None,
-    collect: Callable[[Any], Any] | None,
+    keys: list[Any],
+    collect: Callable[[Model], Any] | None,
     batch_size: int,
     concurrency: int,
     episodes: list[tuple[int, int]],
     bar: Any,
 ) -> tuple[list[Records], list[Any]]:
-    """Play episodes, which are pairs of number and seed.
+    """Play episodes, given as pairs of number and seed.
 
-    Return the records by place of their policy, and values.
+    Return the records of each policy, and the result of ``collect`` for each episode.
     """
-    plan = plan or learners_plan(*arguments)
+    plan = plan or make_plan()
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)
 
-    def finish(place: int, simulation: Any) -> None:
+    def finish(place: int, simulation: Model) -> None:
         if collect is not None:
             collected[place] = collect(simulation)
         bar.update()
 
-    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder, concurrency)
-    _, policies, *_ = arguments
-    return recorder.records(plan, policies), collected
+    run(
+        plan,
+        [seed for _, seed in episodes],
+        batch_size,
+        finish,
+        recorder,
+        concurrency,
+    )
+    return recorder.records(plan, keys), collected
 
 
 # -- mixtures -------------------------------------------------------------------------------------
 
 
 class Mixture:
-    """A policy for ``collect_episodes`` that draws, for each decision, which of several policies answers it.
+    """A policy for ``collect_episodes`` that draws one of several policies for each decision.
 
     The draw depends only on the seed of the episode and the number of the decision in it. It does
     not depend on other simulations or on the number of processes. ``extras["component"]`` has the
@@ -195,82 +261,110 @@ class Mixture:
         Raises:
             OptionValueError: There are no policies, or a weight is invalid.
         """
-        pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
-        if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
+        try:
+            policies, weights = zip(
+                *(parts.items() if isinstance(parts, Mapping) else parts), strict=True
+            )
+        except (TypeError, ValueError):
             raise OptionValueError(
                 "a mixture needs a dict from policies to weights, or pairs of these, not"
                 f" {short_repr(parts)}"
-            )
-        for policy, weight in pairs:
-            if policy is not RULE and not callable(policy):
-                raise OptionValueError(
-                    "a mixture consists of policies, callables or RULE, not of"
-                    f" {short_repr(policy)}"
-                )
-            if is_asked_alone(policy):
-                raise OptionValueError(
-                    f"{short_repr(policy)} answers one decision at a time, and a mixture asks in"
-                    " batches"
-                )
-            number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
-            if not number or not isfinite(weight) or weight < 0:
-                raise OptionValueError(
-                    f"the weight of {short_repr(policy)} must be a number that is not negative, not"
-                    f" {short_repr(weight)}"
-                )
-        weights = np.array([weight for _, weight in pairs], np.float64)
-        if not weights.sum() > 0:
+            ) from None
+        for policy, weight in zip(policies, weights, strict=True):
+            _check_part(policy, weight)
+        if not any(weights):
             raise OptionValueError("at least one weight of a mixture must be positive")
-        self.policies: tuple[Any, ...] = tuple(policy for policy, _ in pairs)
-        self.weights: NDArray[np.float64] = weights / weights.sum()
+        self.policies: tuple[Policy, ...] = policies
+        self.weights: Floats = np.array(weights, np.float64) / sum(weights)
         self._bounds = np.cumsum(self.weights)[:-1]
-        self._batch_policies = [
-            None if policy is RULE else BatchPolicy(policy) for policy in self.policies
+        self._parts = [
+            _BatchedPolicy(_follow_rule if policy is RULE else policy) for policy in policies
         ]
 
     def __repr__(self) -> str:
-        parts = zip(self.policies, self.weights.tolist(), strict=True)
-        return (
-            "<Mixture:"
-            f" {', '.join(f'{weight:.3g} {policy_name(policy)}' for policy, weight in parts)}>"
-        )
+        parts = [
+            f"{weight:.3g} {policy_name(policy)}"
+            for policy, weight in zip(self.policies, self.weights, strict=True)
+        ]
+        return f"<Mixture: {', '.join(parts)}>"
 
     def __call__(
-        self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]
+        self,
+        observations: Observation,
+        infos: Infos,
+        identities: Identities,
     ) -> Any:
         """Answer a batch of decisions, as policies of ``collect_episodes`` do."""
         component = np.searchsorted(self._bounds, _random_numbers(identities), side="right")
-        actions: list[Any] = [RULE] * len(identities)
-        for number, batch_policy in enumerate(self._batch_policies):
-            own = np.flatnonzero(component == number)
-            if batch_policy is None or not len(own):
+        answers: list[Action] = [RULE] * len(identities)
+        for number, part in enumerate(self._parts):
+            index = np.flatnonzero(component == number)
+            rows = index.tolist()
+            if not rows:
                 continue
-            places = own.tolist()
-            arguments = (
-                taken(observations, own),
-                [infos[row] for row in places],
-                [identities[row] for row in places],
+            actions = part.actions(
+                taken(observations, index),
+                [infos[row] for row in rows],
+                [identities[row] for row in rows],
             )
-            for row, action in zip(
-                places, _ask(self.policies[number], batch_policy, *arguments), strict=True
-            ):
-                actions[row] = action
-        return actions, {"component": component}
+            for row, action in zip(rows, actions, strict=True):
+                answers[row] = action
+        return answers, {"component": component}
 
 
-def _random_numbers(identities: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
-    """Return a number in [0, 1) for each decision, which depends on its identity alone."""
+def _check_part(policy: Any, weight: Any) -> None:
+    """Check a policy of a mixture and its weight."""
+    if policy is not RULE and not callable(policy):
+        raise OptionValueError(
+            f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
+        )
+    if is_asked_alone(policy):
+        raise OptionValueError(
+            f"{short_repr(policy)} answers one decision at a time, and a mixture asks in batches"
+        )
+    is_number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
+    if not is_number or not 0 <= weight < float("inf"):
+        raise OptionValueError(
+            f"the weight of {short_repr(policy)} must be a number that is not negative, not"
+            f" {short_repr(weight)}"
+        )
+
+
+class _BatchedPolicy:
+    """A policy that answers many decisions at once."""
+
+    def __init__(self, policy: Callable[..., Action]) -> None:
+        self._policy = policy
+        self._batch_policy = BatchPolicy(policy)
+
+    def actions(
+        self,
+        observations: Observation,
+        infos: Infos,
+        identities: Identities,
+    ) -> list[Action]:
+        """Ask the policy for one action for each decision, and drop its extras."""
+        answers = self._batch_policy.answers(observations, infos, identities)
+        return read_answers(answers, self._policy, len(identities))[0]
+
+
+def _random_numbers(identities: Identities) -> Array:
+    """Return a float64 number in [0, 1) for each decision, by its identity alone."""
     # SplitMix64, twice: to make a generator for each decision would take longer than the decision.
-    seeds = np.array([seed % 2**64 for seed, _ in identities], np.uint64)
-    turns = np.array([turn for _, turn in identities], np.uint64)
-    return np.asarray((_splitmix(_splitmix(seeds) + turns) >> np.uint64(11)) * 2.0**-53, np.float64)
+    pairs = [(seed % 2**64, turn) for seed, turn in identities]
+    seeds, turns = np.array(pairs, np.uint64).reshape(-1, 2).T
+    return (_splitmix(_splitmix(seeds) + turns) >> 11) * 2.0**-53
 
 
-def _splitmix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    state = state + np.uint64(0x9E3779B97F4A7C15)
-    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return state ^ (state >> np.uint64(31))
+def _splitmix(state: Array) -> Array:
+    """Return the output of SplitMix64 for each uint64 state."""
+    state = state + 0x9E3779B97F4A7C15
+    state ^= state >> 30
+    state *= 0xBF58476D1CE4E5B9
+    state ^= state >> 27
+    state *= 0x94D049BB133111EB
+    state ^= state >> 31
+    return state
 
 
 # -- comparisons ----------------------------------------------------------------------------------
@@ -278,7 +372,7 @@ def _splitmix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The decisions of the model's own rule, and what a policy would have decided. Made by ``compare_with_rule``.
+    """The decisions of the model's own rule beside a policy's, from ``compare_with_rule``.
 
     Attributes:
         trajectories: The trajectories of the rule.
@@ -289,12 +383,12 @@ class Comparison:
     """
 
     trajectories: Trajectories
-    policy_actions: Any
-    agreements: NDArray[np.bool_]
+    policy_actions: Action
+    agreements: Bools
 
     @property
     def agreement(self) -> float:
-        """The share of decisions in which both agree, 0 to 1; nan if there are no decisions."""
+        """The share of agreements among the decisions, 0 to 1; nan without decisions."""
         return float(self.agreements.mean()) if len(self.agreements) else float("nan")
 
     def __repr__(self) -> str:
@@ -302,19 +396,19 @@ class Comparison:
 
 
 def compare_with_rule(
-    simulation: Any,
-    policies: Mapping[Any, Any],
+    simulation: Model,
+    policies: Policies,
     *,
     seeds: Iterable[int],
     points: Points = None,
-    others: Mapping[Any, Any] | None = None,
+    others: Policies | None = None,
     tolerance: float = 0.0,
     **options: Unpack[EpisodeOptions],
 ) -> dict[Any, Comparison]:
-    """Let the model's own rule decide, and record what policies would have decided instead.
+    """Let the model's own rule decide, and record the actions of policies beside it.
 
-    At each decision the policy gets what it would get if it decided; then the rule decides. So the
-    episodes are those of the plain model, unless ``others`` names policies that decide.
+    At each decision the policy gets the same arguments as if it decided; then the rule decides. So
+    the plain model would run the same episodes, unless ``others`` names policies that decide.
 
     Args:
         simulation: As ``simulate_many`` takes it.
@@ -334,16 +428,14 @@ def compare_with_rule(
     Raises:
         DefinitionError: The actions that correspond to the rule's decisions are unknown.
         OptionValueError: An argument has an invalid value.
-        BaseException: All other errors are those of ``collect_episodes``.
+        BaseException: Any other error of ``collect_episodes``.
     """
-    if not isinstance(policies, Mapping) or not all(
-        callable(policy) for policy in policies.values()
-    ):
+    if not isinstance(policies, Mapping) or not all(map(callable, policies.values())):
         raise OptionValueError(
             "policies must be a dict from agents or points to callables, not"
             f" {short_repr(policies)}"
         )
-    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
+    if not isinstance(tolerance, (int, float)) or not tolerance >= 0:
         raise OptionValueError(
             f"tolerance must be a number that is not negative, not {short_repr(tolerance)}"
         )
@@ -352,106 +444,111 @@ def compare_with_rule(
             "others must be a dict of policies for agents or points that policies does not name,"
             f" not {short_repr(others)}"
         )
-    # policies that record an action; one for each, so that keys share batches
-    shadows: dict[int, Any] = {}
+    # One shadow for each policy, so that keys share batches.
+    shadows: dict[int, LeftToRule] = {}
     for policy in policies.values():
-        shadows[id(policy)] = partial(_record, policy, BatchPolicy(policy))
-        if is_asked_alone(policy):
-            shadows[id(policy)] = _Shadow(policy)
-    deciding = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
+        shadow = _Shadow if is_asked_alone(policy) else _BatchedShadow
+        shadows[id(policy)] = LeftToRule(shadow(policy))
+    shadows_by_key = {key: shadows[id(policy)] for key, policy in policies.items()}
     collected = collect_episodes(
-        simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options
+        simulation, {**shadows_by_key, **(others or {})}, seeds=seeds, points=points, **options
     )
-    return {key: _compare(collected[key], float(tolerance)) for key in policies}
+    return {key: _compare(collected[key], tolerance) for key in policies}
 
 
-def _record(
-    policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any
-) -> Any:
-    """Record the actions of a policy as an extra, and leave the decisions to the rule."""
-    actions = _ask(policy, batch_policy, observations, infos, identities)
-    return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
+class _BatchedShadow(_BatchedPolicy):
+    """Records the actions of a policy as an extra, and leaves the decisions to the rule."""
+
+    def __call__(
+        self,
+        observations: Observation,
+        infos: Infos,
+        identities: Identities,
+    ) -> Any:
+        actions = self.actions(observations, infos, identities)
+        return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 
 
 class _Shadow(PolicyWrapper):
-    """The same for a policy that answers one decision at a time."""
+    """Does the same for a policy that answers one decision at a time."""
 
-    def __call__(self, observation: Any, info: Any, **asked: Any) -> Any:
-        return when_answered(self.ask(observation, info, asked), self._record)
+    def __call__(
+        self,
+        observation: Observation,
+        info: dict[str, Any],
+        **context: Any,
+    ) -> Any:
+        return when_answered(self.ask(observation, info, context), self._record)
 
-    def _record(self, action: Any) -> Any:
-        recorded = np.empty((), object)
-        recorded[()] = action
-        return RULE, {SHADOW: recorded}
+    def _record(self, action: Action) -> Any:
+        shadow_actions = np.empty((), object)
+        shadow_actions[()] = action
+        return RULE, {SHADOW: shadow_actions}
 
 
-def _compare(found: Trajectories, tolerance: float) -> Comparison:
-    """Compare the rule's actions with those that a shadow has recorded."""
-    recorded = found.extras.get(SHADOW, ())
-    found = replace(
-        found, extras={name: values for name, values in found.extras.items() if name != SHADOW}
+def _compare(trajectories: Trajectories, tolerance: float) -> Comparison:
+    """Compare the rule's actions with the actions that a shadow has recorded."""
+    extras = dict(trajectories.extras)
+    shadow_actions = extras.pop(SHADOW, ())
+    trajectories = replace(trajectories, extras=extras)
+    rule_actions = trajectories.actions
+    if trajectories.action_space is None:
+        return Comparison(trajectories, rule_actions, np.zeros(0, np.bool_))
+    check_known(trajectories)
+    policy_actions = stacker(trajectories.action_space)(
+        [
+            taken(rule_actions, row) if action is RULE else action
+            for row, action in enumerate(shadow_actions)
+        ]
     )
-    if not len(found):
-        return Comparison(found, found.actions, np.zeros(0, np.bool_))
-    check_known(found)
-    assert found.action_space is not None
-    actions = [
-        taken(found.actions, row) if action is RULE else action
-        for row, action in enumerate(recorded)
-    ]
-    policy_actions = stacker(found.action_space)(actions)
-    pairs = zip(leaves(found.actions), leaves(policy_actions), strict=True)
-    agreements = [_agreements(one, other, tolerance) for (_, one), (_, other) in pairs]
-    return Comparison(found, policy_actions, np.all(agreements, axis=0))
+    agreements = np.ones(len(trajectories), np.bool_)
+    pairs = zip(action_arrays(rule_actions), action_arrays(policy_actions), strict=True)
+    for (_, one), (_, other) in pairs:
+        agreements &= _agreements(one, other, tolerance)
+    return Comparison(trajectories, policy_actions, agreements)
 
 
-def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> Any:
-    """Return in which rows two arrays agree."""
+def _agreements(
+    one: Array,
+    other: Array,
+    tolerance: float,
+) -> Bools:
+    """Return ``(N,)``: whether two arrays agree, for each row."""
+    equal = one == other
     if one.dtype == object:
-        return [same(*pair) for pair in zip(one, other, strict=True)]
-    equal = np.abs(one - other) <= tolerance if one.dtype.kind == "f" else one == other
-    return equal.reshape(len(one), -1).all(axis=1)
+        equal = np.array(list(map(same, one, other)))
+    elif one.dtype.kind == "f":
+        equal = np.abs(one - other) <= tolerance
+    agree: Bools = equal.all(axis=tuple(range(1, one.ndim)))
+    return agree
 
 
-# -- policies and their answers -------------------------------------------------------------------
+# -- properties of policies -----------------------------------------------------------------------
 
 
-def _ask(
-    policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any
-) -> list[Any]:
-    """Ask a policy for one action for each decision, and drop the extras."""
-    answers = batch_policy.answers(observations, infos, identities)
-    return read_answers(answers, policy, len(identities))[0]
-
-
-def policy_name(policy: Any) -> str:
+def policy_name(policy: Policy) -> str:
     """Return the name of a policy."""
-    return (
-        "rule"
-        if policy is RULE
-        else str(getattr(policy, "__qualname__", None) or short_repr(policy))
-    )
+    return "rule" if policy is RULE else name_of(policy)
 
 
-def follows_rule(policy: Any) -> bool:
+def follows_rule(policy: Policy) -> bool:
     """Return whether a policy certainly leaves decisions to the rule."""
     if isinstance(policy, Mixture):
-        return any(
-            follows_rule(part)
-            for part, weight in zip(policy.policies, policy.weights, strict=True)
-            if weight
-        )
+        parts = zip(policy.policies, policy.weights, strict=True)
+        return any(weight > 0 and follows_rule(part) for part, weight in parts)
     return policy is RULE
 
 
-def check_known(found: Trajectories) -> None:
-    """Check that the action of each decision is known, also of those that were left to the rule."""
-    unknown = np.flatnonzero(~found.known)
+def check_known(trajectories: Trajectories) -> None:
+    """Check that the action of each decision is known, also where the rule decided."""
+    unknown = np.flatnonzero(~trajectories.known)
     if len(unknown):
-        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
+        first = unknown[0]
+        agent = trajectories.names[trajectories.agents[first]]
+        seed = trajectories.seeds[trajectories.episodes[first]]
         raise DefinitionError(
-            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known,"
-            f" first for {agent!r} at turn {found.turns[unknown[0]]} of the episode of seed"
-            f" {seed}; its decision point needs a rule_action_mapping that returns an action for"
-            " every decision of the rule"
+            f"in {len(unknown)} of {len(trajectories)} decisions the action of the rule is not"
+            f" known, first for {agent!r} at turn {trajectories.turns[first]} of the episode of"
+            f" seed {seed}; its decision point needs a rule_action_mapping that returns an action"
+            " for every decision of the rule"
         )

@@ -1,28 +1,47 @@
-"""Demonstrations: data sets of the decisions of the model's rule, or of policies, for imitation and offline learning.
+"""Minari data sets of the decisions of the model's rule or of policies.
 
-They are made of the ``Trajectories`` that ``collect_episodes`` returns. Minari is imported only
-when a data set is written.
+They serve imitation and offline learning, and consist of the ``Trajectories`` that
+``collect_episodes`` returns. Minari is imported only when a data set is written.
 """
+
+from __future__ import annotations
 
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core import EpisodeOptions, Points, joined, provenance, taken
-from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
-from .collect import LeftToRule, check_known, collect_episodes, follows_rule, policy_name
-from .trajectories import Trajectories
+from ..errors import (
+    MissingExtraError,
+    OptionValueError,
+    did_you_mean,
+    short_repr,
+)
+from ..runs import checked_policies
+from ..simulation import Model
+from .collect import (
+    LeftToRule,
+    Policies,
+    check_known,
+    collect_episodes,
+    follows_rule,
+    policy_name,
+)
+from .trajectories import Array, Integers, Trajectories
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+    from minari.data_collector import EpisodeBuffer
 
 
 def record_dataset(
     dataset_id: str | Mapping[Any, str],
-    simulation: Any,
-    policies: Mapping[Any, Any],
+    simulation: Model,
+    policies: Policies,
     *,
     seeds: Iterable[int],
     points: Points = None,
@@ -60,59 +79,72 @@ def record_dataset(
         error or an interrupt, none of them is left on disk.
 
     Raises:
-        BaseException: Any error of ``collect_episodes`` or ``save_dataset``. What can be checked
-            before is checked before anything runs.
+        BaseException: Any error of ``collect_episodes`` or ``save_dataset``. Errors in the
+            arguments are raised before anything runs, where possible.
     """
-    if not isinstance(policies, Mapping) or not policies:
-        raise OptionValueError(
-            f"policies must be a dict from agents or points to policies, not {short_repr(policies)}"
-        )
+    policies = checked_policies(policies)
     names = _dataset_ids(dataset_id, policies)
-    paths = {key: _free_path(name) for key, name in names.items()}
-    left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
-    sizes: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress}
+    paths = [_free_path(name) for name in names.values()]
+    to_rule = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
     collected = collect_episodes(
-        simulation, {**policies, **left}, seeds=seeds, points=points, **sizes, **options
+        simulation,
+        {**policies, **to_rule},
+        seeds=seeds,
+        points=points,
+        batch_size=batch_size,
+        workers=workers,
+        progress=progress,
+        **options,
     )
     origin = provenance(simulation, points, **options)
-    written: dict[Any, Any] = {}
+    datasets = {}
     try:
         for key, name in names.items():
-            described = {"algorithm_name": policy_name(policies[key]), **(metadata or {})}
-            written[key] = save_dataset(name, collected[key], **described)
-            written[key].storage.update_metadata({"provenance": origin})
+            datasets[key] = save_dataset(
+                name,
+                collected[key],
+                **{"algorithm_name": policy_name(policies[key]), **(metadata or {})},
+            )
+            datasets[key].storage.update_metadata({"provenance": origin})
     except BaseException:
-        for key in written:
-            shutil.rmtree(paths[key], ignore_errors=True)  # all of them or none
+        for path in paths:
+            shutil.rmtree(path, ignore_errors=True)  # all of them or none
         raise
-    return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
+    return datasets if isinstance(dataset_id, Mapping) else next(iter(datasets.values()))
 
 
-def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> Mapping[Any, str]:
+def _dataset_ids(
+    dataset_id: str | Mapping[Any, str],
+    policies: Policies,
+) -> Mapping[Any, str]:
     """Return the name of each data set, by the key of its policy."""
-    if isinstance(dataset_id, str) and len(policies) == 1:
-        return {next(iter(policies)): dataset_id}
-    names = dataset_id.values() if isinstance(dataset_id, Mapping) else ()
-    if not names or not all(isinstance(name, str) for name in names):
+    names = dataset_id
+    if isinstance(dataset_id, str):
+        names = dict.fromkeys(policies, dataset_id)
+    if (
+        not isinstance(names, Mapping)
+        or not names
+        or not all(isinstance(name, str) for name in names.values())
+        or len(set(names.values())) < len(names)
+    ):
         raise OptionValueError(
-            f"dataset_id must be a name, or for {len(policies)} policies a dict from their keys to"
-            f" names, not {short_repr(dataset_id)}"
+            f"dataset_id must be a name, or for {len(policies)} policies a dict that gives each its"
+            f" own name, not {short_repr(dataset_id)}"
         )
-    unknown = [key for key in dataset_id if key not in policies]
-    if unknown:
-        raise OptionValueError(
-            f"dataset_id names {short_repr(unknown[0])}, which has no policy"
-            f"{did_you_mean(unknown[0], map(str, policies))}"
-        )
-    if len(set(names)) < len(names):
-        raise OptionValueError(
-            f"each policy needs a data set of its own: {short_repr(dict(dataset_id))}"
-        )
-    named: Mapping[Any, str] = dataset_id
-    return named
+    for key in names:
+        if key not in policies:
+            raise OptionValueError(
+                f"dataset_id names {short_repr(key)}, which has no policy"
+                f"{did_you_mean(key, map(str, policies))}"
+            )
+    return names
 
 
-def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -> Any:
+def save_dataset(
+    dataset_id: str,
+    trajectories: Trajectories,
+    **metadata: Any,
+) -> MinariDataset:
     """Write the decisions of one policy as a Minari data set.
 
     Each trajectory becomes an episode, with its seed. An episode has one more observation than
@@ -126,7 +158,7 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
         dataset_id: The name of the data set, by Minari's rules: ``"(namespace/)name-v0"``.
         trajectories: The trajectories that ``collect_episodes`` returned under one key.
         **metadata: As ``minari.create_dataset_from_buffers`` takes it: ``author``, ``description``,
-            ``env`` or ``eval_env`` (from which readers recover the environment),
+            ``env`` or ``eval_env`` (to recover the environment),
             ``algorithm_name``, ``data_format``, ... Images are stored as they are, unless
             ``jpeg_encoding=True``.
 
@@ -155,25 +187,22 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
 
     try:
         with warnings.catch_warnings():
-            # Warnings about missing metadata: users know best whether readers of the data set need
-            # it.
+            # Minari warns of missing metadata, but not every data set needs them.
             warnings.filterwarnings("ignore", r"`\w+` is set to None|env_spec is None")
             dataset = minari.create_dataset_from_buffers(
                 dataset_id,
-                list(_episodes(trajectories, minari.data_collector.EpisodeBuffer)),
+                list(_episodes(trajectories)),
                 observation_space=trajectories.observation_space,
                 action_space=trajectories.action_space,
                 **{"jpeg_encoding": False, **metadata},
             )
-        starts, names = trajectories.starts, trajectories.names
-        columns = (
-            trajectories.agents[starts],
-            trajectories.episodes[starts],
-            trajectories.turns[starts],
-        )
         dataset.storage.update_episode_metadata(
-            {"agent": names[agent], "episode": episode, "turn": turn}
-            for agent, episode, turn in zip(*(column.tolist() for column in columns), strict=True)
+            {
+                "agent": trajectories.names[trajectories.agents[start]],
+                "episode": int(trajectories.episodes[start]),
+                "turn": int(trajectories.turns[start]),
+            }
+            for start in trajectories.starts
         )
     except BaseException:
         shutil.rmtree(path, ignore_errors=True)  # never leave half a data set
@@ -182,7 +211,7 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
 
 
 def _free_path(name: str) -> Path:
-    """Return the path of a data set, which must not exist yet."""
+    """Return the path of a data set that does not exist yet."""
     try:
         from minari.dataset.minari_dataset import parse_dataset_id
         from minari.storage.datasets_root_dir import get_dataset_path
@@ -205,41 +234,46 @@ def _free_path(name: str) -> Path:
     return path
 
 
-def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
-    """Make a Minari episode buffer of each trajectory."""
-    number, lasts = len(found.starts), found.starts + found.lengths - 1
-    # The rows of the ends follow those of the decisions.
-    infos: dict[str, Any] = {"by_rule": _extend(found.by_rule, number, False)}
-    if isinstance(found.action_masks, tuple):
-        infos["action_mask"] = {
-            str(place): _extend(mask, number, 1) for place, mask in enumerate(found.action_masks)
-        }
-    elif found.action_masks is not None:
-        infos["action_mask"] = _extend(found.action_masks, number, 1)
-    if found.times is not None and found.elapsed is not None:
-        infos["time"] = np.append(found.times, found.times[lasts] + found.elapsed[lasts])
-    for name, values in found.extras.items():
-        if values.dtype.kind in "biufc":
-            infos.setdefault(name, _extend(values, number, 0))
-    columns = {
-        "observations": joined([found.observations, found.last_observations]),
-        "infos": infos,
-    }
-    for place, (start, last) in enumerate(zip(found.starts, lasts, strict=True)):
-        rows = np.arange(start, last + 1)
-        seed = found.seeds[found.episodes[start]]
-        own = taken(columns, np.append(rows, len(found) + place))
-        yield buffer(
+def _episodes(trajectories: Trajectories) -> Iterator[EpisodeBuffer]:
+    """Make a Minari episode of each trajectory."""
+    from minari.data_collector import EpisodeBuffer
+
+    for place, start in enumerate(trajectories.starts):
+        rows = np.arange(start, start + trajectories.lengths[place])
+        seed = trajectories.seeds[trajectories.episodes[start]]
+        last_observation = taken(trajectories.last_observations, np.array([place]))
+        yield EpisodeBuffer(
             seed=seed if seed < 2**63 else str(seed),  # Minari reads the string as an integer
-            observations=own["observations"],
-            actions=taken(found.actions, rows),
-            rewards=found.rewards[rows],
-            terminations=found.terminations[rows],
-            truncations=found.truncations[rows],
-            infos=own["infos"],
+            observations=joined([taken(trajectories.observations, rows), last_observation]),
+            actions=taken(trajectories.actions, rows),
+            rewards=trajectories.rewards[rows],
+            terminations=trajectories.terminations[rows],
+            truncations=trajectories.truncations[rows],
+            infos=_infos(trajectories, rows),
         )
 
 
-def _extend(values: NDArray[Any], number: int, filler: Any) -> NDArray[Any]:
-    """Append rows that consist of a filler."""
-    return np.concatenate([values, np.full((number, *values.shape[1:]), filler, values.dtype)])
+def _infos(trajectories: Trajectories, rows: Integers) -> dict[str, Any]:
+    """Return the infos of a trajectory, with a row for each decision and one for the end."""
+    infos: dict[str, Any] = {
+        name: _extend(values[rows], 0)
+        for name, values in trajectories.extras.items()
+        if values.dtype.kind in "biufc"
+    }
+    infos["by_rule"] = _extend(trajectories.by_rule[rows], False)
+    masks = trajectories.action_masks
+    if isinstance(masks, tuple):
+        infos["action_mask"] = {
+            str(place): _extend(mask[rows], 1) for place, mask in enumerate(masks)
+        }
+    elif masks is not None:
+        infos["action_mask"] = _extend(masks[rows], 1)
+    if trajectories.times is not None and trajectories.elapsed is not None:
+        times = trajectories.times[rows]
+        infos["time"] = np.append(times, times[-1] + trajectories.elapsed[rows[-1]])
+    return infos
+
+
+def _extend(values: Array, filler: int) -> Array:
+    """Append a row that consists of a filler."""
+    return np.concatenate([values, np.full_like(values[:1], filler)])

@@ -1,32 +1,56 @@
-"""The plot of one episode: when each agent decided what, and with which reward."""
+"""The plot of one episode: the decisions of each agent and their rewards, over time."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
+from collections import ChainMap
+from collections.abc import (
+    Callable,
+    Hashable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from dataclasses import dataclass
+from math import ceil
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from gymnasium.spaces import Discrete
-from numpy.typing import NDArray
 
-from ..errors import OptionValueError, UnknownAgentError, did_you_mean, short_repr
-from .plots import ABSENT, COLOURS, INK, PALE, by_key, style, title_of, write_beside
-from .trajectories import Trajectories, leaves
+from ..errors import OptionValueError, UnknownAgentError, short_repr
+from .plots import (
+    ABSENT,
+    COLOURS,
+    INK,
+    Collection,
+    by_key,
+    style,
+    title_of,
+    write_beside,
+)
+from .trajectories import (
+    Array,
+    Bools,
+    Floats,
+    Trajectories,
+    action_arrays,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure, SubFigure
 
-CHARTED: Final = 6
+    NewFigure = Callable[[float, float], Any]
+
+ActionNames = Sequence[Any] | Mapping[Any, Any] | None
+"""The names of discrete actions: see ``plot_timeline``."""
+
+MOST_CHARTS: Final = 6
 """The largest number of agents that have charts. More agents have a row of colours each."""
 
-DRAWN: Final = 4
-"""The largest number of parts of an action that are charted, and of lines in each chart."""
-
-NAMED: Final = 12
+MOST_COLOURS: Final = 12
 """The largest number of different actions that have a colour each.
 
 More actions share a colour scale.
@@ -35,51 +59,95 @@ More actions share a colour scale.
 UNKNOWN: Final = "#BDBDBD"
 """The colour of decisions whose action is unknown."""
 
-ENDS: Final = {"x": "terminated", "|": "truncated"}
-"""The marks of terminations and truncations."""
+MARKS: Final[dict[str, dict[str, Any]]] = {
+    "policy": {"marker": "o", "color": COLOURS[0], "linewidth": 0, "markersize": 4},
+    "rule": {
+        "marker": "o",
+        "color": COLOURS[0],
+        "markerfacecolor": "white",
+        "linewidth": 0,
+        "markersize": 4,
+    },
+    "by rule": {"color": INK, "linewidth": 2},
+    "by rule, action unknown": {"color": UNKNOWN, "linewidth": 2},
+    "terminated": {"marker": "x", "color": INK, "linewidth": 0, "markersize": 6},
+    "truncated": {"marker": "|", "color": INK, "linewidth": 0, "markersize": 6},
+}
+"""The marks of decisions in charts, of decisions in rows of colours, and of ends."""
+
+BESIDE: Final[dict[str, Any]] = {
+    "loc": "upper left",
+    "bbox_to_anchor": (1.0, 1.0),
+    "handlelength": 0.9,
+    "handleheight": 0.9,
+}
+"""The layout of a legend to the right of its axes."""
+
+ABOVE: Final[dict[str, Any]] = {
+    "loc": "lower right",
+    "bbox_to_anchor": (1.0, 1.0),
+    "ncols": 6,
+    "borderaxespad": 0.2,
+}
+"""The layout of a legend above its axes."""
 
 
 @dataclass(frozen=True)
 class _Component:
-    """One number of the actions of a policy or of one of its agents."""
+    """One number of the actions of a policy.
 
-    part: str  # the place of its array in the action; empty if the action is one array
-    values: NDArray[Any]  # of the decisions
-    # of the policy's values in all episodes, where each has a colour
-    labels: Mapping[int, str] | None
-    limits: tuple[float, float]  # of the array's values in all episodes
+    Attributes:
+        part: The name of its array in the action; empty if the action is one array.
+        values: ``(N,)``: the numbers, one for each decision of the policy.
+        labels: The text of each value of the array, if it has few values; else empty.
+    """
+
+    part: str
+    values: Array
+    labels: dict[int, str]
 
 
 @dataclass(frozen=True)
 class TimelineRow:
-    """The decisions of one agent in the episode."""
+    """The decisions of one agent in the episode.
 
-    key: Any  # of its policy
+    Attributes:
+        key: The key of its policy.
+        actions: The components of the policy's actions, by name.
+        rows: The agent's rows of the policy's decisions.
+        times: ``(n,)``: the float times of the agent's decisions, or without a clock their int
+            numbers.
+        end: The time of its end.
+        ending: "terminated" or "truncated".
+    """
+
+    key: Hashable
     agent: str
-    times: NDArray[Any]  # of its decisions
-    end: float  # the time of its end
-    actions: dict[str, _Component]  # by the name of the component
-    rewards: NDArray[np.float64]
-    known: NDArray[np.bool_]
-    by_rule: NDArray[np.bool_]
-    marks: list[str]  # of its end
+    actions: dict[str, _Component]
+    rows: slice
+    times: Array
+    rewards: Floats
+    known: Bools
+    by_rule: Bools
+    end: float
+    ending: str
 
 
 def plot_timeline(
-    trajectories: Trajectories | Mapping[Any, Trajectories],
+    trajectories: Collection,
     episode: int = 0,
     *,
     agents: Sequence[str] | None = None,
-    action_names: Any = None,
+    action_names: ActionNames = None,
     component: str | None = None,
     figure: Figure | SubFigure | None = None,
 ) -> Figure | SubFigure:
-    """Draw one episode: when each agent decided what, with which reward, and when it was born and ended.
+    """Draw one episode: the decisions of each agent, their rewards, and the agent's birth and end.
 
     The horizontal axis is the simulation's time or, without a clock, the number of the decision
     among all decisions that policies answered in the episode.
 
-    Up to six agents have charts of their own: dots at the height of the action, stems at the height
+    Up to six agents have separate charts: dots at the height of the action, stems at the height
     of its reward. A dot is hollow where the decision was left to the model's rule. More agents have
     one row each, in the order of their births, once coloured by action and once by reward. A colour
     lasts until the agent's next decision. It is a slim bar where the rule decided, and grey where
@@ -93,8 +161,8 @@ def plot_timeline(
         action_names: The names of discrete actions: a sequence of names, or a dict from action to
             name; where policies differ in them, a dict from their keys to these. None: the
             ``action_labels`` of ``make_step``, else the numbers of the actions.
-        component: The component of the action by which rows are coloured, where actions have
-            several components. The name of a component is its index: ``"[1]"`` in a vector,
+        component: The component of the action that colours the rows, where actions have several
+            components. The name of a component is its index: ``"[1]"`` in a vector,
             ``"litres"`` in a ``Dict``, ``"litres[1]"`` in a vector of the dict. None: the first
             component.
         figure: The figure or subfigure to draw in; its size does not change. None: a new figure.
@@ -109,8 +177,8 @@ def plot_timeline(
         UnknownAgentError: One of ``agents`` did not decide in this episode.
         MissingExtraError: Matplotlib is missing.
     """
-    found_by_key = by_key(trajectories)
-    seeds = next(iter(found_by_key.values())).seeds
+    by_policy = by_key(trajectories)
+    seeds = next(iter(by_policy.values())).seeds
     try:
         number = range(len(seeds))[operator.index(episode)]
     except (IndexError, TypeError):
@@ -118,373 +186,411 @@ def plot_timeline(
             f"episode must be the number of one of the {len(seeds)} episodes, counted from 0, not"
             f" {short_repr(episode)}"
         ) from None
-    deciding = {
-        key: found for key, found in found_by_key.items() if (found.episodes == number).any()
-    }
-    if not deciding:
+    rows: list[TimelineRow] = []
+    for key, group in by_policy.items():
+        if number in group.episodes:
+            actions = _components(group, _action_labels(key, group, action_names))
+            rows += _rows(key, group, actions, number)
+    if not rows:
         raise OptionValueError(
             f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has"
             " decided in it"
         )
-    rows = [
-        row for key, found in deciding.items() for row in _rows(key, found, action_names, number)
-    ]
     if agents is not None:
         rows = _choose(rows, agents, number)
-    begin, end = min(row.times[0] for row in rows), max(row.end for row in rows)
+    begin = min(row.times[0] for row in rows)
+    end = max(row.end for row in rows)
+    margin = 0.015 * (end - begin or 1.0)
     with style("plot_timeline") as new_figure:
         make = new_figure if figure is None else lambda width, height: figure
-        charts = len(rows) <= CHARTED
-        columns = (
-            _draw_charts(rows, make, begin, end) if charts else _draw_panels(rows, make, component)
-        )
-        margin = (0.02 if charts else 0.01) * (end - begin or 1.0)
-        clock = all(found.times is not None for found in deciding.values())
-        for column in columns:
-            column[-1].set_xlabel("time" if clock else "decision number in the episode")
-            column[-1].set_xlim(begin - margin, end + margin)
-        _mark_legend(columns[-1][0], rows, charts=charts)
-        drawn: Figure | SubFigure = columns[0][0].figure
-        drawn.suptitle(f"Episode {number}, seed {seeds[number]}", x=0.01, ha="left")
-    return drawn
+        if len(rows) <= MOST_CHARTS:
+            grid = _draw_charts(rows, make, begin, end)
+        else:
+            grid = _draw_panels(rows, make, component)
+        unit = "time" if isinstance(begin, float) else "decision number in the episode"
+        for axes in grid[-1]:
+            axes.set_xlabel(unit)
+            axes.set_xlim(begin - margin, end + margin)
+        corner: Axes = grid[0, -1]
+        corner.figure.suptitle(f"Episode {number}, seed {seeds[number]}", x=0.01, ha="left")
+    return corner.figure
 
 
-# -- what is drawn --------------------------------------------------------------------------------
+# -- rows -----------------------------------------------------------------------------------------
 
 
-def _components(key: Any, found: Trajectories, action_names: Any) -> dict[str, _Component]:
-    """Split the actions of a policy into their components, by name. Some actions may be unknown."""
-    if isinstance(action_names, Mapping) and not isinstance(action_names.get(key, ""), str):
-        action_names = action_names[key]
-    if isinstance(action_names, (str, bytes)) or not isinstance(
-        action_names, (Mapping, Sequence, type(None))
-    ):
+def _action_labels(
+    key: Hashable,
+    trajectories: Trajectories,
+    action_names: ActionNames,
+) -> Mapping[Any, Any]:
+    """Return the names of the discrete actions of a policy, by action; some may have none."""
+    start = 0
+    if action_names is None and isinstance(trajectories.action_space, Discrete):
+        action_names = trajectories.action_labels
+        start = trajectories.action_space.start
+    if isinstance(action_names, Mapping):
+        action_names = action_names.get(key, action_names)
+    if isinstance(action_names, Mapping):
+        return action_names
+    if isinstance(action_names, str) or not isinstance(action_names or (), Sequence):
         raise OptionValueError(
             f"action_names must be a sequence or a dict of names, not {short_repr(action_names)}"
         )
-    if action_names is None and isinstance(found.action_space, Discrete):
-        action_names = found.action_labels
-    start = (
-        int(getattr(found.action_space, "start", 0)) if action_names is found.action_labels else 0
-    )
-    given = (
-        action_names
-        if isinstance(action_names, Mapping)
-        else dict(enumerate(action_names or (), start))
-    )
+    return dict(enumerate(action_names or (), start))
+
+
+def _components(
+    trajectories: Trajectories,
+    action_labels: Mapping[Any, Any],
+) -> dict[str, _Component]:
+    """Split the actions of a policy into their components, by name."""
     components = {}
-    for part, array in leaves(found.actions):
-        names = given
-        if array.dtype == object:  # values without a shape are distinguished by their text
+    for part, array in action_arrays(trajectories.actions):
+        names = action_labels
+        if array.dtype == object:  # values without a shape are told apart by their text
             texts, array = np.unique([str(action) for action in array], return_inverse=True)
-            names = {
-                code: text if len(text) < 20 else f"{text[:18]}…" for code, text in enumerate(texts)
-            }
-        values = array.reshape(len(array), -1)
-        known = values[found.known]
-        distinct = np.unique(known).tolist() if values.dtype.kind in "iub" else []
-        labels = {int(value): str(names.get(value, int(value))) for value in distinct}
-        finite = known[np.isfinite(known)]
-        limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
-        for place, column in enumerate(values.T):
-            name = f"{part}[{place}]" if values.shape[1] > 1 else part
-            components[name] = _Component(
-                part, column, labels if 0 < len(labels) <= NAMED else None, limits
-            )
+            names = {code: f"{text:.20}" for code, text in enumerate(texts)}
+        columns = array.reshape(len(array), -1).T
+        distinct = np.unique(columns[:, trajectories.known]).tolist()
+        labels = {}
+        if array.dtype.kind in "iub" and len(distinct) <= MOST_COLOURS:
+            labels = {value: str(names.get(value, value)) for value in distinct}
+        for place, values in enumerate(columns):
+            name = part if len(columns) == 1 else f"{part}[{place}]"
+            components[name] = _Component(part, values, labels)
     return components
 
 
-def _rows(key: Any, found: Trajectories, action_names: Any, episode: int) -> Iterator[TimelineRow]:
-    """Yield the row of each agent that a policy answered for in the episode."""
-    actions = _components(key, found, action_names)
-    for place in np.flatnonzero(found.episodes[found.starts] == episode):
-        start, last = int(found.starts[place]), int(found.starts[place] + found.lengths[place]) - 1
-        rows = slice(start, last + 1)
-        times: NDArray[Any] = found.turns[rows]
-        end = float(found.last_turns[place])
-        if found.times is not None and found.elapsed is not None:
-            times, end = found.times[rows], float(found.times[last] + found.elapsed[last])
-        ends = zip(ENDS, (found.terminations[last], found.truncations[last]), strict=True)
+def _rows(
+    key: Hashable,
+    trajectories: Trajectories,
+    actions: dict[str, _Component],
+    episode: int,
+) -> Iterator[TimelineRow]:
+    """Yield the row of each agent of a policy that decided in the episode."""
+    for place in np.flatnonzero(trajectories.episodes[trajectories.starts] == episode):
+        start = trajectories.starts[place]
+        rows = slice(start, start + trajectories.lengths[place])
+        times: Array = trajectories.turns[rows]
+        end = trajectories.last_turns[place]
+        if trajectories.times is not None and trajectories.elapsed is not None:
+            times = trajectories.times[rows]
+            end = times[-1] + trajectories.elapsed[rows][-1]
         yield TimelineRow(
             key=key,
-            agent=found.names[found.agents[start]],
+            agent=trajectories.names[trajectories.agents[start]],
+            actions=actions,
+            rows=rows,
             times=times,
+            rewards=trajectories.rewards[rows],
+            known=trajectories.known[rows],
+            by_rule=trajectories.by_rule[rows],
             end=end,
-            actions={name: replace(own, values=own.values[rows]) for name, own in actions.items()},
-            rewards=found.rewards[rows],
-            known=found.known[rows],
-            by_rule=found.by_rule[rows],
-            marks=[mark for mark, ended in ends if ended],
+            ending="terminated" if trajectories.terminations[rows][-1] else "truncated",
         )
 
 
-def _choose(rows: Sequence[TimelineRow], agents: Any, episode: int) -> list[TimelineRow]:
+def _choose(rows: Sequence[TimelineRow], agents: Sequence[str], episode: int) -> list[TimelineRow]:
     """Return the rows of some agents, in the order of ``agents``."""
     if isinstance(agents, str) or not agents:
         raise OptionValueError(f"agents must be a sequence of names, not {short_repr(agents)}")
     by_name = {row.agent: row for row in rows}
-    for name in agents:
-        if name not in by_name:
-            raise UnknownAgentError(
-                f"{short_repr(name)} did not decide in episode {episode}; these agents did:"
-                f" {', '.join(list(by_name)[:20])}{' and others' if len(by_name) > 20 else ''}"
-            )
-    return [by_name[name] for name in dict.fromkeys(agents)]
+    try:
+        return [by_name[name] for name in dict.fromkeys(agents)]
+    except KeyError as error:
+        raise UnknownAgentError(
+            f"the agent {error} did not decide in episode {episode}; these agents did:"
+            f" {short_repr(list(by_name))}"
+        ) from None
 
 
-def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> None:
-    """Explain the marks that occur, above axes that may have another legend."""
+def _mark_legend(
+    axes: Axes,
+    rows: Sequence[TimelineRow],
+    by_rule: list[str],
+    unknown: list[str],
+) -> None:
+    """Explain the marks that occur, above axes that may have another legend.
+
+    ``by_rule`` and ``unknown`` are the marks to explain where the rule has decided, and where its
+    action is unknown.
+    """
     from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
-    by_rule, known = any(row.by_rule.any() for row in rows), all(row.known.all() for row in rows)
-    dot: dict[str, Any] = {"marker": "o", "linewidth": 0, "markersize": 4}
-    marks: dict[str, dict[str, Any]] = {}
-    if by_rule and charts:
-        marks["policy"] = dot | {"color": COLOURS[0]}
-        marks["rule"] = dot | {
-            "color": COLOURS[0] if known else UNKNOWN,
-            "markerfacecolor": "white",
-        }
-    elif by_rule:
-        marks["by rule"] = {"color": INK, "linewidth": 2}
-        if not known:
-            marks["by rule, action unknown"] = {"color": UNKNOWN, "linewidth": 2}
-    for mark, text in ENDS.items():
-        if any(mark in row.marks for row in rows):
-            marks[text] = {"marker": mark, "color": INK, "linewidth": 0, "markersize": 6}
-    above: dict[str, Any] = {
-        "loc": "lower right",
-        "bbox_to_anchor": (1.0, 1.0),
-        "bbox_transform": axes.transAxes,
-    }
-    handles = [Line2D([], [], **look) for look in marks.values()]
-    axes.add_artist(Legend(axes, handles, list(marks), ncols=6, borderaxespad=0.2, **above))
+    labels = sorted({row.ending for row in rows})
+    if not all(row.known.all() for row in rows):
+        labels = unknown + labels
+    if any(row.by_rule.any() for row in rows):
+        labels = by_rule + labels
+    handles = [Line2D([], [], **MARKS[label]) for label in labels]
+    axes.add_artist(Legend(axes, handles, labels, **ABOVE))
 
 
 # -- few agents: charts ---------------------------------------------------------------------------
 
 
 def _draw_charts(
-    rows: Sequence[TimelineRow], make: Callable[..., Any], begin: float, end: float
-) -> list[list[Any]]:
+    rows: Sequence[TimelineRow],
+    make: NewFigure,
+    begin: float,
+    end: float,
+) -> Array:
     """Draw charts of the actions and one of the rewards for each agent.
 
-    Return them as one column.
+    Return the axes, ``(charts, 1)``.
     """
-    parts = [list(dict.fromkeys(own.part for own in row.actions.values()))[:DRAWN] for row in rows]
-    heights = [height for own in parts for height in [1.0] * len(own) + [0.6]]
-    figure = make(9.5, 0.9 + sum(0.75 + 0.95 * len(own) for own in parts))
-    column = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[
-        :, 0
-    ].tolist()
-    remaining = iter(column)
-    for row, own in zip(rows, parts, strict=True):
-        *charts, rewards = islice(remaining, len(own) + 1)
-        for axes, part in zip(charts, own, strict=True):
-            _chart_actions(axes, row, part)
+    charts: list[tuple[TimelineRow, str | None, str]] = []
+    for row in rows:
         title = title_of(row.key)
-        charts[0].set_title(row.agent if title in ("", row.agent) else f"{row.agent}  ({title})")
-        rewards.vlines(
-            row.times, 0.0, row.rewards, color=INK, linewidth=1.4 if len(row.times) <= 150 else 0.7
-        )
-        rewards.axhline(0.0, color=PALE, linewidth=0.8, zorder=1)
-        rewards.set_ylabel("reward")
-        write_beside(rewards, f"sum {row.rewards.sum():.4g}", 0.5, rewards.transAxes)
-        for axes in (*charts, rewards):
-            for left, right in ((begin, row.times[0]), (row.end, end)):
-                if right > left:  # where the agent does not live
-                    axes.axvspan(left, right, color=ABSENT, linewidth=0, zorder=0)
-            ground = {"transform": axes.get_xaxis_transform(), "clip_on": False}
-            for mark in row.marks:
-                axes.plot([row.end], [0.0], mark, color=INK, markersize=7, zorder=4, **ground)
-    figure.align_ylabels(column)
-    return [column]
+        title = row.agent if title in ("", row.agent) else f"{row.agent}  ({title})"
+        for part in dict.fromkeys(component.part for component in row.actions.values()):
+            charts.append((row, part, title))
+            title = ""  # the first chart of an agent has the title
+        charts.append((row, None, ""))
+    heights = [0.6 if part is None else 1.0 for _, part, _ in charts]
+    figure = make(9.5, 0.9 + 0.18 * len(rows) + 0.95 * sum(heights))
+    grid: Array = figure.subplots(
+        len(charts),
+        1,
+        sharex=True,
+        squeeze=False,
+        height_ratios=heights,
+    )
+    for axes, (row, name, title) in zip(grid[:, 0], charts, strict=True):
+        axes.set_title(title)
+        if name is None:
+            _chart_rewards(axes, row)
+        else:
+            _chart_actions(axes, row, name)
+        _shade_absence(axes, row, begin, end)
+    figure.align_ylabels()
+    _mark_legend(grid[0, 0], rows, ["policy", "rule"], [])
+    return grid
 
 
 def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
     """Draw a line for each component of a part of the actions, with a dot for each decision."""
-    hollow: dict[str, Any] = {"color": "white", "linewidths": 0.9, "zorder": 3}
-    size = 14 if len(row.times) <= 150 else 5
-    by_policy, by_rule = row.known & ~row.by_rule, row.known & row.by_rule
-    components = {name: own for name, own in row.actions.items() if own.part == part}
-    for (name, component), colour in zip(list(components.items())[:DRAWN], COLOURS, strict=False):
-        heights = component.values.astype(float)
-        line = np.where(row.known, heights, np.nan)
-        axes.step(row.times, line, where="post", color=colour, linewidth=0.8, alpha=0.5, zorder=2)
-        axes.scatter(
-            row.times[by_policy], heights[by_policy], size, **hollow | {"color": colour}, label=name
+    components = {
+        name: component for name, component in row.actions.items() if component.part == part
+    }
+    # Not strict: there are at most as many lines as colours.
+    for (name, component), colour in zip(components.items(), COLOURS, strict=False):
+        values = component.values[row.rows]
+        line = np.where(row.known, values, np.nan)
+        axes.step(
+            row.times,
+            line,
+            where="post",
+            color=colour,
+            linewidth=0.8,
+            label=name,
         )
-        axes.scatter(row.times[by_rule], heights[by_rule], size, edgecolors=colour, **hollow)
-    if not row.known.all():  # their heights are unknown
-        times, ground = row.times[~row.known], axes.get_xaxis_transform()
-        axes.scatter(
-            times, np.full(len(times), 0.04), 12, edgecolors=UNKNOWN, transform=ground, **hollow
-        )
+        by_rule = row.known & row.by_rule
+        for mask, fill in ((~row.by_rule, colour), (by_rule, "white")):
+            axes.scatter(
+                row.times[mask],
+                values[mask],
+                14,
+                color=fill,
+                edgecolors=colour,
+                zorder=3,
+            )
+    unknown = row.times[~row.known]
+    axes.scatter(
+        unknown,
+        np.full(len(unknown), 0.04),
+        14,
+        color="white",
+        edgecolors=UNKNOWN,
+        zorder=3,
+        transform=axes.get_xaxis_transform(),
+    )
     axes.set_ylabel(part or "action")
-    first = next(iter(components.values()))  # all of them have the same labels and limits
-    low, high = first.limits
-    margin = 0.12 * (high - low or 1.0)
-    axes.set_ylim(low - margin, high + margin)
-    if first.labels is not None:
-        axes.set_yticks(list(first.labels), list(first.labels.values()))
+    labels = next(iter(components.values())).labels  # all of them have the same labels
+    if labels:
+        axes.set_yticks(list(labels), list(labels.values()))
+        axes.set_ylim(min(labels) - 0.5, max(labels) + 0.5)
     if len(components) > 1:
-        more = len(components) - DRAWN
-        beside: dict[str, Any] = {
-            "loc": "upper left",
-            "bbox_to_anchor": (1.0, 1.05),
-            "handletextpad": 0.1,
-        }
-        axes.legend(
-            title=f"and {more} more" if more > 0 else None, fontsize=8, title_fontsize=8, **beside
-        )
+        axes.legend(**BESIDE)
+
+
+def _chart_rewards(axes: Axes, row: TimelineRow) -> None:
+    """Draw a stem for the reward of each decision."""
+    axes.vlines(row.times, 0.0, row.rewards, color=INK, linewidth=1.0)
+    axes.set_ylabel("reward")
+    write_beside(axes, f"sum {row.rewards.sum():.4g}", 0.5, axes.transAxes)
+
+
+def _shade_absence(
+    axes: Axes,
+    row: TimelineRow,
+    begin: float,
+    end: float,
+) -> None:
+    """Shade the times when an agent does not live, and mark its end."""
+    for left, right in ((begin, row.times[0]), (row.end, end)):
+        if right > left:
+            axes.axvspan(left, right, color=ABSENT, zorder=0)
+    axes.plot(
+        [row.end],
+        [0.0],
+        **MARKS[row.ending],
+        transform=axes.get_xaxis_transform(),
+        clip_on=False,
+    )
 
 
 # -- many agents: rows of colours -----------------------------------------------------------------
 
 
 def _draw_panels(
-    agents: list[TimelineRow], make: Callable[..., Any], component: str | None
-) -> list[list[Any]]:
+    rows: list[TimelineRow],
+    make: NewFigure,
+    component: str | None,
+) -> Array:
     """Draw a row for each agent, coloured by its actions and by its rewards.
 
-    Return the axes in two columns.
+    Return the axes, ``(panels, 2)``.
     """
-    keys = list(dict.fromkeys(row.key for row in agents))
-    kinds = {
-        tuple((name, own.labels is None) for name, own in row.actions.items()) for row in agents
-    }
-    panels = [[row for row in agents if row.key == key] for key in keys]
-    if len(keys) > CHARTED and len(kinds) == 1:  # many policies with like actions share a panel
-        panels = [sorted(agents, key=lambda row: row.times[0])]
-    every = dict.fromkeys(name for rows in panels for name in rows[0].actions)
-    if component is not None and component not in every:
+    panels = _panels(rows)
+    names = dict.fromkeys(name for row in rows for name in row.actions)
+    if component not in (None, *names):
         raise OptionValueError(
             f"no action has a component {short_repr(component)}; there are"
-            f" {', '.join(map(repr, every))}{did_you_mean(component, every)}"
+            f" {', '.join(map(repr, names))}"
         )
-    heights = np.clip([0.16 * len(rows) for rows in panels], 1.2, 6.0)
-    heights = np.maximum(1.2, heights * min(1.0, 9.0 / heights.sum()))
-    figure = make(11.0, 1.0 + 0.3 * len(panels) + heights.sum())
-    grid = figure.subplots(
-        len(panels), 2, sharex=True, sharey="row", squeeze=False, height_ratios=heights
+    heights = [min(max(0.16 * len(panel), 1.2), 6.0) for panel in panels.values()]
+    figure = make(11.0, 1.0 + 0.3 * len(panels) + sum(heights))
+    grid: Array = figure.subplots(
+        len(panels),
+        2,
+        sharex=True,
+        sharey="row",
+        squeeze=False,
+        height_ratios=heights,
     )
-    for (left, right), rows in zip(grid, panels, strict=True):
-        names = list(rows[0].actions)
-        name = component if component in names else names[0]
-        _colour_actions(left, rows, name)
-        _colour_rewards(right, rows)
-        # the height of a row
-        points = 72 * left.get_window_extent().height / figure.dpi / len(rows)
-        size = float(np.clip(0.8 * points, 1.5, 6.0))
-        for axes in (left, right):
-            axes.set_facecolor(ABSENT)
-            for mark in ENDS:
-                ends = {at: row.end for at, row in enumerate(rows) if mark in row.marks}
-                if ends:
-                    axes.plot(
-                        list(ends.values()),
-                        list(ends),
-                        mark,
-                        color=INK,
-                        markersize=size,
-                        mew=size / 6,
-                        zorder=4,
-                    )
-        step = max(1, int(np.ceil(9.0 / points)))
-        left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
-        left.set_ylim(len(rows) - 0.4, -0.6)
-        title = title_of(rows[0].key) if len({row.key for row in rows}) == 1 else ""
-        what = f"action {name}, one of {len(names)}" if len(names) > 1 else "action"
-        left.set_title(f"{title}, {len(rows)} agents: {what}".removeprefix(", "))
-        right.set_title("reward")
-    columns: list[list[Any]] = grid.T.tolist()
-    return columns
+    for (left, right), (key, panel) in zip(grid, panels.items(), strict=True):
+        _draw_panel(left, right, key, panel, component)
+    _mark_legend(grid[0, 1], rows, ["by rule"], ["by rule, action unknown"])
+    return grid
 
 
-def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> NDArray[np.float64]:
+def _panels(rows: list[TimelineRow]) -> dict[Hashable, list[TimelineRow]]:
+    """Return the rows of each panel, by the key of its policy.
+
+    Many policies with similar actions share one panel, whose key is None.
+    """
+    panels: dict[Hashable, list[TimelineRow]] = {}
+    for row in rows:
+        panels.setdefault(row.key, []).append(row)
+    if len(panels) > MOST_CHARTS and len({tuple(row.actions) for row in rows}) == 1:
+        return {None: sorted(rows, key=lambda row: row.times[0])}
+    return panels
+
+
+def _draw_panel(
+    left: Axes,
+    right: Axes,
+    key: Hashable,
+    rows: list[TimelineRow],
+    component: str | None,
+) -> None:
+    """Draw the rows of a panel, on the left the actions and on the right the rewards."""
+    names = list(rows[0].actions)
+    name = component if component in names else names[0]
+    _colour_actions(left, rows, name)
+    _colour_rewards(right, rows)
+    points = 72 * left.get_window_extent().height / left.figure.dpi / len(rows)
+    for axes in (left, right):
+        axes.set_facecolor(ABSENT)
+        for ending in ("terminated", "truncated"):
+            ends = {place: row.end for place, row in enumerate(rows) if row.ending == ending}
+            mark = {**MARKS[ending], "markersize": min(points, 6.0)}
+            axes.plot(list(ends.values()), list(ends), **mark)
+    step = ceil(9.0 / points)
+    left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
+    left.set_ylim(len(rows) - 0.4, -0.6)
+    title = f"{title_of(key)}, {len(rows)} agents: action"
+    if len(names) > 1:
+        title += f" {name}, one of {len(names)}"
+    left.set_title(title.removeprefix(", "))
+    right.set_title("reward")
+
+
+def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> Floats:
     """Return ``(decisions, 4, 2)``: the corners of each decision's coloured cell, row by row."""
     cells = []
-    for number, row in enumerate(rows):
+    for place, row in enumerate(rows):
+        number = len(row.times)
         # Decisions at the same time divide the time until the next one among them.
-        times, which, same = np.unique(
-            row.times.astype(float), return_inverse=True, return_counts=True
+        times, first = np.unique(row.times, return_index=True)
+        edges = np.interp(
+            np.arange(number + 1),
+            np.append(first, number),
+            np.append(times, max(row.end, times[-1])),
         )
-        width = (np.diff(times, append=max(row.end, times[-1])) / same)[which]
-        left = times[which] + width * (
-            np.arange(len(row.times)) - np.searchsorted(row.times, row.times)
-        )
-        half = np.full(len(left), 0.5 if len(rows) > 60 else 0.42)
+        half = np.full(number, 0.5 if len(rows) > 60 else 0.42)
         if slim:
             half[row.by_rule] *= 0.45
-        x = np.stack([left, left + width, left + width, left], axis=1)
-        cells.append(np.stack([x, number + np.stack([-half, -half, half, half], axis=1)], axis=2))
+        left, right = edges[:-1], edges[1:]
+        low, high = place - half, place + half
+        corners = [[left, low], [right, low], [right, high], [left, high]]
+        cells.append(np.transpose(corners, (2, 0, 1)))
     return np.concatenate(cells)
 
 
-def _colour(axes: Axes, cells: NDArray[np.float64], **colours: Any) -> Any:
+def _colour(
+    axes: Axes,
+    cells: Floats,
+    **colours: Any,
+) -> PolyCollection:
     """Draw cells in their colours."""
     from matplotlib.collections import PolyCollection
 
     # In vector graphics, many cells become one image.
-    return axes.add_collection(
-        PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours)
-    )
+    collection = PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours)
+    axes.add_collection(collection)
+    return collection
 
 
-def _colour_by_scale(
-    axes: Axes, cells: Any, values: Any, scale: Any, limits: tuple[float, float], extend: str
-) -> None:
+def _colour_by_scale(axes: Axes, cells: Floats, values: Array, **colours: Any) -> None:
     """Draw cells in the colours of their values, and the scale beside the axes."""
-    drawn = _colour(axes, cells, array=values, cmap=scale, clim=limits)
-    bar = axes.figure.colorbar(drawn, ax=axes, extend=extend, fraction=0.04, pad=0.01, aspect=30)
-    bar.outline.set_visible(False)
+    collection = _colour(axes, cells, array=values, **colours)
+    axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)
 
 
-def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
+def _colour_actions(
+    axes: Axes,
+    rows: Sequence[TimelineRow],
+    name: str,
+) -> None:
     """Colour the decisions by a component of their actions."""
     from matplotlib.patches import Patch
 
-    components = [row.actions[name] for row in rows]
-    values = np.concatenate([own.values for own in components])
     known = np.concatenate([row.known for row in rows])
+    values = np.concatenate([row.actions[name].values[row.rows] for row in rows])[known]
     _colour(axes, _cells(rows, slim=False), facecolors="white")  # white while the agent lives
     cells = _cells(rows, slim=True)
-    if not known.all():
-        _colour(axes, cells[~known], facecolors=UNKNOWN)
-    labels = {value: label for own in components for value, label in (own.labels or {}).items()}
-    if not 0 < len(labels) <= NAMED:
-        limits = min(own.limits[0] for own in components), max(own.limits[1] for own in components)
-        _colour_by_scale(
-            axes, cells[known], values[known].astype(float), "viridis", limits, "neither"
-        )
+    _colour(axes, cells[~known], facecolors=UNKNOWN)
+    labels_of_rows = [row.actions[name].labels for row in rows]
+    labels = dict(ChainMap(*labels_of_rows))
+    if not all(labels_of_rows) or len(labels) > MOST_COLOURS:
+        _colour_by_scale(axes, cells[known], values, cmap="viridis")
         return
-    inside = all(0 <= action < len(COLOURS) for action in labels)
-    colours = {
-        action: COLOURS[action if inside else rank] for rank, action in enumerate(sorted(labels))
-    }
-    _colour(axes, cells[known], facecolors=[colours[int(value)] for value in values[known]])
-    patches = [Patch(color=colour, label=labels[action]) for action, colour in colours.items()]
-    axes.legend(
-        handles=patches,
-        loc="upper left",
-        bbox_to_anchor=(1.0, 1.0),
-        handlelength=0.9,
-        handleheight=0.9,
-    )
+    palette = dict(enumerate(COLOURS))
+    if not labels.keys() <= palette.keys():
+        palette = dict(zip(sorted(labels), COLOURS, strict=False))
+    _colour(axes, cells[known], facecolors=[palette[value] for value in values.tolist()])
+    patches = [Patch(color=palette[action], label=labels[action]) for action in sorted(labels)]
+    axes.legend(handles=patches, **BESIDE)
 
 
 def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
-    """Colour the decisions by their rewards; zero is white."""
-    from matplotlib.colors import LinearSegmentedColormap
-
+    """Colour the decisions by their rewards; zero is nearly white."""
     rewards = np.concatenate([row.rewards for row in rows])
-    # So that a few large rewards do not make all others pale.
-    most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
-    extend = ("neither", "min", "max", "both")[
-        int(rewards.min() < -most) + 2 * int(rewards.max() > most)
-    ]
-    colours = LinearSegmentedColormap.from_list(
-        "reward", ["#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B"]
-    )
-    _colour_by_scale(axes, _cells(rows, slim=False), rewards, colours, (-most, most), extend)
+    sizes = np.abs(rewards)
+    # A quantile, so that a few large rewards do not make all others pale.
+    most = np.quantile(sizes, 0.99) or sizes.max() or 1.0
+    _colour_by_scale(axes, _cells(rows, slim=False), rewards, cmap="PuOr", clim=(-most, most))

@@ -1,15 +1,20 @@
-"""Trajectories of many episodes: observations, actions, rewards and what else a learner needs.
+"""Trajectories of many episodes: observations, actions, rewards and further arrays for learners.
 
 While the episodes run, a ``Recorder`` keeps a log for each group of decisions, in the order of the
 answers. Learners get the same rows sorted by policy, episode, agent and step, independent of that
 order.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from math import nan
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
@@ -18,20 +23,43 @@ from numpy.typing import NDArray
 from ..core import Agent, Episode, Plan, Point, Stacker, blank, joined, stack_masks, stacker, taken
 from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Answers, Group, PolicyKey
-from ..simulation import RULE
+from ..simulation import RULE, Action, Observation
 
-# -- what learners get ----------------------------------------------------------------------------
+# Types of arrays.
+Array = NDArray[Any]
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Masks = Array | tuple[Array, ...]
+"""The int8 masks of N decisions: ``(N, n)``, for a ``MultiDiscrete`` a tuple of such arrays."""
+
+TRAJECTORY: Final = np.dtype(
+    [
+        ("length", "i8"),
+        ("episode", "i8"),
+        ("agent", "O"),
+        ("last_turn", "i8"),
+        ("terminated", "?"),
+        ("truncated", "?"),
+    ]
+)
+"""The dtype of the records of trajectories."""
+
+End = tuple[int, bool, bool]
+"""The end of an agent: the turn, and whether the agent terminated and was truncated."""
+
+# -- trajectories for learners --------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """The trajectories of all agents that one policy answered for, in one or many episodes. Immutable.
+    """The trajectories of all agents that share a policy, in one or many episodes. Immutable.
 
-    There are N rows, one for each decision, and M trajectories, one for each agent in each episode
-    in which it decided. The rows of a trajectory are consecutive, in the order of its decisions.
-    Trajectories are sorted by episode and, within an episode, by their first decision. For ``Dict``
-    and ``Tuple`` spaces, an attribute is a dict or a tuple of arrays instead of one array. For
-    spaces without a shape (text, graphs, ...), it is an array of objects.
+    There are N rows, one for each decision, and M trajectories. A trajectory has the decisions of
+    one agent in one episode, in consecutive rows. Trajectories are sorted by episode and, within an
+    episode, by their first decision. For ``Dict`` and ``Tuple`` spaces, an attribute is a dict or a
+    tuple of arrays instead of one array. For spaces without a shape (text, graphs, ...), it is an
+    array of objects.
 
     Attributes:
         observations: ``(N, *shape)``, in the dtype of the observation space: the observations at
@@ -56,8 +84,8 @@ class Trajectories:
         agents: ``(N,)`` int64: the deciding agent, as an index into ``names``.
         names: The names of the agents, in order of appearance.
         steps: ``(N,)`` int64: the number of the decision in its trajectory, from 0.
-        turns: ``(N,)`` int64: the number of the decision among those of all agents of all policies
-            in the episode, from 0.
+        turns: ``(N,)`` int64: the number of the decision among the decisions of all agents of all
+            policies in the episode, from 0.
         by_rule: ``(N,)`` bool: whether the policy left the decision to the model's rule.
         known: ``(N,)`` bool: whether ``actions`` has the action that was taken.
         action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such arrays: the legal
@@ -65,40 +93,40 @@ class Trajectories:
         times: ``(N,)`` float64: the simulation's time at the decision. None where it has no clock.
         elapsed: ``(N,)`` float64: the time from the decision until its reward was known, at the
             agent's next decision or its end. None where there is no clock.
-        extras: A dict from name to array, ``(N, ...)``: what the policy returned besides the
-            actions.
+        extras: A dict from name to array, ``(N, ...)``: the values that the policy returned besides
+            the actions.
         observation_space, action_space: The spaces of the decision point. None where no agent
             decided and the decision point is not known.
         action_labels: The ``action_labels`` of the decision point; None where it has none, or they
             vary with the call.
-        collected: What ``collect`` returned for each episode's simulation, in the order of the
+        collected: The result of ``collect`` for each episode's simulation, in the order of the
             seeds. None where there was no ``collect``.
     """
 
     _: KW_ONLY
-    observations: Any
-    actions: Any
-    rewards: NDArray[np.float64]
-    terminations: NDArray[np.bool_]
-    truncations: NDArray[np.bool_]
-    last_observations: Any
-    last_turns: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    episodes: NDArray[np.int64]
+    observations: Observation
+    actions: Action
+    rewards: Floats
+    terminations: Bools
+    truncations: Bools
+    last_observations: Observation
+    last_turns: Integers
+    starts: Integers
+    episodes: Integers
     seeds: tuple[int, ...]
-    agents: NDArray[np.int64]
+    agents: Integers
     names: tuple[str, ...]
-    steps: NDArray[np.int64]
-    turns: NDArray[np.int64]
-    by_rule: NDArray[np.bool_]
-    known: NDArray[np.bool_]
-    action_masks: Any = None
-    times: NDArray[np.float64] | None = None
-    elapsed: NDArray[np.float64] | None = None
-    extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    steps: Integers
+    turns: Integers
+    by_rule: Bools
+    known: Bools
+    action_masks: Masks | None = None
+    times: Floats | None = None
+    elapsed: Floats | None = None
+    extras: Mapping[str, Array] = field(default_factory=dict)
     observation_space: spaces.Space[Any] | None = None
     action_space: spaces.Space[Any] | None = None
-    action_labels: Any = None
+    action_labels: Sequence[str] | Mapping[Any, str] | None = None
     collected: tuple[Any, ...] | None = None
 
     def __len__(self) -> int:
@@ -112,150 +140,206 @@ class Trajectories:
         )
 
     @cached_property
-    def lengths(self) -> NDArray[np.int64]:
+    def lengths(self) -> Integers:
         """``(M,)`` int64: the number of decisions in each trajectory."""
         return np.diff(self.starts, append=len(self))
 
     @cached_property
-    def returns(self) -> NDArray[np.float64]:
+    def returns(self) -> Floats:
         """``(M,)`` float64: the undiscounted return of each trajectory, the sum of its rewards."""
         return np.add.reduceat(self.rewards, self.starts) if len(self) else np.zeros(0)
 
     @cached_property
-    def next_observations(self) -> Any:
+    def next_observations(self) -> Observation:
         """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
-        ends = self.starts + self.lengths - 1
-        following = np.arange(1, len(self) + 1)
-        # the last observations lie behind all others
-        following[ends] = len(self) + np.arange(len(ends))
-        return taken(joined([self.observations, self.last_observations]), following)
+        next_rows = np.arange(1, len(self) + 1)
+        last_rows = self.starts + self.lengths - 1
+        next_rows[last_rows] = len(self) + np.arange(len(last_rows))
+        return taken(joined([self.observations, self.last_observations]), next_rows)
 
 
-def leaves(stack: Any, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the arrays of a stack, with their names: ``[1]`` in a tuple, ``litres`` or ``[1]['litres']`` in a dict."""
-    if isinstance(stack, Mapping):
-        for key, part in stack.items():
-            yield from leaves(part, f"{name}[{key!r}]" if name else str(key))
-    elif isinstance(stack, tuple):
-        for place, part in enumerate(stack):
-            yield from leaves(part, f"{name}[{place}]")
+def action_arrays(actions: Action, name: str = "") -> Iterator[tuple[str, Array]]:
+    """Yield the arrays of stacked actions, each with its name.
+
+    The name is ``[1]`` in a tuple, ``litres`` or ``[1]['litres']`` in a dict; empty for one array.
+    """
+    if isinstance(actions, Mapping):
+        for key, part in actions.items():
+            yield from action_arrays(part, f"{name}[{key!r}]" if name else str(key))
+    elif isinstance(actions, tuple):
+        for place, part in enumerate(actions):
+            yield from action_arrays(part, f"{name}[{place}]")
     else:
-        yield name, stack
+        yield name, actions
 
 
 @dataclass(frozen=True)
 class Records:
-    """The records of one policy in some episodes, in the order of its ``Trajectories``."""
+    """The records of one policy in some episodes, in the order of its ``Trajectories``.
 
-    # by attribute of ``Trajectories``: arrays with a row for each decision
-    decisions: Mapping[str, Any]
-    trajectories: Mapping[str, Any]  # the same with a row for each trajectory
-    observation_space: spaces.Space[Any] | None
-    action_space: spaces.Space[Any] | None
-    action_labels: Any
+    Attributes:
+        decisions: By attribute of ``Trajectories``, a stack with a row for each decision.
+        trajectories: ``(M,)``, in the dtype ``TRAJECTORY``.
+        last_observations: The stack of the final observations of the trajectories.
+        point: The attributes of ``Trajectories`` that describe the decision point.
+    """
+
+    decisions: dict[str, Any]
+    trajectories: Array
+    last_observations: Observation
+    point: dict[str, Any]
 
 
 def combine(
-    parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[Any, ...] | None = None
+    parts: Sequence[Records],
+    seeds: tuple[int, ...],
+    collected: tuple[Any, ...] | None = None,
 ) -> Trajectories:
     """Combine the records of one policy in consecutive parts of the episodes.
 
-    Seeds and values are those of all.
+    ``seeds`` and ``collected`` have an item for each episode of all parts.
     """
-    filled = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
-    _check_extras([part.decisions["extras"] for part in filled])
-    trajectories = joined([part.trajectories for part in filled])
-    lengths, names = trajectories["lengths"], dict.fromkeys(trajectories["agents"].tolist())
-    starts, codes = np.cumsum(lengths) - lengths, {name: code for code, name in enumerate(names)}
-    agents = np.array([codes[name] for name in trajectories["agents"].tolist()], np.int64)
+    nonempty = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
+    _check_extras([part.decisions["extras"] for part in nonempty])
+    decisions = joined([part.decisions for part in nonempty])
+    trajectories = np.concatenate([part.trajectories for part in nonempty])
+    lengths = trajectories["length"]
+    starts = np.cumsum(lengths) - lengths
+
+    def per_decision(values: Array) -> Array:
+        return np.repeat(values, lengths)
+
+    codes: dict[str, int] = {}
+    agents = [codes.setdefault(name, len(codes)) for name in trajectories["agent"]]
+    steps = np.arange(len(decisions["rewards"])) - per_decision(starts)
+    is_last = steps == per_decision(lengths) - 1
     return Trajectories(
-        **joined([part.decisions for part in filled]),
-        last_observations=trajectories["last_observations"],
-        last_turns=trajectories["last_turns"],
+        **decisions,
+        **nonempty[0].point,
+        terminations=is_last & per_decision(trajectories["terminated"]),
+        truncations=is_last & per_decision(trajectories["truncated"]),
+        last_observations=joined([part.last_observations for part in nonempty]),
+        last_turns=trajectories["last_turn"],
         starts=starts,
-        episodes=np.repeat(trajectories["episodes"], lengths),
+        episodes=per_decision(trajectories["episode"]),
         seeds=seeds,
-        agents=np.repeat(agents, lengths),
-        names=tuple(names),
-        steps=np.arange(lengths.sum()) - np.repeat(starts, lengths),
-        observation_space=filled[0].observation_space,
-        action_space=filled[0].action_space,
-        action_labels=filled[0].action_labels,
+        agents=per_decision(np.array(agents, np.int64)),
+        names=tuple(codes),
+        steps=steps,
         collected=collected,
     )
 
 
-# -- while episodes run ---------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class _TrajectoryLog:
-    """The record of one trajectory. If its episode fails, it has no end."""
-
-    decisions: "_DecisionLog"
-    episode: int
-    agent: str
-    rows: list[int] = field(default_factory=list)  # of its decisions in their log
-    last_observation: Any = None
-    last_turn: int = -1  # the number of decisions in the episode when it ended
-    terminated: bool = False
-    truncated: bool = False
+# -- logs of running episodes ---------------------------------------------------------------------
 
 
 class _DecisionLog:
     """The decisions of one group, in the order of the answers.
 
-    The point is one of those at which the group decides; None if it is not known, and there are no
-    decisions.
+    ``point`` is one of the group's decision points. It is None if no point is known; such a log
+    stays empty.
     """
 
     def __init__(self, point: Point | None) -> None:
-        self.observation_space = self.action_space = self.action_labels = None
         self.stack_observations: Stacker = np.array
         self.stack_actions: Stacker = np.array
+        self.point: dict[str, Any] = {}
         if point is not None:
-            self.name, definition = point.hook.name, point.definition
-            self.observation_space, self.action_space = (
-                definition.observation_space,
-                definition.action_space,
-            )
-            self.action_labels = (
-                None if callable(definition.action_labels) else definition.action_labels
-            )
-            self.stack_observations, self.stack_actions = (
-                stacker(self.observation_space),
-                stacker(self.action_space),
-            )
-            self.unknown_action = blank(self.action_space)
+            definition = point.definition
+            labels = definition.action_labels
+            self.point = {
+                "observation_space": definition.observation_space,
+                "action_space": definition.action_space,
+                "action_labels": None if callable(labels) else labels,
+            }
+            self.stack_observations = stacker(definition.observation_space)
+            self.stack_actions = stacker(definition.action_space)
+            self.unknown_action = blank(definition.action_space)
         # One entry for each batch.
-        self.observations: list[Any] = []
-        self.actions: list[Any] = []
-        self.masks: list[Any] = []
-        self.extras: list[dict[str, NDArray[Any]]] = []
+        self.observations: list[Observation] = []
+        self.actions: list[Action] = []
+        self.masks: list[Masks] = []
+        self.extras: list[dict[str, Array]] = []
         # One entry for each decision.
         self.turns: list[int] = []
         self.by_rule: list[bool] = []
-        self.times: list[float] = []
+        self.times: list[float | None] = []
         self.rewards: list[float] = []
         self.elapsed: list[float] = []
-        self.rule_actions: dict[int, Any] = {}  # by row; only those that are known
-        self.trajectories: dict[int, list[_TrajectoryLog]] = {}  # by the place of their policy
+        # By row; only the known ones.
+        self.rule_actions: dict[int, Action] = {}
+        # By row of the last decision.
+        self.ends: dict[int, tuple[Observation, *End]] = {}
+        # The rows of each trajectory, by place of its policy, and by episode and agent.
+        self.trajectories: dict[int, dict[tuple[int, str], list[int]]] = {}
+
+    def add(
+        self,
+        group: Group,
+        episodes: Sequence[Episode],
+        agents: Sequence[Agent],
+        observations: Sequence[Observation],
+        answers: Answers,
+    ) -> None:
+        """Add a batch of decisions, whose rewards are not known yet."""
+        actions, extras = answers
+        number = len(actions)
+        self.observations.append(group.stack(observations))
+        if group.point.legal is not None:
+            self.masks.append(stack_masks([agent.mask for agent in agents]))
+        self.actions.append(
+            self.stack_actions(
+                [self.unknown_action if action is RULE else action for action in actions]
+            )
+        )
+        # Copied, because policies may reuse their arrays. Two steps, because np.array cannot copy
+        # every tensor.
+        arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
+        for name, array in arrays.items():
+            if array.shape[:1] != (number,):
+                raise OptionValueError(
+                    f"{group.asked!r} returned {short_repr(name)} of shape {array.shape} for"
+                    f" {number} decisions; the length of its first axis must be their number"
+                )
+        self.extras.append(arrays)
+        self.by_rule += [action is RULE for action in actions]
+        self.turns += [episode.turns for episode in episodes]
+        if episodes[0].clock is not None:
+            # Not from the infos, because the policy may have changed them.
+            self.times += [agent.now for agent in agents]
+        self.rewards += [0.0] * number
+        self.elapsed += [nan] * number
+
+    def pay(
+        self,
+        row: int,
+        agent: Agent,
+        end: End | None,
+    ) -> None:
+        """Record the reward of a decision, the rule's action if it decided, and an end."""
+        self.rewards[row] = agent.reward
+        self.elapsed[row] = agent.info.get("elapsed", nan)
+        rule_action = agent.take_rule_action()  # a rule that is cut short must not report it again
+        if rule_action is not None:
+            self.rule_actions[row] = rule_action
+        if end is not None:
+            self.ends[row] = (agent.observation, *end)
 
     @cached_property
     def columns(self) -> dict[str, Any]:
-        """Return the values of all decisions, by attribute of ``Trajectories``."""
+        """The values of all decisions, by attribute of ``Trajectories``."""
         _check_extras(self.extras)
-        number, by_rule = len(self.rewards), np.array(self.by_rule, np.bool_)
-        # The actions of the rule lie behind those of the policy; ``rows`` finds the action of each
-        # decision.
+        by_rule = np.array(self.by_rule, np.bool_)
+        rule_rows = list(self.rule_actions)
+        # The rule's actions come after the policy's.
         actions = joined([*self.actions, self.stack_actions(list(self.rule_actions.values()))])
-        rows, replaced = np.arange(number), list(self.rule_actions)
-        rows[replaced] = number + np.arange(len(replaced))
+        action_rows = np.arange(len(by_rule))
+        action_rows[rule_rows] = len(by_rule) + np.arange(len(rule_rows))
         known = ~by_rule
-        known[replaced] = True
+        known[rule_rows] = True
         columns = {
             "observations": joined([*self.observations, self.stack_observations([])]),
-            "actions": taken(actions, rows),
+            "actions": taken(actions, action_rows),
             "rewards": np.array(self.rewards, np.float64),
             "turns": np.array(self.turns, np.int64),
             "by_rule": by_rule,
@@ -271,26 +355,22 @@ class _DecisionLog:
 
     def records(self, place: int) -> Records:
         """Return the records of the policy at a place, sorted by episode, agent and step."""
-        logs = sorted(self.trajectories.get(place, ()), key=lambda log: (log.episode, log.rows[0]))
-        lengths = np.array([len(log.rows) for log in logs], np.int64)
-        last_rows = np.cumsum(lengths) - 1
-        terminations, truncations = np.zeros((2, lengths.sum()), np.bool_)
-        terminations[last_rows] = [log.terminated for log in logs]
-        truncations[last_rows] = [log.truncated for log in logs]
-        rows = np.array([row for log in logs for row in log.rows], np.int64)
-        decisions = taken(self.columns, rows) | {
-            "terminations": terminations,
-            "truncations": truncations,
-        }
-        trajectories = {
-            "lengths": lengths,
-            "episodes": np.array([log.episode for log in logs], np.int64),
-            "agents": np.array([log.agent for log in logs], object),
-            "last_turns": np.array([log.last_turn for log in logs], np.int64),
-            "last_observations": self.stack_observations([log.last_observation for log in logs]),
-        }
+        rows: list[int] = []
+        records = []
+        last_observations = []
+        for (episode, agent), agent_rows in sorted(
+            self.trajectories.get(place, {}).items(),
+            key=lambda item: (item[0][0], item[1]),
+        ):
+            last_observation, *end = self.ends[agent_rows[-1]]
+            rows += agent_rows
+            records.append((len(agent_rows), episode, agent, *end))
+            last_observations.append(last_observation)
         return Records(
-            decisions, trajectories, self.observation_space, self.action_space, self.action_labels
+            decisions=taken(self.columns, np.array(rows, np.int64)),
+            trajectories=np.array(records, TRAJECTORY),
+            last_observations=self.stack_observations(last_observations),
+            point=self.point,
         )
 
 
@@ -300,111 +380,91 @@ class Recorder:
     def __init__(self, first_episode: int) -> None:
         self._first_episode = first_episode
         self._logs: dict[Group, _DecisionLog] = {}
-        self._trajectories: dict[Agent, _TrajectoryLog] = {}  # of agents that have not ended
+        # The latest decision of each agent that has not ended: its log and its row.
+        self._decisions: dict[Agent, tuple[_DecisionLog, int]] = {}
 
     def record(
         self,
         group: Group,
         places: list[int],
-        waiting: list[Any],
-        observations: Any,
+        waiting: list[Episode],
+        observations: Sequence[Observation],
         answers: Answers,
     ) -> None:
         """Record decisions and their answers: see ``Watcher``."""
-        actions, extras = answers
-        log = self._logs.get(group)
-        if log is None:
-            log = self._logs[group] = _DecisionLog(group.point)
-        row, turns = len(log.rewards), log.turns
-        agents = [episode.pending for episode in waiting]
-        for place, episode, agent in zip(places, waiting, agents, strict=True):
-            trajectory = self._trajectories.get(agent)
-            if trajectory is None:
-                trajectory = _TrajectoryLog(log, self._first_episode + place, agent.name)
-                self._trajectories[agent] = trajectory
-                log.trajectories.setdefault(agent.policy.place, []).append(trajectory)
-            trajectory.rows.append(row)
-            turns.append(episode.turns)
-            row += 1
-        log.observations.append(group.stack(observations))
-        log.rewards.extend([0.0] * len(agents))
-        log.elapsed.extend([nan] * len(agents))
-        if group.point.legal is not None:
-            log.masks.append(stack_masks([agent.mask for agent in agents]))
-        if waiting[0].clock is not None:
-            # the policy may have been given the info
-            log.times.extend([agent.now for agent in agents])
-        log.by_rule += [action is RULE for action in actions]
-        log.actions.append(
-            log.stack_actions(
-                [log.unknown_action if action is RULE else action for action in actions]
-            )
+        if group not in self._logs:
+            self._logs[group] = _DecisionLog(group.point)
+        log = self._logs[group]
+        first = len(log.rewards)
+        agents = [agent for episode in waiting if (agent := episode.pending) is not None]
+        log.add(
+            group,
+            waiting,
+            agents,
+            observations,
+            answers,
         )
-        # Copied because policies may reuse their arrays; in two steps because np.array cannot copy
-        # every tensor.
-        arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
-        for name, array in arrays.items():
-            if not array.ndim or len(array) != len(actions):
-                raise OptionValueError(
-                    f"{group.asked!r} returned {short_repr(name)} of shape {array.shape} for"
-                    f" {len(actions)} decisions; the length of its first axis must be their number"
-                )
-        log.extras.append(arrays)
+        for row, (place, agent) in enumerate(zip(places, agents, strict=True), first):
+            policy: Any = agent.policy  # a ``PolicyKey``, because the episode has waited for it
+            trajectories = log.trajectories.setdefault(policy.place, {})
+            key = (self._first_episode + place, agent.name)
+            trajectories.setdefault(key, []).append(row)
+            self._decisions[agent] = (log, row)
 
     def pay(self, episode: Episode) -> None:
-        """Record the rewards: see ``Watcher``."""
+        """Record the rewards and the ends of agents: see ``Watcher``."""
         if episode.pending is not None:
-            self._reward(episode.pending)
-        if not (episode.over or episode.just_ended):
-            return
-        ended = [(agent, True, False) for agent in episode.take_ended()]
+            self._pay(episode.pending)
+        for agent in episode.take_ended():
+            self._pay(agent, (episode.turns, True, False))
         if episode.over:
-            ended += [
-                (agent, episode.terminated, episode.truncated) for agent in episode.agents.values()
-            ]
-        for agent, terminated, truncated in ended:
-            self._reward(agent)
-            trajectory = self._trajectories.pop(agent, None)
-            if trajectory is not None:
-                trajectory.last_observation, trajectory.last_turn = agent.observation, episode.turns
-                trajectory.terminated, trajectory.truncated = terminated, truncated
+            end = (episode.turns, episode.terminated, episode.truncated)
+            for agent in episode.agents.values():
+                self._pay(agent, end)
 
-    def _reward(self, agent: Agent) -> None:
-        """Record the reward of the agent's latest action, if it has decided before."""
-        trajectory = self._trajectories.get(agent)
-        if trajectory is None:
-            return
-        log, row = trajectory.decisions, trajectory.rows[-1]
-        log.rewards[row] = agent.reward
-        log.elapsed[row] = agent.info.get("elapsed", nan)
-        rule_action = agent.take_rule_action()
-        if rule_action is not None:
-            log.rule_actions[row] = rule_action
+    def _pay(
+        self,
+        agent: Agent,
+        end: End | None = None,
+    ) -> None:
+        """Record the reward of an agent's latest decision, and the agent's end."""
+        if agent in self._decisions:
+            log, row = self._decisions[agent]
+            log.pay(row, agent, end)
+            if end is not None:
+                del self._decisions[agent]
 
-    def records(self, plan: Plan, keys: Iterable[Any]) -> list[Records]:
-        """Return the records of each policy, in the order of the policies, which have these keys."""
+    def records(
+        self,
+        plan: Plan,
+        keys: Iterable[Any],
+    ) -> list[Records]:
+        """Return the records of each policy, by the order of their keys."""
         records = []
         for place, key in enumerate(keys):
-            logs = [log for log in self._logs.values() if place in log.trajectories]
+            logs = {
+                group.point.hook.name: log
+                for group, log in self._logs.items()
+                if place in log.trajectories
+            }
             if len(logs) > 1:
                 raise AgentError(
-                    f"{short_repr(key)} has decided at"
-                    f" {' and at '.join(log.name for log in logs)}, whose spaces differ; give its"
-                    " policy under the names of the points"
+                    f"{short_repr(key)} has decided at {' and at '.join(logs)}, whose spaces"
+                    " differ; give its policy under the names of the points"
                 )
             if not logs:
-                point = next(
-                    (point for point in plan.points if is_answered_by(plan, point, place)), None
-                )
-                logs = [_DecisionLog(point)]
-            records.append(logs[0].records(place))
+                logs[""] = _DecisionLog(next(points_of(plan, place), None))
+            (log,) = logs.values()
+            records.append(log.records(place))
         return records
 
 
-def is_answered_by(plan: Plan, point: Point, place: int) -> bool:
-    """Return whether it is known beforehand that the policy at this place answers at a decision point."""
-    policy = point.policy if point.agent is None else plan.policies.get(point.agent, point.policy)
-    return isinstance(policy, PolicyKey) and policy.place == place
+def points_of(plan: Plan, place: int) -> Iterator[Point]:
+    """Yield the decision points that are known to be answered by the policy at a place."""
+    for point in plan.points:
+        policy = plan.policies.get(point.agent or "", point.policy)
+        if isinstance(policy, PolicyKey) and policy.place == place:
+            yield point
 
 
 def _check_extras(batches: Sequence[Mapping[str, Any]]) -> None:

@@ -1,18 +1,18 @@
-"""Extensions: handlers before, after and instead of a model's functions, without a change to the model (paper).
+"""Extensions: handlers before, after and instead of a model's functions, which stays unchanged.
 
 Handlers are attached to functions, methods, generator and coroutine functions, and iterables: for
 the whole process (``attach_handler``), for a block (``handlers``), or for one environment (the
-option ``plugins``). A function without handlers costs nothing extra or, if ``expose_to_plugins``
-exposed it, one test.
+option ``plugins``). A function without handlers costs nothing extra; or one test, if
+``expose_to_plugins`` exposed it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from types import FunctionType, MappingProxyType, MethodType
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
 
 from .decision import decision_points
 from .errors import HandlerError, PatchError, UnknownTargetError, name_of, short_repr
@@ -24,9 +24,10 @@ from .hooks.handlers import (
     ChangedResult,
     Handler,
     Installation,
+    make_handler,
     recorder,
 )
-from .hooks.hook import Hook, hook_of, hooks
+from .hooks.hook import Hook, hook_of, hooks, rebind
 from .hooks.places import (
     find_hook,
     hook_at,
@@ -60,7 +61,7 @@ Entry = tuple[Callable[..., Any], Any, str]
 _FUNCTIONS: Final = (staticmethod, classmethod, FunctionType, MethodType)
 
 
-# -- what exists ----------------------------------------------------------------------------------
+# -- lists of targets and handlers ----------------------------------------------------------------
 
 
 def exposed_functions() -> list[str]:
@@ -81,21 +82,18 @@ def attached_handlers(env: Any = None) -> list[Entry]:
     if env is not None:
         entries: list[Entry] = env.unwrapped.plugins
         return entries
-    found = sorted(hooks(), key=lambda target: target.name)
-    return [
-        (handler.function, target.name, handler.position)
-        for target in found
-        for handler in _general(target)
-    ]
+    targets = sorted(hooks(), key=lambda target: target.name)
+    return [_entry(handler) for target in targets for handler in _process_handlers(target)]
 
 
-def _general(target: Hook) -> list[Handler]:
+def _entry(handler: Handler) -> Entry:
+    return handler.function, handler.target.name, handler.position
+
+
+def _process_handlers(target: Hook) -> list[Handler]:
     """Return the handlers of a target that users have attached for the whole process."""
-    return [
-        handler
-        for handler in target.handlers
-        if handler.owner is None and handler.position is not TRACE
-    ]
+    present = [handler for handler in target.handlers if handler.owner is None]
+    return [handler for handler in present if handler.position != TRACE]
 
 
 # -- targets --------------------------------------------------------------------------------------
@@ -118,66 +116,77 @@ def expose_to_plugins(function_or_iterable: Thing) -> Thing:
     Raises:
         PatchError: It is neither of these, or a method that is bound to one object.
     """
-    thing: Any = function_or_iterable
-    if _proxied(thing) is not None:
-        return function_or_iterable
+    exposed: Thing = _expose(function_or_iterable)
+    return exposed
+
+
+def _expose(thing: Any) -> Any:
+    if _target_of_proxy(thing) is not None:
+        return thing
     if isinstance(thing, _FUNCTIONS):
-        wrapper, binding = split_binding(thing)
-        known = hook_of(wrapper)
-        if known is None or not known.permanent:  # else it is decorated or exposed already
-            known, _ = permanent_hook(thing)
-            wrapper = known.make_wrapper()
-        known.exposed = True
-        if isinstance(thing, (staticmethod, classmethod)) and thing.__func__ is wrapper:
-            return function_or_iterable
-        return cast("Thing", wrapper if binding is None else binding(wrapper))
+        return _expose_function(thing)
     if isinstance(thing, type):
         raise PatchError(
             f"the class {name_of(thing)} cannot be exposed to plugins: expose one of its"
             " functions, such as __init__ or an __iter__ that is a generator function"
         )
-    if isinstance(thing, Iterable) or (
-        hasattr(type(thing), "__getitem__") and hasattr(type(thing), "__len__")
-    ):
-        # its dependency imports asyncio, which slows down decisions
+    is_sequence = hasattr(type(thing), "__getitem__") and hasattr(type(thing), "__len__")
+    if is_sequence or isinstance(thing, Iterable):
+        # Imported here, because its dependency imports asyncio, which slows down decisions.
         from .hooks.iterables import expose
 
-        return cast("Thing", expose(thing))
+        return expose(thing)
     if callable(thing):
-        hook = Hook(thing, f"{getattr(thing, '__module__', None) or '?'}.{name_of(thing)}")
-        hook.exposed = True
-        return cast("Thing", hook.make_wrapper())
+        module = getattr(thing, "__module__", None) or "?"
+        return Hook(thing, f"{module}.{name_of(thing)}", exposed=True).make_wrapper()
     raise PatchError(
         f"{short_repr(thing)} cannot be exposed to plugins: it is neither a function nor an"
         " iterable"
     )
 
 
-def _proxied(thing: Any) -> Hook | None:
+def _expose_function(function: Any) -> Any:
+    wrapper, binding = split_binding(function)
+    hook = hook_of(wrapper)
+    if hook is None or not hook.permanent:  # it is neither decorated nor exposed yet
+        hook, _ = permanent_hook(function)
+        wrapper = hook.make_wrapper()
+    hook.expose()
+    unchanged = getattr(function, "__func__", None) is wrapper
+    return function if unchanged else rebind(wrapper, binding)
+
+
+def _target_of_proxy(thing: Any) -> Hook | None:
     """Return the target of an exposed iterable; None for anything else."""
     return thing._self_target if hasattr(type(thing), "_self_next") else None
 
 
 def _find_target(target: Any) -> Hook:
-    """Find the target for handlers: a function, an exposed iterable, or the dotted name of one of these."""
+    """Find a target of handlers: a function, an exposed iterable, or the name of one of these."""
     if isinstance(target, str):
-        try:
-            owner, attribute = resolve(target, UnknownTargetError)
-        except (UnknownTargetError, PatchError):
-            named = [other for other in hooks() if other.name == target and other.exposed]
-            if not named:
-                raise
-            return named[-1]  # exposed inside a function, under the latest's name
-        return _proxied(raw_attribute(owner, attribute)) or hook_at(
-            target, owner, attribute, UnknownTargetError
-        )
-    found = _proxied(target)
-    if found is None and not isinstance(target, _FUNCTIONS):
+        return _find_named_target(target)
+    if isinstance(target, _FUNCTIONS):
+        return find_hook(target, UnknownTargetError)
+    hook = _target_of_proxy(target)
+    if hook is None:
         raise PatchError(
             f"no handlers can be attached to {short_repr(target)}: pass what expose_to_plugins"
             " returns for it, or the dotted name of a function"
         )
-    return found or find_hook(target, UnknownTargetError)
+    return hook
+
+
+def _find_named_target(name: str) -> Hook:
+    try:
+        owner, attribute = resolve(name, UnknownTargetError)
+    except (UnknownTargetError, PatchError):
+        # A function that was exposed inside another one: the latest of this name.
+        for hook in reversed(hooks()):
+            if hook.name == name and hook.exposed:
+                return hook
+        raise
+    target = _target_of_proxy(raw_attribute(owner, attribute))
+    return target or hook_at(name, owner, attribute, UnknownTargetError)
 
 
 # -- handlers -------------------------------------------------------------------------------------
@@ -204,8 +213,8 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        made = _make_handler((handler, target, position))
-        made.target.install(None, made)
+        hook = _find_target(target)
+        hook.install(None, make_handler(handler, hook, position))
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
@@ -222,21 +231,24 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
         HandlerError: There is no such handler.
     """
     with LOCK:
-        found = _find_target(target)
-        present = _general(found)
+        hook = _find_target(target)
+        present = _process_handlers(hook)
         chosen = [
-            h
-            for h in present
-            if h.position == position and (handler is None or h.function == handler)
+            attached
+            for attached in present
+            if attached.position == position and handler in (None, attached.function)
         ]
         if not chosen:
-            what = "no handler is" if handler is None else f"{name_of(handler)} is not"
-            at = ", ".join(sorted({h.position for h in present})) or "nowhere"
+            absent = "no handler is" if handler is None else f"{name_of(handler)} is not"
+            positions = sorted({attached.position for attached in present})
             raise HandlerError(
-                f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}"
+                f"{absent} attached {short_repr(position)} {hook.name}; handlers are attached:"
+                f" {', '.join(positions) or 'nowhere'}"
             )
-        for removed in chosen if handler is None else chosen[-1:]:
-            found.uninstall(None, removed)
+        if handler is not None:
+            chosen = chosen[-1:]
+        for removed in chosen:
+            hook.uninstall(None, removed)
 
 
 @contextmanager
@@ -250,8 +262,8 @@ def handlers(*entries: Entry) -> Iterator[None]:
         SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
-        made = [_make_handler(entry) for entry in entries]
-    installation = Installation([(handler.target, handler) for handler in made])
+        attached = [_make_handler(entry) for entry in entries]
+    installation = Installation([(handler.target, handler) for handler in attached])
     try:
         yield
     finally:
@@ -274,27 +286,29 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
         SimEnvError: As ``attach_handler``.
     """
     calls: list[Call] = []
-    record = partial(recorder, calls)
     with LOCK:
-        found = [_find_target(target) for target in functions] if functions else hooks()
-        traced = [target for target in dict.fromkeys(found) if CALLS[0] in target.positions]
-    installation = Installation(
-        [
-            (hook, Handler(record, hook, TRACE))
-            for hook in traced
-            if functions or hook.permanent or hook.slot
-        ]
-    )
+        if functions:
+            targets = list(dict.fromkeys(_find_target(function) for function in functions))
+        else:
+            targets = [hook for hook in hooks() if hook.permanent or hook.slot]
+    traced = [target for target in targets if CALLS[0] in target.positions]
+    record = partial(recorder, calls)
+    installation = Installation([(target, Handler(record, target, TRACE)) for target in traced])
     try:
         yield calls
     finally:
         installation.uninstall()
 
 
+_NO_NAMES: Final[Mapping[str, Hook]] = MappingProxyType({})
+
+
 def _make_handler(
-    entry: Any, named: Mapping[str, Hook] = MappingProxyType({}), owner: Any = None
+    entry: Entry,
+    named: Mapping[str, Hook] = _NO_NAMES,
+    owner: Hashable | None = None,
 ) -> Handler:
-    """Return a handler, checked to fit its target.
+    """Return a handler for an entry.
 
     ``named`` has names that take precedence over importable names.
     """
@@ -303,35 +317,41 @@ def _make_handler(
             f"handlers are given as (handler, target, position), not {short_repr(entry)}"
         )
     function, target, position = entry
-    known = named.get(target) if isinstance(target, str) else None
-    return Handler(function, _find_target(target) if known is None else known, position, owner)
+    hook = named.get(target) if isinstance(target, str) else None
+    return make_handler(function, hook or _find_target(target), position, owner)
 
 
 class Plugins:
     """The handlers of the environments of one plan, attached while one of these is in use.
 
-    It is also the key under which targets know them, and an entry in ``EVALUATING``; agents have
-    the memory.
+    It is the owner of these handlers, and an ``Evaluation``.
+
+    Attributes:
+        handlers: The handlers.
+        hooks: Their targets, each once.
+        entries: The handlers as ``attached_handlers`` returns them.
+        portable: The entries for another process: with the given target instead of a name that
+            does not lead to the target there.
+        memory: None, because only agents remember values of differences.
     """
 
     memory: dict[Any, Any] | None = None
 
-    def __init__(self, entries: Any, named: Mapping[str, Hook] = MappingProxyType({})) -> None:
+    def __init__(self, entries: Iterable[Entry], named: Mapping[str, Hook] = _NO_NAMES) -> None:
         """Find the targets, and check that the handlers fit.
 
         ``named`` has the names that the simulation defines.
         """
+        self.handlers: list[Handler] = []
+        self.portable: list[Entry] = []
         with LOCK:
-            self.handlers = [_make_handler(entry, named, self) for entry in entries]
-        self.hooks = dict.fromkeys(handler.target for handler in self.handlers)
-        self.entries: list[Entry] = [
-            (own.function, own.target.name, own.position) for own in self.handlers
-        ]
-        # With the given target where its name would not lead to it in another process.
-        pairs = zip(self.entries, entries, strict=True)
-        self.portable: list[Entry] = [
-            entry if is_importable(entry[1]) else own for entry, own in pairs
-        ]
+            for entry in entries:
+                handler = _make_handler(entry, named, self)
+                self.handlers.append(handler)
+                importable = is_importable(handler.target.name)
+                self.portable.append(_entry(handler) if importable else entry)
+        self.entries = [_entry(handler) for handler in self.handlers]
+        self.hooks: dict[Hook, None] = dict.fromkeys(handler.target for handler in self.handlers)
 
     @property
     def plugins(self) -> Plugins:

@@ -96,6 +96,4 @@ def _named_hook(function: Any, name: str) -> Hook:
     """Return the hook of a function that is found by a name, not in a module."""
     setattr(function, BY_NAME, name)
     function.__name__, function.__qualname__ = name.rpartition(".")[2], name
-    hook = Hook(function, name)
-    hook.bound = hook.alone = hook.exposed = True
-    return hook
+    return Hook(function, name, bound=True, exposed=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from types import FunctionType, MappingProxyType, MethodType
+from types import FunctionType, MethodType
 from typing import Any, Final, TypeVar
 
 from .decision import decision_points
@@ -24,7 +24,6 @@ from .hooks.handlers import (
     ChangedResult,
     Handler,
     Installation,
-    make_handler,
     recorder,
 )
 from .hooks.hook import Hook, hook_of, hooks, rebind
@@ -93,7 +92,7 @@ def _entry(handler: Handler) -> Entry:
 def _process_handlers(target: Hook) -> list[Handler]:
     """Return the handlers of a target that users have attached for the whole process."""
     present = [handler for handler in target.handlers if handler.owner is None]
-    return [handler for handler in present if handler.position != TRACE]
+    return [handler for handler in present if handler.position is not TRACE]
 
 
 # -- targets --------------------------------------------------------------------------------------
@@ -214,7 +213,7 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
     """
     with LOCK:
         hook = _find_target(target)
-        hook.install(None, make_handler(handler, hook, position))
+        hook.install(None, Handler(handler, hook, position))
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
@@ -262,7 +261,7 @@ def handlers(*entries: Entry) -> Iterator[None]:
         SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
-        attached = [_make_handler(entry) for entry in entries]
+        attached = [_make_handler(entry, {}) for entry in entries]
     installation = Installation([(handler.target, handler) for handler in attached])
     try:
         yield
@@ -300,14 +299,7 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
         installation.uninstall()
 
 
-_NO_NAMES: Final[Mapping[str, Hook]] = MappingProxyType({})
-
-
-def _make_handler(
-    entry: Entry,
-    named: Mapping[str, Hook] = _NO_NAMES,
-    owner: Hashable | None = None,
-) -> Handler:
+def _make_handler(entry: Entry, named: Mapping[str, Hook], owner: Hashable = None) -> Handler:
     """Return a handler for an entry.
 
     ``named`` has names that take precedence over importable names.
@@ -318,7 +310,7 @@ def _make_handler(
         )
     function, target, position = entry
     hook = named.get(target) if isinstance(target, str) else None
-    return make_handler(function, hook or _find_target(target), position, owner)
+    return Handler(function, hook or _find_target(target), position, owner)
 
 
 class Plugins:
@@ -337,7 +329,7 @@ class Plugins:
 
     memory: dict[Any, Any] | None = None
 
-    def __init__(self, entries: Iterable[Entry], named: Mapping[str, Hook] = _NO_NAMES) -> None:
+    def __init__(self, entries: Iterable[Entry], named: Mapping[str, Hook]) -> None:
         """Find the targets, and check that the handlers fit.
 
         ``named`` has the names that the simulation defines.

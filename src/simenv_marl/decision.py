@@ -7,7 +7,7 @@ decision point, its hook, with any number of definitions.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from functools import update_wrapper
 from types import FunctionType
 from typing import Any, Final
@@ -32,7 +32,7 @@ Labels = Mapped | Mapping[Any, str] | Sequence[str] | None
 # -- definitions ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Definition:
     """The definition of a decision point: how an environment observes, decides and rewards it.
 
@@ -41,7 +41,6 @@ class Definition:
     ``make_step``.
     """
 
-    _: KW_ONLY
     observation_space: spaces.Space[Any]
     observation_space_mapping: Mapped
     action_space: spaces.Space[Any]
@@ -291,13 +290,13 @@ def fit_labels(space: spaces.Space[Any], labels: object) -> bool:
     elif isinstance(space, spaces.Dict):
         parts = space.spaces
     elif space.shape is not None and len(space.shape) == 1:
-        parts = range(space.shape[0])
+        parts = range(*space.shape)
+    texts = None
     if isinstance(labels, Mapping):
-        texts = list(labels.values()) if set(labels) == set(parts) else None
-    elif isinstance(labels, str) or isinstance(space, spaces.Dict):
-        texts = None
-    else:
-        texts = list(labels) if isinstance(labels, Sequence) else None
+        if set(labels) == set(parts):
+            texts = list(labels.values())
+    elif isinstance(labels, Sequence) and not isinstance(space, spaces.Dict):
+        texts = None if isinstance(labels, str) else list(labels)
     if texts is None or len(texts) != len(parts):
         return False
     if not all(isinstance(text, str) for text in texts):
@@ -343,7 +342,7 @@ def point_for(hook: Hook) -> DecisionPoint:
     Raises:
         PatchError: The hook's function is not written in Python.
     """
-    if not isinstance(hook.function, FunctionType):
+    if hook.kind == "iterable" or not isinstance(hook.function, FunctionType):
         raise PatchError(
             f"{hook.name} cannot be a decision point: it is not a function written in Python"
         )

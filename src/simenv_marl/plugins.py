@@ -29,12 +29,10 @@ from .hooks.handlers import (
 from .hooks.hook import Hook, hook_of, hooks, rebind
 from .hooks.places import (
     find_hook,
-    hook_at,
     is_importable,
     permanent_hook,
-    raw_attribute,
-    resolve,
     split_binding,
+    target_of,
 )
 from .hooks.stacks import LOCK
 
@@ -91,8 +89,11 @@ def _entry(handler: Handler) -> Entry:
 
 def _process_handlers(target: Hook) -> list[Handler]:
     """Return the handlers of a target that users have attached for the whole process."""
-    present = [handler for handler in target.handlers if handler.owner is None]
-    return [handler for handler in present if handler.position is not TRACE]
+    return [
+        handler
+        for handler in target.handlers
+        if handler.owner is None and handler.position is not TRACE
+    ]
 
 
 # -- targets --------------------------------------------------------------------------------------
@@ -120,7 +121,7 @@ def expose_to_plugins(function_or_iterable: Thing) -> Thing:
 
 
 def _expose(thing: Any) -> Any:
-    if _target_of_proxy(thing) is not None:
+    if target_of(thing) is not None:
         return thing
     if isinstance(thing, _FUNCTIONS):
         return _expose_function(thing)
@@ -155,39 +156,6 @@ def _expose_function(function: Any) -> Any:
     return function if unchanged else rebind(wrapper, binding)
 
 
-def _target_of_proxy(thing: Any) -> Hook | None:
-    """Return the target of an exposed iterable; None for anything else."""
-    return thing._self_target if hasattr(type(thing), "_self_next") else None
-
-
-def _find_target(target: Any) -> Hook:
-    """Find a target of handlers: a function, an exposed iterable, or the name of one of these."""
-    if isinstance(target, str):
-        return _find_named_target(target)
-    if isinstance(target, _FUNCTIONS):
-        return find_hook(target, UnknownTargetError)
-    hook = _target_of_proxy(target)
-    if hook is None:
-        raise PatchError(
-            f"no handlers can be attached to {short_repr(target)}: pass what expose_to_plugins"
-            " returns for it, or the dotted name of a function"
-        )
-    return hook
-
-
-def _find_named_target(name: str) -> Hook:
-    try:
-        owner, attribute = resolve(name, UnknownTargetError)
-    except (UnknownTargetError, PatchError):
-        # A function that was exposed inside another one: the latest of this name.
-        for hook in reversed(hooks()):
-            if hook.name == name and hook.exposed:
-                return hook
-        raise
-    target = _target_of_proxy(raw_attribute(owner, attribute))
-    return target or hook_at(name, owner, attribute, UnknownTargetError)
-
-
 # -- handlers -------------------------------------------------------------------------------------
 
 
@@ -212,7 +180,7 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        hook = _find_target(target)
+        hook = find_hook(target, UnknownTargetError)
         hook.install(None, Handler(handler, hook, position))
 
 
@@ -230,7 +198,7 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
         HandlerError: There is no such handler.
     """
     with LOCK:
-        hook = _find_target(target)
+        hook = find_hook(target, UnknownTargetError)
         present = _process_handlers(hook)
         chosen = [
             attached
@@ -287,7 +255,9 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
     calls: list[Call] = []
     with LOCK:
         if functions:
-            targets = list(dict.fromkeys(_find_target(function) for function in functions))
+            targets = list(
+                dict.fromkeys(find_hook(function, UnknownTargetError) for function in functions)
+            )
         else:
             targets = [hook for hook in hooks() if hook.permanent or hook.slot]
     traced = [target for target in targets if CALLS[0] in target.positions]
@@ -310,7 +280,7 @@ def _make_handler(entry: Entry, named: Mapping[str, Hook], owner: Hashable = Non
         )
     function, target, position = entry
     hook = named.get(target) if isinstance(target, str) else None
-    return Handler(function, hook or _find_target(target), position, owner)
+    return Handler(function, hook or find_hook(target, UnknownTargetError), position, owner)
 
 
 class Plugins:

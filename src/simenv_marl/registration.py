@@ -54,30 +54,26 @@ def register_simulation(
     Raises:
         SimEnvError: An argument is invalid. The subclass says which.
     """
-    if name is None:
-        if not hasattr(simulation, "environment_arguments"):  # it is not a variant
-            raise OptionValueError("register_simulation needs a name= for the ids")
+    if name is None and hasattr(simulation, "environment_arguments"):  # a variant
         name = simulation.name
     if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
         raise OptionValueError(
-            f"name must consist of letters, digits, _ and -, not {short_repr(name)}"
+            f"name= must consist of letters, digits, _ and -, not {short_repr(name)}"
         )
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
     plan = Plan(simulation, points, options)
     recipe = f"{name}-v{version}"
     _RECIPES[recipe] = simulation, points, options
-    single = [point for point in plan.active if point.agent or plan.one_agent]
-    titles = _titles([point.hook.name for point in single])
+    origin = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
+    entry_point = f"{__name__}:make_view"
+    single = {point.hook.name: point for point in plan.active if point.agent or plan.one_agent}
     views: dict[str, dict[str, str | None]] = {}
-    for title, point in zip(titles, single, strict=True):
+    for title, point in zip(_titles(list(single)), single.values(), strict=True):
         views[title] = {"view": "single", "agent": point.agent or plan.one_agent}
         if point.agent is not None:  # the view has no other agents, and so no roster
             views[title] |= {"possible_agents": None, "undeclared": "error"}
     views["Joint"] = {"view": "joint"}
-    module = sys._getframe(1).f_globals.get("__name__", "__main__")
-    origin = {"recipe": recipe, "module": module}
-    entry_point = f"{__name__}:make_view"
     ids: list[str] = []
     for title, view in views.items():
         identity = f"{name}/{title}-v{version}"
@@ -108,14 +104,15 @@ def _titles(points: list[str]) -> list[str]:
     another point has the same title.
     """
     names = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
-    functions = [_camel(name, 1) for name in names]
-    methods = [_camel(name, 2) for name in names]
+    styles = [[_camel(name, 1) for name in names], [_camel(name, 2) for name in names], names]
     titles: list[str] = []
-    for candidates in zip(functions, methods, names, strict=True):
-        for title, style in zip(candidates, (functions, methods, names), strict=True):
-            if [*style, "Joint"].count(title) == 1:
-                titles.append(title)
-                break
+    for candidates in zip(*styles, strict=True):
+        unique = (
+            title
+            for title, style in zip(candidates, styles, strict=True)
+            if [*style, "Joint"].count(title) == 1
+        )
+        titles.append(next(unique))
     return titles
 
 

@@ -8,10 +8,16 @@ handlers around it; at the end it removes the entry.
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Callable, Collection, Hashable
 from functools import partial, update_wrapper
+from inspect import (
+    Parameter,
+    Signature,
+    isasyncgenfunction,
+    iscoroutinefunction,
+    isgeneratorfunction,
+)
 from threading import current_thread, local
 from types import FunctionType
 from typing import Any, Final
@@ -144,26 +150,25 @@ class _Code(str):
         return str(self)
 
 
-def _make_binder(signature: inspect.Signature) -> Callable[..., Bound]:
+def _make_binder(signature: Signature) -> Callable[..., Bound]:
     """Make a function that returns its arguments: by position where possible, with defaults."""
-    defaults: dict[str, Model] = {}
-    declared: list[inspect.Parameter] = []
+    declared: list[Parameter] = []
     placed = ""
     named = ""
     for name, p in signature.parameters.items():
-        default = p.default
-        if default is not p.empty:
-            defaults[name] = default
-            default = _Code(f"defaults[{name!r}]")
-        declared.append(inspect.Parameter(name, p.kind, default=default))
-        if p.kind is p.VAR_KEYWORD:
-            named += f"**{name}, "
+        default = p.empty if p.default is p.empty else _Code(f"defaults[{name!r}]")
+        declared.append(Parameter(name, p.kind, default=default))
+        if p.kind in POSITIONAL:
+            placed += f"{name}, "
+        elif p.kind is p.VAR_POSITIONAL:
+            placed += f"*{name}, "
         elif p.kind is p.KEYWORD_ONLY:
             named += f"{name!r}: {name}, "
         else:
-            placed += f"*{name}, " if p.kind is p.VAR_POSITIONAL else f"{name}, "
+            named += f"**{name}, "
+    defaults = {name: p.default for name, p in signature.parameters.items()}
     scope: dict[str, Any] = {"defaults": defaults}
-    exec(f"def bind{inspect.Signature(declared)}: return ({placed}), {{{named}}}", scope)
+    exec(f"def bind{Signature(declared)}: return ({placed}), {{{named}}}", scope)
     bind: Callable[..., Bound] = scope["bind"]
     return bind
 
@@ -516,14 +521,14 @@ def kind_of(function: Callable[..., Any], name: str) -> str:
     Raises:
         PatchError: It is an async generator function.
     """
-    if inspect.isasyncgenfunction(function):
+    if isasyncgenfunction(function):
         raise PatchError(
             f"{name} is an async generator function, which cannot return a decision or call"
             " handlers"
         )
-    if inspect.isgeneratorfunction(function):
+    if isgeneratorfunction(function):
         return "generator"
-    return "coroutine" if inspect.iscoroutinefunction(function) else "function"
+    return "coroutine" if iscoroutinefunction(function) else "function"
 
 
 _HOOKS: Final[WeakValueDictionary[int, Hook]] = WeakValueDictionary()

@@ -20,9 +20,12 @@ from .errors import DefinitionError, PatchError, name_of, short_repr
 from .hooks.hook import Hook, hook_of, hooks, made_with, rebind
 from .hooks.places import permanent_hook
 from .hooks.stacks import DIFFERENCES, EVALUATING
-from .simulation import Model
+from .simulation import Function, Model
 
-Mapped = Callable[..., Any]
+Space = spaces.Space[Any]
+"""A space of Gymnasium."""
+
+Mapped = Function
 """A mapping: a callable of the decision call's arguments, bound to the function's signature."""
 
 Labels = Mapped | Mapping[Any, str] | Sequence[str] | None
@@ -41,11 +44,11 @@ class Definition:
     ``make_step``.
     """
 
-    observation_space: spaces.Space[Any]
+    observation_space: Space
     observation_space_mapping: Mapped
-    action_space: spaces.Space[Any]
+    action_space: Space
     reward_mapping: Mapped
-    action_space_mapping: Callable[[Any], Any] | None
+    action_space_mapping: Function | None
     apply: Mapped | None
     choices: Mapped | None
     split: Mapped | None
@@ -55,10 +58,10 @@ class Definition:
     agent: str | Mapped | None
     action_mask_mapping: Mapped | None
     removed_by: Mapping[str, Mapped | None]
-    goal_space: spaces.Space[Any] | None
+    goal_space: Space | None
     achieved_goal_mapping: Mapped | None
     desired_goal_mapping: Mapped | None
-    compute_reward: Callable[[Any, Any, Any], Any] | None
+    compute_reward: Function | None
     action_labels: Labels
     observation_labels: Labels
 
@@ -106,10 +109,10 @@ class Definition:
 
 def make_step(
     *,
-    observation_space: spaces.Space[Any],
+    observation_space: Space,
     observation_space_mapping: Mapped,
-    action_space: spaces.Space[Any],
-    action_space_mapping: Callable[[Any], Any] | Mapping[Any, Any] | None = None,
+    action_space: Space,
+    action_space_mapping: Function | Mapping[Any, Any] | None = None,
     reward_mapping: Mapped,
     apply: Mapped | None = None,
     choices: Mapped | None = None,
@@ -120,10 +123,10 @@ def make_step(
     agent: str | Mapped | None = None,
     action_mask_mapping: Mapped | None = None,
     removed_by: str | Iterable[str] | Mapping[str, Mapped | None] = (),
-    goal_space: spaces.Space[Any] | None = None,
+    goal_space: Space | None = None,
     achieved_goal_mapping: Mapped | None = None,
     desired_goal_mapping: Mapped | None = None,
-    compute_reward: Callable[[Any, Any, Any], Any] | None = None,
+    compute_reward: Function | None = None,
     action_labels: Labels = None,
     observation_labels: Labels = None,
 ) -> Definition:
@@ -282,7 +285,7 @@ def _actions(space: spaces.Discrete) -> range:
     return range(int(space.start), int(space.start + space.n))
 
 
-def fit_labels(space: spaces.Space[Any], labels: object) -> bool:
+def fit_labels(space: Space, labels: object) -> bool:
     """Return whether labels are texts for the parts of a space."""
     parts: Collection[int | str] = ()
     if isinstance(space, spaces.Discrete):

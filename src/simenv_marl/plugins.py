@@ -8,7 +8,7 @@ option ``plugins``). A function without handlers costs nothing extra; or one tes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from types import FunctionType, MethodType
@@ -35,6 +35,7 @@ from .hooks.places import (
     target_of,
 )
 from .hooks.stacks import LOCK
+from .simulation import Function
 
 __all__ = [
     "Call",
@@ -52,7 +53,7 @@ __all__ = [
 
 Thing = TypeVar("Thing")
 
-Entry = tuple[Callable[..., Any], Any, str]
+Entry = tuple[Function, Any, str]
 """A handler, its target, and its position."""
 
 _FUNCTIONS: Final = (staticmethod, classmethod, FunctionType, MethodType)
@@ -159,7 +160,7 @@ def _expose_function(function: Any) -> Any:
 # -- handlers -------------------------------------------------------------------------------------
 
 
-def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> None:
+def attach_handler(handler: Function, target: Any, position: str) -> None:
     """Attach a handler to a function, for the whole process (paper, section 3.4).
 
     Args:
@@ -184,7 +185,7 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         hook.install(None, Handler(handler, hook, position))
 
 
-def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
+def remove_handler(target: Any, position: str, handler: Function | None = None) -> None:
     """Remove a handler that ``attach_handler`` attached.
 
     Args:

@@ -26,7 +26,7 @@ from weakref import WeakValueDictionary, finalize
 from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
-from ..simulation import POSITIONAL, Model, signature_of
+from ..simulation import POSITIONAL, Function, Model, signature_of
 from .handlers import CALLS, ITEMS, Handler, Slot, each, make_slots, run, wait
 from .stacks import (
     EVALUATING,
@@ -267,7 +267,7 @@ class Hook:
 
     def __init__(
         self,
-        function: Callable[..., Any],
+        function: Function,
         name: str,
         *,
         bound: bool | None = None,
@@ -301,7 +301,7 @@ class Hook:
         self.interceptors = Interceptors(self)
         self.threads: set[str] = set()
         self.definition: Any = None
-        self.removed_by: dict[Any, Callable[..., Any] | None] = {}
+        self.removed_by: dict[Any, Function | None] = {}
         self.slot: dict[Hashable, Slot] = {}
         self._applied = False
         # The users of each handler, and of the hook itself under None, in the order of arrival.
@@ -434,7 +434,7 @@ class Hook:
         """Run the rule."""
         return self.rule(*args, **kwargs)
 
-    def replace_rule(self, rule: Callable[..., Any] | None = None) -> None:
+    def replace_rule(self, rule: Function | None = None) -> None:
         """Replace the rule; None restores the function."""
         self.rule = rule or self.function
         self._update()
@@ -515,7 +515,7 @@ _POSITIONS: Final = {
 }
 
 
-def kind_of(function: Callable[..., Any], name: str) -> str:
+def kind_of(function: Function, name: str) -> str:
     """Return the kind of a function with a dotted name.
 
     Raises:
@@ -540,9 +540,7 @@ def hooks() -> list[Hook]:
     return [hook for reference in _HOOKS.valuerefs() if (hook := reference()) is not None]
 
 
-def _restore(
-    function: Callable[..., Any], name: str, bound: bool, kind: str, exposed: bool
-) -> Hook:
+def _restore(function: Function, name: str, bound: bool, kind: str, exposed: bool) -> Hook:
     """Return the hook of an unpickled function: an existing one, or a new one."""
     for hook in hooks():
         if hook.function is function and hook.name == name:

@@ -133,11 +133,11 @@ def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
     no such class, and therefore applies Gymnasium's wrapper itself.
     """
     simulation, points, options = _recall(recipe, module, view, options)
+    mode = options.pop("render_mode", None)
     plan = Plan(simulation, points, {**options, "render_mode": None})
-    mode = options.get("render_mode")
     modes = plan.render_modes
-    shows_images = mode == "human" and mode not in modes and "rgb_array" in modes
-    if shows_images and view in ("single", "joint"):
+    in_window = mode == "human" and mode not in modes and "rgb_array" in modes
+    if in_window and view in ("single", "joint"):
         images = plan.amended({"render_mode": "rgb_array"})
         return HumanRendering(view_class(plan, view)(images))
     return view_class(plan, view)(plan.amended({"render_mode": mode}))

@@ -312,8 +312,8 @@ class Hook:
         return f"<{type(self).__name__} {self.name}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        arguments = (self.function, self.name, self.bound, self.kind, self.exposed)
-        return _restore, arguments, self.definition
+        properties = {"bound": self.bound, "kind": self.kind, "exposed": self.exposed}
+        return _restore, (self.function, self.name, properties), self.definition
 
     def __setstate__(self, definition: Any) -> None:
         """Set the definition after unpickling, unless the hook has one of this process."""
@@ -385,12 +385,12 @@ class Hook:
 
     def _interceptor_at(self, here: greenlet) -> Interceptor:
         driver = (stack_of(here) or spawner_of(here)) if STACKS else None
-        evaluation = EVALUATING.get(here) if driver is None else driver
-        plugins = None if evaluation is None else evaluation.plugins
+        evaluation = driver or EVALUATING.get(here)
         decide = None if driver is None else driver.interceptor(self)
         if here.parent is None and here not in STACKS:
             _THREAD_ROOT.register(here)
             self.threads.add(current_thread().name)
+        plugins = None if evaluation is None else evaluation.plugins
         return self.around(decide or self.run_rule, plugins)
 
     # -- interceptors -----------------------------------------------------------------------------
@@ -540,9 +540,9 @@ def hooks() -> list[Hook]:
     return [hook for reference in _HOOKS.valuerefs() if (hook := reference()) is not None]
 
 
-def _restore(function: Function, name: str, bound: bool, kind: str, exposed: bool) -> Hook:
+def _restore(function: Function, name: str, properties: dict[str, Any]) -> Hook:
     """Return the hook of an unpickled function: an existing one, or a new one."""
     for hook in hooks():
         if hook.function is function and hook.name == name:
             return hook
-    return Hook(function, name, bound=bound, kind=kind, exposed=exposed)
+    return Hook(function, name, **properties)

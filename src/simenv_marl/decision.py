@@ -262,7 +262,11 @@ def _problems(definition: Definition) -> Iterator[str]:
         )
 
 
-def _required_kind(definition: Definition, name: str, part: object) -> str | None:
+def _required_kind(
+    definition: Definition,
+    name: str,
+    part: object,
+) -> str | None:
     """Return the kind of value that a part must be; None if the part is of this kind."""
     if name.endswith("_space"):
         return None if isinstance(part, spaces.Space) else "a gymnasium space"

@@ -160,7 +160,11 @@ def _expose_function(function: Any) -> Any:
 # -- handlers -------------------------------------------------------------------------------------
 
 
-def attach_handler(handler: Function, target: Any, position: str) -> None:
+def attach_handler(
+    handler: Function,
+    target: Any,
+    position: str,
+) -> None:
     """Attach a handler to a function, for the whole process (paper, section 3.4).
 
     Args:
@@ -185,7 +189,11 @@ def attach_handler(handler: Function, target: Any, position: str) -> None:
         hook.install(None, Handler(handler, hook, position))
 
 
-def remove_handler(target: Any, position: str, handler: Function | None = None) -> None:
+def remove_handler(
+    target: Any,
+    position: str,
+    handler: Function | None = None,
+) -> None:
     """Remove a handler that ``attach_handler`` attached.
 
     Args:
@@ -270,7 +278,11 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
         installation.uninstall()
 
 
-def _make_handler(entry: Entry, named: Mapping[str, Hook], owner: Hashable = None) -> Handler:
+def _make_handler(
+    entry: Entry,
+    named: Mapping[str, Hook],
+    owner: Hashable = None,
+) -> Handler:
     """Return a handler for an entry.
 
     ``named`` has names that take precedence over importable names.

@@ -125,7 +125,12 @@ def _camel(name: str, parts: int) -> str:
 # -- entry points ---------------------------------------------------------------------------------
 
 
-def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
+def make_view(
+    recipe: str,
+    module: str,
+    view: str,
+    **options: Any,
+) -> Any:
     """Make an environment of a registered simulation.
 
     For a simulation with images but without the mode "human", Gymnasium would show the images
@@ -143,7 +148,12 @@ def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
     return view_class(plan, view)(plan.amended({"render_mode": mode}))
 
 
-def make_vector_view(recipe: str, module: str, view: str, **options: Any) -> SimulationVectorEnv:
+def make_vector_view(
+    recipe: str,
+    module: str,
+    view: str,
+    **options: Any,
+) -> SimulationVectorEnv:
     """Make a vector environment.
 
     ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, limits ``max_steps``.
@@ -155,7 +165,10 @@ def make_vector_view(recipe: str, module: str, view: str, **options: Any) -> Sim
 
 
 def _recall(
-    recipe: str, module: str, view: str, options: dict[str, Any]
+    recipe: str,
+    module: str,
+    view: str,
+    options: dict[str, Any],
 ) -> tuple[Model, Points, dict[str, Any]]:
     """Return the simulation and the points of a recipe, and its options for a view."""
     if recipe not in _RECIPES and module != "__main__":

@@ -100,13 +100,12 @@ def _source(hook: Hook, reserved: Collection[str]) -> str:
     named_only = [p for p in parameters if p.kind is p.KEYWORD_ONLY]
     names = [f"_{number}" for number in range(len(positional))]
     only_self = hook.bound and len(parameters) == len(required) == 1
+    nothing = hook.signature is not None and not parameters
     incomplete = "True"
     doubtful = "True"
     accepted = "*args, **kwargs"
     passed = "args"
-    if hook.signature is not None and (
-        not parameters or (only_self and required[0] not in reserved)
-    ):
+    if nothing or (only_self and required[0] not in reserved):
         incomplete = ""
         # A staticmethod that looks like a method may receive its argument by keyword.
         names = required
@@ -150,7 +149,7 @@ class _Code(str):
         return str(self)
 
 
-def _make_binder(signature: Signature) -> Callable[..., Bound]:
+def _make_binder(signature: Signature) -> Any:
     """Make a function that returns its arguments: by position where possible, with defaults."""
     declared: list[Parameter] = []
     placed = ""
@@ -169,8 +168,7 @@ def _make_binder(signature: Signature) -> Callable[..., Bound]:
     defaults = {name: p.default for name, p in signature.parameters.items()}
     scope: dict[str, Any] = {"defaults": defaults}
     exec(f"def bind{Signature(declared)}: return ({placed}), {{{named}}}", scope)
-    bind: Callable[..., Bound] = scope["bind"]
-    return bind
+    return scope["bind"]
 
 
 def unbind(value: object) -> object:
@@ -354,10 +352,7 @@ class Hook:
             "rule": self.function,
         }
         exec(compile(_source(self, scope), f"<wrapper of {self.name}>", "exec"), scope)
-        template = scope.pop("wrapper")
-        # Tracebacks show the name of the code.
-        code = template.__code__.replace(co_name=getattr(self.function, "__name__", "call"))
-        wrapper = FunctionType(code, scope, argdefs=template.__defaults__)
+        wrapper: FunctionType = scope.pop("wrapper")
         update_wrapper(wrapper, self.function)
         vars(wrapper)[_MADE_WITH] = made_with
         return wrapper
@@ -395,7 +390,12 @@ class Hook:
 
     # -- interceptors -----------------------------------------------------------------------------
 
-    def enter(self, stack: greenlet, decide: Interceptor | None, plugins: Hashable | None) -> None:
+    def enter(
+        self,
+        stack: greenlet,
+        decide: Interceptor | None,
+        plugins: Hashable | None,
+    ) -> None:
         """Enter an interceptor for calls on the stack of a simulation.
 
         Args:
@@ -540,7 +540,11 @@ def hooks() -> list[Hook]:
     return [hook for reference in _HOOKS.valuerefs() if (hook := reference()) is not None]
 
 
-def _restore(function: Function, name: str, properties: dict[str, Any]) -> Hook:
+def _restore(
+    function: Function,
+    name: str,
+    properties: dict[str, Any],
+) -> Hook:
     """Return the hook of an unpickled function: an existing one, or a new one."""
     for hook in hooks():
         if hook.function is function and hook.name == name:

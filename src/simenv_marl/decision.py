@@ -17,8 +17,8 @@ from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, name_of, short_repr
-from .hooks.hook import Hook, hook_of, hooks, made_with, rebind
-from .hooks.places import permanent_hook
+from .hooks.hook import Hook, hook_of, hooks, made_with
+from .hooks.places import decorate
 from .hooks.stacks import DIFFERENCES, EVALUATING
 from .simulation import Function, Model
 
@@ -101,10 +101,10 @@ class Definition:
         Raises:
             PatchError: ``function`` is none of these.
         """
-        hook, binding = permanent_hook(function)
-        wrapper = point_for(hook).make_wrapper(self)
-        hook.define(self)
-        return rebind(wrapper, binding)
+        hook = hook_of(function)
+        if hook is not None:
+            point_for(hook)  # refuses an exposed builtin
+        return decorate(function, self)
 
 
 def make_step(

@@ -28,9 +28,9 @@ from .hooks.handlers import (
 )
 from .hooks.hook import Hook, hook_of, hooks, rebind
 from .hooks.places import (
+    decorate,
     find_hook,
     is_importable,
-    permanent_hook,
     split_binding,
     target_of,
 )
@@ -78,8 +78,7 @@ def attached_handlers(env: Any = None) -> list[Entry]:
         A list of tuples: the handler, the dotted name of its target, and its position.
     """
     if env is not None:
-        entries: list[Entry] = env.unwrapped.plugins
-        return entries
+        return list(env.unwrapped.plugins)
     targets = sorted(hooks(), key=lambda target: target.name)
     return [_entry(handler) for target in targets for handler in _process_handlers(target)]
 
@@ -149,12 +148,12 @@ def _expose(thing: Any) -> Any:
 def _expose_function(function: Any) -> Any:
     wrapper, binding = split_binding(function)
     hook = hook_of(wrapper)
-    if hook is None or not hook.permanent:  # it is neither decorated nor exposed yet
-        hook, _ = permanent_hook(function)
-        wrapper = hook.make_wrapper()
-    hook.expose()
-    unchanged = getattr(function, "__func__", None) is wrapper
-    return function if unchanged else rebind(wrapper, binding)
+    if hook is None or not hook.permanent:
+        return decorate(function, exposed=True)
+    hook.make_permanent(None, exposed=True)  # it is decorated or exposed already
+    return (
+        function if isinstance(function, (staticmethod, classmethod)) else rebind(wrapper, binding)
+    )
 
 
 # -- handlers -------------------------------------------------------------------------------------
@@ -326,7 +325,7 @@ class Plugins:
                 importable = is_importable(handler.target.name)
                 self.portable.append(_entry(handler) if importable else entry)
         self.entries = [_entry(handler) for handler in self.handlers]
-        self.hooks: dict[Hook, None] = dict.fromkeys(handler.target for handler in self.handlers)
+        self.hooks = {handler.target for handler in self.handlers}
 
     @property
     def plugins(self) -> Plugins:

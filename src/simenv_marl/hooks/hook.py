@@ -165,8 +165,9 @@ def _make_binder(signature: Signature) -> Any:
             named += f"{name!r}: {name}, "
         else:
             named += f"**{name}, "
-    defaults = {name: p.default for name, p in signature.parameters.items()}
-    scope: dict[str, Any] = {"defaults": defaults}
+    scope: dict[str, Any] = {
+        "defaults": {name: p.default for name, p in signature.parameters.items()},
+    }
     exec(f"def bind{Signature(declared)}: return ({placed}), {{{named}}}", scope)
     return scope["bind"]
 
@@ -327,17 +328,11 @@ class Hook:
         """The letters of the function's name in lower case, for the default name of its agent."""
         return re.sub("[^a-z]", "", self.name.rpartition(".")[2].lower()) or "agent"
 
-    def define(self, definition: Any) -> None:
-        """Set the latest definition."""
-        self.definition = definition
-
-    def make_permanent(self) -> None:
-        """Note that a wrapper of the hook was set permanently."""
+    def make_permanent(self, definition: Any, exposed: bool) -> None:
+        """Note that a wrapper was set permanently: for a definition, or exposed to plugins."""
         self.permanent = True
-
-    def expose(self) -> None:
-        """Expose the function to plugins."""
-        self.exposed = True
+        self.definition = definition or self.definition
+        self.exposed = exposed or self.exposed
 
     def make_wrapper(self, made_with: Any = None) -> FunctionType:
         """Make a wrapper of the function, for which ``made_with(wrapper)`` returns that object."""
@@ -494,11 +489,12 @@ class Hook:
 
     def _update(self) -> None:
         """Fill the slot, and enter the stacks of simulations again."""
-        present: list[Handler] | None = None
-        # Meanwhile, garbage collection may close an environment and remove its handlers.
-        while present != (attached := self.handlers):
-            present = attached
+        while True:
+            present = self.handlers
             self.slot = make_slots(present)  # one assignment: another thread may run a call
+            # Meanwhile, garbage collection may close an environment and remove its handlers.
+            if present == self.handlers:
+                break
         changed = bool(self.slot) or self.rule is not self.function
         self.interceptors.intercept_elsewhere(self.run_rule if changed else None)
         for stack in list(self.interceptors):

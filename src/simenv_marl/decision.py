@@ -159,7 +159,7 @@ def make_step(
             length. The action mask follows from it. The decision function returns the chosen
             answer; with ``apply``, that gets the answer instead of the action.
         split: For a call that decides for many entities at once: a callable of the call's arguments
-            that returns the items, each of which is a decision. All other callables get the item
+            that returns the items, with one decision for each. All other callables get the item
             before the call's arguments (``apply`` after the action). The function must return its
             decisions, and not act in place.
         gather: With ``split``: a callable of the items, their decisions and the call's arguments.
@@ -216,7 +216,7 @@ _REQUIRED: Final = (
 
 
 def _problems(definition: Definition) -> Iterator[str]:
-    """Yield the faults of a definition: first those of its parts, then contradictions."""
+    """Yield the faults of a definition: first in single parts, then between parts."""
     for name, part in vars(definition).items():
         if name != "removed_by" and (part is not None or name in _REQUIRED):
             required = _required_kind(definition, name, part)

@@ -1,4 +1,4 @@
-"""Extensions: handlers before, after and instead of a model's functions, which stays unchanged.
+"""Extensions: handlers around a model's functions, without a change to the model (paper).
 
 Handlers are attached to functions, methods, generator and coroutine functions, and iterables: for
 the whole process (``attach_handler``), for a block (``handlers``), or for one environment (the
@@ -68,7 +68,7 @@ def exposed_functions() -> list[str]:
 
 
 def attached_handlers(env: Any = None) -> list[Entry]:
-    """Return the attached handlers, by target, in the order in which they run.
+    """Return the attached handlers, by target, in the order of their calls.
 
     Args:
         env: An environment, for the handlers of its option ``plugins``. None: the handlers of the
@@ -151,9 +151,9 @@ def _expose_function(function: Any) -> Any:
     if hook is None or not hook.permanent:
         return decorate(function, exposed=True)
     hook.make_permanent(None, exposed=True)  # it is decorated or exposed already
-    return (
-        function if isinstance(function, (staticmethod, classmethod)) else rebind(wrapper, binding)
-    )
+    if isinstance(function, (staticmethod, classmethod)):
+        return function
+    return rebind(wrapper, binding)
 
 
 # -- handlers -------------------------------------------------------------------------------------
@@ -247,7 +247,7 @@ def handlers(*entries: Entry) -> Iterator[None]:
 
 @contextmanager
 def trace(*functions: Any) -> Iterator[list[Call]]:
-    """Record the calls of a model's functions, in the order in which they begin.
+    """Record the calls of a model's functions, in the order of their beginnings.
 
     Args:
         *functions: The functions, as ``attach_handler`` takes them. If none is given: all functions
@@ -263,11 +263,9 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
     calls: list[Call] = []
     with LOCK:
         if functions:
-            targets = list(
-                dict.fromkeys(find_hook(function, UnknownTargetError) for function in functions)
-            )
+            targets = {find_hook(function, UnknownTargetError) for function in functions}
         else:
-            targets = [hook for hook in hooks() if hook.permanent or hook.slot]
+            targets = {hook for hook in hooks() if hook.permanent or hook.slot}
     traced = [target for target in targets if CALLS[0] in target.positions]
     record = partial(recorder, calls)
     installation = Installation([(target, Handler(record, target, TRACE)) for target in traced])

@@ -75,7 +75,7 @@ BOUND: Final[Kwargs] = {}
 """The keyword arguments of a call that passes each parameter by position and needs no binding."""
 
 _MADE_WITH: Final = "__simenv_marl__"
-"""The attribute of a wrapper with its hook and its object ``made_with``."""
+"""The attribute of a wrapper with the object that it was made with."""
 
 _RETURN: Final = {
     "function": "return {}",
@@ -193,7 +193,7 @@ def hook_of(value: object) -> Hook | None:
 
 
 def made_with(wrapper: object) -> Any:
-    """Return the object that a wrapper was made with."""
+    """Return the object that a wrapper was made with: a definition or None."""
     return vars(unbind(wrapper))[_MADE_WITH]
 
 
@@ -244,7 +244,7 @@ class Hook:
     users: handlers and environments.
 
     Attributes:
-        function: The function. Its signature is its own, not that of a function that it wraps.
+        function: The function.
         rule: The innermost part of a call: the function, or its temporary replacement.
         name: The dotted name of the function.
         kind: The result of a call: "function" (a value), "generator" or "coroutine"; or "iterable".
@@ -278,7 +278,7 @@ class Hook:
         Args:
             function: The function.
             name: The dotted name.
-            bound: See ``Hook``. None: whether the name is that of a class's attribute.
+            bound: See ``Hook``. None: whether the function is an attribute of a class, by its name.
             kind: See ``Hook``. None: the kind of the function.
             exposed: Whether the function is exposed to plugins.
 
@@ -335,7 +335,7 @@ class Hook:
         self.exposed = exposed or self.exposed
 
     def make_wrapper(self, made_with: Any = None) -> FunctionType:
-        """Make a wrapper of the function, for which ``made_with(wrapper)`` returns that object."""
+        """Make a wrapper of the function. ``made_with`` returns the given object for it."""
         scope: dict[str, Any] = {
             "__name__": __name__,
             "ABSENT": _ABSENT,
@@ -378,7 +378,8 @@ class Hook:
         evaluation = driver or EVALUATING.get(here)
         decide = None if driver is None else driver.interceptor(self)
         if here.parent is None and here not in STACKS:
-            _THREAD_ROOT.register(here)
+            if here not in _ROOTS:
+                _THREAD_ROOT.register(here)
             self.threads.add(current_thread().name)
         plugins = None if evaluation is None else evaluation.plugins
         return self.around(decide or self.run_rule, plugins)
@@ -531,7 +532,7 @@ _HOOKS: Final[WeakValueDictionary[int, Hook]] = WeakValueDictionary()
 
 
 def hooks() -> list[Hook]:
-    """Return all hooks, in the order in which they were made."""
+    """Return all hooks, the oldest first."""
     # The list of references is taken at once, because other threads may make hooks meanwhile.
     return [hook for reference in _HOOKS.valuerefs() if (hook := reference()) is not None]
 

@@ -1,4 +1,4 @@
-"""The stacks of simulations, and the environments for which code on a stack is evaluated.
+"""The stacks of simulations, and evaluations for an environment on the user's side.
 
 A *stack* is a greenlet; a thread without greenlets has one as well, its root. ``STACKS`` maps the
 stack of each simulation to its driver. A greenlet belongs to the simulation whose stack is the
@@ -32,7 +32,7 @@ It receives the positional and keyword arguments, and returns the call's result.
 
 
 class Evaluation(Protocol):
-    """An agent, or the plugins of an environment, for which code is evaluated."""
+    """An agent, or the plugins of an environment, while code is evaluated for it."""
 
     @property
     def plugins(self) -> Hashable | None:
@@ -47,7 +47,7 @@ LOCK: Final = RLock()
 """Protects changes of patches and handlers. Calls do not need it."""
 
 SIMULATION: Final = "simulation"
-"""The name of the threads in which simulations run."""
+"""The name of threads that run simulations."""
 
 STACKS: Final[dict[greenlet, Any]] = {}
 """The driver of each simulation by its stack, and by the root of each thread that the simulation

@@ -6,7 +6,14 @@ simulation runs in an environment, it asks the environment for its decision. One
 decision point, its hook, with any number of definitions.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass
 from functools import update_wrapper
 from types import FunctionType
@@ -76,10 +83,10 @@ class Definition:
         decisions = _decisions(self.action_space_mapping)
         if decisions is not None:
             object.__setattr__(self, "action_space_mapping", dict(decisions).__getitem__)
-        named: Any = self.removed_by
-        if isinstance(named, str):
-            named = [named]
-        removed_by = dict(named if isinstance(named, Mapping) else dict.fromkeys(named))
+        names: Any = self.removed_by
+        if isinstance(names, str):
+            names = [names]
+        removed_by = dict(names if isinstance(names, Mapping) else dict.fromkeys(names))
         for name, agent in removed_by.items():
             if not isinstance(name, str) or not (agent is None or callable(agent)):
                 raise DefinitionError(

@@ -15,7 +15,13 @@ from types import FunctionType, MethodType
 from typing import Any, Final, TypeVar
 
 from .decision import decision_points
-from .errors import HandlerError, PatchError, UnknownTargetError, name_of, short_repr
+from .errors import (
+    HandlerError,
+    PatchError,
+    UnknownTargetError,
+    name_of,
+    short_repr,
+)
 from .hooks.handlers import (
     CALLS,
     TRACE,
@@ -208,22 +214,22 @@ def remove_handler(
     with LOCK:
         hook = find_hook(target, UnknownTargetError)
         present = _process_handlers(hook)
-        chosen = [
-            attached
-            for attached in present
-            if attached.position == position and handler in (None, attached.function)
+        matches = [
+            other
+            for other in present
+            if other.position == position and handler in (None, other.function)
         ]
-        if not chosen:
+        if not matches:
             absent = "no handler is" if handler is None else f"{name_of(handler)} is not"
-            positions = sorted({attached.position for attached in present})
+            positions = sorted({other.position for other in present})
             raise HandlerError(
                 f"{absent} attached {short_repr(position)} {hook.name}; handlers are attached:"
                 f" {', '.join(positions) or 'nowhere'}"
             )
         if handler is not None:
-            chosen = chosen[-1:]
-        for removed in chosen:
-            hook.uninstall(None, removed)
+            matches = matches[-1:]
+        for match in matches:
+            hook.uninstall(None, match)
 
 
 @contextmanager
@@ -234,11 +240,11 @@ def handlers(*entries: Entry) -> Iterator[None]:
         *entries: Tuples of the arguments of ``attach_handler``: handler, target, position.
 
     Raises:
-        SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
+        SimEnvError: As ``attach_handler`` raises it; then none of the handlers is new_handlers.
     """
     with LOCK:
-        attached = [_make_handler(entry, {}) for entry in entries]
-    installation = Installation([(handler.target, handler) for handler in attached])
+        new_handlers = [_make_handler(entry, {}) for entry in entries]
+    installation = Installation([(handler.target, handler) for handler in new_handlers])
     try:
         yield
     finally:
@@ -266,9 +272,14 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
             targets = {find_hook(function, UnknownTargetError) for function in functions}
         else:
             targets = {hook for hook in hooks() if hook.permanent or hook.slot}
-    traced = [target for target in targets if CALLS[0] in target.positions]
     record = partial(recorder, calls)
-    installation = Installation([(target, Handler(record, target, TRACE)) for target in traced])
+    installation = Installation(
+        [
+            (target, Handler(record, target, TRACE))
+            for target in targets
+            if CALLS[0] in target.positions
+        ]
+    )
     try:
         yield calls
     finally:

@@ -178,8 +178,8 @@ def _recall(
             f"no simulation is registered as {recipe!r} in this process; import the module that"
             ' registers it, or make the environment by "module:id"'
         )
-    simulation, points, registered = _RECIPES[recipe]
-    merged: dict[str, Any] = {**registered, **options}
+    simulation, points, defaults = _RECIPES[recipe]
+    all_options: dict[str, Any] = {**defaults, **options}
     if view != "joint" and "flatten" not in options:
-        merged["flatten"] = False  # an option of the joint view alone
-    return simulation, points, merged
+        all_options["flatten"] = False  # an option of the joint view alone
+    return simulation, points, all_options

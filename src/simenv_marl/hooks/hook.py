@@ -27,7 +27,16 @@ from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
 from ..simulation import POSITIONAL, Function, Model, signature_of
-from .handlers import CALLS, ITEMS, Handler, Slot, each, make_slots, run, wait
+from .handlers import (
+    CALLS,
+    ITEMS,
+    Handler,
+    Slot,
+    each,
+    make_slots,
+    run,
+    wait,
+)
 from .stacks import (
     EVALUATING,
     LOCK,
@@ -101,36 +110,36 @@ def _source(hook: Hook, reserved: Collection[str]) -> str:
     names = [f"_{number}" for number in range(len(positional))]
     only_self = hook.bound and len(parameters) == len(required) == 1
     nothing = hook.signature is not None and not parameters
-    incomplete = "True"
-    doubtful = "True"
-    accepted = "*args, **kwargs"
-    passed = "args"
+    is_incomplete = "True"
+    may_not_fit = "True"
+    declaration = "*args, **kwargs"
+    arguments = "args"
     if nothing or (only_self and required[0] not in reserved):
-        incomplete = ""
+        is_incomplete = ""
         # A staticmethod that looks like a method may receive its argument by keyword.
         names = required
-        accepted = ", ".join(names)
+        declaration = ", ".join(names)
     elif (
         positional
         and all(p.kind is not p.VAR_POSITIONAL for p in parameters)
         and all(p.default is not p.empty for p in named_only)
     ):
-        incomplete = f"kwargs or {names[-1]} is ABSENT"
-        doubtful = f"kwargs or len(args) < {len(required)}"
-        accepted = ", ".join(f"{name}=ABSENT" for name in names) + ", /, **kwargs"
-        passed = "()"
+        is_incomplete = f"kwargs or {names[-1]} is ABSENT"
+        may_not_fit = f"kwargs or len(args) < {len(required)}"
+        declaration = ", ".join(f"{name}=ABSENT" for name in names) + ", /, **kwargs"
+        arguments = "()"
         for number, name in enumerate(names, start=1):
-            passed = f"({', '.join(names[:number])},) if {name} is not ABSENT else {passed}"
+            arguments = f"({', '.join(names[:number])},) if {name} is not ABSENT else {arguments}"
     values = "".join(f"{name}, " for name in names)
     result = _RETURN[hook.kind].format
-    source = f"def wrapper({accepted}):"
+    source = f"def wrapper({declaration}):"
     if hook.kind == "coroutine":
         source = f"async {source}"
-    if incomplete:
+    if is_incomplete:
         source += f"""
-    if {incomplete}:
-        args = {passed}
-        if {_RULE_DECIDES} or ({doubtful}) and fits(args, kwargs) is None:
+    if {is_incomplete}:
+        args = {arguments}
+        if {_RULE_DECIDES} or ({may_not_fit}) and fits(args, kwargs) is None:
             {result("rule(*args, **kwargs)")}
         {result(f"{_INTERCEPT}(args, kwargs)")}"""
     return f"""{source}
@@ -151,24 +160,24 @@ class _Code(str):
 
 def _make_binder(signature: Signature) -> Any:
     """Make a function that returns its arguments: by position where possible, with defaults."""
-    declared: list[Parameter] = []
-    placed = ""
-    named = ""
+    parameters: list[Parameter] = []
+    args = ""
+    kwargs = ""
     for name, p in signature.parameters.items():
         default = p.empty if p.default is p.empty else _Code(f"defaults[{name!r}]")
-        declared.append(Parameter(name, p.kind, default=default))
+        parameters.append(Parameter(name, p.kind, default=default))
         if p.kind in POSITIONAL:
-            placed += f"{name}, "
+            args += f"{name}, "
         elif p.kind is p.VAR_POSITIONAL:
-            placed += f"*{name}, "
+            args += f"*{name}, "
         elif p.kind is p.KEYWORD_ONLY:
-            named += f"{name!r}: {name}, "
+            kwargs += f"{name!r}: {name}, "
         else:
-            named += f"**{name}, "
+            kwargs += f"**{name}, "
     scope: dict[str, Any] = {
         "defaults": {name: p.default for name, p in signature.parameters.items()},
     }
-    exec(f"def bind{Signature(declared)}: return ({placed}), {{{named}}}", scope)
+    exec(f"def bind{Signature(parameters)}: return ({args}), {{{kwargs}}}", scope)
     return scope["bind"]
 
 

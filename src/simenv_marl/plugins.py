@@ -162,6 +162,18 @@ def _expose_function(function: Any) -> Any:
     return rebind(wrapper, binding)
 
 
+def _find_target(target: Any) -> Hook:
+    """Find the hook of a function, an exposed iterable, or a name for one of these."""
+    try:
+        return find_hook(target, UnknownTargetError)
+    except (UnknownTargetError, PatchError):
+        # A function that was exposed inside another function: the latest of this name.
+        for hook in reversed(hooks()):
+            if hook.exposed and hook.name == target:
+                return hook
+        raise
+
+
 # -- handlers -------------------------------------------------------------------------------------
 
 
@@ -190,7 +202,7 @@ def attach_handler(
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        hook = find_hook(target, UnknownTargetError)
+        hook = _find_target(target)
         hook.install(None, Handler(handler, hook, position))
 
 
@@ -212,7 +224,7 @@ def remove_handler(
         HandlerError: There is no such handler.
     """
     with LOCK:
-        hook = find_hook(target, UnknownTargetError)
+        hook = _find_target(target)
         present = _process_handlers(hook)
         matches = [
             other
@@ -269,7 +281,7 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
     calls: list[Call] = []
     with LOCK:
         if functions:
-            targets = {find_hook(function, UnknownTargetError) for function in functions}
+            targets = {_find_target(function) for function in functions}
         else:
             targets = {hook for hook in hooks() if hook.permanent or hook.slot}
     record = partial(recorder, calls)
@@ -301,7 +313,7 @@ def _make_handler(
         )
     function, target, position = entry
     hook = named.get(target) if isinstance(target, str) else None
-    return Handler(function, hook or find_hook(target, UnknownTargetError), position, owner)
+    return Handler(function, hook or _find_target(target), position, owner)
 
 
 class Plugins:

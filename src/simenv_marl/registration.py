@@ -104,7 +104,8 @@ def _titles(points: list[str]) -> list[str]:
     another point has the same title.
     """
     names = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
-    styles = [[_camel(name, 1) for name in names], [_camel(name, 2) for name in names], names]
+    styles = [[_camel(name, parts) for name in names] for parts in (1, 2)]
+    styles.append(names)
     titles: list[str] = []
     for candidates in zip(*styles, strict=True):
         unique = (
@@ -142,10 +143,10 @@ def make_view(
     plan = Plan(simulation, points, {**options, "render_mode": None})
     modes = plan.render_modes
     in_window = mode == "human" and mode not in modes and "rgb_array" in modes
-    if in_window and view in ("single", "joint"):
-        images = plan.amended({"render_mode": "rgb_array"})
-        return HumanRendering(view_class(plan, view)(images))
-    return view_class(plan, view)(plan.amended({"render_mode": mode}))
+    if view not in ("single", "joint"):
+        in_window = False
+    env = view_class(plan, view)(plan.amended({"render_mode": "rgb_array" if in_window else mode}))
+    return HumanRendering(env) if in_window else env
 
 
 def make_vector_view(

@@ -1,4 +1,4 @@
-"""Decision points: functions of a model that decide something, and definitions of how an environment decides it.
+"""Decision points: functions of a model that decide something, and their definitions.
 
 ``make_step`` makes a ``Definition``. Applied to a function, the definition gives a *decision
 function*. It looks and behaves like the function, whose body is the *rule*. But if the calling
@@ -6,9 +6,15 @@ simulation runs in an environment, it asks the environment for its decision. One
 decision point, its hook, with any number of definitions.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from copy import copy
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from dataclasses import dataclass
 from functools import update_wrapper
 from types import FunctionType
 from typing import Any, Final
@@ -17,13 +23,17 @@ import numpy as np
 from greenlet import getcurrent
 from gymnasium import spaces
 
-from .errors import DefinitionError, PatchError, short_repr
-from .hooks.hook import Hook, hook_of, hooks, made_with, unbind
-from .hooks.places import permanent_hook
+from .errors import DefinitionError, PatchError, name_of, short_repr
+from .hooks.hook import Hook, hook_of, hooks, made_with
+from .hooks.places import decorate
 from .hooks.stacks import DIFFERENCES, EVALUATING
+from .simulation import Function, Model
 
-Mapped = Callable[..., Any]
-"""A mapping: a callable of the decision call's arguments, bound to the signature of the function that decides."""
+Space = spaces.Space[Any]
+"""A space of Gymnasium."""
+
+Mapped = Function
+"""A mapping: a callable of the decision call's arguments, bound to the function's signature."""
 
 Labels = Mapped | Mapping[Any, str] | Sequence[str] | None
 """Texts for the parts of a space, or a callable of the call's arguments that returns them."""
@@ -32,20 +42,20 @@ Labels = Mapped | Mapping[Any, str] | Sequence[str] | None
 # -- definitions ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Definition:
     """The definition of a decision point: how an environment observes, decides and rewards it.
 
-    Made by ``make_step``; immutable. Apply it to a function, staticmethod, classmethod or method of
-    a class to get the decision function. Its attributes are the arguments of ``make_step``.
+    ``make_step`` makes it; it is immutable. Apply it to a function, staticmethod, classmethod or
+    method of a class to get the decision function. Its attributes are the arguments of
+    ``make_step``.
     """
 
-    _: KW_ONLY
-    observation_space: spaces.Space[Any]
+    observation_space: Space
     observation_space_mapping: Mapped
-    action_space: spaces.Space[Any]
+    action_space: Space
     reward_mapping: Mapped
-    action_space_mapping: Callable[[Any], Any] | None
+    action_space_mapping: Function | None
     apply: Mapped | None
     choices: Mapped | None
     split: Mapped | None
@@ -55,10 +65,10 @@ class Definition:
     agent: str | Mapped | None
     action_mask_mapping: Mapped | None
     removed_by: Mapping[str, Mapped | None]
-    goal_space: spaces.Space[Any] | None
+    goal_space: Space | None
     achieved_goal_mapping: Mapped | None
     desired_goal_mapping: Mapped | None
-    compute_reward: Callable[[Any, Any, Any], Any] | None
+    compute_reward: Function | None
     action_labels: Labels
     observation_labels: Labels
 
@@ -66,15 +76,17 @@ class Definition:
         """Check the definition, and make callables of dicts; also after ``dataclasses.replace``.
 
         Raises:
-            DefinitionError: The definition cannot work.
+            DefinitionError: An argument is invalid. The message says which.
         """
         for problem in _problems(self):
             raise DefinitionError(f"make_step: {problem}")
-        answers = _answers(self.action_space_mapping)
-        if answers is not None:
-            object.__setattr__(self, "action_space_mapping", dict(answers).__getitem__)
-        named: Any = [self.removed_by] if isinstance(self.removed_by, str) else self.removed_by
-        removed_by = dict(named if isinstance(named, Mapping) else dict.fromkeys(named))
+        decisions = _decisions(self.action_space_mapping)
+        if decisions is not None:
+            object.__setattr__(self, "action_space_mapping", dict(decisions).__getitem__)
+        names: Any = self.removed_by
+        if isinstance(names, str):
+            names = [names]
+        removed_by = dict(names if isinstance(names, Mapping) else dict.fromkeys(names))
         for name, agent in removed_by.items():
             if not isinstance(name, str) or not (agent is None or callable(agent)):
                 raise DefinitionError(
@@ -96,18 +108,18 @@ class Definition:
         Raises:
             PatchError: ``function`` is none of these.
         """
-        hook, binding = permanent_hook(function)
-        wrapper = point_for(hook).make_wrapper(self)
-        hook.definition = self
-        return wrapper if binding is None else binding(wrapper)
+        hook = hook_of(function)
+        if hook is not None:
+            point_for(hook)  # refuses an exposed builtin
+        return decorate(function, self)
 
 
 def make_step(
     *,
-    observation_space: spaces.Space[Any],
+    observation_space: Space,
     observation_space_mapping: Mapped,
-    action_space: spaces.Space[Any],
-    action_space_mapping: Callable[[Any], Any] | Mapping[Any, Any] | None = None,
+    action_space: Space,
+    action_space_mapping: Function | Mapping[Any, Any] | None = None,
     reward_mapping: Mapped,
     apply: Mapped | None = None,
     choices: Mapped | None = None,
@@ -118,14 +130,16 @@ def make_step(
     agent: str | Mapped | None = None,
     action_mask_mapping: Mapped | None = None,
     removed_by: str | Iterable[str] | Mapping[str, Mapped | None] = (),
-    goal_space: spaces.Space[Any] | None = None,
+    goal_space: Space | None = None,
     achieved_goal_mapping: Mapped | None = None,
     desired_goal_mapping: Mapped | None = None,
-    compute_reward: Callable[[Any, Any, Any], Any] | None = None,
+    compute_reward: Function | None = None,
     action_labels: Labels = None,
     observation_labels: Labels = None,
 ) -> Definition:
-    """Define a decision point: what its agent observes, may do and is rewarded with (paper, section 3.3).
+    """Define a decision point: the observations, actions and rewards of its agent.
+
+    See section 3.3 of the paper.
 
     Callables other than ``compute_reward`` may have a keyword-only parameter ``_simulation``: it
     gets the simulation.
@@ -133,13 +147,13 @@ def make_step(
     Args:
         observation_space: The space of the agent's observations.
         observation_space_mapping: A callable of the decision call's arguments (``self`` first for a
-            method). However the model writes the call, it gets all arguments that can be passed by
-            position so, the others by keyword, and defaults for those left out. It returns the
-            observation, which is cast to the dtype of the space.
+            method). It gets by position all arguments that can be passed by position, and the
+            others by keyword, however the model writes the call; defaults are filled in. It returns
+            the observation, which is cast to the dtype of the space.
         action_space: The space of the agent's actions.
         action_space_mapping: The decision for an action: a callable of the action, or a dict with
-            an entry for each action of a ``Discrete`` space. Its value is what the decision
-            function returns.
+            an entry for each action of a ``Discrete`` space. The decision function returns its
+            value.
         reward_mapping: A callable like ``observation_space_mapping``, called at each decision of
             the agent and at its end. It returns the reward of the agent's previous action.
         apply: An alternative to ``action_space_mapping``: a callable of the action and the call's
@@ -152,9 +166,9 @@ def make_step(
             length. The action mask follows from it. The decision function returns the chosen
             answer; with ``apply``, that gets the answer instead of the action.
         split: For a call that decides for many entities at once: a callable of the call's arguments
-            that returns the items, each of which is a decision. All other callables get the item
-            before the call's arguments (``apply`` after the action). The function must return what
-            it decides, and not act in place.
+            that returns the items, with one decision for each. All other callables get the item
+            before the call's arguments (``apply`` after the action). The function must return its
+            decisions, and not act in place.
         gather: With ``split``: a callable of the items, their decisions and the call's arguments.
             It returns the value of the call. Default: a list of the decisions.
         part: With ``split``: a callable of the rule's result, an item and the call's arguments. It
@@ -182,20 +196,20 @@ def make_step(
         compute_reward: A callable of achieved goals, desired goals and infos, of one step or
             stacked (shape ``(n, *goal_space.shape)``). It returns the reward of each, for learners
             that replay with other goals.
-        action_labels: What people and language models read instead of numbers: for a ``Discrete`` a
-            sequence of texts, or a dict from action to text; for a space with one dimension a
-            sequence, with a text for each component; for a ``Dict`` a dict; or a callable of the
-            call's arguments that returns one of these. Default: choices and decisions as text, else
-            numbers.
+        action_labels: The texts that people and language models read instead of numbers: for a
+            ``Discrete`` a sequence of texts, or a dict from action to text; for a space with one
+            dimension a sequence, with a text for each component; for a ``Dict`` a dict; or a
+            callable of the call's arguments that returns one of these. Default: choices and
+            decisions as text, else numbers.
         observation_labels: The same for the parts of observations.
 
     Returns:
         The definition, which is a decorator for the function that decides.
 
     Raises:
-        DefinitionError: The definition cannot work.
+        DefinitionError: An argument is invalid. The message says which.
     """
-    return Definition(**locals())  # which checks them
+    return Definition(**locals())
 
 
 _GOAL: Final = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
@@ -209,36 +223,24 @@ _REQUIRED: Final = (
 
 
 def _problems(definition: Definition) -> Iterator[str]:
-    """Yield what is wrong with the parts of a definition, one by one and together."""
+    """Yield the faults of a definition: first in single parts, then between parts."""
     for name, part in vars(definition).items():
-        if name == "removed_by" or (part is None and name not in _REQUIRED):
-            continue
-        fits, kind = callable(part), "callable"
-        if name.endswith("_space"):
-            fits, kind = isinstance(part, spaces.Space), "a gymnasium space"
-        elif name == "agent":
-            fits, kind = fits or (isinstance(part, str) and part != ""), "a name or a callable"
-        elif name in ("action_space_mapping", "rule_action_mapping"):
-            fits, kind = fits or isinstance(part, Mapping), "a callable or a dict"
-        elif name.endswith("_labels"):
-            space = getattr(definition, name.removesuffix("_labels") + "_space")
-            fits, kind = (
-                fits or fit_labels(space, part),
-                f"texts for the parts of {short_repr(space)}, or a callable",
-            )
-        if not fits:
-            yield f"{name} must be {kind}, not {short_repr(part)}"
-    given = [
+        if name != "removed_by" and (part is not None or name in _REQUIRED):
+            required = _required_kind(definition, name, part)
+            if required is not None:
+                yield f"{name} must be {required}, not {short_repr(part)}"
+    deciding = [
         name
         for name in ("action_space_mapping", "apply", "choices")
         if getattr(definition, name) is not None
     ]
-    if len(given) != 1 and given != ["apply", "choices"]:
+    if len(deciding) != 1 and deciding != ["apply", "choices"]:
         yield (
             "give one of action_space_mapping, apply and choices (or both apply and choices), to"
-            f" say what an action decides; given: {', '.join(given) or 'none'}"
+            f" say what an action decides; given: {', '.join(deciding) or 'none'}"
         )
-    space, has_mask = definition.action_space, definition.action_mask_mapping is not None
+    space = definition.action_space
+    has_mask = definition.action_mask_mapping is not None
     if has_mask and not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
         yield f"action_mask_mapping needs a Discrete or MultiDiscrete action_space, not {space}"
     if definition.choices is not None:
@@ -251,14 +253,15 @@ def _problems(definition: Definition) -> Iterator[str]:
     missing = [name for name in _GOAL if getattr(definition, name) is None]
     if 0 < len(missing) < len(_GOAL):
         yield f"a goal needs all of its parts; missing: {', '.join(missing)}"
-    answers = _answers(definition.action_space_mapping)
-    if answers is None:
+    decisions = _decisions(definition.action_space_mapping)
+    if decisions is None:
         return
     if not isinstance(space, spaces.Discrete):
         yield f"a dict as action_space_mapping needs a Discrete action_space, not {space}"
-    actions = range(int(space.start), int(space.start + space.n))
-    absent = [action for action in actions if action not in answers]
-    surplus = [action for action in answers if action not in actions]
+        return
+    actions = _actions(space)
+    absent = [action for action in actions if action not in decisions]
+    surplus = [action for action in decisions if action not in actions]
     if absent or surplus:
         yield (
             f"the dict action_space_mapping must have just the actions of {space}; missing:"
@@ -266,59 +269,82 @@ def _problems(definition: Definition) -> Iterator[str]:
         )
 
 
-def fit_labels(space: Any, labels: Any) -> bool:
+def _required_kind(
+    definition: Definition,
+    name: str,
+    part: object,
+) -> str | None:
+    """Return the kind of value that a part must be; None if the part is of this kind."""
+    if name.endswith("_space"):
+        return None if isinstance(part, spaces.Space) else "a gymnasium space"
+    if callable(part):
+        return None
+    if name == "agent":
+        return None if isinstance(part, str) and part else "a name or a callable"
+    if name in ("action_space_mapping", "rule_action_mapping"):
+        return None if isinstance(part, Mapping) else "a callable or a dict"
+    if name.endswith("_labels"):
+        space = getattr(definition, name.removesuffix("_labels") + "_space")
+        if fit_labels(space, part):
+            return None
+        return f"texts for the parts of {short_repr(space)}, or a callable"
+    return "callable"
+
+
+def _actions(space: spaces.Discrete) -> range:
+    """Return the actions of a ``Discrete`` space."""
+    return range(int(space.start), int(space.start + space.n))
+
+
+def fit_labels(space: Space, labels: object) -> bool:
     """Return whether labels are texts for the parts of a space."""
-    parts: Any = ()
+    parts: Collection[int | str] = ()
     if isinstance(space, spaces.Discrete):
-        parts = range(int(space.start), int(space.start + space.n))
+        parts = _actions(space)
     elif isinstance(space, spaces.Dict):
         parts = space.spaces
-    elif len(getattr(space, "shape", None) or ()) == 1:
-        parts = range(space.shape[0])
-    texts: list[Any] | None = None
-    if isinstance(labels, Mapping) and set(labels) == set(parts):
-        texts = list(labels.values())
-    elif (
-        isinstance(labels, Sequence)
-        and not isinstance(labels, str)
-        and not isinstance(space, spaces.Dict)
-    ):
-        texts = list(labels)
-    if (
-        texts is None
-        or len(texts) != len(parts)
-        or not all(isinstance(text, str) for text in texts)
-    ):
+    elif space.shape is not None and len(space.shape) == 1:
+        parts = range(*space.shape)
+    texts = None
+    if isinstance(labels, Mapping):
+        if set(labels) == set(parts):
+            texts = list(labels.values())
+    elif isinstance(labels, Sequence) and not isinstance(space, spaces.Dict):
+        texts = None if isinstance(labels, str) else list(labels)
+    if texts is None or len(texts) != len(parts):
         return False
-    # The parts of arrays and dicts are told apart by their labels.
+    if not all(isinstance(text, str) for text in texts):
+        return False
+    # Labels distinguish the parts of arrays and dicts.
     return isinstance(space, spaces.Discrete) or len(set(texts)) == len(texts)
 
 
-def _answers(mapping: Any) -> Mapping[Any, Any] | None:
-    """Return the dict from action to decision that was given as ``action_space_mapping``.
+def _decisions(mapping: object) -> Mapping[Any, Any] | None:
+    """Return the dict from action to decision that an ``action_space_mapping`` was made of.
 
     None for a callable.
     """
     if isinstance(mapping, Mapping):
         return mapping
     owner = getattr(mapping, "__self__", None)
-    return owner if isinstance(owner, dict) and mapping.__name__ == "__getitem__" else None
+    is_lookup = getattr(mapping, "__name__", None) == "__getitem__"
+    return owner if is_lookup and isinstance(owner, dict) else None
 
 
 def inverse(definition: Definition) -> dict[Any, Any] | None:
-    """Return the dict from decision to action, if ``action_space_mapping`` is a dict that can be inverted."""
-    answers = _answers(definition.action_space_mapping) or {}
+    """Return the dict from decision to action; None without an invertible dict of decisions."""
+    decisions = _decisions(definition.action_space_mapping) or {}
     try:
-        actions = {decision: action for action, decision in answers.items()}
+        actions = {decision: action for action, decision in decisions.items()}
     except TypeError:  # unhashable decisions
         return None
-    return actions if actions and len(actions) == len(answers) else None
+    return actions if actions and len(actions) == len(decisions) else None
 
 
 # -- decision points ------------------------------------------------------------------------------
 
 BY_NAME: Final = "simenv_marl_point"
-"""The attribute with the name of a function that a simulation names itself and that is not in a module."""
+"""The attribute with the name of a function that is in no module, but named by a simulation."""
 
 DecisionPoint = Hook
 """A function of a model that decides something, under any definition: the hook of that function."""
@@ -330,32 +356,32 @@ def point_for(hook: Hook) -> DecisionPoint:
     Raises:
         PatchError: The hook's function is not written in Python.
     """
-    if not isinstance(hook.function, FunctionType):
+    if hook.kind == "iterable" or not isinstance(hook.function, FunctionType):
         raise PatchError(
             f"{hook.name} cannot be a decision point: it is not a function written in Python"
         )
     return hook
 
 
-def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
-    """Return the point of a decision function, also as an attribute of a class, and its definition.
+def point_of(function: object) -> tuple[DecisionPoint, Definition | None] | None:
+    """Return the point of a decision function, also of a bound one, and its definition.
 
-    Or None.
+    None for other functions.
     """
     hook = hook_of(function)
-    return None if hook is None else (hook, made_with(unbind(function)))
+    return None if hook is None else (hook, made_with(function))
 
 
 def registered() -> dict[str, DecisionPoint]:
     """Return the decorated points, by dotted name.
 
-    Nothing keeps them, so that a model is collected with its points.
+    These references are weak, so that a model is collected with its points.
     """
     return {hook.name: hook for hook in hooks() if hook.definition is not None}
 
 
 def decision_points() -> list[str]:
-    """Return the dotted names of all decorated decision points, in the order in which they were first wrapped."""
+    """Return the dotted names of all decorated decision points, in the order of decoration."""
     return list(registered())
 
 
@@ -382,16 +408,16 @@ class difference:  # noqa: N801 - it is used like a function
         """
         if not callable(function):
             raise DefinitionError(f"difference: {short_repr(function)} is not callable")
-        if not DIFFERENCES:  # one is enough
-            DIFFERENCES.append(getattr(function, "__qualname__", None) or short_repr(function))
+        if not DIFFERENCES:
+            DIFFERENCES.append(name_of(function))
         self._function = function
         update_wrapper(self, function)
 
-    def __reduce__(self) -> Any:
-        # which notes, in another process too, that there are differences
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Mapped]]:
+        # The constructor notes, also in another process, that there are differences.
         return difference, (self._function,)
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+    def __call__(self, *args: Model, **kwargs: Model) -> Any:
         """Return the change of the function's value for these arguments."""
         value = self._function(*args, **kwargs)
         evaluation = EVALUATING.get(getcurrent())
@@ -399,6 +425,6 @@ class difference:  # noqa: N801 - it is used like a function
         if memory is None:
             return 0.0
         before = memory.get(self, value)
-        # an array may change in place
-        memory[self] = copy(value) if isinstance(value, np.ndarray) else value
+        # A copy, because an array may change in place.
+        memory[self] = value.copy() if isinstance(value, np.ndarray) else value
         return value - before

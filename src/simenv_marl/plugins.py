@@ -1,21 +1,27 @@
-"""Extensions: handlers before, after and instead of a model's functions, without a change to the model (paper).
+"""Extensions: handlers around a model's functions, without a change to the model (paper).
 
 Handlers are attached to functions, methods, generator and coroutine functions, and iterables: for
 the whole process (``attach_handler``), for a block (``handlers``), or for one environment (the
-option ``plugins``). A function without handlers costs nothing extra or, if ``expose_to_plugins``
-exposed it, one test.
+option ``plugins``). A function without handlers costs nothing extra; or one test, if
+``expose_to_plugins`` exposed it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
-from types import FunctionType, MappingProxyType, MethodType
-from typing import Any, Final, TypeVar, cast
+from types import FunctionType, MethodType
+from typing import Any, Final, TypeVar
 
 from .decision import decision_points
-from .errors import HandlerError, PatchError, UnknownTargetError, name_of, short_repr
+from .errors import (
+    HandlerError,
+    PatchError,
+    UnknownTargetError,
+    name_of,
+    short_repr,
+)
 from .hooks.handlers import (
     CALLS,
     TRACE,
@@ -26,17 +32,16 @@ from .hooks.handlers import (
     Installation,
     recorder,
 )
-from .hooks.hook import Hook, hook_of, hooks
+from .hooks.hook import Hook, hook_of, hooks, rebind
 from .hooks.places import (
+    decorate,
     find_hook,
-    hook_at,
     is_importable,
-    permanent_hook,
-    raw_attribute,
-    resolve,
     split_binding,
+    target_of,
 )
 from .hooks.stacks import LOCK
+from .simulation import Function
 
 __all__ = [
     "Call",
@@ -54,13 +59,13 @@ __all__ = [
 
 Thing = TypeVar("Thing")
 
-Entry = tuple[Callable[..., Any], Any, str]
+Entry = tuple[Function, Any, str]
 """A handler, its target, and its position."""
 
 _FUNCTIONS: Final = (staticmethod, classmethod, FunctionType, MethodType)
 
 
-# -- what exists ----------------------------------------------------------------------------------
+# -- lists of targets and handlers ----------------------------------------------------------------
 
 
 def exposed_functions() -> list[str]:
@@ -69,7 +74,7 @@ def exposed_functions() -> list[str]:
 
 
 def attached_handlers(env: Any = None) -> list[Entry]:
-    """Return the attached handlers, by target, in the order in which they run.
+    """Return the attached handlers, by target, in the order of their calls.
 
     Args:
         env: An environment, for the handlers of its option ``plugins``. None: the handlers of the
@@ -79,17 +84,16 @@ def attached_handlers(env: Any = None) -> list[Entry]:
         A list of tuples: the handler, the dotted name of its target, and its position.
     """
     if env is not None:
-        entries: list[Entry] = env.unwrapped.plugins
-        return entries
-    found = sorted(hooks(), key=lambda target: target.name)
-    return [
-        (handler.function, target.name, handler.position)
-        for target in found
-        for handler in _general(target)
-    ]
+        return list(env.unwrapped.plugins)
+    targets = sorted(hooks(), key=lambda target: target.name)
+    return [_entry(handler) for target in targets for handler in _process_handlers(target)]
 
 
-def _general(target: Hook) -> list[Handler]:
+def _entry(handler: Handler) -> Entry:
+    return handler.function, handler.target.name, handler.position
+
+
+def _process_handlers(target: Hook) -> list[Handler]:
     """Return the handlers of a target that users have attached for the whole process."""
     return [
         handler
@@ -118,72 +122,66 @@ def expose_to_plugins(function_or_iterable: Thing) -> Thing:
     Raises:
         PatchError: It is neither of these, or a method that is bound to one object.
     """
-    thing: Any = function_or_iterable
-    if _proxied(thing) is not None:
-        return function_or_iterable
+    exposed: Thing = _expose(function_or_iterable)
+    return exposed
+
+
+def _expose(thing: Any) -> Any:
+    if target_of(thing) is not None:
+        return thing
     if isinstance(thing, _FUNCTIONS):
-        wrapper, binding = split_binding(thing)
-        known = hook_of(wrapper)
-        if known is None or not known.permanent:  # else it is decorated or exposed already
-            known, _ = permanent_hook(thing)
-            wrapper = known.make_wrapper()
-        known.exposed = True
-        if isinstance(thing, (staticmethod, classmethod)) and thing.__func__ is wrapper:
-            return function_or_iterable
-        return cast("Thing", wrapper if binding is None else binding(wrapper))
+        return _expose_function(thing)
     if isinstance(thing, type):
         raise PatchError(
             f"the class {name_of(thing)} cannot be exposed to plugins: expose one of its"
             " functions, such as __init__ or an __iter__ that is a generator function"
         )
-    if isinstance(thing, Iterable) or (
-        hasattr(type(thing), "__getitem__") and hasattr(type(thing), "__len__")
-    ):
-        # its dependency imports asyncio, which slows down decisions
+    is_sequence = hasattr(type(thing), "__getitem__") and hasattr(type(thing), "__len__")
+    if is_sequence or isinstance(thing, Iterable):
+        # Imported here, because its dependency imports asyncio, which slows down decisions.
         from .hooks.iterables import expose
 
-        return cast("Thing", expose(thing))
+        return expose(thing)
     if callable(thing):
-        hook = Hook(thing, f"{getattr(thing, '__module__', None) or '?'}.{name_of(thing)}")
-        hook.exposed = True
-        return cast("Thing", hook.make_wrapper())
+        module = getattr(thing, "__module__", None) or "?"
+        return Hook(thing, f"{module}.{name_of(thing)}", exposed=True).make_wrapper()
     raise PatchError(
         f"{short_repr(thing)} cannot be exposed to plugins: it is neither a function nor an"
         " iterable"
     )
 
 
-def _proxied(thing: Any) -> Hook | None:
-    """Return the target of an exposed iterable; None for anything else."""
-    return thing._self_target if hasattr(type(thing), "_self_next") else None
+def _expose_function(function: Any) -> Any:
+    wrapper, binding = split_binding(function)
+    hook = hook_of(wrapper)
+    if hook is None or not hook.permanent:
+        return decorate(function, exposed=True)
+    hook.make_permanent(None, exposed=True)  # it is decorated or exposed already
+    if isinstance(function, (staticmethod, classmethod)):
+        return function
+    return rebind(wrapper, binding)
 
 
 def _find_target(target: Any) -> Hook:
-    """Find the target for handlers: a function, an exposed iterable, or the dotted name of one of these."""
-    if isinstance(target, str):
-        try:
-            owner, attribute = resolve(target, UnknownTargetError)
-        except (UnknownTargetError, PatchError):
-            named = [other for other in hooks() if other.name == target and other.exposed]
-            if not named:
-                raise
-            return named[-1]  # exposed inside a function, under the latest's name
-        return _proxied(raw_attribute(owner, attribute)) or hook_at(
-            target, owner, attribute, UnknownTargetError
-        )
-    found = _proxied(target)
-    if found is None and not isinstance(target, _FUNCTIONS):
-        raise PatchError(
-            f"no handlers can be attached to {short_repr(target)}: pass what expose_to_plugins"
-            " returns for it, or the dotted name of a function"
-        )
-    return found or find_hook(target, UnknownTargetError)
+    """Find the hook of a function, an exposed iterable, or a name for one of these."""
+    try:
+        return find_hook(target, UnknownTargetError)
+    except (UnknownTargetError, PatchError):
+        # A function that was exposed inside another function: the latest of this name.
+        for hook in reversed(hooks()):
+            if hook.exposed and hook.name == target:
+                return hook
+        raise
 
 
 # -- handlers -------------------------------------------------------------------------------------
 
 
-def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> None:
+def attach_handler(
+    handler: Function,
+    target: Any,
+    position: str,
+) -> None:
     """Attach a handler to a function, for the whole process (paper, section 3.4).
 
     Args:
@@ -204,11 +202,15 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        made = _make_handler((handler, target, position))
-        made.target.install(None, made)
+        hook = _find_target(target)
+        hook.install(None, Handler(handler, hook, position))
 
 
-def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
+def remove_handler(
+    target: Any,
+    position: str,
+    handler: Function | None = None,
+) -> None:
     """Remove a handler that ``attach_handler`` attached.
 
     Args:
@@ -222,21 +224,24 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
         HandlerError: There is no such handler.
     """
     with LOCK:
-        found = _find_target(target)
-        present = _general(found)
-        chosen = [
-            h
-            for h in present
-            if h.position == position and (handler is None or h.function == handler)
+        hook = _find_target(target)
+        present = _process_handlers(hook)
+        matches = [
+            other
+            for other in present
+            if other.position == position and handler in (None, other.function)
         ]
-        if not chosen:
-            what = "no handler is" if handler is None else f"{name_of(handler)} is not"
-            at = ", ".join(sorted({h.position for h in present})) or "nowhere"
+        if not matches:
+            absent = "no handler is" if handler is None else f"{name_of(handler)} is not"
+            positions = sorted({other.position for other in present})
             raise HandlerError(
-                f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}"
+                f"{absent} attached {short_repr(position)} {hook.name}; handlers are attached:"
+                f" {', '.join(positions) or 'nowhere'}"
             )
-        for removed in chosen if handler is None else chosen[-1:]:
-            found.uninstall(None, removed)
+        if handler is not None:
+            matches = matches[-1:]
+        for match in matches:
+            hook.uninstall(None, match)
 
 
 @contextmanager
@@ -247,11 +252,11 @@ def handlers(*entries: Entry) -> Iterator[None]:
         *entries: Tuples of the arguments of ``attach_handler``: handler, target, position.
 
     Raises:
-        SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
+        SimEnvError: As ``attach_handler`` raises it; then none of the handlers is new_handlers.
     """
     with LOCK:
-        made = [_make_handler(entry) for entry in entries]
-    installation = Installation([(handler.target, handler) for handler in made])
+        new_handlers = [_make_handler(entry, {}) for entry in entries]
+    installation = Installation([(handler.target, handler) for handler in new_handlers])
     try:
         yield
     finally:
@@ -260,7 +265,7 @@ def handlers(*entries: Entry) -> Iterator[None]:
 
 @contextmanager
 def trace(*functions: Any) -> Iterator[list[Call]]:
-    """Record the calls of a model's functions, in the order in which they begin.
+    """Record the calls of a model's functions, in the order of their beginnings.
 
     Args:
         *functions: The functions, as ``attach_handler`` takes them. If none is given: all functions
@@ -274,15 +279,17 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
         SimEnvError: As ``attach_handler``.
     """
     calls: list[Call] = []
-    record = partial(recorder, calls)
     with LOCK:
-        found = [_find_target(target) for target in functions] if functions else hooks()
-        traced = [target for target in dict.fromkeys(found) if CALLS[0] in target.positions]
+        if functions:
+            targets = {_find_target(function) for function in functions}
+        else:
+            targets = {hook for hook in hooks() if hook.permanent or hook.slot}
+    record = partial(recorder, calls)
     installation = Installation(
         [
-            (hook, Handler(record, hook, TRACE))
-            for hook in traced
-            if functions or hook.permanent or hook.slot
+            (target, Handler(record, target, TRACE))
+            for target in targets
+            if CALLS[0] in target.positions
         ]
     )
     try:
@@ -292,9 +299,11 @@ def trace(*functions: Any) -> Iterator[list[Call]]:
 
 
 def _make_handler(
-    entry: Any, named: Mapping[str, Hook] = MappingProxyType({}), owner: Any = None
+    entry: Entry,
+    named: Mapping[str, Hook],
+    owner: Hashable = None,
 ) -> Handler:
-    """Return a handler, checked to fit its target.
+    """Return a handler for an entry.
 
     ``named`` has names that take precedence over importable names.
     """
@@ -303,35 +312,41 @@ def _make_handler(
             f"handlers are given as (handler, target, position), not {short_repr(entry)}"
         )
     function, target, position = entry
-    known = named.get(target) if isinstance(target, str) else None
-    return Handler(function, _find_target(target) if known is None else known, position, owner)
+    hook = named.get(target) if isinstance(target, str) else None
+    return Handler(function, hook or _find_target(target), position, owner)
 
 
 class Plugins:
     """The handlers of the environments of one plan, attached while one of these is in use.
 
-    It is also the key under which targets know them, and an entry in ``EVALUATING``; agents have
-    the memory.
+    It is the owner of these handlers, and an ``Evaluation``.
+
+    Attributes:
+        handlers: The handlers.
+        hooks: Their targets, each once.
+        entries: The handlers as ``attached_handlers`` returns them.
+        portable: The entries for another process: with the given target instead of a name that
+            does not lead to the target there.
+        memory: None, because only agents remember values of differences.
     """
 
     memory: dict[Any, Any] | None = None
 
-    def __init__(self, entries: Any, named: Mapping[str, Hook] = MappingProxyType({})) -> None:
+    def __init__(self, entries: Iterable[Entry], named: Mapping[str, Hook]) -> None:
         """Find the targets, and check that the handlers fit.
 
         ``named`` has the names that the simulation defines.
         """
+        self.handlers: list[Handler] = []
+        self.portable: list[Entry] = []
         with LOCK:
-            self.handlers = [_make_handler(entry, named, self) for entry in entries]
-        self.hooks = dict.fromkeys(handler.target for handler in self.handlers)
-        self.entries: list[Entry] = [
-            (own.function, own.target.name, own.position) for own in self.handlers
-        ]
-        # With the given target where its name would not lead to it in another process.
-        pairs = zip(self.entries, entries, strict=True)
-        self.portable: list[Entry] = [
-            entry if is_importable(entry[1]) else own for entry, own in pairs
-        ]
+            for entry in entries:
+                handler = _make_handler(entry, named, self)
+                self.handlers.append(handler)
+                importable = is_importable(handler.target.name)
+                self.portable.append(_entry(handler) if importable else entry)
+        self.entries = [_entry(handler) for handler in self.handlers]
+        self.hooks = {handler.target for handler in self.handlers}
 
     @property
     def plugins(self) -> Plugins:

@@ -1,25 +1,29 @@
-"""Registers simulations with Gymnasium and PettingZoo, with string entry points, so that specs can be serialised."""
+"""Registers simulations with Gymnasium and PettingZoo.
+
+Entry points are strings, so that specs can be serialised.
+"""
 
 import importlib
 import re
 import sys
-from typing import Any, Unpack
+from typing import Any, Final, Unpack
 
 import gymnasium
 import pettingzoo
 from gymnasium.wrappers import HumanRendering
 
 from .core import Points, ViewOptions
-from .envs import vector_env, view_class
+from .envs import SimulationVectorEnv, vector_env, view_class
 from .envs.single import plan_of
 from .errors import OptionValueError, UnknownPointError, short_repr
+from .simulation import Model
 
-_RECIPES: dict[str, tuple[Any, Any, Any]] = {}
-"""The simulation, the points and the options that ``register_simulation`` was given, by name and version."""
+_RECIPES: Final[dict[str, tuple[Model, Points, ViewOptions]]] = {}
+"""The registered simulations with their points and options, by name and version."""
 
 
 def register_simulation(
-    simulation: Any,
+    simulation: Model,
     points: Points = None,
     *,
     name: str | None = None,
@@ -47,86 +51,112 @@ def register_simulation(
         The ids, Gymnasium's first.
 
     Raises:
-        SimEnvError: Something cannot work. The subclass tells what.
+        SimEnvError: An argument is invalid. The subclass says which.
     """
-    if name is None:
-        if not hasattr(simulation, "environment_arguments"):  # it is not a variant
-            raise OptionValueError("register_simulation needs a name= for the ids")
+    if name is None and hasattr(simulation, "environment_arguments"):  # a variant
         name = simulation.name
     if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
         raise OptionValueError(
-            f"name must consist of letters, digits, _ and -, not {short_repr(name)}"
+            f"name= must consist of letters, digits, _ and -, not {short_repr(name)}"
         )
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
     plan = plan_of(simulation, points, options)
     recipe = f"{name}-v{version}"
     _RECIPES[recipe] = simulation, points, options
-    named = [point for point in plan.active if point.agent or plan.one_agent]
-    views: dict[str, dict[str, Any]] = {}
-    for title, point in zip(_titles([point.hook.name for point in named]), named, strict=True):
-        no_roster = {} if point.agent is None else {"possible_agents": None, "undeclared": "error"}
-        views[title] = {"view": "single", "agent": point.agent or plan.one_agent, **no_roster}
-    entry, vector_entry = f"{__name__}:make_view", f"{__name__}:make_vector_view"
-    where = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
-    made: list[str] = []
-    for title, kwargs in {**views, "Joint": {"view": "joint"}}.items():
-        made.append(f"{name}/{title}-v{version}")
-        # it may be registered again, as when a notebook's cell is rerun
-        gymnasium.registry.pop(made[-1], None)
-        gymnasium.register(made[-1], entry, vector_entry_point=vector_entry, kwargs=where | kwargs)
-    register: Any = getattr(pettingzoo, "register", None)
+    origin = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
+    entry_point = f"{__name__}:make_view"
+    single = {point.hook.name: point for point in plan.active if point.agent or plan.one_agent}
+    views: dict[str, dict[str, str | None]] = {}
+    for title, point in zip(_titles(list(single)), single.values(), strict=True):
+        views[title] = {"view": "single", "agent": point.agent or plan.one_agent}
+        if point.agent is not None:  # the view has no other agents, and so no roster
+            views[title] |= {"possible_agents": None, "undeclared": "error"}
+    views["Joint"] = {"view": "joint"}
+    ids: list[str] = []
+    for title, view in views.items():
+        identity = f"{name}/{title}-v{version}"
+        # A notebook's cell, for example, registers the same simulation again.
+        gymnasium.registry.pop(identity, None)
+        gymnasium.register(
+            identity,
+            entry_point,
+            vector_entry_point=f"{__name__}:make_vector_view",
+            kwargs=origin | view,
+        )
+        ids.append(identity)
+    register = getattr(pettingzoo, "register", None)
     if register is not None:  # PettingZoo has a registry since 1.26
-        made.append(f"{name}/coop_v{version}")
-        for view in ("aec", "parallel"):
-            getattr(pettingzoo, f"{view}_registry", {}).pop(f"{name}/coop-v{version}", None)
-            register(view, made[-1], entry, kwargs=where | {"view": view})
-    return made
+        identity = f"{name}/coop_v{version}"
+        for kind in ("aec", "parallel"):
+            registry = getattr(pettingzoo, f"{kind}_registry", {})
+            registry.pop(f"{name}/coop-v{version}", None)
+            register(kind, identity, entry_point, kwargs=origin | {"view": kind})
+        ids.append(identity)
+    return ids
 
 
 def _titles(points: list[str]) -> list[str]:
-    """Return the names of decision points in ids: the function's name, with its class if the name alone is taken."""
-    whole = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
-    styles = [[_camel(point, 1) for point in whole], [_camel(point, 2) for point in whole], whole]
-    return [
-        next(style[number] for style in styles if [*style, "Joint"].count(style[number]) == 1)
-        for number in range(len(points))
-    ]
+    """Return the titles of decision points in ids.
+
+    A title is the function's name in CamelCase; with its class, or all of the dotted name, if
+    another point has the same title.
+    """
+    names = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
+    styles = [[_camel(name, parts) for name in names] for parts in (1, 2)]
+    styles.append(names)
+    titles: list[str] = []
+    for candidates in zip(*styles, strict=True):
+        unique = (
+            title
+            for title, style in zip(candidates, styles, strict=True)
+            if [*style, "Joint"].count(title) == 1
+        )
+        titles.append(next(unique))
+    return titles
 
 
-def _camel(point: str, parts: int) -> str:
-    """The last parts of a dotted name in CamelCase."""
-    words = [word for part in point.split(".")[-parts:] for word in part.split("_")]
+def _camel(name: str, parts: int) -> str:
+    """Return the last parts of a dotted name in CamelCase."""
+    words = "_".join(name.split(".")[-parts:]).split("_")
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 
 # -- entry points ---------------------------------------------------------------------------------
 
 
-def make_view(recipe: str, module: str, view: str, **options: Any) -> Any:
+def make_view(
+    recipe: str,
+    module: str,
+    view: str,
+    **options: Any,
+) -> Any:
     """Make an environment of a registered simulation.
 
-    Gymnasium reads render modes from the metadata of a class, which an entry point for many
-    simulations lacks. Therefore this applies the wrapper by which Gymnasium shows the pictures of a
-    simulation without the mode "human".
+    For a simulation with images but without the mode "human", Gymnasium would show the images
+    itself, if the class of the environment had metadata. An entry point for many simulations has
+    no such class, and therefore applies Gymnasium's wrapper itself.
     """
     simulation, points, options = _recall(recipe, module, view, options)
+    mode = options.pop("render_mode", None)
     plan = plan_of(simulation, points, {**options, "render_mode": None})
-    mode, modes = options.get("render_mode"), plan.subject.render_modes
-    if (
-        view in ("single", "joint")
-        and mode == "human"
-        and mode not in modes
-        and "rgb_array" in modes
-    ):
-        return HumanRendering(view_class(plan, view)(plan.amended({"render_mode": "rgb_array"})))
-    return view_class(plan, view)(plan.amended({"render_mode": mode}))
+    modes = plan.subject.render_modes
+    in_window = mode == "human" and mode not in modes and "rgb_array" in modes
+    if view not in ("single", "joint"):
+        in_window = False
+    env = view_class(plan, view)(plan.amended({"render_mode": "rgb_array" if in_window else mode}))
+    return HumanRendering(env) if in_window else env
 
 
-def make_vector_view(recipe: str, module: str, view: str, **options: Any) -> Any:
+def make_vector_view(
+    recipe: str,
+    module: str,
+    view: str,
+    **options: Any,
+) -> SimulationVectorEnv:
     """Make a vector environment.
 
-    ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``.
+    ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, limits ``max_steps``.
     """
     simulation, points, options = _recall(recipe, module, view, options)
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
@@ -134,16 +164,22 @@ def make_vector_view(recipe: str, module: str, view: str, **options: Any) -> Any
     return vector_env(simulation, points, view=view, **options)
 
 
-def _recall(recipe: str, module: str, view: str, options: Any) -> tuple[Any, Any, dict[str, Any]]:
+def _recall(
+    recipe: str,
+    module: str,
+    view: str,
+    options: dict[str, Any],
+) -> tuple[Model, Points, dict[str, Any]]:
     """Return the simulation and the points of a recipe, and its options for a view."""
     if recipe not in _RECIPES and module != "__main__":
-        importlib.import_module(module)  # as in a process that has only the spec
+        importlib.import_module(module)  # this process may have only the spec
     if recipe not in _RECIPES:
         raise UnknownPointError(
             f"no simulation is registered as {recipe!r} in this process; import the module that"
-            " registers it, or"
-            ' make the environment by "module:id"'
+            ' registers it, or make the environment by "module:id"'
         )
-    simulation, points, registered = _RECIPES[recipe]
-    for_view = {} if view == "joint" else {"flatten": False}  # an option of the joint view alone
-    return simulation, points, {**registered, **for_view, **options}
+    simulation, points, defaults = _RECIPES[recipe]
+    all_options: dict[str, Any] = {**defaults, **options}
+    if view != "joint" and "flatten" not in options:
+        all_options["flatten"] = False  # an option of the joint view alone
+    return simulation, points, all_options

@@ -481,7 +481,7 @@ def test_returns_are_not_counted_where_two_points_have_the_same_agent_which_is_t
 
     own = [name for name in decision_points() if name.startswith("tests.")]
     # without those of studies
-    monkeypatch.setattr("simenv_marl.core.points.decision_points", lambda: own)
+    monkeypatch.setattr("simenv_marl.core.plans.points.decision_points", lambda: own)
     with pytest.warns(UserWarning, match="not counted, .* have the same agent"):
         found = evaluate(Doubled, {"rule": {}}, seeds=[1])
     assert found.frame["length"].tolist() == [0]

@@ -926,7 +926,7 @@ def test_generators_and_iterables_suspended_over_decisions_have_their_environmen
 
 def test_mappings_of_vector_environments_see_the_plugins_too(monkeypatch):
     # as long as no difference was made, less is entered
-    monkeypatch.setattr("simenv_marl.core.agent.DIFFERENCES", [])
+    monkeypatch.setattr("simenv_marl.core.episodes.agent.DIFFERENCES", [])
     reward = {House.water: define(agent="a_0", reward_mapping=lambda self: len(self.word()))}
     for points, observations, rewards in ((reward, [1, 2], 4), (House.water, [4, 0], 0)):
         envs = vector_env(House, points, num_envs=2, plugins=[says("mine")])

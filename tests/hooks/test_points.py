@@ -121,7 +121,7 @@ def test_without_points_the_simulation_names_them(points):
 
 def test_without_points_all_registered_ones_of_one_package_are_meant(monkeypatch):
     registered = []
-    monkeypatch.setattr("simenv_marl.core.points.decision_points", lambda: registered)
+    monkeypatch.setattr("simenv_marl.core.plans.points.decision_points", lambda: registered)
     with pytest.raises(UnknownPointError, match="there is no decision point"):
         aec_env(home())
     registered += [f"{HOME}.cool", f"{HOME}.heat"]
@@ -407,7 +407,7 @@ def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypa
 
 @pytest.mark.parametrize("others", [[], ["a difference that was made elsewhere"]])
 def test_each_reward_is_checked_also_where_no_difference_was_made(others, monkeypatch):
-    monkeypatch.setattr("simenv_marl.core.agent.DIFFERENCES", others)
+    monkeypatch.setattr("simenv_marl.core.episodes.agent.DIFFERENCES", others)
     rewards = iter([0.0, 2, np.float32(0.5), "2", 0.0, float("nan")])
     decide = decision(reward_mapping=lambda: next(rewards))
     env = single_env(calling(*[decide] * 4), decide)

@@ -1,4 +1,4 @@
-"""Hooks: one for each function of a model that is decided or extended, with wrappers in front of it.
+"""Hooks: one for each function of a model that is decided or extended, with its wrappers.
 
 A *wrapper* looks and behaves like the function, has its signature, and costs almost nothing while
 the hook has no *interceptors*. A call finds its interceptor by the greenlet it runs in. For an
@@ -8,11 +8,16 @@ handlers around it; at the end it removes the entry.
 
 from __future__ import annotations
 
-import inspect
 import re
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Collection, Hashable
 from functools import partial, update_wrapper
+from inspect import (
+    Parameter,
+    Signature,
+    isasyncgenfunction,
+    iscoroutinefunction,
+    isgeneratorfunction,
+)
 from threading import current_thread, local
 from types import FunctionType
 from typing import Any, Final
@@ -21,151 +26,187 @@ from weakref import WeakValueDictionary, finalize
 from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
-from .handlers import CALLS, ITEMS, Handler, each, run, slots, wait
-from .stacks import EVALUATING, LOCK, OUTSIDE, STACKS, Interceptor, spawner_of, stack_of
+from ..simulation import POSITIONAL, Function, Model, signature_of
+from .handlers import (
+    CALLS,
+    ITEMS,
+    Handler,
+    Slot,
+    each,
+    make_slots,
+    run,
+    wait,
+)
+from .stacks import (
+    EVALUATING,
+    LOCK,
+    STACKS,
+    Args,
+    Interceptor,
+    Kwargs,
+    spawner_of,
+    stack_of,
+)
+
+Bound = tuple[Args, Kwargs]
+"""The arguments of a call, bound to a signature."""
+
+Binding = Callable[[FunctionType], Model]
+"""``staticmethod`` or ``classmethod``."""
 
 _ROOTS: Final[set[greenlet]] = set()
-"""Roots of threads on which no simulation runs.
+"""Roots of threads without simulations. Hooks without handlers run their rule there at once."""
 
-Hooks without handlers run their rule there at once.
-"""
 
-_THREAD: Final = local()
-"""Has a mark in each thread whose root is in ``_ROOTS``. It is freed with the thread."""
+class _ThreadRoot(local):
+    """Keeps the root of a thread in ``_ROOTS`` until the thread ends."""
+
+    _lifetime: set[object] | None = None
+
+    def register(self, root: greenlet) -> None:
+        """Register the root of the current thread."""
+        if self._lifetime is None:
+            self._lifetime = set()  # freed with the thread
+            # A root that outlives its thread makes greenlets crash.
+            finalize(self._lifetime, _ROOTS.discard, root)
+        _ROOTS.add(root)
+
+
+_THREAD_ROOT: Final = _ThreadRoot()
 
 
 # -- wrappers -------------------------------------------------------------------------------------
 
 _ABSENT: Final = object()
-"""The default of arguments that a call may leave out, because interceptors must get them as they were passed."""
+"""The default of arguments that a call may leave out. Interceptors do not get it."""
 
-BOUND: Final[dict[str, Any]] = {}
-"""The keyword arguments of a call that passes each parameter by position, and so needs no binding."""
+BOUND: Final[Kwargs] = {}
+"""The keyword arguments of a call that passes each parameter by position and needs no binding."""
 
 _MADE_WITH: Final = "__simenv_marl__"
-"""The attribute of a wrapper with its hook and the object that it was made with."""
+"""The attribute of a wrapper with the object that it was made with."""
 
-# No variable has the stack: a suspended stack that refers to itself could not be collected.
-_RULE = "not INTERCEPTORS or getcurrent() in INTERCEPTORS.roots"
-_INTERCEPT = "(INTERCEPTORS.get(getcurrent()) or intercept)"
-
-_RETURN = {
+_RETURN: Final = {
     "function": "return {}",
     "generator": "return (yield from {})",
     "coroutine": "return (await {})",
 }
 
-# These determine the cost of a call without interceptors: two plain calls if no call can be
-# incomplete, else three.
-_INCOMPLETE = """
-    if {incomplete}:
-        args = {passed}
-        if {rule} or ({doubtful}) and fits(args, kwargs) is None:
-            {rule_as_passed}
-        {intercept_as_passed}"""
-_COMPLETE = """
-    if {rule}:
-        {rule_at_once}
-    {intercept}
+# No variable has the stack, because a suspended stack that refers to itself cannot be collected.
+_RULE_DECIDES: Final = "not INTERCEPTORS or getcurrent() in INTERCEPTORS.roots"
+_INTERCEPT: Final = "(INTERCEPTORS.get(getcurrent()) or intercept)"
+
+
+def _source(hook: Hook, reserved: Collection[str]) -> str:
+    """Return the source code of a hook's wrappers, which uses the reserved names.
+
+    It determines the cost of a call without interceptors: two plain calls if no call can be
+    incomplete, else three.
+    """
+    parameters = [] if hook.signature is None else list(hook.signature.parameters.values())
+    positional = [p for p in parameters if p.kind in POSITIONAL]
+    required = [p.name for p in positional if p.default is p.empty]
+    named_only = [p for p in parameters if p.kind is p.KEYWORD_ONLY]
+    names = [f"_{number}" for number in range(len(positional))]
+    only_self = hook.bound and len(parameters) == len(required) == 1
+    nothing = hook.signature is not None and not parameters
+    is_incomplete = "True"
+    may_not_fit = "True"
+    declaration = "*args, **kwargs"
+    arguments = "args"
+    if nothing or (only_self and required[0] not in reserved):
+        is_incomplete = ""
+        # A staticmethod that looks like a method may receive its argument by keyword.
+        names = required
+        declaration = ", ".join(names)
+    elif (
+        positional
+        and all(p.kind is not p.VAR_POSITIONAL for p in parameters)
+        and all(p.default is not p.empty for p in named_only)
+    ):
+        is_incomplete = f"kwargs or {names[-1]} is ABSENT"
+        may_not_fit = f"kwargs or len(args) < {len(required)}"
+        declaration = ", ".join(f"{name}=ABSENT" for name in names) + ", /, **kwargs"
+        arguments = "()"
+        for number, name in enumerate(names, start=1):
+            arguments = f"({', '.join(names[:number])},) if {name} is not ABSENT else {arguments}"
+    values = "".join(f"{name}, " for name in names)
+    result = _RETURN[hook.kind].format
+    source = f"def wrapper({declaration}):"
+    if hook.kind == "coroutine":
+        source = f"async {source}"
+    if is_incomplete:
+        source += f"""
+    if {is_incomplete}:
+        args = {arguments}
+        if {_RULE_DECIDES} or ({may_not_fit}) and fits(args, kwargs) is None:
+            {result("rule(*args, **kwargs)")}
+        {result(f"{_INTERCEPT}(args, kwargs)")}"""
+    return f"""{source}
+    if {_RULE_DECIDES}:
+        {result(f"rule({values})")}
+    {result(f"{_INTERCEPT}(({values}), {'{}' if named_only else 'BOUND'})")}
 """
 
 
-def _source(hook: Hook, scope: dict[str, Any]) -> str:
-    """Return the source code of a hook's wrappers; ``scope`` has the names that it uses."""
-    signature = hook.signature
-    parameters = [] if signature is None else list(signature.parameters.values())
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    names = [f"_{number}" for number in range(len(positional))]
-    incomplete, doubtful, template = "True", "True", _INCOMPLETE + _COMPLETE
-    passed, accepted = "args", "*args, **kwargs"
-    if (hook.alone and parameters[0].name not in scope) or (
-        signature is not None and not parameters
-    ):
-        template = _COMPLETE
-        # a staticmethod that looks like a method may be passed it by keyword
-        names = [p.name for p in positional]
-        accepted = ", ".join(names)
-    elif positional and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        required = sum(p.default is p.empty for p in positional)
-        doubtful = f"kwargs or len(args) < {required}"
-        if any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in parameters):
-            doubtful = "True"
+class _Code(str):
+    """A string that is shown without quotes."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def _make_binder(signature: Signature) -> Any:
+    """Make a function that returns its arguments: by position where possible, with defaults."""
+    parameters: list[Parameter] = []
+    args = ""
+    kwargs = ""
+    for name, p in signature.parameters.items():
+        default = p.empty if p.default is p.empty else _Code(f"defaults[{name!r}]")
+        parameters.append(Parameter(name, p.kind, default=default))
+        if p.kind in POSITIONAL:
+            args += f"{name}, "
+        elif p.kind is p.VAR_POSITIONAL:
+            args += f"*{name}, "
+        elif p.kind is p.KEYWORD_ONLY:
+            kwargs += f"{name!r}: {name}, "
         else:
-            incomplete = f"kwargs or {names[-1]} is ABSENT"
-        accepted = ", ".join(f"{name}=ABSENT" for name in names) + ", /, **kwargs"
-        passed = "()"
-        for number, name in enumerate(names):
-            passed = f"({', '.join(names[: number + 1])},) if {name} is not ABSENT else {passed}"
-    given = ", ".join(names)
-    bound = "{}" if any(p.kind is p.KEYWORD_ONLY for p in parameters) else "BOUND"
-    answer = _RETURN[hook.kind].format
-    source = f"def wrapper({accepted}):" + template.format(
-        incomplete=incomplete,
-        passed=passed,
-        doubtful=doubtful,
-        rule=_RULE,
-        rule_as_passed=answer("rule(*args, **kwargs)"),
-        intercept_as_passed=answer(f"{_INTERCEPT}(args, kwargs)"),
-        rule_at_once=answer(f"rule({given})"),
-        intercept=answer(f"{_INTERCEPT}(({given + ',' if given else ''}), {bound})"),
-    )
-    return f"async {source}" if hook.kind == "coroutine" else source
-
-
-def _binder(signature: inspect.Signature) -> Callable[..., tuple[tuple[Any, ...], dict[str, Any]]]:
-    """Make a function with a signature that returns its arguments: by position where they can be, with defaults."""
-    parameters = signature.parameters.values()
-    prefixes: dict[Any, str] = {
-        inspect.Parameter.VAR_POSITIONAL: "*",
-        inspect.Parameter.VAR_KEYWORD: "**",
+            kwargs += f"**{name}, "
+    scope: dict[str, Any] = {
+        "defaults": {name: p.default for name, p in signature.parameters.items()},
     }
-    # Short defaults, and no annotations: code can name neither. The defaults themselves are set
-    # below.
-    declared = [
-        p.replace(annotation=p.empty, default=p.empty if p.default is p.empty else 0)
-        for p in parameters
-    ]
-    names = {p.name: prefixes.get(p.kind, "") + p.name for p in parameters}
-    placed = [f"{names[p.name]}," for p in parameters if p.kind < inspect.Parameter.KEYWORD_ONLY]
-    keyed = [
-        names[p.name] if p.kind is p.VAR_KEYWORD else f"{p.name!r}: {p.name}"
-        for p in parameters
-        if p.kind >= inspect.Parameter.KEYWORD_ONLY
-    ]
-    found: dict[str, Any] = {}
-    source = f"def bind{inspect.Signature(declared)}: return ({' '.join(placed)}), {{{', '.join(keyed)}}}"
-    exec(source, found)
-    bind: FunctionType = found["bind"]
-    optional = [p for p in parameters if p.default is not p.empty]
-    bind.__defaults__ = tuple(p.default for p in optional if p.kind is not p.KEYWORD_ONLY)
-    bind.__kwdefaults__ = {p.name: p.default for p in optional if p.kind is p.KEYWORD_ONLY}
-    return bind
+    exec(f"def bind{Signature(parameters)}: return ({args}), {{{kwargs}}}", scope)
+    return scope["bind"]
 
 
-def unbind(value: Any) -> Any:
+def unbind(value: object) -> object:
     """Return an attribute of a class or module without its binding."""
     return value.__func__ if isinstance(value, (staticmethod, classmethod)) else value
 
 
-def hook_of(value: Any) -> Hook | None:
-    """Return the hook of a wrapper, also as an attribute of a class; None for anything else."""
+def rebind(wrapper: FunctionType, binding: Binding | None) -> Model:
+    """Return a wrapper with a binding; None for a plain function."""
+    return wrapper if binding is None else binding(wrapper)
+
+
+def hook_of(value: object) -> Hook | None:
+    """Return the hook of a wrapper, also of a bound one; None for anything else."""
     function = unbind(value)
-    # A wrapper is known by its globals, not by an attribute: other decorators copy a function's
-    # attributes.
-    if isinstance(function, FunctionType) and isinstance(
-        function.__globals__.get("INTERCEPTORS"), Interceptors
-    ):
-        hook: Hook = vars(function)[_MADE_WITH][0]
-        return hook
-    return None
+    if not isinstance(function, FunctionType):
+        return None
+    # Not an attribute of the wrapper, because other decorators copy attributes.
+    interceptors = function.__globals__.get("INTERCEPTORS")
+    return interceptors.hook if isinstance(interceptors, Interceptors) else None
 
 
-def made_with(wrapper: FunctionType) -> Any:
-    """Return the object that a wrapper was made with."""
-    return vars(wrapper)[_MADE_WITH][1]
+def made_with(wrapper: object) -> Any:
+    """Return the object that a wrapper was made with: a definition or None."""
+    return vars(unbind(wrapper))[_MADE_WITH]
 
 
-def unwrap(function: Any) -> Any:
+def unwrap(function: object) -> Model:
     """Return the function behind a wrapper; any other function itself, unbound."""
     function = getattr(function, "__func__", function)
     hook = hook_of(function)
@@ -175,130 +216,152 @@ def unwrap(function: Any) -> Any:
 # -- hooks ----------------------------------------------------------------------------------------
 
 
-class Interceptors(dict[Any, Interceptor]):
-    """The interceptors of one hook. A wrapper that is pickled by value finds those of the process it arrives in.
+class Interceptors(dict[greenlet | None, Interceptor]):
+    """The interceptors of one hook, by stack.
 
-    ``roots`` has the roots of threads from which calls run the rule at once.
+    A wrapper that was pickled by value gets the interceptors of the process that unpickles it.
+
+    Attributes:
+        hook: The hook.
+        roots: The roots of threads whose calls run the rule at once.
     """
 
     __slots__ = ("hook", "roots")
 
     def __init__(self, hook: Hook) -> None:
         super().__init__()
-        self.hook, self.roots = hook, _ROOTS
+        self.hook = hook
+        self.roots = _ROOTS
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[Any, ...]:
         return getattr, (self.hook, "interceptors")
+
+    def intercept_elsewhere(self, interceptor: Interceptor | None) -> None:
+        """Intercept calls away from all simulations; None: such calls run the function again."""
+        if interceptor is None:
+            self.pop(None, None)
+            self.roots = _ROOTS
+        else:
+            self[None] = interceptor
+            self.roots = set()
 
 
 class Hook:
-    """A function of a model that is decided or extended, or an exposed iterable: handlers, and interceptors of calls.
+    """A function of a model that is decided or extended, or an exposed iterable.
 
-    It is in force while it has users: its handlers, and environments.
+    It holds the handlers and the interceptors of calls. Its wrapper is in place while the hook has
+    users: handlers and environments.
 
     Attributes:
-        function: The function. Its signature is its own, not that of what it wraps.
+        function: The function.
         rule: The innermost part of a call: the function, or its temporary replacement.
-        kind: What a call returns: "function" (a value), "generator" or "coroutine".
-        bound: Whether its first argument is the object it is called on, which is never passed by
-            keyword.
-        alone: Whether every call has only that argument.
-        interceptors: Those of calls on the stacks of simulations. An entry for None says that all
-            other calls do not just run the function.
-        slot: Its handlers, as ``slots`` returns them. Empty while it has none.
-        stale: Whether another object has replaced it while nothing was set in its place.
-        permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
-        threads: The names of threads that called it before anything else, and where its rule
-            decides.
-        definition: The latest definition of a decision function, which its name means; None for all
-            other functions.
-        removed_by: Functions (or names) whose calls end its agents, under every definition: see
-            ``make_step``.
+        name: The dotted name of the function.
+        kind: The result of a call: "function" (a value), "generator" or "coroutine"; or "iterable".
+        positions: The positions of handlers.
+        bound: Whether the first argument is the object that the function is called on, which is
+            never passed by keyword.
+        interceptors: The interceptors of calls on the stacks of simulations. An entry for None
+            intercepts all other calls.
+        slot: The handlers by owner. Empty without handlers.
+        permanent: Whether a wrapper was set permanently, on a decorated or exposed function.
+        exposed: Whether the function is exposed to plugins.
+        threads: The names of threads that called the function outside of simulations.
+        definition: The latest definition of a decision function; None for other functions.
+        removed_by: Functions (or names) whose calls end the hook's agents, under every definition:
+            see ``make_step``.
     """
 
     permanent = True
-    stale = False
 
-    def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None) -> None:
+    def __init__(
+        self,
+        function: Function,
+        name: str,
+        *,
+        bound: bool | None = None,
+        kind: str | None = None,
+        exposed: bool = False,
+    ) -> None:
         """Make the hook of a function with a dotted name.
 
-        Raise a ``PatchError`` for an async generator function.
+        Args:
+            function: The function.
+            name: The dotted name.
+            bound: See ``Hook``. None: whether the function is an attribute of a class, by its name.
+            kind: See ``Hook``. None: the kind of the function.
+            exposed: Whether the function is exposed to plugins.
 
-        ``bound`` tells whether, in a class, its first argument is the object it is called on;
-        ``like`` determines what calls return if the function only forwards to it.
+        Raises:
+            PatchError: The function is an async generator function.
         """
-        like = function if like is None else like
-        if inspect.isasyncgenfunction(like):
-            raise PatchError(
-                f"{name} is an async generator function, which cannot return a decision or call"
-                " handlers"
-            )
-        awaited = "coroutine" if inspect.iscoroutinefunction(like) else "function"
-        self.kind = "generator" if inspect.isgeneratorfunction(like) else awaited
-        self.function = self.rule = function
-        self.name, self.positions = name, CALLS + ITEMS if self.kind == "generator" else CALLS
-        self.signature: inspect.Signature | None = None
-        with suppress(TypeError, ValueError):  # the signature is unknown
-            self.signature = inspect.signature(function, follow_wrapped=False)
-        self.bound = (
-            bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
-        )
-        parameters = () if self.signature is None else self.signature.parameters.values()
-        first = [
-            p
-            for p in parameters
-            if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-        ]
-        self.alone = self.bound and len(first) == len(parameters) == 1
-        # made when it is needed
-        self._binder: Callable[..., tuple[tuple[Any, ...], dict[str, Any]]] | None = None
+        if bound is None:
+            local_name = name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
+            bound = "." in local_name
+        self.function = function
+        self.rule = function
+        self.name = name
+        self.bound = bound
+        self.kind = kind_of(function, name) if kind is None else kind
+        self.positions = _POSITIONS[self.kind]
+        self.exposed = exposed
+        self.signature = signature_of(function, follow_wrapped=False)
+        self._binder: Callable[..., Bound] | None = None  # made at the first use
         self.interceptors = Interceptors(self)
         self.threads: set[str] = set()
         self.definition: Any = None
-        self.removed_by: dict[Any, Any] = {}
-        self.slot: dict[Any, list[list[list[Handler]]]] = {}
-        self.exposed = self._applied = False
-        # The users of each handler, and those of the hook itself under None, in the order in which
-        # they came.
-        self._users: dict[Handler | None, set[object]] = {}
+        self.removed_by: dict[Any, Function | None] = {}
+        self.slot: dict[Hashable, Slot] = {}
+        self._applied = False
+        # The users of each handler, and of the hook itself under None, in the order of arrival.
+        self._users: dict[Handler | None, set[Hashable]] = {}
         _HOOKS[id(self)] = self
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name}>"
 
-    def __reduce__(self) -> Any:
-        return (
-            _restored,
-            (self.function, self.name, self.bound, self.kind, self.exposed),
-            self.definition,
-        )
+    def __reduce__(self) -> tuple[Any, ...]:
+        properties = {"bound": self.bound, "kind": self.kind, "exposed": self.exposed}
+        return _restore, (self.function, self.name, properties), self.definition
 
     def __setstate__(self, definition: Any) -> None:
         """Set the definition after unpickling, unless the hook has one of this process."""
         self.definition = self.definition or definition
 
     @property
+    def stale(self) -> bool:
+        """Whether other code has replaced the function while no wrapper was in its place."""
+        return False
+
+    @property
     def letters(self) -> str:
         """The letters of the function's name in lower case, for the default name of its agent."""
         return re.sub("[^a-z]", "", self.name.rpartition(".")[2].lower()) or "agent"
 
-    def make_wrapper(self, made_with: Any = None) -> FunctionType:
-        """Make a wrapper of the hook's function, for which the function ``made_with`` returns that object."""
-        scope: dict[str, Any] = {
-            "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors, "fits": self.bind,
-            "getcurrent": getcurrent, "intercept": self._intercept, "rule": self.function, "BOUND": BOUND,
-        }  # fmt: skip
-        exec(compile(_source(self, scope), f"<wrapper of {self.name}>", "exec"), scope)
-        made: FunctionType = scope["wrapper"]
-        # for tracebacks
-        made.__code__ = made.__code__.replace(co_name=getattr(self.function, "__name__", "call"))
-        update_wrapper(made, self.function)
-        vars(made)[_MADE_WITH] = self, made_with
-        return made
+    def make_permanent(self, definition: Any, exposed: bool) -> None:
+        """Note that a wrapper was set permanently: for a definition, or exposed to plugins."""
+        self.permanent = True
+        self.definition = definition or self.definition
+        self.exposed = exposed or self.exposed
 
-    def bind(
-        self, args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
+    def make_wrapper(self, made_with: Any = None) -> FunctionType:
+        """Make a wrapper of the function. ``made_with`` returns the given object for it."""
+        scope: dict[str, Any] = {
+            "__name__": __name__,
+            "ABSENT": _ABSENT,
+            "BOUND": BOUND,
+            "INTERCEPTORS": self.interceptors,
+            "fits": self.bind,
+            "getcurrent": getcurrent,
+            "intercept": self._intercept,
+            "rule": self.function,
+        }
+        exec(compile(_source(self, scope), f"<wrapper of {self.name}>", "exec"), scope)
+        wrapper: FunctionType = scope.pop("wrapper")
+        update_wrapper(wrapper, self.function)
+        vars(wrapper)[_MADE_WITH] = made_with
+        return wrapper
+
+    def bind(self, args: Args, kwargs: Kwargs) -> Bound | None:
         """Bind a call to the function's own signature, with defaults.
 
         None if the function does not take it.
@@ -306,37 +369,45 @@ class Hook:
         if self.signature is None:
             return args, kwargs
         if self._binder is None:
-            self._binder = _binder(self.signature)
+            self._binder = _make_binder(self.signature)
         try:
             return self._binder(*args, **kwargs)
         except TypeError:
             return None
 
-    def _intercept(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Run a call for which the stack itself has no interceptor, or refuse it with a ``WrongThreadError``."""
+    def _intercept(self, args: Args, kwargs: Kwargs) -> Model:
+        """Run a call on a stack without an interceptor, or refuse it with a ``WrongThreadError``.
+
+        No variable has the stack here, because the frame may be suspended on it.
+        """
         return self._interceptor_at(getcurrent())(args, kwargs)
 
     def _interceptor_at(self, here: greenlet) -> Interceptor:
         driver = (stack_of(here) or spawner_of(here)) if STACKS else None
-        evaluation = EVALUATING.get(here) if driver is None else driver
-        plugins = None if evaluation is None else evaluation.plugins
+        evaluation = driver or EVALUATING.get(here)
         decide = None if driver is None else driver.interceptor(self)
         if here.parent is None and here not in STACKS:
-            if not hasattr(_THREAD, "mark"):
-                _THREAD.mark = set()
-                # a root that outlives its thread makes greenlets crash
-                finalize(_THREAD.mark, _ROOTS.discard, here)
-            _ROOTS.add(here)
+            if here not in _ROOTS:
+                _THREAD_ROOT.register(here)
             self.threads.add(current_thread().name)
+        plugins = None if evaluation is None else evaluation.plugins
         return self.around(decide or self.run_rule, plugins)
 
-    # -- who takes part ---------------------------------------------------------------------------
+    # -- interceptors -----------------------------------------------------------------------------
 
-    def enter(self, stack: greenlet, decide: Interceptor | None, plugins: Any) -> None:
-        """Enter an interceptor for calls on the stack of a simulation, whose environment has these plugins.
+    def enter(
+        self,
+        stack: greenlet,
+        decide: Interceptor | None,
+        plugins: Hashable | None,
+    ) -> None:
+        """Enter an interceptor for calls on the stack of a simulation.
 
-        ``decide`` decides instead of the rule. None: the rule decides, with handlers if the plugins
-        have some.
+        Args:
+            stack: The stack.
+            decide: The interceptor that decides instead of the rule. None: the rule decides, with
+                the handlers of the plugins.
+            plugins: The plugins of the simulation's environment.
         """
         _ROOTS.discard(stack)
         if decide is None and plugins not in self.slot:
@@ -348,45 +419,48 @@ class Hook:
         """Remove the interceptor of a stack, if there is one."""
         self.interceptors.pop(stack, None)
 
-    def around(self, inner: Interceptor, plugins: Any) -> Interceptor:
-        """Return an interceptor that runs the handlers of plugins, or of the whole process, around ``inner``."""
-        found = self.slot.get(plugins) or self.slot.get(None)
-        if found is None:
-            return inner
-        calls, items, (traces,) = found
-        if any(items):
-            inner = partial(each, self, inner)
-        around: Interceptor = partial(run if self.kind == "function" else wait, calls, inner)
-        for trace in traces:
-            around = trace.function(self, self.kind, around)
-        return around
+    def around(self, inner: Interceptor, plugins: Hashable | None) -> Interceptor:
+        """Return an interceptor that runs handlers around ``inner``.
 
-    def run_rule(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        These are the handlers of the plugins, if there are any, or of the whole process.
+        """
+        slot = self.slot.get(plugins) or self.slot.get(None)
+        if slot is None:
+            return inner
+        if slot.items is not None:
+            inner = partial(each, self, inner)
+        if slot.calls is not None:
+            inner = partial(run if self.kind == "function" else wait, slot.calls, inner)
+        for trace in slot.traces:
+            inner = trace.function(self.name, self.kind, inner)
+        return inner
+
+    def run_rule(self, args: Args, kwargs: Kwargs) -> Model:
         """Run the rule."""
         return self.rule(*args, **kwargs)
 
-    def replace_rule(self, rule: Any = None) -> None:
+    def replace_rule(self, rule: Function | None = None) -> None:
         """Replace the rule; None restores the function."""
-        self.rule = self.function if rule is None else rule
+        self.rule = rule or self.function
         self._update()
 
     # -- users ------------------------------------------------------------------------------------
 
     @property
     def handlers(self) -> list[Handler]:
-        """The handlers of all owners, in the order in which they were attached."""
+        """The handlers of all owners, in the order of their attachment."""
         return [handler for handler in list(self._users) if handler is not None]
 
-    def install(self, user: object, handler: Handler | None = None) -> None:
-        """Set it in its place, or attach a handler, until every user has called ``uninstall``.
+    def install(self, user: Hashable, handler: Handler | None = None) -> None:
+        """Set the wrapper in its place, or attach a handler, until every user uninstalls it.
 
-        Handlers of the whole process have one user. Raise a ``PatchError`` if it cannot be set.
+        Raises:
+            PatchError: The wrapper cannot be set.
         """
         with LOCK:
-            user = user if handler is None else handler.owner and user
             try:
-                # Noted first: garbage collection may close another environment that uses it
-                # meanwhile.
+                # The user comes first, because garbage collection may close another environment
+                # that uses the hook meanwhile.
                 users = self._users.get(handler, set())
                 users.add(user)
                 self._users[handler] = users
@@ -399,14 +473,16 @@ class Hook:
                 self.uninstall(user, handler)
                 raise
 
-    def uninstall(self, user: object, handler: Handler | None = None) -> None:
+    def uninstall(self, user: Hashable, handler: Handler | None = None) -> None:
         """Undo ``install``; the last user restores the original.
 
-        After an interrupt, call it again.
+        After an interrupt, call this again. A handler of the whole process has one user.
         """
         with LOCK:
             users = self._users.get(handler, set())
-            users.discard(user if handler is None else handler.owner and user)
+            users.discard(user)
+            if handler is not None and handler.owner is None:
+                users.clear()
             if not users:
                 self._users.pop(handler, None)
                 if handler is not None:
@@ -416,43 +492,67 @@ class Hook:
                 self._revert()
 
     def _apply(self) -> None:
-        """Set it in its place."""
+        """Set the wrapper in its place."""
 
     def _revert(self) -> None:
-        """Undo ``_apply``, also where that failed half-way or was never called."""
+        """Undo ``_apply``, also after an error in it, or without a call of it."""
 
     def _update(self) -> None:
         """Fill the slot, and enter the stacks of simulations again."""
-        present: Any = None
-        # Meanwhile, garbage collection may close an environment and remove its handlers.
-        while present != (attached := self.handlers):
-            present = attached
-            self.slot = slots(present)  # one assignment, because another thread may run a call
-        if self.slot or self.rule is not self.function:
-            self.interceptors[None], self.interceptors.roots = self.run_rule, set()
-        else:
-            self.interceptors.pop(None, None)
-            self.interceptors.roots = _ROOTS
+        while True:
+            present = self.handlers
+            self.slot = make_slots(present)  # one assignment: another thread may run a call
+            # Meanwhile, garbage collection may close an environment and remove its handlers.
+            if present == self.handlers:
+                break
+        changed = bool(self.slot) or self.rule is not self.function
+        self.interceptors.intercept_elsewhere(self.run_rule if changed else None)
         for stack in list(self.interceptors):
-            driver = STACKS.get(stack, OUTSIDE)
-            if driver is not OUTSIDE:
+            driver = None if stack is None else STACKS.get(stack)
+            if driver is not None:
                 driver.enter_hooks()
+
+
+_POSITIONS: Final = {
+    "function": CALLS,
+    "coroutine": CALLS,
+    "generator": CALLS + ITEMS,
+    "iterable": ITEMS,
+}
+
+
+def kind_of(function: Function, name: str) -> str:
+    """Return the kind of a function with a dotted name.
+
+    Raises:
+        PatchError: It is an async generator function.
+    """
+    if isasyncgenfunction(function):
+        raise PatchError(
+            f"{name} is an async generator function, which cannot return a decision or call"
+            " handlers"
+        )
+    if isgeneratorfunction(function):
+        return "generator"
+    return "coroutine" if iscoroutinefunction(function) else "function"
 
 
 _HOOKS: Final[WeakValueDictionary[int, Hook]] = WeakValueDictionary()
 
 
 def hooks() -> list[Hook]:
-    """Return all hooks, in the order in which they were made."""
-    # The list of references is taken at once: other threads may make hooks meanwhile.
+    """Return all hooks, the oldest first."""
+    # The list of references is taken at once, because other threads may make hooks meanwhile.
     return [hook for reference in _HOOKS.valuerefs() if (hook := reference()) is not None]
 
 
-def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -> Hook:
+def _restore(
+    function: Function,
+    name: str,
+    properties: dict[str, Any],
+) -> Hook:
     """Return the hook of an unpickled function: an existing one, or a new one."""
     for hook in hooks():
         if hook.function is function and hook.name == name:
             return hook
-    hook = Hook(function, name, bound=bound)
-    hook.bound, hook.kind, hook.exposed = bound, kind, exposed
-    return hook
+    return Hook(function, name, **properties)

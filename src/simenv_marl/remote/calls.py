@@ -111,11 +111,7 @@ def _named_hook(code: CodeType, name: str) -> Hook:
     code = code.replace(co_name=name.rpartition(".")[2], co_qualname=name)
     function = FunctionType(code, globals())
     setattr(function, BY_NAME, name)
-    hook = Hook(function, name)
-    hook.bound = True
-    hook.alone = True
-    hook.exposed = True
-    return hook
+    return Hook(function, name, bound=True, exposed=True)
 
 
 # -- episodes -------------------------------------------------------------------------------------

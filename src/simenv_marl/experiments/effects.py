@@ -17,7 +17,7 @@ from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,9 @@ class Effects:
     _cells: "dict[tuple[str, str], DataFrame]" = field(repr=False)
 
     def cells(self, one: str, other: str) -> "DataFrame":
-        """Return the mean of the value for each combination of two factors: one row for each level of the first.
+        """Return the mean of the value for each combination of the levels of two factors.
+
+        The first factor has the rows, the second the columns.
 
         Raises:
             OptionValueError: One of them is not a factor.
@@ -93,67 +95,66 @@ def effects(
         OptionValueError: There is no such column, contender or agent, the values are not numbers,
             or nothing varies.
     """
-    pandas = import_extra("pandas", "effects")
+    import pandas
+
     check_probability("confidence", confidence, 0.95)
     table, factors = _select(frame, metric, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
-    coded = {name: _codes(table[name]) for name in factors}
-    coded = {name: (codes, levels) for name, (codes, levels) in coded.items() if len(levels) > 1}
-    if not coded:
+    levels: dict[str, list[Any]] = {}
+    codes: dict[str, NDArray[np.intp]] = {}
+    for name in factors:
+        places, known = _encode(table[name])
+        if len(known) > 1:
+            levels[name] = known
+            codes[name] = places
+    if not levels:
         raise OptionValueError("no factor has more than one level")
-    levels = {name: own for name, (_, own) in coded.items()}
-    values = pandas.Series(numbers(table[metric], metric).to_numpy())
     labels = {
-        name: own if len(set(own)) == len(own) else list(map(repr, own))
-        for name, own in levels.items()
+        name: known if len(set(known)) == len(known) else list(map(repr, known))
+        for name, known in levels.items()
     }
+    values = pandas.Series(numbers(table[metric], metric).to_numpy())
     seeds = table["seed"].to_numpy()
-    zero_or_one = is_proportion(table[metric].to_numpy())
-    whole = _over_seeds(values, seeds)[0].mean()
-    main: dict[tuple[str, Any], list[float]] = {}
-    for name, (codes, _) in coded.items():
-        for code, here in values.groupby(codes):
-            sample, single = _over_seeds(here, seeds[here.index])
-            low, high, _ = interval(sample, confidence, proportion=zero_or_one and single)
-            main[name, labels[name][code]] = [
-                sample.mean(),
-                low,
-                high,
-                sample.mean() - whole,
-                len(here),
-            ]
-    index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
-    columns = ["mean", "low", "high", "effect", "count"]
-    rows = pandas.DataFrame(main.values(), index, columns).astype({"count": int})
+    is_share = is_proportion(table[metric].to_numpy())
+    overall = _over_seeds(values, seeds)[0].mean()
+    rows = []
+    for name in levels:
+        for code, group in values.groupby(codes[name]):
+            sample, is_single = _over_seeds(group, seeds[group.index])
+            mean = sample.mean()
+            low, high, _ = interval(sample, confidence, proportion=is_share and is_single)
+            rows.append((name, labels[name][code], mean, low, high, mean - overall, len(group)))
+    columns = ["factor", "level", "mean", "low", "high", "effect", "count"]
+    main = pandas.DataFrame(rows, columns=columns).set_index(columns[:2])
     cells: dict[tuple[str, str], DataFrame] = {}
     strengths = []
     for one, other in combinations(levels, 2):
-        means = values.groupby([coded[one][0], coded[other][0]]).mean().unstack()
+        means = values.groupby([codes[one], codes[other]]).mean().unstack()
         means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
-        means.index, means.columns = (
-            pandas.Index(labels[one], name=one),
-            pandas.Index(labels[other], name=other),
-        )
-        cells |= {(one, other): means, (other, one): means.T}
         grid = means.to_numpy(np.float64)
-        rest = (
-            grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0, keepdims=True) + grid.mean()
+        means = pandas.DataFrame(
+            grid, pandas.Index(labels[one], name=one), pandas.Index(labels[other], name=other)
         )
+        cells[one, other] = means
+        cells[other, one] = means.T
+        rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0) + grid.mean()
         # nan if a combination is missing
-        strengths.append([one, other, float(np.sqrt((rest**2).mean()))])
-    interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(
-        ["factor", "other"]
-    )
-    return Effects(
-        rows, interactions.sort_values("strength", ascending=False), metric, levels, cells
-    )
+        strengths.append((one, other, np.sqrt((rest**2).mean())))
+    columns = ["factor", "other", "strength"]
+    interactions = pandas.DataFrame(strengths, columns=columns).set_index(columns[:2])
+    interactions = interactions.sort_values("strength", ascending=False)
+    return Effects(main, interactions, metric, levels, cells)
 
 
-def _over_seeds(values: Any, seeds: NDArray[Any]) -> tuple[NDArray[np.float64], bool]:
-    """Return the mean of each seed, or all values of a single seed, and whether each of them is one run's value."""
+def _over_seeds(values: "Series[float]", seeds: NDArray[Any]) -> tuple[NDArray[np.float64], bool]:
+    """Return the mean of each seed, or all values of a single seed.
+
+    The second value says whether each of them is the value of one run.
+    """
     means = values.groupby(seeds).mean()
-    return (means if len(means) > 1 else values).to_numpy(), len(means) in (1, len(values))
+    sample = means if len(means) > 1 else values
+    return sample.to_numpy(), len(sample) == len(values)
 
 
 def _select(
@@ -166,39 +167,43 @@ def _select(
     factors = columns[: columns.index("contender")]
     check_metric(metric, columns[len(factors) :])
     selection = frame["status"] == "ok"
-    for what, value in (("contender", contender), ("agent", agent)):
+    for column, value in (("contender", contender), ("agent", agent)):
         if value is None:
             continue
-        names = sorted(set(frame[what]))
+        names = sorted(set(frame[column]))
         if value not in names:
             raise OptionValueError(
-                f"there is no {what} {short_repr(value)}; there are"
+                f"there is no {column} {short_repr(value)}; there are"
                 f" {names}{did_you_mean(value, names)}"
             )
-        selection &= frame[what] == value
+        selection &= frame[column] == value
     if not selection.any():
         raise OptionValueError("no run has come to its end")
     return frame[selection], factors
 
 
-def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
-    """Return the place of each row's level, and the levels: numbers sorted, others as they appear, missing ones last.
+def _encode(column: "Series[Any]") -> tuple[NDArray[np.intp], list[Any]]:
+    """Return the index of each row's level, and the levels.
 
-    Numeric factors with more than eight values are grouped into quarters of these values, however
-    often each occurs.
+    Levels that are numbers are sorted, others have the order of the rows. Missing values are the
+    last level. Numeric factors with more than eight values are grouped into quarters of these
+    values, however often each occurs.
     """
-    pandas = import_extra("pandas", "effects")
+    import pandas
+
     if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
         _, bounds = pandas.qcut(column.drop_duplicates(), 4, retbins=True)
         column = pandas.cut(column, bounds, include_lowest=True)
-    keys: list[Any] = [(type(value), value) if value == value else nan for value in column.tolist()]
-    levels = [key[1] for key in dict.fromkeys(keys) if key is not nan]
+    values = column.tolist()
+    # A key has a type, because 1, True and 1.0 are equal. A missing value differs from itself.
+    levels = list({(type(value), value): value for value in values if value == value}.values())
     if all(type(level) in (int, float, pandas.Interval) for level in levels):
         levels.sort()
     places = {(type(level), level): place for place, level in enumerate(levels)}
-    if nan in keys:
+    codes = [places.get((type(value), value), len(places)) for value in values]
+    if len(places) in codes:
         levels.append(nan)
-    return np.array([places.get(key, len(levels) - 1) for key in keys]), levels
+    return np.array(codes), levels
 
 
 # -- shares of the variance -----------------------------------------------------------------------
@@ -232,7 +237,8 @@ def sobol_indices(
             no number or equal.
         MissingExtraError: SALib is missing.
     """
-    pandas = import_extra("pandas", "sobol_indices")
+    import pandas
+
     analyze = import_extra("SALib.analyze.sobol", "sobol_indices").analyze
     check_probability("confidence", confidence, 0.95)
     table, names = _select(frame, metric, contender, agent)
@@ -241,7 +247,8 @@ def sobol_indices(
             "some runs have failed, but shares of the variance need all rows of the design"
         )
     seeds = table["seed"].nunique()
-    values, rows = numbers(table[metric], metric).to_numpy(), table[names].to_numpy(object)
+    values = numbers(table[metric], metric).to_numpy()
+    rows = table[names].to_numpy(object)
     if not np.isfinite(values).all():
         raise OptionValueError(
             f"{metric!r} is missing or not finite in some rows, but shares of the variance need all"
@@ -266,14 +273,20 @@ def sobol_indices(
 
 
 def _is_saltelli(rows: NDArray[Any]) -> bool:
-    """Return whether rows are blocks of: A.
+    """Return whether a design has the rows of a Saltelli design.
 
-    A with each factor of B in turn; B with each factor of A in turn; B.
+    Each sample is a block: a row A; A with each factor of B in turn; B with each factor of A in
+    turn; the row B.
+
+    Args:
+        rows: The values of the factors, of shape ``(rows, factors)``.
     """
     count = rows.shape[1]
     if not count or len(rows) % (2 * count + 2):
         return False
-    blocks, own = rows.reshape(-1, 2 * count + 2, count), np.eye(count, dtype=bool)
-    first, last = blocks[:, :1], blocks[:, -1:]
+    blocks = rows.reshape(-1, 2 * count + 2, count)
+    first = blocks[:, :1]
+    last = blocks[:, -1:]
+    own = np.eye(count, dtype=bool)
     mixed = np.concatenate([np.where(own, last, first), np.where(own, first, last)], axis=1)
     return bool((blocks[:, 1:-1] == mixed).all())

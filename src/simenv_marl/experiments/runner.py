@@ -1,19 +1,20 @@
-"""Runs the episodes of contenders: who decides, what is measured, and the rows of a table that this gives."""
+"""Runs the episodes of contenders, and measures them: the returns of agents, and metrics."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from types import NoneType
+from typing import TYPE_CHECKING, Any, Final, SupportsFloat, SupportsIndex
 
 import numpy as np
 
-from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.points import declared_agents
+from ..core.points import Points, declared_agents
 from ..core.policies import has_fallback, waits
 from ..data.collect import learners_plan
 from ..decision import decision_points
@@ -25,11 +26,10 @@ from ..errors import (
     did_you_mean,
     short_repr,
     warn_user,
-)  # fmt: skip
+)
 from ..many.batch import Group, run, takes_identities
-from ..many.parallel import import_extra
-from ..many.simulate import check_options, checked_seeds
-from ..simulation import RULE
+from ..many.simulate import checked_seeds
+from ..simulation import RULE, Model
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -41,36 +41,56 @@ RUN_COLUMNS: Final = ("contender", "seed", "agent", "return", "length")
 """The first columns of tables, after the factors."""
 
 FALLBACKS: Final = "fallbacks"
-"""The column, after these, with the number of decisions that a fallback answered, if a contender has one."""
+"""The next column, if a contender has a fallback: the number of decisions that it answered."""
 
 STATUS_COLUMNS: Final = ("status", "error")
 """The last columns of the table of an experiment, after the metrics."""
 
+EXACT: Final = 2**53
+"""The integers up to this are exact as floats."""
 
-class Outcome(NamedTuple):
-    """The results of one episode: each agent's undiscounted return and number of decisions, and the metrics.
+Contenders = Mapping[str, Mapping[Any, Any]]
+"""The policies of each contender, as ``simulate`` takes them."""
 
-    ``fallbacks`` has the agents for which a fallback has answered, and how often.
+Metric = Callable[[Model], object]
+"""A callable of a simulation after its end. ``plain_value`` checks its result."""
+
+Metrics = Metric | Mapping[str, Metric] | None
+"""The argument ``metric`` of ``evaluate`` and ``run_experiment``."""
+
+Value = str | float | None
+"""A factor or the result of a metric: a string, a number, a bool or None."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The results of one episode.
+
+    Attributes:
+        returns: The undiscounted return of each agent that has decided.
+        lengths: The number of decisions of each of these agents.
+        metrics: The result of each metric.
+        fallbacks: For each agent with a fallback: the number of decisions that it answered.
     """
 
     returns: dict[str, float]
     lengths: dict[str, int]
-    metrics: dict[str, Any]
+    metrics: dict[str, Value]
     fallbacks: dict[str, int]
 
 
 class Returns(tuple[float, ...]):
-    """The returns of an episode's agents: a tuple of numbers, for ``sum`` and ``max``, and a mapping by agent."""
+    """The returns of an episode's agents: a tuple of numbers, and a mapping by agent."""
 
     _by_agent: dict[str, float]
 
     def __new__(cls, returns: Mapping[str, float]) -> Returns:
-        """Make the returns from a dict."""
+        """Copy the returns from a dict."""
         instance = super().__new__(cls, returns.values())
-        instance._by_agent = dict(returns)  # the user of the tuple may change it
+        instance._by_agent = dict(returns)
         return instance
 
-    def __getitem__(self, key: Any) -> Any:
+    def __getitem__(self, key: SupportsIndex | slice | str) -> Any:
         if not isinstance(key, str):
             return super().__getitem__(key)
         if key not in self._by_agent:
@@ -84,12 +104,16 @@ class Returns(tuple[float, ...]):
         return key in self._by_agent if isinstance(key, str) else super().__contains__(key)
 
     def __getattr__(self, name: str) -> Any:
-        """Return ``get``, ``keys``, ``values`` or ``items`` of the dict."""
+        """Return a method of the dict, such as ``get`` or ``items``."""
         return getattr(self._by_agent, name)
 
 
+Team = Callable[[Returns], SupportsFloat]
+"""A callable that combines the returns of agents into the team's value."""
+
+
 @contextmanager
-def noting(note: str) -> Iterator[None]:
+def error_note(note: str) -> Iterator[None]:
     """Add a note to errors."""
     try:
         yield
@@ -99,46 +123,26 @@ def noting(note: str) -> Iterator[None]:
 
 
 class Runner:
-    """Runs episodes of contenders, with the arguments that ``evaluate`` and ``run_experiment`` share.
+    """Runs episodes of contenders for ``evaluate`` and ``run_experiment``.
 
     Workers get a copy. With a ``batch_size`` of 0, policies answer one decision at a time.
     """
 
     def __init__(
-        self, contenders: Any, points: Any, options: Mapping[str, Any], metric: Any, team: Any, *, batched: bool,
-        batch_size: int, concurrency: int, workers: int, factors: Collection[str] = (),
-    ) -> None:  # fmt: skip
+        self,
+        contenders: Contenders,
+        points: Points,
+        options: Mapping[str, Any],
+        metric: Metrics,
+        team: Team | None,
+        batch_size: int,
+        concurrency: int,
+        factors: Collection[str] = (),
+    ) -> None:
         """Check the arguments.
 
         ``factors`` are the columns of the design, whose names metrics must not have.
         """
-        check_options(batch_size, workers, None, concurrency)
-        if not isinstance(contenders, Mapping):
-            raise OptionValueError(
-                f"contenders must be a dict from a name to policies, not {short_repr(contenders)}"
-            )
-        for name, policies in contenders.items():
-            if not isinstance(name, str) or not name:
-                raise OptionValueError(
-                    f"the name of a contender must be a string, not {short_repr(name)}"
-                )
-            if not isinstance(policies, Mapping):
-                raise OptionValueError(
-                    f"the contender {name!r} must be a dict from agents or points to policies,"
-                    f" {{}} for the model as it is, not {short_repr(policies)}"
-                )
-            for key, policy in policies.items():
-                if (
-                    callable(policy)
-                    and policy is not RULE
-                    and not batched
-                    and takes_identities(policy)
-                ):
-                    raise OptionValueError(
-                        f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)},"
-                        " answers many decisions at once, as mixtures do; pass batched=True, and"
-                        " only policies as simulate_many takes them"
-                    )
         if team is not None and not callable(team):
             raise OptionValueError(
                 f"team must be a callable of the returns, or None, not {short_repr(team)}"
@@ -148,10 +152,12 @@ class Runner:
                 "there is no option policies here; pass the policies of each contender in"
                 " contenders="
             )
-        self.contenders: Mapping[str, Mapping[Any, Any]] = contenders
-        self.metrics: Mapping[str, Callable[[Any], Any]] = {"metric": metric}
-        if metric is None or isinstance(metric, Mapping):
-            self.metrics = metric or {}
+        self.contenders = contenders
+        self.metrics: Mapping[str, Metric] = {}
+        if isinstance(metric, Mapping):
+            self.metrics = metric
+        elif metric is not None:
+            self.metrics = {"metric": metric}
         for name, function in self.metrics.items():
             if not isinstance(name, str) or not callable(function):
                 raise OptionValueError(
@@ -162,44 +168,39 @@ class Runner:
                 raise OptionValueError(
                     f"the metric {name!r} has the name of another column; rename it"
                 )
-        self.batch_size, self._concurrency = int(batch_size) if batched else 0, int(concurrency)
-        policies = [policy for own in contenders.values() for policy in own.values()]
-        self._fallbacks = (FALLBACKS,) if any(map(has_fallback, policies)) else ()
-        self._team = team
-        # They may be iterators, and every plan reads them.
+        self.batch_size = int(batch_size)
+        self._concurrency = int(concurrency)
+        self._counts_fallbacks = any(
+            has_fallback(policy) for policies in contenders.values() for policy in policies.values()
+        )
+        self._team = sum if team is None else team
+        # Iterators are copied, because each plan reads them again.
         self._points = list(points) if isinstance(points, Iterator) else points
         self._options = {
-            n: list(value) if isinstance(value, Iterator) else value for n, value in options.items()
+            name: list(value) if isinstance(value, Iterator) else value
+            for name, value in options.items()
         }
 
-    def plan(self, simulation: Any, contender: str) -> Plan:
+    def plan(self, simulation: Model, contender: str) -> Plan:
         """Return the plan of a contender's episodes.
 
-        All agents whose rewards count decide in it.
+        All entities that decide are agents with rewards, also without a policy. If the decision
+        points are not known, the points that contenders name are used, if there are any.
         """
-        policies, points, options = self.contenders[contender], self._points, self._options
-        alone = not self.batch_size
-        with noting(f"of the contender {contender!r}"):
+        policies = self.contenders[contender]
+        make_plan = partial(
+            learners_plan, simulation, policies, options=self._options, alone=not self.batch_size
+        )
+        with error_note(f"of the contender {contender!r}"):
             try:
-                return learners_plan(
-                    simulation, policies, points, options, all_points=True, alone=alone
-                )
+                return make_plan(points=self._points, all_points=True)
             except (AgentError, UnknownPointError) as error:
-                if points is not None:
+                if self._points is not None:
                     raise
-                # The points are not known: those that the contenders name are used, if there are
-                # any.
                 keys = dict.fromkeys(key for own in self.contenders.values() for key in own)
                 points = [key for key in keys if not isinstance(key, str) or "." in key] or None
                 with suppress(AgentError, UnknownPointError):
-                    plan = learners_plan(
-                        simulation,
-                        policies,
-                        points,
-                        options,
-                        all_points=points is not None,
-                        alone=alone,
-                    )
+                    plan = make_plan(points=points, all_points=points is not None)
                     if points is None and decision_points():
                         warn_user(
                             "returns are not counted, because the decision points are not known:"
@@ -208,30 +209,16 @@ class Runner:
                     return plan
                 raise
 
-    def unproven_agents(self, plan: Plan, contender: str) -> set[str]:
-        """Return the names in a contender of which only episodes tell whether they are agents'."""
-        known = {point.agent for point in plan.points}.union(
-            declared_agents(plan.options.possible_agents)
-        )
-        return {
-            name
-            for name in self.contenders[contender]
-            if name in plan.policies and name not in known
-        }
+    def undeclared_agents(self, plan: Plan, contender: str) -> set[str]:
+        """Return the agents that a contender names, but neither points nor ``possible_agents``."""
+        declared = {point.agent for point in plan.points}
+        declared.update(declared_agents(plan.options.possible_agents))
+        return (self.contenders[contender].keys() & plan.policies.keys()) - declared
 
-    def check_agents(self, contender: str, names: set[str], present: Collection[str]) -> None:
-        """Check that agents of these names have decided."""
-        for name in sorted(names.difference(present)):
-            raise AgentError(
-                f"the contender {contender!r} has a policy for {name!r}, but no agent of that name"
-                " has decided; declare it in possible_agents= if it may appear later; these have"
-                f" decided: {', '.join(present) or 'none'}{did_you_mean(name, present)}"
-            )
-
-    def together(self, contender: str) -> int:
-        """Return how many episodes of a contender run together."""
-        waiting = any(map(waits, self.contenders[contender].values()))
-        return self.batch_size or (self._concurrency if waiting else 1)
+    def episodes_at_once(self, contender: str) -> int:
+        """Return how many episodes of a contender run at once."""
+        is_awaited = any(map(waits, self.contenders[contender].values()))
+        return self.batch_size or (self._concurrency if is_awaited else 1)
 
     def run(
         self,
@@ -242,95 +229,118 @@ class Runner:
     ) -> None:
         """Run one episode for each seed.
 
-        ``report`` gets the seed and its results when the simulation is closed.
+        ``report`` gets the seed and the results after the simulation is closed.
         """
         tally = Tally()
+        number = self.episodes_at_once(contender)
 
-        def finish(place: int, simulation: Any) -> Callable[[], None]:
-            return partial(report, seeds[place], tally.outcome(place, simulation, self.metrics))
+        def finish(place: int, simulation: Model) -> Callable[[], None]:
+            seed = seeds[place]
+            return partial(report, seed, tally.outcome(seed, simulation, self.metrics))
 
-        run(plan, seeds, self.together(contender), finish, tally, self._concurrency)
+        with error_note(f"of the contender {contender!r}"):
+            run(plan, seeds, number, finish, tally, self._concurrency)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of ``rows``, with those of contender and seed before them."""
-        return (*RUN_COLUMNS, *self._fallbacks, *self.metrics)
+        """The columns of ``rows``."""
+        return (*RUN_COLUMNS, *([FALLBACKS] if self._counts_fallbacks else []), *self.metrics)
 
-    def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
-        """Return agent, return, length, fallbacks and metrics for each agent and for the team."""
-        metrics = [outcome.metrics.get(name) for name in self.metrics]
-        rows = []
-        for agent, of_agent in outcome.returns.items():
-            own = [outcome.fallbacks.get(agent, 0) for _ in self._fallbacks]
-            rows.append((agent, of_agent, outcome.lengths[agent], *own, *metrics))
-        value: Any = (
-            sum(outcome.returns.values())
-            if self._team is None
-            else self._team(Returns(outcome.returns))
-        )
-        fallbacks = [sum(outcome.fallbacks.values()) for _ in self._fallbacks]
+    def rows(self, contender: str, seed: int, outcome: Outcome) -> list[tuple[Value, ...]]:
+        """Return a row of the table for each agent, and one for the team."""
+        value = self._team(Returns(outcome.returns))
         try:
-            return [
-                *rows,
-                (TEAM, float(value), sum(outcome.lengths.values()), *fallbacks, *metrics),
-            ]
+            returns = {**outcome.returns, TEAM: float(value)}
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
+        lengths = {**outcome.lengths, TEAM: sum(outcome.lengths.values())}
+        fallbacks = {**outcome.fallbacks, TEAM: sum(outcome.fallbacks.values())}
+        metrics = [outcome.metrics.get(name) for name in self.metrics]
+        rows = []
+        for agent, length in lengths.items():
+            counts = [fallbacks.get(agent, 0)] if self._counts_fallbacks else []
+            rows.append((contender, seed, agent, returns[agent], length, *counts, *metrics))
+        return rows
 
 
 class Tally:
-    """Counts the returns of agents while episodes run: a ``Watcher`` for ``run``, and for one episode alone."""
+    """Counts the decisions and rewards of agents while episodes run: a ``Watcher`` for ``run``."""
 
     def __init__(self) -> None:
-        # by place and agent: return, length, fallbacks
-        self._accounts: dict[int, dict[str, list[Any]]] = {}
+        self._outcomes = defaultdict[int, Outcome](
+            lambda: Outcome({}, Counter(), {}, {})
+        )  # by seed
 
-    def count(self, place: int, agent: Agent) -> None:
-        """Count a decision of an agent."""
-        account = agent.notes
-        if account is None:
-            account = agent.notes = self._accounts.setdefault(place, {}).setdefault(
-                agent.name, [0.0, 0, 0]
-            )
-        account[1] += 1
-
-    def record(self, group: Group, places: list[int], waiting: list[Any], *_: Any) -> None:
+    def record(self, group: Group, places: list[int], waiting: list[Any], *_: object) -> None:
         """Count decisions: see ``Watcher``."""
-        for place, episode in zip(places, waiting, strict=True):
-            self.count(place, episode.pending)
+        for episode in waiting:
+            outcome = self._outcomes[episode.seed]
+            name = episode.pending.name
+            outcome.returns.setdefault(name, 0.0)
+            outcome.lengths[name] += 1
 
     def pay(self, episode: Episode) -> None:
-        """Add the rewards: see ``Watcher``."""
-        paid = [*episode.just_ended, *(episode.agents.values() if episode.over else ())]
-        episode.just_ended = []
-        if episode.pending is not None:
-            paid.append(episode.pending)
-        for agent in paid:
-            if agent.notes is not None:
-                agent.notes[0] += agent.reward
-                agent.notes[2] = agent.fallbacks
+        """Add the rewards: see ``Watcher``.
 
-    def outcome(
-        self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]
-    ) -> Outcome:
+        Agents that end before the simulation get their last reward when it is over.
+        """
+        outcome = self._outcomes[episode.seed]
+        agents = [*episode.ended.values(), *episode.agents.values()]
+        for agent in agents if episode.pending is None else [episode.pending]:
+            if agent.name in outcome.returns:
+                outcome.returns[agent.name] += agent.reward
+                if agent.fallbacks:
+                    outcome.fallbacks[agent.name] = agent.fallbacks
+
+    def outcome(self, seed: int, simulation: Model, metrics: Mapping[str, Metric]) -> Outcome:
         """Return the results of an episode that is over."""
-        accounts = self._accounts.pop(place, {})
-        if TEAM in accounts:
+        outcome = self._outcomes.pop(seed)
+        if TEAM in outcome.returns:
             raise AgentError(
                 f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
                 " agent"
             )
-        returns = {name: float(account[0]) for name, account in accounts.items()}
-        lengths = {name: account[1] for name, account in accounts.items()}
-        values = {
-            name: plain_value(f"the metric {name!r}", metric(simulation))
-            for name, metric in metrics.items()
-        }
-        fallbacks = {name: account[2] for name, account in accounts.items() if account[2]}
-        return Outcome(returns, lengths, values, fallbacks)
+        for name, metric in metrics.items():
+            outcome.metrics[name] = plain_value(f"the metric {name!r}", metric(simulation))
+        return outcome
 
 
-# -- seeds, values and tables ---------------------------------------------------------------------
+# -- checks ---------------------------------------------------------------------------------------
+
+
+def check_contenders(contenders: Contenders, *, batched: bool) -> None:
+    """Check that contenders are a dict from names to policies."""
+    if not isinstance(contenders, Mapping):
+        raise OptionValueError(
+            f"contenders must be a dict from a name to policies, not {short_repr(contenders)}"
+        )
+    for name, policies in contenders.items():
+        if not isinstance(name, str) or not name:
+            raise OptionValueError(
+                f"the name of a contender must be a string, not {short_repr(name)}"
+            )
+        if not isinstance(policies, Mapping):
+            raise OptionValueError(
+                f"the contender {name!r} must be a dict from agents or points to policies,"
+                f" {{}} for the model as it is, not {short_repr(policies)}"
+            )
+        for key, policy in {} if batched else policies.items():
+            if policy is not RULE and callable(policy) and takes_identities(policy):
+                raise OptionValueError(
+                    f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)},"
+                    " answers many decisions at once, as mixtures do; pass batched=True, and"
+                    " only policies as simulate_many takes them"
+                )
+
+
+def check_agents(contender: str, names: set[str], present: Collection[str]) -> None:
+    """Check that agents of these names have decided."""
+    for name in sorted(names.difference(present)):
+        raise AgentError(
+            f"the contender {contender!r} has a policy for {name!r}, but no agent of that name"
+            " has decided; declare it in possible_agents= if it may appear later; these have"
+            f" decided: {', '.join(present) or 'none'}{did_you_mean(name, present)}"
+        )
 
 
 def distinct_seeds(seeds: Iterable[int]) -> list[int]:
@@ -344,50 +354,50 @@ def distinct_seeds(seeds: Iterable[int]) -> list[int]:
     return checked
 
 
-def plain_value(what: str, value: Any, advice: str = "") -> Any:
-    """Return a number, a string, a bool or None as an object of Python; refuse any other value."""
+def plain_value(name: str, value: Any, advice: str = "") -> Value:
+    """Return the named value without NumPy's types, or raise an error with some advice."""
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
         value = value.item()
-    # 4,214 digits
-    plain = type(value) in (bool, float, str) or (
-        type(value) is int and value.bit_length() < 14_000
-    )
-    if value is not None and not plain:
-        what += " must be a number of no more than 4,200 digits, a string or None"
-        raise OptionValueError(f"{what}, not {short_repr(value)}{advice}")
-    return value
+    is_short = type(value) is int and value.bit_length() < 14_000  # 4,214 digits
+    if not is_short and type(value) not in (bool, float, str, NoneType):
+        raise OptionValueError(
+            f"{name} must be a number of no more than 4,200 digits, a string or None, not"
+            f" {short_repr(value)}{advice}"
+        )
+    plain: Value = value
+    return plain
 
 
-def make_table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> DataFrame:
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def make_table(names: Sequence[str], rows: Iterable[Sequence[Value]]) -> DataFrame:
     """Return a table whose columns keep the types of their values.
 
     A numeric column with missing values is float.
     """
-    pandas = import_extra("pandas", "a table")
-    columns = dict(zip(names, zip(*rows, strict=True), strict=True))
-    table: DataFrame = pandas.DataFrame(
+    import pandas
+
+    columns = zip(*rows, strict=True)
+    return pandas.DataFrame(
         {
             name: pandas.Series(values, dtype=dtype_of(values, missing=True))
-            for name, values in columns.items()
+            for name, values in zip(names, columns, strict=True)
         }
     )
-    return table
 
 
-def dtype_of(values: Collection[Any], *, missing: bool) -> Any:
+def dtype_of(values: Collection[Any], *, missing: bool) -> str:
     """Return the dtype of a column that keeps the types of its values.
 
-    With ``missing``, None is a missing number, and numbers of both types become floats where that
-    is exact.
+    With ``missing``, None is a missing number, and numbers of both types become floats if that is
+    exact.
     """
     kinds = set(map(type, values))
     if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
-        return np.int64
-    if missing and kinds & {int, float} and kinds <= {int, float, type(None)}:
-        exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
-        return np.float64 if exact else object
-    return (
-        {str: "str", float: np.float64, bool: np.bool_}.get(kinds.pop(), object)
-        if len(kinds) == 1
-        else object
-    )
+        return "int64"
+    if missing and kinds & {int, float} and kinds <= {int, float, NoneType}:
+        is_exact = all(type(value) is not int or abs(value) <= EXACT for value in values)
+        return "float64" if is_exact else "object"
+    dtypes = {str: "str", float: "float64", bool: "bool"}
+    return dtypes.get(kinds.pop(), "object") if len(kinds) == 1 else "object"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, groupby, product
 from math import inf, isfinite, nan, sqrt
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
 import numpy as np
@@ -30,9 +31,9 @@ from .runner import (
     Contenders,
     Metrics,
     Outcome,
+    Row,
     Runner,
     Team,
-    Value,
     check_agents,
     check_contenders,
     distinct_seeds,
@@ -49,7 +50,7 @@ FIRST_CHECK: Final = 16
 MOST_SEEDS: Final = 10_000_000
 """A difference that needs more seeds than this counts as none."""
 
-Rows = dict[tuple[str, int], list[tuple[Value, ...]]]
+Rows = dict[tuple[str, int], list[Row]]
 """The rows of a table by contender and seed."""
 
 FALLBACK_LIMIT: Final = 0.05
@@ -428,8 +429,7 @@ def seeds_needed(
 
 
 def _check_number(name: str, value: float) -> None:
-    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not is_number or not isfinite(value):
+    if not isinstance(value, Real) or isinstance(value, bool) or not isfinite(value):
         raise OptionValueError(f"{name} must be a finite number, not {short_repr(value)}")
 
 

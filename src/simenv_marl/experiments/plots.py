@@ -94,7 +94,7 @@ def plot_factors(
                     "o-",
                     color=COLOURS[place % len(COLOURS)],
                     markersize=4,
-                    label=_short(level),
+                    label=_short_text(level),
                 )
             _label_levels(axes, levels[one], one)
             axes.legend(title=other, frameon=True, framealpha=0.8, edgecolor="none")
@@ -156,10 +156,8 @@ def _label_below(axes: "Axes", names: Sequence[str]) -> None:
 def _label_levels(axes: "Axes", levels: list[Any], factor: str) -> None:
     axes.set_xlim(-0.4, len(levels) - 0.6)
     axes.set_xlabel(factor)
-    _label_below(axes, [_short(level) for level in levels])
+    _label_below(axes, [_short_text(level) for level in levels])
 
 
-def _short(level: Any) -> str:
-    if hasattr(level, "left"):
-        return f"{level.left:.3g} to {level.right:.3g}"
+def _short_text(level: Any) -> str:
     return f"{level:.4g}" if isinstance(level, float) else str(level)

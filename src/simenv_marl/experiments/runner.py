@@ -61,6 +61,9 @@ Metrics = Metric | Mapping[str, Metric] | None
 Value = str | float | None
 """A factor or the result of a metric: a string, a number, a bool or None."""
 
+Row = tuple[Value, ...]
+"""A row of a table."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -232,13 +235,22 @@ class Runner:
         ``report`` gets the seed and the results after the simulation is closed.
         """
         tally = Tally()
-        number = self.episodes_at_once(contender)
 
         def finish(place: int, simulation: Model) -> Callable[[], None]:
             seed = seeds[place]
-            return partial(report, seed, tally.outcome(seed, simulation, self.metrics))
+            outcome = tally.outcomes.pop(seed)
+            if TEAM in outcome.returns:
+                raise AgentError(
+                    f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
+                    " agent"
+                )
+            for name, metric in self.metrics.items():
+                value = metric(simulation)
+                outcome.metrics[name] = plain_value(f"the metric {name!r}", value)
+            return partial(report, seed, outcome)
 
         with error_note(f"of the contender {contender!r}"):
+            number = self.episodes_at_once(contender)
             run(plan, seeds, number, finish, tally, self._concurrency)
 
     @property
@@ -246,7 +258,7 @@ class Runner:
         """The columns of ``rows``."""
         return (*RUN_COLUMNS, *([FALLBACKS] if self._counts_fallbacks else []), *self.metrics)
 
-    def rows(self, contender: str, seed: int, outcome: Outcome) -> list[tuple[Value, ...]]:
+    def rows(self, contender: str, seed: int, outcome: Outcome) -> list[Row]:
         """Return a row of the table for each agent, and one for the team."""
         value = self._team(Returns(outcome.returns))
         try:
@@ -264,17 +276,19 @@ class Runner:
 
 
 class Tally:
-    """Counts the decisions and rewards of agents while episodes run: a ``Watcher`` for ``run``."""
+    """Counts the decisions and rewards of agents while episodes run: a ``Watcher`` for ``run``.
+
+    Attributes:
+        outcomes: The results of the episodes, by seed.
+    """
 
     def __init__(self) -> None:
-        self._outcomes = defaultdict[int, Outcome](
-            lambda: Outcome({}, Counter(), {}, {})
-        )  # by seed
+        self.outcomes = defaultdict[int, Outcome](lambda: Outcome({}, Counter(), {}, {}))
 
     def record(self, group: Group, places: list[int], waiting: list[Any], *_: object) -> None:
         """Count decisions: see ``Watcher``."""
         for episode in waiting:
-            outcome = self._outcomes[episode.seed]
+            outcome = self.outcomes[episode.seed]
             name = episode.pending.name
             outcome.returns.setdefault(name, 0.0)
             outcome.lengths[name] += 1
@@ -284,25 +298,13 @@ class Tally:
 
         Agents that end before the simulation get their last reward when it is over.
         """
-        outcome = self._outcomes[episode.seed]
+        outcome = self.outcomes[episode.seed]
         agents = [*episode.ended.values(), *episode.agents.values()]
         for agent in agents if episode.pending is None else [episode.pending]:
             if agent.name in outcome.returns:
                 outcome.returns[agent.name] += agent.reward
                 if agent.fallbacks:
                     outcome.fallbacks[agent.name] = agent.fallbacks
-
-    def outcome(self, seed: int, simulation: Model, metrics: Mapping[str, Metric]) -> Outcome:
-        """Return the results of an episode that is over."""
-        outcome = self._outcomes.pop(seed)
-        if TEAM in outcome.returns:
-            raise AgentError(
-                f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
-                " agent"
-            )
-        for name, metric in metrics.items():
-            outcome.metrics[name] = plain_value(f"the metric {name!r}", metric(simulation))
-        return outcome
 
 
 # -- checks ---------------------------------------------------------------------------------------
@@ -371,7 +373,7 @@ def plain_value(name: str, value: Any, advice: str = "") -> Value:
 # -- tables ---------------------------------------------------------------------------------------
 
 
-def make_table(names: Sequence[str], rows: Iterable[Sequence[Value]]) -> DataFrame:
+def make_table(names: Sequence[str], rows: Iterable[Row]) -> DataFrame:
     """Return a table whose columns keep the types of their values.
 
     A numeric column with missing values is float.

@@ -32,6 +32,7 @@ from ..errors import (
     SimulationError,
     StoreError,
     describe_error,
+    name_of,
     short_repr,
 )
 from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
@@ -45,6 +46,7 @@ from .runner import (
     Contenders,
     Metrics,
     Outcome,
+    Row,
     Runner,
     Team,
     Value,
@@ -139,10 +141,11 @@ def run_experiment(
     runner = Runner(contenders, points, options, metric, team, batch_size, concurrency, rows[0])
     if isinstance(make, Variant):
         replace(make, parameters={**make.parameters, **rows[0]})  # a variant checks its parameters
-    else:
-        what = "make must be a callable of the factors, such as a class, or a Variant"
-        arguments = f"the factors {', '.join(rows[0]) or '(none)'}"
-        check_call(make, rows[0], OptionValueError, what, arguments)
+    elif problem := find_call_problem(make, rows[0]):
+        raise OptionValueError(
+            f"{name_of(make)} cannot be called with the factors {', '.join(rows[0]) or '(none)'}:"
+            f" {problem}; make must be a callable of the factors, such as a class, or a Variant"
+        )
     try:
         folder = Path(store).absolute()  # other processes may have another working directory
     except TypeError as error:
@@ -218,31 +221,17 @@ def _read_design(design: "DataFrame | Iterable[Any]") -> "tuple[DataFrame, list[
     return table, rows
 
 
-def check_call(
-    source: Model,
-    arguments: Mapping[str, Any],
-    error: type[SimEnvError],
-    requirement: str,
-    described: str,
-) -> None:
-    """Check that a source of simulations can be called with some arguments.
-
-    Args:
-        source: A class or a factory.
-        arguments: The keyword arguments.
-        error: The class of the error if it cannot be called.
-        requirement: The beginning of the message if it is not callable.
-        described: The arguments in the other message.
-    """
+def find_call_problem(source: Model, arguments: Mapping[str, Any]) -> str:
+    """Return why a class or factory cannot be called with some arguments; empty if it can."""
     if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
-        raise error(f"{requirement}, not {short_repr(source)}")
+        return "it is neither a class nor a factory"
     try:
         inspect.signature(source).bind(**arguments)
     except TypeError as problem:
-        name = getattr(source, "__qualname__", None) or short_repr(source)
-        raise error(f"{name} cannot be called with {described}: {problem}") from problem
+        return str(problem)
     except ValueError:  # a builtin without a signature
         pass
+    return ""
 
 
 # -- runs -----------------------------------------------------------------------------------------
@@ -331,11 +320,18 @@ class Job:
 
         If a worker dies, joblib ends all others. Each half of the missing runs is then tried
         separately. A single run that kills its worker twice becomes an error.
+
+        Raises:
+            BrokenExecutor: The workers have died before one of them opened its file.
         """
+        if not runs:
+            return
         try:
             # Small parts cost nothing.
             spread(self.run_part, (), runs, workers, least, bar, share=16)
         except BrokenExecutor:
+            if not any(self.folder.glob(f"runs-{self.session}-*")):
+                raise
             if is_retry and len(runs) == 1:
                 with closing(Writer(self.folder, self.session)) as writer:
                     writer.write(make_entry(runs[0], DEATH, {}))
@@ -428,24 +424,23 @@ def _make_frame(
 ) -> "DataFrame":
     """Return the table of all runs, in the order of the design, the contenders and the seeds."""
     places: list[int] = []
-    rows: list[tuple[Value, ...]] = []
+    rows: list[Row] = []
     for (place, key), contender, seed in product(enumerate(keys), runner.contenders, seeds):
-        run = Run(key, contender, seed)
-        rows += _rows_of_run(run, results.get(run, "its result is no longer stored"), runner)
+        result = results.get(Run(key, contender, seed), "its result is no longer stored")
+        rows += _rows_of_run(contender, seed, result, runner)
         places += [place] * (len(rows) - len(places))
     factors = table.iloc[places].reset_index(drop=True)
     return factors.join(make_table((*runner.columns, *STATUS_COLUMNS), rows))
 
 
-def _rows_of_run(run: Run, result: Result, runner: Runner) -> list[tuple[Value, ...]]:
+def _rows_of_run(contender: str, seed: int, result: Result, runner: Runner) -> list[Row]:
     if isinstance(result, Outcome):
         try:
-            rows = runner.rows(run.contender, run.seed, result)
-            return [(*row, "ok", None) for row in rows]
+            return [(*row, "ok", None) for row in runner.rows(contender, seed, result)]
         except Exception as error:  # raised by team=, which is called for stored runs, too
             result = describe_error(error)
     missing = [None] * (len(runner.columns) - len(RUN_COLUMNS))
-    return [(run.contender, run.seed, TEAM, nan, 0, *missing, "error", result)]
+    return [(contender, seed, TEAM, nan, 0, *missing, "error", result)]
 
 
 # -- variants -------------------------------------------------------------------------------------
@@ -501,13 +496,13 @@ class Variant:
                 f"{' and '.join(sorted(misplaced))} must be arguments of the variant"
                 f" {self.name!r} itself, not among its options"
             )
-        if self.parameters:
-            described = f"the parameters of the variant {self.name!r}"
-            what = (
-                f"the variant {self.name!r} has parameters, so its simulation must be a class or a"
-                " factory"
+        problem = find_call_problem(source, self.parameters)
+        if self.parameters and problem:
+            raise SimulationError(
+                f"{name_of(source)} cannot be called with the parameters of the variant"
+                f" {self.name!r}: {problem}; its simulation must be a class or a factory that takes"
+                " them"
             )
-            check_call(source, self.parameters, SimulationError, what, described)
 
     def __reduce__(self) -> tuple[Callable[..., "Variant"], tuple[()]]:
         # Functions are pickled by name, because hooks replace them while environments are in use.

@@ -292,14 +292,11 @@ class Writer:
 
     def __init__(self, folder: Path, session: str) -> None:
         """Open the file of this process in a session, whose id all its processes share."""
-        if not (folder / HEADER).exists():
-            raise StoreError(
-                f"the process that must write to the store {folder} cannot see it; pass a folder"
-                " that all machines share"
-            )
         process = _processes.setdefault((os.getpid(), threading.get_ident()), uuid4().hex[:12])
         path = folder / f"runs-{session}-{process}.jsonl"
-        self._unwritable = f"cannot write to {path}, but what was stored before is still there"
+        self._unwritable = (
+            f"cannot write to {path}, whose folder all machines must share; stored runs stay"
+        )
         with _explain_errors(self._unwritable):
             self._file = path.open("ab", buffering=0)
         self.close = self._file.close

@@ -7,6 +7,7 @@ from fractions import Fraction
 from importlib.util import find_spec
 from itertools import product
 from math import ceil, prod
+from numbers import Integral
 from string import ascii_lowercase
 from sys import float_info
 from typing import TYPE_CHECKING, Any, Final
@@ -154,7 +155,7 @@ def design(
             f"method must be one of {', '.join(METHODS)}, not"
             f" {short_repr(method)}{did_you_mean(method, METHODS)}"
         )
-    if n is not None and (isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1):
+    if n is not None and (isinstance(n, bool) or not isinstance(n, Integral) or n < 1):
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     builder = Builder(parsed, None if n is None else int(n), checked_seed(seed) or 0)
     columns: Columns = getattr(builder, method)()
@@ -276,13 +277,12 @@ class Builder:
     def central_composite(self) -> Columns:
         """Repeat a central composite design of the ranges for each combination of levels."""
         ranges = [factor for factor in self.factors if factor.is_range]
-        lists = [factor for factor in self.factors if not factor.is_range]
+        levels = [factor.values for factor in self.factors if not factor.is_range]
         number = len(ranges)
         if number < 2:
             raise OptionValueError(
                 f"a central composite design needs at least two ranges (low, high), not {number}"
             )
-        levels = [factor.values for factor in lists]
         size = check_size((2**number + 2 * number + 1) * prod(map(len, levels)))
         if self.n not in (None, size):
             raise OptionValueError(

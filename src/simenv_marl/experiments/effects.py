@@ -97,7 +97,7 @@ def effects(
     """
     import pandas
 
-    check_probability("confidence", confidence, 0.95)
+    check_probability("confidence", confidence)
     table, factors = _select(frame, metric, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
@@ -240,7 +240,7 @@ def sobol_indices(
     import pandas
 
     analyze = import_extra("SALib.analyze.sobol", "sobol_indices").analyze
-    check_probability("confidence", confidence, 0.95)
+    check_probability("confidence", confidence)
     table, names = _select(frame, metric, contender, agent)
     if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():
         raise OptionValueError(

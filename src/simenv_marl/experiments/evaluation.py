@@ -164,7 +164,7 @@ class Evaluation:
             OptionValueError: There is no baseline, or an argument has an invalid value.
         """
         _check_number("difference", difference)
-        check_probability("power", power, 0.8)
+        check_probability("power", power)
         if difference == 0:
             raise OptionValueError(
                 "difference must not be 0: no number of seeds is enough to detect that"
@@ -294,7 +294,7 @@ def evaluate(
             f"the baseline {short_repr(baseline)} is not one of the contenders:"
             f" {', '.join(contenders)}{did_you_mean(baseline, contenders)}"
         )
-    check_probability("confidence", confidence, 0.95)
+    check_probability("confidence", confidence)
     if width is not None:
         _check_number("width", width)
         if width <= 0:
@@ -433,10 +433,10 @@ def _check_number(name: str, value: float) -> None:
         raise OptionValueError(f"{name} must be a finite number, not {short_repr(value)}")
 
 
-def check_probability(name: str, value: float, example: float) -> None:
+def check_probability(name: str, value: float) -> None:
     """Check that an argument is a number between 0 and 1."""
     _check_number(name, value)
     if not 0 < value < 1:
         raise OptionValueError(
-            f"{name} must lie between 0 and 1, such as {example}, not {short_repr(value)}"
+            f"{name} must lie between 0 and 1, such as 0.95, not {short_repr(value)}"
         )

@@ -159,9 +159,10 @@ def run_experiment(
     job = Job(make, runner, folder, session)
     if workers:
         pack(job)  # errors of pickling come before any run
-    row, prepared = job.try_contenders(sorted(keys, key=lambda key: key != storage.sample))
+    keys_to_try = sorted(keys, key=lambda key: key != storage.sample)
+    row, provenances, undeclared = job.try_contenders(keys_to_try)
     storage.create()
-    storage.warn_of_changes(row, {name: made for name, (_, made) in prepared.items()})
+    storage.warn_of_changes(row, provenances)
     # A row that occurs twice has the same results.
     runs = list(starmap(Run, product(dict.fromkeys(keys), contenders, all_seeds)))
     missing = [
@@ -172,11 +173,10 @@ def run_experiment(
     done = len(runs) - len(missing)
     with progress_bar(len(runs), progress, "run", done) as bar:
         trials = []
-        for contender, (names, _) in prepared.items():
-            names = {name for name in names if (contender, name) not in storage.agents}
-            own = [run for run in missing if run.contender == contender]
-            if own and names:
-                trials.append((names, [run for run in own if run.row == own[0].row]))
+        for (_, contender), group in groupby(missing, lambda run: run[:2]):
+            names = undeclared.pop(contender, set()) - storage.agents[contender]
+            if names:
+                trials.append((names, list(group)))
         if trials:
             with suppress(BrokenExecutor):  # a run that kills its worker does so again below
                 spread(job.try_agents, (), trials, workers, 1, NO_BAR)
@@ -286,26 +286,27 @@ class Job:
 
     def try_contenders(
         self, rows: Sequence[str]
-    ) -> tuple[str, dict[str, tuple[set[str], Provenance]]]:
+    ) -> tuple[str, dict[str, Provenance], dict[str, set[str]]]:
         """Check that all contenders can be set up.
 
-        Return the first row whose simulations can be made and, for each contender, its undeclared
-        agents and its provenance. Both are empty if the simulations of the first ten rows cannot be
-        made, because the runs of all rows tell why.
+        Returns:
+            The first row whose simulations can be made and, by contender, provenances and
+            undeclared agents. All three are empty if the simulations of the first ten rows cannot
+            be made, because the runs of all rows tell why.
         """
         for row in rows[:10]:
-            prepared = {}
+            provenances = {}
+            undeclared = {}
             try:
                 for contender in self.runner.contenders:
-                    plan, provenance = self.prepare(row, contender)
-                    names = self.runner.undeclared_agents(plan, contender)
-                    prepared[contender] = (names, provenance)
+                    plan, provenances[contender] = self.prepare(row, contender)
+                    undeclared[contender] = self.runner.undeclared_agents(plan, contender)
             except SimEnvError:
                 raise
             except Exception:  # this row fails; another may not
                 continue
-            return row, prepared
-        return "", {}
+            return row, provenances, undeclared
+        return "", {}, {}
 
     def run_all(
         self,
@@ -345,9 +346,8 @@ class Job:
     def run_part(self, runs: Sequence[Run], bar: Any) -> None:
         """Do runs and store their results."""
         with closing(Writer(self.folder, self.session)) as writer, reuse_resources():
-            for (row, contender), group in groupby(runs, lambda run: run[:2]):
-                seeds = [run.seed for run in group]
-                self._run_seeds(row, contender, seeds, writer.write, bar)
+            for _, group in groupby(runs, lambda run: run[:2]):
+                self._run_seeds(list(group), writer.write, bar)
 
     def try_agents(self, trials: Sequence[tuple[set[str], list[Run]]], bar: Any) -> None:
         """Run the first row of contenders until all agents that they name have decided.
@@ -364,8 +364,8 @@ class Job:
         for names, runs in trials:
             entries: list[Entry] = []
             present: dict[str, float] = {}
-            for row, contender, seed in runs:
-                self._run_seeds(row, contender, [seed], entries.append, bar)
+            for run in runs:
+                self._run_seeds([run], entries.append, bar)
                 present |= entries[-1].get("returns", {})
                 if present.keys() >= names:
                     break
@@ -375,33 +375,26 @@ class Job:
                 for entry in entries:
                     writer.write(entry)
 
-    def _run_seeds(
-        self,
-        row: str,
-        contender: str,
-        seeds: Sequence[int],
-        write: Callable[[Entry], None],
-        bar: Any,
-    ) -> None:
-        """Run seeds of a row with a contender, and ``write`` the result of each.
+    def _run_seeds(self, runs: Sequence[Run], write: Callable[[Entry], None], bar: Any) -> None:
+        """Do runs of one row and one contender, and ``write`` the result of each.
 
         An error is a result, too.
         """
-        remaining = dict.fromkeys(seeds)
-        number = len(remaining)
+        row, contender, _ = runs[0]
+        remaining = {run.seed: run for run in runs}
+        number = len(runs)
 
         def report(seed: int, result: Result, trace: str | None = None) -> None:
-            run = Run(row, contender, seed)
+            run = remaining.pop(seed)
             write(make_entry(run, result, {**provenance, "seed": seed}, trace))
-            del remaining[seed]
             bar.update()
 
         while remaining:
-            part = list(remaining)[:number]
+            seeds = list(remaining)[:number]
             provenance: Provenance = {}  # unknown if the simulation cannot be made
             try:
                 plan, provenance = self.prepare(row, contender)
-                self.runner.run(plan, contender, part, report)
+                self.runner.run(plan, contender, seeds, report)
             except (KeyboardInterrupt, StoreError):
                 raise
             except BaseException as error:

@@ -17,6 +17,7 @@ import json
 import os
 import re
 import threading
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -91,7 +92,7 @@ class Store:
             latest error.
         sample: The row of the design, as JSON, whose provenance is compared. It has a successful
             run; the text is empty if no row has one.
-        agents: Pairs of a contender and an agent that has decided.
+        agents: The agents that have decided, by contender.
     """
 
     def __init__(
@@ -159,7 +160,7 @@ class Store:
         self.exists()
         self.runs: dict[Run, Result] = {}
         self.sample = ""
-        self.agents: set[tuple[str, str]] = set()
+        self.agents = defaultdict[str, set[str]](set)
         self._parts: dict[str, dict[str, str]] = {}  # of the sample, by contender
         for path in sorted(self.folder.glob(f"runs-{session}*.jsonl")):
             with _explain_errors(f"{path} cannot be read"), path.open("rb") as file:
@@ -196,7 +197,7 @@ class Store:
         if not isinstance(self.runs.get(run), Outcome):
             self.runs[run] = result
         if isinstance(result, Outcome):
-            self.agents.update((run.contender, name) for name in result.returns)
+            self.agents[run.contender].update(result.returns)
         if parts:
             self.sample = row
             self._parts[run.contender] = parts

@@ -51,45 +51,43 @@ class Factor:
     """A factor of an experiment.
 
     Attributes:
-        values: The levels or, of a range, the lowest and the highest value: two integers or two
-            floats.
-        is_range: Whether it is a range.
+        values: The levels. Of a range: the lowest and the highest value.
+        kind: The type of the values of a range, int or float. None: the factor has levels.
     """
 
     name: str
     values: tuple[Any, ...]
-    is_range: bool
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether it is a range of integers."""
-        return self.is_range and isinstance(self.values[0], int)
+    kind: type[float] | None = None
 
     def sample(self, unit: Matrix) -> list[Any]:
         """Map numbers in [0, 1) to values of the factor, uniformly."""
-        if self.is_whole:
-            low, high = self.values
-            return [low + int(u * EXACT) * (high - low + 1) // EXACT for u in unit.tolist()]
-        if self.is_range:
+        if self.kind is float:
             return self.scale(unit)
-        return [self.values[int(u * EXACT) * len(self.values) // EXACT] for u in unit.tolist()]
+        low, high = self.values if self.kind else (0, len(self.values) - 1)
+        exact = [int(u * EXACT) for u in unit.tolist()]
+        numbers = [low + u * (high - low + 1) // EXACT for u in exact]
+        return numbers if self.kind else [self.values[number] for number in numbers]
 
     def scale(self, unit: Matrix) -> list[Any]:
         """Map numbers in [0, 1], inclusive, to values of a range."""
         low, high = self.values
-        if self.is_whole and max(-low, high) >= EXACT:
+        if self.kind is int and max(-low, high) >= EXACT:
             return [low + round(Fraction(u) * (high - low)) for u in unit.tolist()]
-        # Not low + u * (high - low), because the difference may overflow.
-        values = np.clip([low * (1 - u) + high * u for u in unit.tolist()], low, high)
-        return [round(value) if self.is_whole else value for value in values.tolist()]
+        # Not low + unit * (high - low), because the difference may overflow.
+        values = np.clip(low * (1 - unit) + high * unit, low, high).tolist()
+        return list(map(round, values)) if self.kind is int else values
 
     def steps(self, number: int | None) -> Collection[Any]:
         """Return all levels, or ``number`` values (default 2) of a range from bound to bound."""
         if number == 1:
             raise OptionValueError("this method takes n values of each range; n must be at least 2")
-        if not self.is_range:
+        if self.kind is None:
             return self.values
         return dict.fromkeys(self.scale(np.linspace(0.0, 1.0, check_size(number or 2))))
+
+    def centre(self) -> Any:
+        """Return the first of levels, or the middle of a range."""
+        return self.scale(np.array([0.5]))[0] if self.kind else self.values[0]
 
     def ends(self) -> tuple[Any, ...]:
         """Return the two values for a two-level design."""
@@ -155,10 +153,11 @@ def design(
             f"method must be one of {', '.join(METHODS)}, not"
             f" {short_repr(method)}{did_you_mean(method, METHODS)}"
         )
-    if n is not None and (isinstance(n, bool) or not isinstance(n, Integral) or n < 1):
+    is_integer = isinstance(n, Integral) and not isinstance(n, bool)
+    if n is not None and not (is_integer and n > 0):
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     builder = Builder(parsed, None if n is None else int(n), checked_seed(seed) or 0)
-    columns: Columns = getattr(builder, method)()
+    columns = getattr(builder, method)()
     return pandas.DataFrame(
         {
             factor.name: pandas.Series(column, dtype=dtype_of(factor.values, missing=False))
@@ -182,7 +181,8 @@ def _parse_factor(name: str, values: Iterable[Any]) -> Factor:
         )
     plain = tuple(value.item() if isinstance(value, np.generic) else value for value in values)
     if isinstance(values, tuple):
-        return Factor(name, _parse_bounds(name, plain), is_range=True)
+        bounds = _parse_bounds(name, plain)
+        return Factor(name, bounds, type(bounds[0]))
     if not plain:
         raise OptionValueError(f"the factor {name!r} has no levels")
     groups: dict[tuple[type, Any], list[Any]] = {}  # so that few pairs of levels are compared
@@ -192,14 +192,14 @@ def _parse_factor(name: str, values: Iterable[Any]) -> Factor:
         if level in others:
             raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
         others.append(level)
-    return Factor(name, plain, is_range=False)
+    return Factor(name, plain)
 
 
 def _parse_bounds(name: str, bounds: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return the bounds of a range as two integers or two floats."""
-    kinds = {type(bound) for bound in bounds}
-    is_finite = kinds <= {int, float} and all(abs(bound) <= float_info.max for bound in bounds)
-    if len(bounds) != 2 or not is_finite:
+    kinds = set(map(type, bounds))
+    are_numbers = len(bounds) == 2 and kinds <= {int, float}
+    if not are_numbers or not all(abs(bound) <= float_info.max for bound in bounds):
         raise OptionValueError(
             f"the factor {name!r} is {short_repr(bounds)}: a tuple is a range (low, high) of"
             " two finite numbers that a float can hold; levels come as a list"
@@ -264,7 +264,7 @@ class Builder:
         pydoe = _import_pydoe()
         for columns in range(number, number + 8):  # pyDOE lacks some sizes; the next one may exist
             with suppress(ValueError):
-                matrix: Matrix = pydoe.pbdesign(columns)[:, :number]
+                matrix = pydoe.pbdesign(columns)[:, :number]
                 break
         else:
             raise OptionValueError(f"no Plackett-Burman design of {number} factors is known")
@@ -276,8 +276,8 @@ class Builder:
 
     def central_composite(self) -> Columns:
         """Repeat a central composite design of the ranges for each combination of levels."""
-        ranges = [factor for factor in self.factors if factor.is_range]
-        levels = [factor.values for factor in self.factors if not factor.is_range]
+        ranges = [factor for factor in self.factors if factor.kind]
+        levels = [factor.values for factor in self.factors if not factor.kind]
         number = len(ranges)
         if number < 2:
             raise OptionValueError(
@@ -290,7 +290,7 @@ class Builder:
                 f" not {self.n}"
             )
         # The centre occurs once: a simulation with the same seed would have the same result.
-        matrix: Matrix = _import_pydoe().ccdesign(
+        matrix = _import_pydoe().ccdesign(
             number, center=(0, 1), alpha="rotatable", face="inscribed"
         )
         points = zip(*map(Factor.scale, ranges, (matrix.T + 1) / 2), strict=True)
@@ -298,12 +298,13 @@ class Builder:
         *of_lists, surface = zip(*rows, strict=True)
         list_columns = iter(of_lists)
         range_columns = zip(*surface, strict=True)
-        return [next(range_columns if f.is_range else list_columns) for f in self.factors]
+        return [next(range_columns if f.kind else list_columns) for f in self.factors]
 
     def latin_hypercube(self) -> Columns:
         """Draw one sample from each slice of each factor."""
         size = check_size(self.n)
-        return self._sample(_import_pydoe().lhs(len(self.factors), samples=size, seed=self.seed))
+        points = _import_pydoe().lhs(len(self.factors), samples=size, seed=self.seed)
+        return self._sample(points)
 
     def sobol(self) -> Columns:
         """Take the first points of a scrambled Sobol sequence."""
@@ -336,13 +337,12 @@ class Builder:
 
     def one_at_a_time(self) -> Columns:
         """Change one factor at a time from the centre of ranges and the first of levels."""
-        half = np.array([0.5])
-        centre = [f.scale(half)[0] if f.is_range else f.values[0] for f in self.factors]
+        centre = [factor.centre() for factor in self.factors]
         rows = [centre]
         for place, factor in enumerate(self.factors):
             for value in factor.steps(self.n):
-                # Levels such as 1 and True are equal, but not the same.
-                is_centre = value is centre[place] or (factor.is_range and value == centre[place])
+                # Two levels may be equal, such as 1 and True.
+                is_centre = value is centre[place] or (factor.kind and value == centre[place])
                 if not is_centre:
                     rows.append([*centre[:place], value, *centre[place + 1 :]])
         return zip(*rows, strict=True)

@@ -101,8 +101,8 @@ def effects(
     table, factors = _select(frame, metric, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
-    levels: dict[str, list[Any]] = {}
-    codes: dict[str, NDArray[np.intp]] = {}
+    levels = {}
+    codes = {}
     for name in factors:
         places, known = _encode(table[name])
         if len(known) > 1:
@@ -127,11 +127,10 @@ def effects(
             rows.append((name, labels[name][code], mean, low, high, mean - overall, len(group)))
     columns = ["factor", "level", "mean", "low", "high", "effect", "count"]
     main = pandas.DataFrame(rows, columns=columns).set_index(columns[:2])
-    cells: dict[tuple[str, str], DataFrame] = {}
+    cells = {}
     strengths = []
     for one, other in combinations(levels, 2):
         means = values.groupby([codes[one], codes[other]]).mean().unstack()
-        means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
         grid = means.to_numpy(np.float64)
         means = pandas.DataFrame(
             grid, pandas.Index(labels[one], name=one), pandas.Index(labels[other], name=other)

@@ -412,7 +412,8 @@ def seeds_needed(
     differences: NDArray[np.float64], difference: float, confidence: float, power: float
 ) -> float:
     """Return the number of seeds that detects a difference: see ``Evaluation.seeds_needed``."""
-    stats = import_extra("scipy.stats", "the number of seeds")
+    from scipy import stats
+
     *_, note = interval(differences, confidence)
     if note:
         return nan

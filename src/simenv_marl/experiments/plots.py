@@ -81,7 +81,7 @@ def plot_factors(
         upper = grid[:above].ravel()
         for axes, factor in zip(upper, levels, strict=False):
             means = main.loc[factor]
-            _draw_means(axes, range(len(means)), means, fmt="o-", color=COLOURS[0], linewidth=1)
+            _draw_means(axes, range(len(means)), means, fmt="o-", color=COLOURS[0])
             _label_levels(axes, levels[factor], factor)
             if axes is not upper[0]:
                 axes.sharey(upper[0])
@@ -97,7 +97,7 @@ def plot_factors(
                     label=_short_text(level),
                 )
             _label_levels(axes, levels[one], one)
-            axes.legend(title=other, frameon=True, framealpha=0.8, edgecolor="none")
+            axes.legend(title=other, frameon=True, edgecolor="none")
         for axes in grid.flat:
             axes.set_visible(axes.has_data())
     return figure
@@ -120,7 +120,7 @@ def _draw_dots(
     for place, name in enumerate(values.columns):
         colour = COLOURS[names.index(name) % len(COLOURS)]
         axes.scatter(place + offsets, values[name], 14, color=colour, alpha=0.5, linewidths=0)
-        _draw_means(axes, [place], means.loc[[name]], fmt="o", color=INK, elinewidth=2, zorder=5)
+        _draw_means(axes, [place], means.loc[[name]], fmt="o", color=INK, elinewidth=2)
         mean = means.loc[name].iloc[0]
         axes.annotate(
             f"{mean:.4g}",

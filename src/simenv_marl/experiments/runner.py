@@ -10,8 +10,6 @@ from functools import partial
 from types import NoneType
 from typing import TYPE_CHECKING, Any, Final, SupportsFloat, SupportsIndex
 
-import numpy as np
-
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.points import Points, declared_agents
@@ -45,6 +43,9 @@ FALLBACKS: Final = "fallbacks"
 
 STATUS_COLUMNS: Final = ("status", "error")
 """The last columns of the table of an experiment, after the metrics."""
+
+RESERVED: Final = (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS)
+"""The columns whose names factors and metrics must not have."""
 
 EXACT: Final = 2**53
 """The integers up to this are exact as floats."""
@@ -167,7 +168,7 @@ class Runner:
                     "metric must be a callable of the simulation, or a dict of them, not"
                     f" {short_repr(metric)}"
                 )
-            if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS, *factors):
+            if name in (*RESERVED, *factors):
                 raise OptionValueError(
                     f"the metric {name!r} has the name of another column; rename it"
                 )
@@ -267,7 +268,7 @@ class Runner:
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
         lengths = {**outcome.lengths, TEAM: sum(outcome.lengths.values())}
         fallbacks = {**outcome.fallbacks, TEAM: sum(outcome.fallbacks.values())}
-        metrics = [outcome.metrics.get(name) for name in self.metrics]
+        metrics = list(map(outcome.metrics.get, self.metrics))
         rows = []
         for agent, length in lengths.items():
             counts = [fallbacks.get(agent, 0)] if self._counts_fallbacks else []
@@ -358,7 +359,7 @@ def distinct_seeds(seeds: Iterable[int]) -> list[int]:
 
 def plain_value(name: str, value: Any, advice: str = "") -> Value:
     """Return the named value without NumPy's types, or raise an error with some advice."""
-    if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
+    if getattr(value, "ndim", None) == 0:
         value = value.item()
     is_short = type(value) is int and value.bit_length() < 14_000  # 4,214 digits
     if not is_short and type(value) not in (bool, float, str, NoneType):

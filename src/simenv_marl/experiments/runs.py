@@ -39,7 +39,7 @@ from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
 from ..many.simulate import check_options
 from ..simulation import Model, make_simulation
 from .runner import (
-    FALLBACKS,
+    RESERVED,
     RUN_COLUMNS,
     STATUS_COLUMNS,
     TEAM,
@@ -140,7 +140,7 @@ def run_experiment(
     batch_size = batch_size if batched else 0
     runner = Runner(contenders, points, options, metric, team, batch_size, concurrency, rows[0])
     if isinstance(make, Variant):
-        replace(make, parameters={**make.parameters, **rows[0]})  # a variant checks its parameters
+        _source_of_row(make, rows[0])  # a variant checks its parameters
     elif problem := find_call_problem(make, rows[0]):
         raise OptionValueError(
             f"{name_of(make)} cannot be called with the factors {', '.join(rows[0]) or '(none)'}:"
@@ -159,8 +159,7 @@ def run_experiment(
     job = Job(make, runner, folder, session)
     if workers:
         pack(job)  # errors of pickling come before any run
-    keys_to_try = sorted(keys, key=lambda key: key != storage.sample)
-    row, provenances, undeclared = job.try_contenders(keys_to_try)
+    row, provenances, undeclared = job.try_contenders([storage.sample or keys[0], *keys])
     storage.create()
     storage.warn_of_changes(row, provenances)
     # A row that occurs twice has the same results.
@@ -205,7 +204,7 @@ def _read_design(design: "DataFrame | Iterable[Any]") -> "tuple[DataFrame, list[
     for name in names:
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
-        if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS):
+        if name in RESERVED:
             raise OptionValueError(
                 f"the factor {name!r} has the name of another column of the table; rename it"
             )
@@ -214,9 +213,9 @@ def _read_design(design: "DataFrame | Iterable[Any]") -> "tuple[DataFrame, list[
     if not len(table):
         raise OptionValueError("the design has no rows")
     advice = "; other values cannot be stored: use a name as the value, and look it up in make"
-    rows: list[dict[str, Value]] = [{} for _ in range(len(table))]
-    for name in names:
-        for row, value in zip(rows, table[name], strict=True):
+    rows = table.to_dict("records") or [{}] * len(table)  # no records without columns
+    for row in rows:
+        for name, value in row.items():
             row[name] = plain_value(f"the factor {name!r}", value, advice)
     return table, rows
 
@@ -280,8 +279,8 @@ class Job:
         source = _source_of_row(self.make, json.loads(row))
         plan = self.runner.plan(source, contender)
         name = self.make.name if isinstance(self.make, Variant) else source_name(self.make)
-        policies = {} if plan.variant is None else dict(plan.variant.policies)
-        policies.update(self.runner.contenders[contender])
+        own_policies = plan.variant.policies if plan.variant else {}
+        policies = {**own_policies, **self.runner.contenders[contender]}
         return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
 
     def try_contenders(

@@ -39,8 +39,9 @@ MADE_OF: Final = (
     "plugins",
     "policies",
     "options",
+    "python",
 )
-"""The parts of the provenance that affect the results of a run."""
+"""The parts of the provenance that affect the results of a run, besides versions of packages."""
 
 VARYING: Final = re.compile(r" at 0x[0-9a-fA-F]+|\w+\.<locals>\.")
 """The differences between texts of equal objects.
@@ -246,19 +247,14 @@ class Store:
 
 
 def _comparable_parts(provenance: Provenance) -> dict[str, str]:
-    """Return all parts of a provenance that affect results, and versions, as texts."""
+    """Return the parts of a provenance that affect results, and versions, as texts."""
     options = dict(provenance["options"])
     options.pop("driver", None)
-    parts = {**provenance, "options": options}
-    versions = {**provenance.get("packages", {}), **provenance.get("dependencies", {})}
+    parts = {part: provenance[part] for part in MADE_OF if part in provenance}
+    parts |= {**provenance["packages"], **provenance["dependencies"], "options": options}
     return {
-        "python": str(provenance.get("python")),
-        **{package: str(version) for package, version in versions.items()},
-        **{
-            part: VARYING.sub("", json.dumps(parts[part], sort_keys=True))
-            for part in MADE_OF
-            if part in parts
-        },
+        name: VARYING.sub("", json.dumps(part, sort_keys=True)).strip('"')
+        for name, part in parts.items()
     }
 
 

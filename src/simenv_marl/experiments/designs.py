@@ -10,7 +10,7 @@ from math import ceil, prod
 from numbers import Integral
 from string import ascii_lowercase
 from sys import float_info
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,10 @@ from .runner import EXACT, dtype_of
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-MOST_ROWS: Final = 10_000_000
+MOST_ROWS = 10_000_000
 """The largest number of rows. A larger design is considered a mistake."""
 
-METHODS: Final = (
+METHODS = (
     "full_factorial",
     "fractional_factorial",
     "latin_hypercube",
@@ -63,10 +63,15 @@ class Factor:
         """Map numbers in [0, 1) to values of the factor, uniformly."""
         if self.kind is float:
             return self.scale(unit)
-        low, high = self.values if self.kind else (0, len(self.values) - 1)
+        low = 0
+        high = len(self.values) - 1
+        if self.kind is int:
+            low, high = self.values
         exact = [int(u * EXACT) for u in unit.tolist()]
         numbers = [low + u * (high - low + 1) // EXACT for u in exact]
-        return numbers if self.kind else [self.values[number] for number in numbers]
+        if self.kind is int:
+            return numbers
+        return [self.values[number] for number in numbers]
 
     def scale(self, unit: Matrix) -> list[Any]:
         """Map numbers in [0, 1], inclusive, to values of a range."""
@@ -75,7 +80,9 @@ class Factor:
             return [low + round(Fraction(u) * (high - low)) for u in unit.tolist()]
         # Not low + unit * (high - low), because the difference may overflow.
         values = np.clip(low * (1 - unit) + high * unit, low, high).tolist()
-        return list(map(round, values)) if self.kind is int else values
+        if self.kind is int:
+            return list(map(round, values))
+        return list(values)
 
     def steps(self, number: int | None) -> Collection[Any]:
         """Return all levels, or ``number`` values (default 2) of a range from bound to bound."""
@@ -83,11 +90,14 @@ class Factor:
             raise OptionValueError("this method takes n values of each range; n must be at least 2")
         if self.kind is None:
             return self.values
-        return dict.fromkeys(self.scale(np.linspace(0.0, 1.0, check_size(number or 2))))
+        unit = np.linspace(0.0, 1.0, check_size(number or 2))
+        return dict.fromkeys(self.scale(unit))
 
     def centre(self) -> Any:
         """Return the first of levels, or the middle of a range."""
-        return self.scale(np.array([0.5]))[0] if self.kind else self.values[0]
+        if self.kind is None:
+            return self.values[0]
+        return self.scale(np.array([0.5]))[0]
 
     def ends(self) -> tuple[Any, ...]:
         """Return the two values for a two-level design."""
@@ -147,7 +157,7 @@ def design(
             "factors must be a dict from names to ranges or lists of levels, not"
             f" {short_repr(factors)}"
         )
-    parsed = [_parse_factor(name, values) for name, values in factors.items()]
+    parsed_factors = [_parse_factor(name, values) for name, values in factors.items()]
     if method not in METHODS:
         raise OptionValueError(
             f"method must be one of {', '.join(METHODS)}, not"
@@ -156,12 +166,12 @@ def design(
     is_integer = isinstance(n, Integral) and not isinstance(n, bool)
     if n is not None and not (is_integer and n > 0):
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
-    builder = Builder(parsed, None if n is None else int(n), checked_seed(seed) or 0)
+    builder = Builder(parsed_factors, None if n is None else int(n), checked_seed(seed) or 0)
     columns = getattr(builder, method)()
     return pandas.DataFrame(
         {
             factor.name: pandas.Series(column, dtype=dtype_of(factor.values, missing=False))
-            for factor, column in zip(parsed, columns, strict=True)
+            for factor, column in zip(parsed_factors, columns, strict=True)
         }
     )
 
@@ -291,7 +301,10 @@ class Builder:
             )
         # The centre occurs once: a simulation with the same seed would have the same result.
         matrix = _import_pydoe().ccdesign(
-            number, center=(0, 1), alpha="rotatable", face="inscribed"
+            number,
+            center=(0, 1),
+            alpha="rotatable",
+            face="inscribed",
         )
         points = zip(*map(Factor.scale, ranges, (matrix.T + 1) / 2), strict=True)
         rows = product(*levels, points)
@@ -310,7 +323,11 @@ class Builder:
         """Take the first points of a scrambled Sobol sequence."""
         size = check_size(self.n)
         points = _import_pydoe().sobol_sequence(
-            size, len(self.factors), scramble=True, seed=self.seed, use_pow_of_2=False
+            size,
+            len(self.factors),
+            scramble=True,
+            seed=self.seed,
+            use_pow_of_2=False,
         )
         return self._sample(points)
 

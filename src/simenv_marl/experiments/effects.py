@@ -62,7 +62,12 @@ class Effects:
         ``figure`` and the result are as in ``plot_timeline``.
         """
         return plot_factors(
-            self.main, self.interactions, self._cells, self.levels, self.metric, figure
+            self.main,
+            self.interactions,
+            self._cells,
+            self.levels,
+            self.metric,
+            figure,
         )
 
 
@@ -102,18 +107,19 @@ def effects(
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
     levels = {}
+    labels = {}
     codes = {}
     for name in factors:
-        places, known = _encode(table[name])
-        if len(known) > 1:
-            levels[name] = known
-            codes[name] = places
+        places, own_levels = _encode(table[name])
+        if len(own_levels) < 2:
+            continue
+        codes[name] = places
+        levels[name] = own_levels
+        labels[name] = own_levels
+        if len(set(own_levels)) < len(own_levels):
+            labels[name] = list(map(repr, own_levels))
     if not levels:
         raise OptionValueError("no factor has more than one level")
-    labels = {
-        name: known if len(set(known)) == len(known) else list(map(repr, known))
-        for name, known in levels.items()
-    }
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
     seeds = table["seed"].to_numpy()
     is_share = is_proportion(table[metric].to_numpy())
@@ -124,29 +130,34 @@ def effects(
             sample, is_single = _over_seeds(group, seeds[group.index])
             mean = sample.mean()
             low, high, _ = interval(sample, confidence, proportion=is_share and is_single)
-            rows.append((name, labels[name][code], mean, low, high, mean - overall, len(group)))
+            label = labels[name][code]
+            rows.append((name, label, mean, low, high, mean - overall, len(group)))
     columns = ["factor", "level", "mean", "low", "high", "effect", "count"]
-    main = pandas.DataFrame(rows, columns=columns).set_index(columns[:2])
+    main = pandas.DataFrame(rows, columns=columns).set_index(["factor", "level"])
     cells = {}
     strengths = []
     for one, other in combinations(levels, 2):
-        means = values.groupby([codes[one], codes[other]]).mean().unstack()
-        grid = means.to_numpy(np.float64)
-        means = pandas.DataFrame(
-            grid, pandas.Index(labels[one], name=one), pandas.Index(labels[other], name=other)
-        )
-        cells[one, other] = means
-        cells[other, one] = means.T
-        rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0) + grid.mean()
-        # nan if a combination is missing
-        strengths.append((one, other, np.sqrt((rest**2).mean())))
-    columns = ["factor", "other", "strength"]
-    interactions = pandas.DataFrame(strengths, columns=columns).set_index(columns[:2])
-    interactions = interactions.sort_values("strength", ascending=False)
-    return Effects(main, interactions, metric, levels, cells)
+        means = values.groupby([codes[one], codes[other]]).mean()
+        grid = means.unstack().to_numpy(np.float64)
+        index = pandas.Index(labels[one], name=one)
+        columns = pandas.Index(labels[other], name=other)
+        table = pandas.DataFrame(grid, index, columns)
+        cells[one, other] = table
+        cells[other, one] = table.T
+        row_means = grid.mean(axis=1, keepdims=True)
+        rest = grid - row_means - grid.mean(axis=0) + grid.mean()
+        strength = np.sqrt((rest**2).mean())  # nan if a combination is missing
+        strengths.append((one, other, strength))
+    interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"])
+    interactions = interactions.set_index(["factor", "other"])
+    strongest_first = interactions.sort_values("strength", ascending=False)
+    return Effects(main, strongest_first, metric, levels, cells)
 
 
-def _over_seeds(values: "Series[float]", seeds: NDArray[Any]) -> tuple[NDArray[np.float64], bool]:
+def _over_seeds(
+    values: "Series[float]",
+    seeds: NDArray[Any],
+) -> tuple[NDArray[np.float64], bool]:
     """Return the mean of each seed, or all values of a single seed.
 
     The second value says whether each of them is the value of one run.
@@ -157,7 +168,10 @@ def _over_seeds(values: "Series[float]", seeds: NDArray[Any]) -> tuple[NDArray[n
 
 
 def _select(
-    frame: "DataFrame", metric: str, contender: str | None, agent: str
+    frame: "DataFrame",
+    metric: str,
+    contender: str | None,
+    agent: str,
 ) -> "tuple[DataFrame, list[str]]":
     """Return the rows to use, and the names of the factors."""
     columns = list(getattr(frame, "columns", ()))
@@ -190,7 +204,8 @@ def _encode(column: "Series[Any]") -> tuple[NDArray[np.intp], list[Any]]:
     """
     import pandas
 
-    if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
+    is_numeric = pandas.api.types.is_numeric_dtype(column) and column.dtype != bool
+    if is_numeric and column.nunique() > 8:
         _, bounds = pandas.qcut(column.drop_duplicates(), 4, retbins=True)
         column = pandas.cut(column, bounds, include_lowest=True)
     values = column.tolist()
@@ -265,10 +280,13 @@ def sobol_indices(
         raise OptionValueError(f"{metric!r} is {means[0]:g} in all rows, so it has no variance")
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     indices = analyze(problem, means, conf_level=confidence, seed=0)
-    columns = {"first": "S1", "first_error": "S1_conf", "total": "ST", "total_error": "ST_conf"}
-    return pandas.DataFrame(
-        {name: indices[key] for name, key in columns.items()}, pandas.Index(names, name="factor")
-    )
+    columns = {
+        "first": indices["S1"],
+        "first_error": indices["S1_conf"],
+        "total": indices["ST"],
+        "total_error": indices["ST_conf"],
+    }
+    return pandas.DataFrame(columns, pandas.Index(names, name="factor"))
 
 
 def _is_saltelli(rows: NDArray[Any]) -> bool:
@@ -287,5 +305,7 @@ def _is_saltelli(rows: NDArray[Any]) -> bool:
     first = blocks[:, :1]
     last = blocks[:, -1:]
     own = np.eye(count, dtype=bool)
-    mixed = np.concatenate([np.where(own, last, first), np.where(own, first, last)], axis=1)
-    return bool((blocks[:, 1:-1] == mixed).all())
+    mixed_first = np.where(own, last, first)
+    mixed_last = np.where(own, first, last)
+    saltelli_blocks = np.concatenate([first, mixed_first, mixed_last, last], axis=1)
+    return bool((blocks == saltelli_blocks).all())

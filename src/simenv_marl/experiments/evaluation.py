@@ -7,7 +7,7 @@ from functools import partial
 from itertools import chain, groupby, product
 from math import inf, isfinite, nan, sqrt
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Final, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,16 +44,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from pandas import DataFrame, Series
 
-FIRST_CHECK: Final = 16
-"""The first number of seeds at which the width is checked. Intervals of fewer are unreliable."""
+FIRST_CHECK = 16
+"""The number of seeds at the first check of the width. Intervals of fewer are unreliable."""
 
-MOST_SEEDS: Final = 10_000_000
+MOST_SEEDS = 10_000_000
 """A difference that needs more seeds than this counts as none."""
 
 Rows = dict[tuple[str, int], list[Row]]
 """The rows of a table by contender and seed."""
 
-FALLBACK_LIMIT: Final = 0.05
+FALLBACK_LIMIT = 0.05
 """A contender with a larger share of decisions by fallbacks is marked."""
 
 
@@ -90,9 +90,8 @@ class Evaluation:
         """Return the team's values: one row for each seed, one column for each contender."""
         check_metric(metric, self.frame.columns)
         team = self.frame[self.frame["agent"] == TEAM]
-        return team.pivot(index="seed", columns="contender", values=metric).loc[
-            team["seed"].unique(), team["contender"].unique()
-        ]
+        table = team.pivot(index="seed", columns="contender", values=metric)
+        return table.loc[team["seed"].unique(), team["contender"].unique()]
 
     def summary(self, metric: str = "return") -> "DataFrame":
         """Return the mean of the team's values for each contender, with its confidence interval.
@@ -123,8 +122,8 @@ class Evaluation:
             table[FALLBACKS] = shares
         for name, share in shares.items():
             if share > FALLBACK_LIMIT:
-                note = f"{share:.0%} of decisions by a fallback"
-                notes[name] = f"{notes[name]}; {note}" if notes[name] else note
+                separator = "; " if notes[name] else ""
+                notes[name] += f"{separator}{share:.0%} of decisions by a fallback"
         return table.assign(note=notes) if any(notes.values()) else table
 
     def improvement(self, metric: str = "return") -> "DataFrame":
@@ -144,7 +143,11 @@ class Evaluation:
         return table.clip(0.0, 1.0).rename(columns={"mean": "probability"})
 
     def seeds_needed(
-        self, difference: float, *, power: float = 0.8, metric: str = "return"
+        self,
+        difference: float,
+        *,
+        power: float = 0.8,
+        metric: str = "return",
     ) -> "Series[float]":
         """Estimate the number of seeds that would detect a difference from the baseline.
 
@@ -191,7 +194,14 @@ class Evaluation:
             for name, share in self._fallback_shares().items()
             if share > FALLBACK_LIMIT
         }
-        return plot_contenders(values, self.summary(metric), metric, self.baseline, marks, figure)
+        return plot_contenders(
+            values,
+            self.summary(metric),
+            metric,
+            self.baseline,
+            marks,
+            figure,
+        )
 
     def _fallback_shares(self) -> dict[str, float]:
         """Return the share of decisions that a fallback answered, by contender.
@@ -200,12 +210,9 @@ class Evaluation:
         """
         if FALLBACKS not in self.frame:
             return {}
-        team = (
-            self.frame[self.frame["agent"] == TEAM]
-            .groupby("contender")[[FALLBACKS, "length"]]
-            .sum()
-        )
-        return {str(name): number / max(1, length) for name, number, length in team.itertuples()}
+        team = self.frame[self.frame["agent"] == TEAM]
+        sums = team.groupby("contender")[[FALLBACKS, "length"]].sum()
+        return dict(sums[FALLBACKS] / sums["length"].clip(lower=1))
 
     def _differences(self, metric: str) -> "DataFrame":
         """Return the differences from the baseline: a column for each other contender."""
@@ -214,13 +221,15 @@ class Evaluation:
                 "there is no baseline to compare with; give evaluate a baseline="
             )
         values = numbers(self.values(metric), metric)
-        return values.sub(values[self.baseline], axis=0).drop(columns=self.baseline)
+        differences = values.sub(values[self.baseline], axis=0)
+        return differences.drop(columns=self.baseline)
 
     def _widest(self) -> float:
         """Return the width of the widest interval that ``width=`` limits; nan if one is unknown."""
         summary = self.summary()
         prefix = "" if self.baseline is None else "difference_"
-        return float((summary[f"{prefix}high"] - summary[f"{prefix}low"]).max(skipna=False))
+        widths = summary[f"{prefix}high"] - summary[f"{prefix}low"]
+        return float(widths.max(skipna=False))
 
 
 def evaluate(
@@ -300,7 +309,13 @@ def evaluate(
         if width <= 0:
             raise OptionValueError(f"width must be positive, not {short_repr(width)}")
     runner = Runner(
-        contenders, points, options, metric, team, batch_size if batched else 0, concurrency
+        contenders,
+        points,
+        options,
+        metric,
+        team,
+        batch_size if batched else 0,
+        concurrency,
     )
     all_seeds = distinct_seeds(seeds)
     # Plans are made and pickled here even if workers do the work, so that errors come first.
@@ -316,7 +331,8 @@ def evaluate(
             missing = [run for run in runs if run not in rows]
             for part in spread(_run, arguments, missing, workers, runner.batch_size, bar):
                 rows |= part
-            table = make_table(runner.columns, chain.from_iterable(rows[run] for run in runs))
+            sorted_rows = chain.from_iterable(rows[run] for run in runs)
+            table = make_table(runner.columns, sorted_rows)
             evaluation = Evaluation(table, baseline, float(confidence))
             if width is not None and end < number and evaluation._widest() <= width:
                 break
@@ -356,7 +372,8 @@ def _run(
     with reuse_resources():
         for name, group in groupby(runs, lambda run: run[0]):
             plan = runner.plan(simulation, name) if plans is None else plans[name]
-            runner.run(plan, name, [seed for _, seed in group], partial(report, name))
+            seeds = [seed for _, seed in group]
+            runner.run(plan, name, seeds, partial(report, name))
     return rows
 
 
@@ -374,7 +391,9 @@ def check_metric(metric: str, columns: Iterable[str]) -> None:
 
 
 def estimate_means(
-    samples: "DataFrame", confidence: float, proportions: Collection[str] = ()
+    samples: "DataFrame",
+    confidence: float,
+    proportions: Collection[str] = (),
 ) -> "tuple[DataFrame, dict[str, str]]":
     """Estimate the means of samples, one column for each contender.
 
@@ -396,7 +415,12 @@ def estimate_means(
         low, high, reasons[name] = interval(sample, confidence, proportion=name in proportions)
         rows[name] = [sample.mean(), low, high]
     columns = ["mean", "low", "high"]
-    table = pandas.DataFrame.from_dict(rows, "index", columns=columns, dtype=float)
+    table = pandas.DataFrame.from_dict(
+        rows,
+        "index",
+        columns=columns,
+        dtype=float,
+    )
     return table.rename_axis("contender"), reasons
 
 
@@ -409,7 +433,10 @@ def numbers(values: "DataFrame", metric: str) -> "DataFrame":
 
 
 def seeds_needed(
-    differences: NDArray[np.float64], difference: float, confidence: float, power: float
+    differences: NDArray[np.float64],
+    difference: float,
+    confidence: float,
+    power: float,
 ) -> float:
     """Return the number of seeds that detects a difference: see ``Evaluation.seeds_needed``."""
     from scipy import stats
@@ -420,13 +447,14 @@ def seeds_needed(
     size = abs(difference) / float(np.std(differences, ddof=1))
 
     def is_enough(number: int) -> bool:
-        critical = stats.t.ppf(1 - (1 - confidence) / 2, number - 1)
+        critical = stats.t.ppf((1 + confidence) / 2, number - 1)
         shift = min(size * sqrt(number), 1e4)  # SciPy has no values for much larger ones
-        # The probability of a significant difference, of either sign.
-        return bool(stats.nct.sf(critical, number - 1, [shift, -shift]).sum() >= power)
+        # The probabilities that a positive or a negative difference is significant.
+        probabilities = stats.nct.sf(critical, number - 1, [shift, -shift])
+        return bool(probabilities.sum() >= power)
 
     number = 2 + bisect_left(range(2, MOST_SEEDS + 1), True, key=is_enough)
-    return float(number) if number <= MOST_SEEDS else inf
+    return number if number <= MOST_SEEDS else inf
 
 
 def _check_number(name: str, value: float) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from math import ceil
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from pandas import DataFrame
 
-LINES: Final = 200
+LINES = 200
 """The largest number of seeds that are drawn as lines."""
 
 
@@ -36,9 +36,16 @@ def plot_contenders(
     with style("plot") as new_figure:
         if figure is None:
             figure = new_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, 14.0), 4.2)
-        left, *right = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)[0]
+        grid = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)
+        left, *right = grid[0]
         for row in values.to_numpy()[:LINES]:
-            left.plot(row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
+            left.plot(
+                row,
+                color=PALE,
+                linewidth=0.7,
+                alpha=0.7,
+                zorder=1,
+            )
         _draw_dots(left, values, names, summary[["mean", "low", "high"]], 0.0)
         _label_below(left, [name + marks.get(name, "") for name in names])
         left.set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
@@ -81,7 +88,13 @@ def plot_factors(
         upper = grid[:above].ravel()
         for axes, factor in zip(upper, levels, strict=False):
             means = main.loc[factor]
-            _draw_means(axes, range(len(means)), means, fmt="o-", color=COLOURS[0])
+            _draw_means(
+                axes,
+                range(len(means)),
+                means,
+                fmt="o-",
+                color=COLOURS[0],
+            )
             _label_levels(axes, levels[factor], factor)
             if axes is not upper[0]:
                 axes.sharey(upper[0])
@@ -119,8 +132,22 @@ def _draw_dots(
     offsets = spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)
     for place, name in enumerate(values.columns):
         colour = COLOURS[names.index(name) % len(COLOURS)]
-        axes.scatter(place + offsets, values[name], 14, color=colour, alpha=0.5, linewidths=0)
-        _draw_means(axes, [place], means.loc[[name]], fmt="o", color=INK, elinewidth=2)
+        axes.scatter(
+            place + offsets,
+            values[name],
+            14,
+            color=colour,
+            alpha=0.5,
+            linewidths=0,
+        )
+        _draw_means(
+            axes,
+            [place],
+            means.loc[[name]],
+            fmt="o",
+            color=INK,
+            elinewidth=2,
+        )
         mean = means.loc[name].iloc[0]
         axes.annotate(
             f"{mean:.4g}",
@@ -134,12 +161,21 @@ def _draw_dots(
 
 
 def _draw_means(
-    axes: "Axes", places: Sequence[int], means: "DataFrame", **format_options: Any
+    axes: "Axes",
+    places: Sequence[int],
+    means: "DataFrame",
+    **format_options: Any,
 ) -> None:
     """Draw means with their intervals, from the first three columns: mean, low and high."""
     mean, low, high = means.to_numpy(float)[:, :3].T
     bars = np.maximum([mean - low, high - mean], 0.0)  # unknown bounds are nan, and not drawn
-    axes.errorbar(places, mean, yerr=bars, markersize=4, **format_options)
+    axes.errorbar(
+        places,
+        mean,
+        yerr=bars,
+        markersize=4,
+        **format_options,
+    )
 
 
 def _label_below(axes: "Axes", names: Sequence[str]) -> None:

@@ -7,8 +7,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from types import NoneType
-from typing import TYPE_CHECKING, Any, Final, SupportsFloat, SupportsIndex
+from typing import TYPE_CHECKING, Any, SupportsFloat, SupportsIndex
 
 from ..core.episode import Episode
 from ..core.plan import Plan
@@ -32,22 +33,22 @@ from ..simulation import RULE, Model
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-TEAM: Final = "team"
+TEAM = "team"
 """The value of the column ``agent`` in the row of the team."""
 
-RUN_COLUMNS: Final = ("contender", "seed", "agent", "return", "length")
+RUN_COLUMNS = ("contender", "seed", "agent", "return", "length")
 """The first columns of tables, after the factors."""
 
-FALLBACKS: Final = "fallbacks"
+FALLBACKS = "fallbacks"
 """The next column, if a contender has a fallback: the number of decisions that it answered."""
 
-STATUS_COLUMNS: Final = ("status", "error")
+STATUS_COLUMNS = ("status", "error")
 """The last columns of the table of an experiment, after the metrics."""
 
-RESERVED: Final = (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS)
+RESERVED = (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS)
 """The columns whose names factors and metrics must not have."""
 
-EXACT: Final = 2**53
+EXACT = 2**53
 """The integers up to this are exact as floats."""
 
 Contenders = Mapping[str, Mapping[Any, Any]]
@@ -105,7 +106,9 @@ class Returns(tuple[float, ...]):
         return self._by_agent[key]
 
     def __contains__(self, key: object) -> bool:
-        return key in self._by_agent if isinstance(key, str) else super().__contains__(key)
+        if isinstance(key, str):
+            return key in self._by_agent
+        return super().__contains__(key)
 
     def __getattr__(self, name: str) -> Any:
         """Return a method of the dict, such as ``get`` or ``items``."""
@@ -172,10 +175,10 @@ class Runner:
                 raise OptionValueError(
                     f"the metric {name!r} has the name of another column; rename it"
                 )
-        self.batch_size = int(batch_size)
-        self._concurrency = int(concurrency)
+        self.batch_size = batch_size
+        self._concurrency = concurrency
         self._counts_fallbacks = any(
-            has_fallback(policy) for policies in contenders.values() for policy in policies.values()
+            any(map(has_fallback, policies.values())) for policies in contenders.values()
         )
         self._team = sum if team is None else team
         # Iterators are copied, because each plan reads them again.
@@ -193,7 +196,11 @@ class Runner:
         """
         policies = self.contenders[contender]
         make_plan = partial(
-            learners_plan, simulation, policies, options=self._options, alone=not self.batch_size
+            learners_plan,
+            simulation,
+            policies,
+            options=self._options,
+            alone=not self.batch_size,
         )
         with error_note(f"of the contender {contender!r}"):
             try:
@@ -201,7 +208,7 @@ class Runner:
             except (AgentError, UnknownPointError) as error:
                 if self._points is not None:
                     raise
-                keys = dict.fromkeys(key for own in self.contenders.values() for key in own)
+                keys = dict.fromkeys(chain.from_iterable(self.contenders.values()))
                 points = [key for key in keys if not isinstance(key, str) or "." in key] or None
                 with suppress(AgentError, UnknownPointError):
                     plan = make_plan(points=points, all_points=points is not None)
@@ -215,9 +222,9 @@ class Runner:
 
     def undeclared_agents(self, plan: Plan, contender: str) -> set[str]:
         """Return the agents that a contender names, but neither points nor ``possible_agents``."""
-        declared = {point.agent for point in plan.points}
-        declared.update(declared_agents(plan.options.possible_agents))
-        return (self.contenders[contender].keys() & plan.policies.keys()) - declared
+        by_option = declared_agents(plan.options.possible_agents)
+        declared_names = {*by_option, *(point.agent for point in plan.points)}
+        return (self.contenders[contender].keys() & plan.policies.keys()) - declared_names
 
     def episodes_at_once(self, contender: str) -> int:
         """Return how many episodes of a contender run at once."""
@@ -252,14 +259,26 @@ class Runner:
 
         with error_note(f"of the contender {contender!r}"):
             number = self.episodes_at_once(contender)
-            run(plan, seeds, number, finish, tally, self._concurrency)
+            run(
+                plan,
+                seeds,
+                number,
+                finish,
+                tally,
+                self._concurrency,
+            )
 
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of ``rows``."""
         return (*RUN_COLUMNS, *([FALLBACKS] if self._counts_fallbacks else []), *self.metrics)
 
-    def rows(self, contender: str, seed: int, outcome: Outcome) -> list[Row]:
+    def rows(
+        self,
+        contender: str,
+        seed: int,
+        outcome: Outcome,
+    ) -> list[Row]:
         """Return a row of the table for each agent, and one for the team."""
         value = self._team(Returns(outcome.returns))
         try:
@@ -286,7 +305,13 @@ class Tally:
     def __init__(self) -> None:
         self.outcomes = defaultdict[int, Outcome](lambda: Outcome({}, Counter(), {}, {}))
 
-    def record(self, group: Group, places: list[int], waiting: list[Any], *_: object) -> None:
+    def record(
+        self,
+        group: Group,
+        places: list[int],
+        waiting: list[Any],
+        *_: object,
+    ) -> None:
         """Count decisions: see ``Watcher``."""
         for episode in waiting:
             outcome = self.outcomes[episode.seed]
@@ -336,7 +361,11 @@ def check_contenders(contenders: Contenders, *, batched: bool) -> None:
                 )
 
 
-def check_agents(contender: str, names: set[str], present: Collection[str]) -> None:
+def check_agents(
+    contender: str,
+    names: set[str],
+    present: Collection[str],
+) -> None:
     """Check that agents of these names have decided."""
     for name in sorted(names.difference(present)):
         raise AgentError(
@@ -348,16 +377,16 @@ def check_agents(contender: str, names: set[str], present: Collection[str]) -> N
 
 def distinct_seeds(seeds: Iterable[int]) -> list[int]:
     """Return the seeds as a list: at least one, and all different."""
-    checked = checked_seeds(seeds)
-    if not checked:
+    all_seeds = checked_seeds(seeds)
+    if not all_seeds:
         raise OptionValueError("seeds must be integers, such as range(32), but there are none")
-    seed, number = Counter(checked).most_common(1)[0]
+    seed, number = Counter(all_seeds).most_common(1)[0]
     if number > 1:
         raise OptionValueError(f"the seed {seed} occurs twice: its result would be counted twice")
-    return checked
+    return all_seeds
 
 
-def plain_value(name: str, value: Any, advice: str = "") -> Value:
+def plain_value(name: str, value: Any, advice: str = "") -> Any:
     """Return the named value without NumPy's types, or raise an error with some advice."""
     if getattr(value, "ndim", None) == 0:
         value = value.item()
@@ -367,8 +396,7 @@ def plain_value(name: str, value: Any, advice: str = "") -> Value:
             f"{name} must be a number of no more than 4,200 digits, a string or None, not"
             f" {short_repr(value)}{advice}"
         )
-    plain: Value = value
-    return plain
+    return value
 
 
 # -- tables ---------------------------------------------------------------------------------------
@@ -402,5 +430,7 @@ def dtype_of(values: Collection[Any], *, missing: bool) -> str:
     if missing and kinds & {int, float} and kinds <= {int, float, NoneType}:
         is_exact = all(type(value) is not int or abs(value) <= EXACT for value in values)
         return "float64" if is_exact else "object"
-    dtypes = {str: "str", float: "float64", bool: "bool"}
-    return dtypes.get(kinds.pop(), "object") if len(kinds) == 1 else "object"
+    for kind, dtype in ((str, "str"), (float, "float64"), (bool, "bool")):
+        if kinds == {kind}:
+            return dtype
+    return "object"

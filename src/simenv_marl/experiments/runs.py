@@ -17,7 +17,7 @@ from math import nan
 from pathlib import Path
 from time import time_ns
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 from uuid import uuid4
 
 from ..core.context import reuse_resources
@@ -56,15 +56,24 @@ from .runner import (
     make_table,
     plain_value,
 )
-from .store import Entry, Provenance, Result, Run, Store, Writer, make_entry, to_json
+from .store import (
+    Entry,
+    Provenance,
+    Result,
+    Run,
+    Store,
+    Writer,
+    make_entry,
+    to_json,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-BY_RULE: Final = "rule"
+BY_RULE = "rule"
 """The contender that is always present: the model as it is."""
 
-DEATH: Final = "WorkerError: the worker died in this run, twice; see retry_errors="
+DEATH = "WorkerError: the worker died in this run, twice; see retry_errors="
 """The result of a run that has killed its worker."""
 
 
@@ -138,7 +147,16 @@ def run_experiment(
             " name"
         )
     batch_size = batch_size if batched else 0
-    runner = Runner(contenders, points, options, metric, team, batch_size, concurrency, rows[0])
+    runner = Runner(
+        contenders,
+        points,
+        options,
+        metric,
+        team,
+        batch_size,
+        concurrency,
+        rows[0],
+    )
     if isinstance(make, Variant):
         _source_of_row(make, rows[0])  # a variant checks its parameters
     elif problem := find_call_problem(make, rows[0]):
@@ -159,21 +177,17 @@ def run_experiment(
     job = Job(make, runner, folder, session)
     if workers:
         pack(job)  # errors of pickling come before any run
-    row, provenances, undeclared = job.try_contenders([storage.sample or keys[0], *keys])
+    row, provenances, agents = job.try_contenders([storage.sample or keys[0], *keys])
     storage.create()
     storage.warn_of_changes(row, provenances)
     # A row that occurs twice has the same results.
     runs = list(starmap(Run, product(dict.fromkeys(keys), contenders, all_seeds)))
-    missing = [
-        run
-        for run in runs
-        if run not in storage.runs or (retry_errors and isinstance(storage.runs[run], str))
-    ]
-    done = len(runs) - len(missing)
-    with progress_bar(len(runs), progress, "run", done) as bar:
+    final_results = Outcome if retry_errors else (Outcome, str)
+    missing = [run for run in runs if not isinstance(storage.runs.get(run), final_results)]
+    with progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar:
         trials = []
         for (_, contender), group in groupby(missing, lambda run: run[:2]):
-            names = undeclared.pop(contender, set()) - storage.agents[contender]
+            names = agents.pop(contender, set()) - storage.agents[contender]
             if names:
                 trials.append((names, list(group)))
         if trials:
@@ -195,7 +209,7 @@ def _read_design(design: "DataFrame | Iterable[Any]") -> "tuple[DataFrame, list[
     import pandas
 
     try:
-        table = design if isinstance(design, pandas.DataFrame) else pandas.DataFrame(design)
+        table = pandas.DataFrame(design)
     except (TypeError, ValueError) as error:
         raise OptionValueError(
             f"design must be a DataFrame, or data to make one from, not {short_repr(design)}"
@@ -295,16 +309,16 @@ class Job:
         """
         for row in rows[:10]:
             provenances = {}
-            undeclared = {}
+            agents = {}
             try:
                 for contender in self.runner.contenders:
                     plan, provenances[contender] = self.prepare(row, contender)
-                    undeclared[contender] = self.runner.undeclared_agents(plan, contender)
+                    agents[contender] = self.runner.undeclared_agents(plan, contender)
             except SimEnvError:
                 raise
             except Exception:  # this row fails; another may not
                 continue
-            return row, provenances, undeclared
+            return row, provenances, agents
         return "", {}, {}
 
     def run_all(
@@ -316,7 +330,7 @@ class Job:
         bar: Any,
         is_retry: bool = False,
     ) -> None:
-        """Do runs in workers, each of which gets parts of at least ``least`` runs.
+        """Do runs in workers, in parts of at least ``least`` runs.
 
         If a worker dies, joblib ends all others. Each half of the missing runs is then tried
         separately. A single run that kills its worker twice becomes an error.
@@ -328,7 +342,15 @@ class Job:
             return
         try:
             # Small parts cost nothing.
-            spread(self.run_part, (), runs, workers, least, bar, share=16)
+            spread(
+                self.run_part,
+                (),
+                runs,
+                workers,
+                least,
+                bar,
+                share=16,
+            )
         except BrokenExecutor:
             if not any(self.folder.glob(f"runs-{self.session}-*")):
                 raise
@@ -340,7 +362,14 @@ class Job:
             missing = [run for run in runs if run not in storage.runs]
             middle = len(missing) // 2
             for half in (missing[:middle], missing[middle:]):
-                self.run_all(half, storage, workers, least, bar, is_retry=True)
+                self.run_all(
+                    half,
+                    storage,
+                    workers,
+                    least,
+                    bar,
+                    is_retry=True,
+                )
 
     def run_part(self, runs: Sequence[Run], bar: Any) -> None:
         """Do runs and store their results."""
@@ -348,7 +377,11 @@ class Job:
             for _, group in groupby(runs, lambda run: run[:2]):
                 self._run_seeds(list(group), writer.write, bar)
 
-    def try_agents(self, trials: Sequence[tuple[set[str], list[Run]]], bar: Any) -> None:
+    def try_agents(
+        self,
+        trials: Sequence[tuple[set[str], list[Run]]],
+        bar: Any,
+    ) -> None:
         """Run the first row of contenders until all agents that they name have decided.
 
         Store the results only then.
@@ -374,7 +407,12 @@ class Job:
                 for entry in entries:
                     writer.write(entry)
 
-    def _run_seeds(self, runs: Sequence[Run], write: Callable[[Entry], None], bar: Any) -> None:
+    def _run_seeds(
+        self,
+        runs: Sequence[Run],
+        write: Callable[[Entry], None],
+        bar: Any,
+    ) -> None:
         """Do runs of one row and one contender, and ``write`` the result of each.
 
         An error is a result, too.
@@ -383,7 +421,11 @@ class Job:
         remaining = {run.seed: run for run in runs}
         number = len(runs)
 
-        def report(seed: int, result: Result, trace: str | None = None) -> None:
+        def report(
+            seed: int,
+            result: Result,
+            trace: str | None = None,
+        ) -> None:
             run = remaining.pop(seed)
             write(make_entry(run, result, {**provenance, "seed": seed}, trace))
             bar.update()
@@ -425,7 +467,12 @@ def _make_frame(
     return factors.join(make_table((*runner.columns, *STATUS_COLUMNS), rows))
 
 
-def _rows_of_run(contender: str, seed: int, result: Result, runner: Runner) -> list[Row]:
+def _rows_of_run(
+    contender: str,
+    seed: int,
+    result: Result,
+    runner: Runner,
+) -> list[Row]:
     if isinstance(result, Outcome):
         try:
             return [(*row, "ok", None) for row in runner.rows(contender, seed, result)]
@@ -482,10 +529,10 @@ class Variant:
             # Copied, so that later changes of the arguments do not change the variant.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         object.__setattr__(self, "plugins", tuple(self.plugins))
-        misplaced = {"plugins", "policies"} & self.options.keys()
-        if misplaced:
+        misplaced_options = {"plugins", "policies"} & self.options.keys()
+        if misplaced_options:
             raise OptionValueError(
-                f"{' and '.join(sorted(misplaced))} must be arguments of the variant"
+                f"{' and '.join(sorted(misplaced_options))} must be arguments of the variant"
                 f" {self.name!r} itself, not among its options"
             )
         problem = find_call_problem(source, self.parameters)
@@ -524,11 +571,13 @@ class Variant:
 
         The arguments of the environment precede the variant's.
         """
-        source = partial(self.simulation, **self.parameters) if self.parameters else self.simulation
-        merged = {
+        source = self.simulation
+        if self.parameters:
+            source = partial(source, **self.parameters)
+        all_options = {
             **self.options,
             **options,
             "policies": {**self.policies, **(options.get("policies") or {})},
             "plugins": (*self.plugins, *options.get("plugins", ())),
         }
-        return source, self.points if points is None else points, merged
+        return source, self.points if points is None else points, all_options

@@ -18,19 +18,19 @@ import os
 import re
 import threading
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 from ..errors import LONGEST, OptionValueError, StoreError, short_repr, warn_user
 from .runner import Outcome, plain_value
 
-VERSION: Final = 1
-HEADER: Final = "experiment.json"
+VERSION = 1
+HEADER = "experiment.json"
 
-MADE_OF: Final = (
+MADE_OF = (
     "make",
     "simulation",
     "variant",
@@ -43,7 +43,7 @@ MADE_OF: Final = (
 )
 """The parts of the provenance that affect the results of a run, besides versions of packages."""
 
-VARYING: Final = re.compile(r" at 0x[0-9a-fA-F]+|\w+\.<locals>\.")
+VARYING = re.compile(r" at 0x[0-9a-fA-F]+|\w+\.<locals>\.")
 """The differences between texts of equal objects.
 
 These are addresses in memory, and functions around classes, whose names workers lose.
@@ -70,7 +70,7 @@ def to_json(value: object) -> str:
     """Return a value as JSON, on one line."""
     try:
         return json.dumps(value, separators=(",", ":"))
-    except (ValueError, RecursionError) as error:  # for example of an integer of 5,000 digits
+    except ValueError as error:  # for example of an integer of 5,000 digits
         raise OptionValueError(
             f"{short_repr(value)} cannot be stored as JSON ({error}); use other values"
         ) from error
@@ -100,13 +100,13 @@ class Store:
         self,
         folder: Path,
         rows: Iterable[str],
-        factors: Iterable[str],
+        factors: Collection[str],
         metrics: Iterable[str],
     ) -> None:
         """Describe an experiment. ``rows`` are the rows of the design, as JSON."""
         self.folder = folder
         self._rows = {row: row for row in rows}
-        self._factors = list(factors)
+        self._factors = factors
         self._header = {
             "simenv_marl": VERSION,
             "factors": sorted(factors),
@@ -121,7 +121,8 @@ class Store:
         """
         header = self.folder / HEADER
         with _explain_errors(self._unusable):
-            names = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
+            exists = self.folder.exists()
+            names = [path.name for path in self.folder.iterdir()] if exists else []
             # This comes after the list, because another process may be writing both.
             if not header.exists():
                 if any(not name.startswith((HEADER, ".")) for name in names):
@@ -203,25 +204,25 @@ class Store:
             self.sample = row
             self._parts[run.contender] = parts
 
-    # -- what has changed since the runs were stored ----------------------------------------------
+    # -- changes since the runs were stored -------------------------------------------------------
 
     def check_rows(self) -> None:
         """Warn of stored rows that are not in the design.
 
         If no row is in the design, the store belongs to another experiment.
         """
-        stored = {run.row for run in self.runs}
-        strange = stored - self._rows.keys()
-        if strange and strange == stored:
+        stored_rows = {run.row for run in self.runs}
+        extra_rows = stored_rows - self._rows.keys()
+        if extra_rows and extra_rows == stored_rows:
             raise OptionValueError(
-                f"the store {self.folder} holds runs of {len(strange)} rows, such as"
-                f" {min(strange)}, but this design has none of them: its first is"
+                f"the store {self.folder} holds runs of {len(extra_rows)} rows, such as"
+                f" {min(extra_rows)}, but this design has none of them: its first is"
                 f" {next(iter(self._rows))}; pass another folder, or a design that includes them"
             )
-        if strange:
+        if extra_rows:
             warn_user(
-                f"the store {self.folder} holds runs of {len(strange)} rows that this design does"
-                f" not have, such as {min(strange)}; they stay in the store, but are not in the"
+                f"the store {self.folder} holds runs of {len(extra_rows)} rows that this design does"
+                f" not have, such as {min(extra_rows)}; they stay in the store, but are not in the"
                 " table"
             )
 
@@ -300,7 +301,7 @@ class Writer:
 
     def write(self, entry: Entry) -> None:
         """Append the line of a run."""
-        left = to_json(entry).encode("ascii") + b"\n"
+        rest = to_json(entry).encode("ascii") + b"\n"
         with _explain_errors(self._unwritable):
-            while left:
-                left = left[os.write(self._file.fileno(), left) :]
+            while rest:
+                rest = rest[os.write(self._file.fileno(), rest) :]

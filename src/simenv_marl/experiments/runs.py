@@ -375,7 +375,7 @@ class Job:
         """Do runs and store their results."""
         with closing(Writer(self.folder, self.session)) as writer, reuse_resources():
             for _, group in groupby(runs, lambda run: run[:2]):
-                self._run_seeds(list(group), writer.write, bar)
+                self._run_group(list(group), writer.write, bar)
 
     def try_agents(
         self,
@@ -397,7 +397,7 @@ class Job:
             entries: list[Entry] = []
             present: dict[str, float] = {}
             for run in runs:
-                self._run_seeds([run], entries.append, bar)
+                self._run_group([run], entries.append, bar)
                 present |= entries[-1].get("returns", {})
                 if present.keys() >= names:
                     break
@@ -407,7 +407,7 @@ class Job:
                 for entry in entries:
                     writer.write(entry)
 
-    def _run_seeds(
+    def _run_group(
         self,
         runs: Sequence[Run],
         write: Callable[[Entry], None],
@@ -535,8 +535,7 @@ class Variant:
                 f"{' and '.join(sorted(misplaced_options))} must be arguments of the variant"
                 f" {self.name!r} itself, not among its options"
             )
-        problem = find_call_problem(source, self.parameters)
-        if self.parameters and problem:
+        if self.parameters and (problem := find_call_problem(source, self.parameters)):
             raise SimulationError(
                 f"{name_of(source)} cannot be called with the parameters of the variant"
                 f" {self.name!r}: {problem}; its simulation must be a class or a factory that takes"

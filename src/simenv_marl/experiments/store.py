@@ -221,9 +221,9 @@ class Store:
             )
         if extra_rows:
             warn_user(
-                f"the store {self.folder} holds runs of {len(extra_rows)} rows that this design does"
-                f" not have, such as {min(extra_rows)}; they stay in the store, but are not in the"
-                " table"
+                f"the store {self.folder} holds runs of {len(extra_rows)} rows that this design"
+                f" does not have, such as {min(extra_rows)}; they stay in the store, but are not in"
+                " the table"
             )
 
     def warn_of_changes(self, row: str, provenances: Mapping[str, Provenance]) -> None:

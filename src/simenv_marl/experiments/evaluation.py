@@ -221,8 +221,7 @@ class Evaluation:
                 "there is no baseline to compare with; give evaluate a baseline="
             )
         values = numbers(self.values(metric), metric)
-        differences = values.sub(values[self.baseline], axis=0)
-        return differences.drop(columns=self.baseline)
+        return values.sub(values[self.baseline], axis=0).drop(columns=self.baseline)
 
     def _widest(self) -> float:
         """Return the width of the widest interval that ``width=`` limits; nan if one is unknown."""
@@ -331,8 +330,10 @@ def evaluate(
             missing = [run for run in runs if run not in rows]
             for part in spread(_run, arguments, missing, workers, runner.batch_size, bar):
                 rows |= part
-            sorted_rows = chain.from_iterable(rows[run] for run in runs)
-            table = make_table(runner.columns, sorted_rows)
+            table = make_table(
+                runner.columns,
+                chain.from_iterable(rows[run] for run in runs),
+            )
             evaluation = Evaluation(table, baseline, float(confidence))
             if width is not None and end < number and evaluation._widest() <= width:
                 break

@@ -110,7 +110,13 @@ def plot_factors(
                     label=_short_text(level),
                 )
             _label_levels(axes, levels[one], one)
-            axes.legend(title=other, frameon=True, edgecolor="none")
+            axes.legend(
+                title=other,
+                fontsize=7,
+                title_fontsize=8,
+                frameon=True,
+                edgecolor="none",
+            )
         for axes in grid.flat:
             axes.set_visible(axes.has_data())
     return figure
@@ -196,4 +202,6 @@ def _label_levels(axes: "Axes", levels: list[Any], factor: str) -> None:
 
 
 def _short_text(level: Any) -> str:
+    if hasattr(level, "left"):  # an interval
+        return f"{level.left:.3g} to {level.right:.3g}"
     return f"{level:.4g}" if isinstance(level, float) else str(level)

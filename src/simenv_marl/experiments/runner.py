@@ -258,11 +258,10 @@ class Runner:
             return partial(report, seed, outcome)
 
         with error_note(f"of the contender {contender!r}"):
-            number = self.episodes_at_once(contender)
             run(
                 plan,
                 seeds,
-                number,
+                self.episodes_at_once(contender),
                 finish,
                 tally,
                 self._concurrency,

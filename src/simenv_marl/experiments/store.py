@@ -121,8 +121,7 @@ class Store:
         """
         header = self.folder / HEADER
         with _explain_errors(self._unusable):
-            exists = self.folder.exists()
-            names = [path.name for path in self.folder.iterdir()] if exists else []
+            names = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
             # This comes after the list, because another process may be writing both.
             if not header.exists():
                 if any(not name.startswith((HEADER, ".")) for name in names):

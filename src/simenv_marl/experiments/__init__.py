@@ -1,4 +1,4 @@
-"""Experiments: policies compared on the same seeds, designs, resumable experiments, effects, variants of a model."""
+"""Experiments: evaluations, designs, experiments that resume, effects, variants of a model."""
 
 from ..core import provenance
 from .designs import design

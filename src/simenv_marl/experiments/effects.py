@@ -17,7 +17,7 @@ from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,9 @@ class Effects:
     _cells: "dict[tuple[str, str], DataFrame]" = field(repr=False)
 
     def cells(self, one: str, other: str) -> "DataFrame":
-        """Return the mean of the value for each combination of two factors: one row for each level of the first.
+        """Return the mean of the value for each combination of the levels of two factors.
+
+        The first factor has the rows, the second the columns.
 
         Raises:
             OptionValueError: One of them is not a factor.
@@ -60,7 +62,12 @@ class Effects:
         ``figure`` and the result are as in ``plot_timeline``.
         """
         return plot_factors(
-            self.main, self.interactions, self._cells, self.levels, self.metric, figure
+            self.main,
+            self.interactions,
+            self._cells,
+            self.levels,
+            self.metric,
+            figure,
         )
 
 
@@ -93,71 +100,78 @@ def effects(
         OptionValueError: There is no such column, contender or agent, the values are not numbers,
             or nothing varies.
     """
-    pandas = import_extra("pandas", "effects")
-    check_probability("confidence", confidence, 0.95)
+    import pandas
+
+    check_probability("confidence", confidence)
     table, factors = _select(frame, metric, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
-    coded = {name: _codes(table[name]) for name in factors}
-    coded = {name: (codes, levels) for name, (codes, levels) in coded.items() if len(levels) > 1}
-    if not coded:
+    levels = {}
+    labels = {}
+    codes = {}
+    for name in factors:
+        places, own_levels = _encode(table[name])
+        if len(own_levels) < 2:
+            continue
+        codes[name] = places
+        levels[name] = own_levels
+        labels[name] = own_levels
+        if len(set(own_levels)) < len(own_levels):
+            labels[name] = list(map(repr, own_levels))
+    if not levels:
         raise OptionValueError("no factor has more than one level")
-    levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    labels = {
-        name: own if len(set(own)) == len(own) else list(map(repr, own))
-        for name, own in levels.items()
-    }
     seeds = table["seed"].to_numpy()
-    zero_or_one = is_proportion(table[metric].to_numpy())
-    whole = _over_seeds(values, seeds)[0].mean()
-    main: dict[tuple[str, Any], list[float]] = {}
-    for name, (codes, _) in coded.items():
-        for code, here in values.groupby(codes):
-            sample, single = _over_seeds(here, seeds[here.index])
-            low, high, _ = interval(sample, confidence, proportion=zero_or_one and single)
-            main[name, labels[name][code]] = [
-                sample.mean(),
-                low,
-                high,
-                sample.mean() - whole,
-                len(here),
-            ]
-    index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
-    columns = ["mean", "low", "high", "effect", "count"]
-    rows = pandas.DataFrame(main.values(), index, columns).astype({"count": int})
-    cells: dict[tuple[str, str], DataFrame] = {}
+    is_share = is_proportion(table[metric].to_numpy())
+    overall = _over_seeds(values, seeds)[0].mean()
+    rows = []
+    for name in levels:
+        for code, group in values.groupby(codes[name]):
+            sample, is_single = _over_seeds(group, seeds[group.index])
+            mean = sample.mean()
+            low, high, _ = interval(sample, confidence, proportion=is_share and is_single)
+            label = labels[name][code]
+            rows.append((name, label, mean, low, high, mean - overall, len(group)))
+    columns = ["factor", "level", "mean", "low", "high", "effect", "count"]
+    main = pandas.DataFrame(rows, columns=columns).set_index(["factor", "level"])
+    cells = {}
     strengths = []
     for one, other in combinations(levels, 2):
-        means = values.groupby([coded[one][0], coded[other][0]]).mean().unstack()
-        means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
-        means.index, means.columns = (
-            pandas.Index(labels[one], name=one),
-            pandas.Index(labels[other], name=other),
-        )
-        cells |= {(one, other): means, (other, one): means.T}
-        grid = means.to_numpy(np.float64)
-        rest = (
-            grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0, keepdims=True) + grid.mean()
-        )
-        # nan if a combination is missing
-        strengths.append([one, other, float(np.sqrt((rest**2).mean()))])
-    interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(
-        ["factor", "other"]
-    )
-    return Effects(
-        rows, interactions.sort_values("strength", ascending=False), metric, levels, cells
-    )
+        means = values.groupby([codes[one], codes[other]]).mean()
+        grid = means.unstack().to_numpy(np.float64)
+        index = pandas.Index(labels[one], name=one)
+        columns = pandas.Index(labels[other], name=other)
+        table = pandas.DataFrame(grid, index, columns)
+        cells[one, other] = table
+        cells[other, one] = table.T
+        row_means = grid.mean(axis=1, keepdims=True)
+        rest = grid - row_means - grid.mean(axis=0) + grid.mean()
+        strength = np.sqrt((rest**2).mean())  # nan if a combination is missing
+        strengths.append((one, other, strength))
+    interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"])
+    interactions = interactions.set_index(["factor", "other"])
+    strongest_first = interactions.sort_values("strength", ascending=False)
+    return Effects(main, strongest_first, metric, levels, cells)
 
 
-def _over_seeds(values: Any, seeds: NDArray[Any]) -> tuple[NDArray[np.float64], bool]:
-    """Return the mean of each seed, or all values of a single seed, and whether each of them is one run's value."""
+def _over_seeds(
+    values: "Series[float]",
+    seeds: NDArray[Any],
+) -> tuple[NDArray[np.float64], bool]:
+    """Return the mean of each seed, or all values of a single seed.
+
+    The second value says whether each of them is the value of one run.
+    """
     means = values.groupby(seeds).mean()
-    return (means if len(means) > 1 else values).to_numpy(), len(means) in (1, len(values))
+    sample = means if len(means) > 1 else values
+    return sample.to_numpy(), len(sample) == len(values)
 
 
 def _select(
-    frame: "DataFrame", metric: str, contender: str | None, agent: str
+    frame: "DataFrame",
+    metric: str,
+    contender: str | None,
+    agent: str,
 ) -> "tuple[DataFrame, list[str]]":
     """Return the rows to use, and the names of the factors."""
     columns = list(getattr(frame, "columns", ()))
@@ -166,39 +180,44 @@ def _select(
     factors = columns[: columns.index("contender")]
     check_metric(metric, columns[len(factors) :])
     selection = frame["status"] == "ok"
-    for what, value in (("contender", contender), ("agent", agent)):
+    for column, value in (("contender", contender), ("agent", agent)):
         if value is None:
             continue
-        names = sorted(set(frame[what]))
+        names = sorted(set(frame[column]))
         if value not in names:
             raise OptionValueError(
-                f"there is no {what} {short_repr(value)}; there are"
+                f"there is no {column} {short_repr(value)}; there are"
                 f" {names}{did_you_mean(value, names)}"
             )
-        selection &= frame[what] == value
+        selection &= frame[column] == value
     if not selection.any():
         raise OptionValueError("no run has come to its end")
     return frame[selection], factors
 
 
-def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
-    """Return the place of each row's level, and the levels: numbers sorted, others as they appear, missing ones last.
+def _encode(column: "Series[Any]") -> tuple[NDArray[np.intp], list[Any]]:
+    """Return the index of each row's level, and the levels.
 
-    Numeric factors with more than eight values are grouped into quarters of these values, however
-    often each occurs.
+    Levels that are numbers are sorted, others have the order of the rows. Missing values are the
+    last level. Numeric factors with more than eight values are grouped into quarters of these
+    values, however often each occurs.
     """
-    pandas = import_extra("pandas", "effects")
-    if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
+    import pandas
+
+    is_numeric = pandas.api.types.is_numeric_dtype(column) and column.dtype != bool
+    if is_numeric and column.nunique() > 8:
         _, bounds = pandas.qcut(column.drop_duplicates(), 4, retbins=True)
         column = pandas.cut(column, bounds, include_lowest=True)
-    keys: list[Any] = [(type(value), value) if value == value else nan for value in column.tolist()]
-    levels = [key[1] for key in dict.fromkeys(keys) if key is not nan]
+    values = column.tolist()
+    # A key has a type, because 1, True and 1.0 are equal. A missing value differs from itself.
+    levels = list({(type(value), value): value for value in values if value == value}.values())
     if all(type(level) in (int, float, pandas.Interval) for level in levels):
         levels.sort()
     places = {(type(level), level): place for place, level in enumerate(levels)}
-    if nan in keys:
+    codes = [places.get((type(value), value), len(places)) for value in values]
+    if len(places) in codes:
         levels.append(nan)
-    return np.array([places.get(key, len(levels) - 1) for key in keys]), levels
+    return np.array(codes), levels
 
 
 # -- shares of the variance -----------------------------------------------------------------------
@@ -232,16 +251,18 @@ def sobol_indices(
             no number or equal.
         MissingExtraError: SALib is missing.
     """
-    pandas = import_extra("pandas", "sobol_indices")
+    import pandas
+
     analyze = import_extra("SALib.analyze.sobol", "sobol_indices").analyze
-    check_probability("confidence", confidence, 0.95)
+    check_probability("confidence", confidence)
     table, names = _select(frame, metric, contender, agent)
     if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():
         raise OptionValueError(
             "some runs have failed, but shares of the variance need all rows of the design"
         )
     seeds = table["seed"].nunique()
-    values, rows = numbers(table[metric], metric).to_numpy(), table[names].to_numpy(object)
+    values = numbers(table[metric], metric).to_numpy()
+    rows = table[names].to_numpy(object)
     if not np.isfinite(values).all():
         raise OptionValueError(
             f"{metric!r} is missing or not finite in some rows, but shares of the variance need all"
@@ -259,21 +280,32 @@ def sobol_indices(
         raise OptionValueError(f"{metric!r} is {means[0]:g} in all rows, so it has no variance")
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     indices = analyze(problem, means, conf_level=confidence, seed=0)
-    columns = {"first": "S1", "first_error": "S1_conf", "total": "ST", "total_error": "ST_conf"}
-    return pandas.DataFrame(
-        {name: indices[key] for name, key in columns.items()}, pandas.Index(names, name="factor")
-    )
+    columns = {
+        "first": indices["S1"],
+        "first_error": indices["S1_conf"],
+        "total": indices["ST"],
+        "total_error": indices["ST_conf"],
+    }
+    return pandas.DataFrame(columns, pandas.Index(names, name="factor"))
 
 
 def _is_saltelli(rows: NDArray[Any]) -> bool:
-    """Return whether rows are blocks of: A.
+    """Return whether a design has the rows of a Saltelli design.
 
-    A with each factor of B in turn; B with each factor of A in turn; B.
+    Each sample is a block: a row A; A with each factor of B in turn; B with each factor of A in
+    turn; the row B.
+
+    Args:
+        rows: The values of the factors, of shape ``(rows, factors)``.
     """
     count = rows.shape[1]
     if not count or len(rows) % (2 * count + 2):
         return False
-    blocks, own = rows.reshape(-1, 2 * count + 2, count), np.eye(count, dtype=bool)
-    first, last = blocks[:, :1], blocks[:, -1:]
-    mixed = np.concatenate([np.where(own, last, first), np.where(own, first, last)], axis=1)
-    return bool((blocks[:, 1:-1] == mixed).all())
+    blocks = rows.reshape(-1, 2 * count + 2, count)
+    first = blocks[:, :1]
+    last = blocks[:, -1:]
+    own = np.eye(count, dtype=bool)
+    mixed_first = np.where(own, last, first)
+    mixed_last = np.where(own, first, last)
+    saltelli_blocks = np.concatenate([first, mixed_first, mixed_last, last], axis=1)
+    return bool((blocks == saltelli_blocks).all())

@@ -1,16 +1,17 @@
-"""Runs the episodes of contenders: who decides, what is measured, and the rows of a table that this gives."""
+"""Runs the episodes of contenders, and measures them: the returns of agents, and metrics."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from itertools import chain
+from types import NoneType
+from typing import TYPE_CHECKING, Any, SupportsFloat, SupportsIndex
 
-import numpy as np
-
-from ..core import Agent, Episode, Plan, declared_agents, has_fallback, waits
+from ..core import Episode, Plan, Points, declared_agents, has_fallback, waits
 from ..data.collect import learners_plan
 from ..decision import decision_points
 from ..errors import (
@@ -21,52 +22,77 @@ from ..errors import (
     did_you_mean,
     short_repr,
     warn_user,
-)  # fmt: skip
+)
 from ..many.batch import Group, run, takes_identities
-from ..many.parallel import import_extra
-from ..runs import check_options, checked_seeds
-from ..simulation import RULE
+from ..runs import checked_seeds
+from ..simulation import RULE, Model
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-TEAM: Final = "team"
+TEAM = "team"
 """The value of the column ``agent`` in the row of the team."""
 
-RUN_COLUMNS: Final = ("contender", "seed", "agent", "return", "length")
+RUN_COLUMNS = ("contender", "seed", "agent", "return", "length")
 """The first columns of tables, after the factors."""
 
-FALLBACKS: Final = "fallbacks"
-"""The column, after these, with the number of decisions that a fallback answered, if a contender has one."""
+FALLBACKS = "fallbacks"
+"""The next column, if a contender has a fallback: the number of decisions that it answered."""
 
-STATUS_COLUMNS: Final = ("status", "error")
+STATUS_COLUMNS = ("status", "error")
 """The last columns of the table of an experiment, after the metrics."""
 
+RESERVED = (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS)
+"""The columns whose names factors and metrics must not have."""
 
-class Outcome(NamedTuple):
-    """The results of one episode: each agent's undiscounted return and number of decisions, and the metrics.
+EXACT = 2**53
+"""The integers up to this are exact as floats."""
 
-    ``fallbacks`` has the agents for which a fallback has answered, and how often.
+Contenders = Mapping[str, Mapping[Any, Any]]
+"""The policies of each contender, as ``simulate`` takes them."""
+
+Metric = Callable[[Model], object]
+"""A callable of a simulation after its end. ``plain_value`` checks its result."""
+
+Metrics = Metric | Mapping[str, Metric] | None
+"""The argument ``metric`` of ``evaluate`` and ``run_experiment``."""
+
+Value = str | float | None
+"""A factor or the result of a metric: a string, a number, a bool or None."""
+
+Row = tuple[Value, ...]
+"""A row of a table."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The results of one episode.
+
+    Attributes:
+        returns: The undiscounted return of each agent that has decided.
+        lengths: The number of decisions of each of these agents.
+        metrics: The result of each metric.
+        fallbacks: For each agent with a fallback: the number of decisions that it answered.
     """
 
     returns: dict[str, float]
     lengths: dict[str, int]
-    metrics: dict[str, Any]
+    metrics: dict[str, Value]
     fallbacks: dict[str, int]
 
 
 class Returns(tuple[float, ...]):
-    """The returns of an episode's agents: a tuple of numbers, for ``sum`` and ``max``, and a mapping by agent."""
+    """The returns of an episode's agents: a tuple of numbers, and a mapping by agent."""
 
     _by_agent: dict[str, float]
 
     def __new__(cls, returns: Mapping[str, float]) -> Returns:
-        """Make the returns from a dict."""
+        """Copy the returns from a dict."""
         instance = super().__new__(cls, returns.values())
-        instance._by_agent = dict(returns)  # the user of the tuple may change it
+        instance._by_agent = dict(returns)
         return instance
 
-    def __getitem__(self, key: Any) -> Any:
+    def __getitem__(self, key: SupportsIndex | slice | str) -> Any:
         if not isinstance(key, str):
             return super().__getitem__(key)
         if key not in self._by_agent:
@@ -77,15 +103,21 @@ class Returns(tuple[float, ...]):
         return self._by_agent[key]
 
     def __contains__(self, key: object) -> bool:
-        return key in self._by_agent if isinstance(key, str) else super().__contains__(key)
+        if isinstance(key, str):
+            return key in self._by_agent
+        return super().__contains__(key)
 
     def __getattr__(self, name: str) -> Any:
-        """Return ``get``, ``keys``, ``values`` or ``items`` of the dict."""
+        """Return a method of the dict, such as ``get`` or ``items``."""
         return getattr(self._by_agent, name)
 
 
+Team = Callable[[Returns], SupportsFloat]
+"""A callable that combines the returns of agents into the team's value."""
+
+
 @contextmanager
-def noting(note: str) -> Iterator[None]:
+def error_note(note: str) -> Iterator[None]:
     """Add a note to errors."""
     try:
         yield
@@ -95,46 +127,26 @@ def noting(note: str) -> Iterator[None]:
 
 
 class Runner:
-    """Runs episodes of contenders, with the arguments that ``evaluate`` and ``run_experiment`` share.
+    """Runs episodes of contenders for ``evaluate`` and ``run_experiment``.
 
     Workers get a copy. With a ``batch_size`` of 0, policies answer one decision at a time.
     """
 
     def __init__(
-        self, contenders: Any, points: Any, options: Mapping[str, Any], metric: Any, team: Any, *, batched: bool,
-        batch_size: int, concurrency: int, workers: int, factors: Collection[str] = (),
-    ) -> None:  # fmt: skip
+        self,
+        contenders: Contenders,
+        points: Points,
+        options: Mapping[str, Any],
+        metric: Metrics,
+        team: Team | None,
+        batch_size: int,
+        concurrency: int,
+        factors: Collection[str] = (),
+    ) -> None:
         """Check the arguments.
 
         ``factors`` are the columns of the design, whose names metrics must not have.
         """
-        check_options(batch_size, workers, None, concurrency)
-        if not isinstance(contenders, Mapping):
-            raise OptionValueError(
-                f"contenders must be a dict from a name to policies, not {short_repr(contenders)}"
-            )
-        for name, policies in contenders.items():
-            if not isinstance(name, str) or not name:
-                raise OptionValueError(
-                    f"the name of a contender must be a string, not {short_repr(name)}"
-                )
-            if not isinstance(policies, Mapping):
-                raise OptionValueError(
-                    f"the contender {name!r} must be a dict from agents or points to policies,"
-                    f" {{}} for the model as it is, not {short_repr(policies)}"
-                )
-            for key, policy in policies.items():
-                if (
-                    callable(policy)
-                    and policy is not RULE
-                    and not batched
-                    and takes_identities(policy)
-                ):
-                    raise OptionValueError(
-                        f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)},"
-                        " answers many decisions at once, as mixtures do; pass batched=True, and"
-                        " only policies as simulate_many takes them"
-                    )
         if team is not None and not callable(team):
             raise OptionValueError(
                 f"team must be a callable of the returns, or None, not {short_repr(team)}"
@@ -144,58 +156,59 @@ class Runner:
                 "there is no option policies here; pass the policies of each contender in"
                 " contenders="
             )
-        self.contenders: Mapping[str, Mapping[Any, Any]] = contenders
-        self.metrics: Mapping[str, Callable[[Any], Any]] = {"metric": metric}
-        if metric is None or isinstance(metric, Mapping):
-            self.metrics = metric or {}
+        self.contenders = contenders
+        self.metrics: Mapping[str, Metric] = {}
+        if isinstance(metric, Mapping):
+            self.metrics = metric
+        elif metric is not None:
+            self.metrics = {"metric": metric}
         for name, function in self.metrics.items():
             if not isinstance(name, str) or not callable(function):
                 raise OptionValueError(
                     "metric must be a callable of the simulation, or a dict of them, not"
                     f" {short_repr(metric)}"
                 )
-            if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS, *factors):
+            if name in (*RESERVED, *factors):
                 raise OptionValueError(
                     f"the metric {name!r} has the name of another column; rename it"
                 )
-        self.batch_size, self._concurrency = int(batch_size) if batched else 0, int(concurrency)
-        policies = [policy for own in contenders.values() for policy in own.values()]
-        self._fallbacks = (FALLBACKS,) if any(map(has_fallback, policies)) else ()
-        self._team = team
-        # They may be iterators, and every plan reads them.
+        self.batch_size = batch_size
+        self._concurrency = concurrency
+        self._counts_fallbacks = any(
+            any(map(has_fallback, policies.values())) for policies in contenders.values()
+        )
+        self._team = sum if team is None else team
+        # Iterators are copied, because each plan reads them again.
         self._points = list(points) if isinstance(points, Iterator) else points
         self._options = {
-            n: list(value) if isinstance(value, Iterator) else value for n, value in options.items()
+            name: list(value) if isinstance(value, Iterator) else value
+            for name, value in options.items()
         }
 
-    def plan(self, simulation: Any, contender: str) -> Plan:
+    def plan(self, simulation: Model, contender: str) -> Plan:
         """Return the plan of a contender's episodes.
 
-        All agents whose rewards count decide in it.
+        All entities that decide are agents with rewards, also without a policy. If the decision
+        points are not known, the points that contenders name are used, if there are any.
         """
-        policies, points, options = self.contenders[contender], self._points, self._options
-        alone = not self.batch_size
-        with noting(f"of the contender {contender!r}"):
+        policies = self.contenders[contender]
+        make_plan = partial(
+            learners_plan,
+            simulation,
+            policies,
+            options=self._options,
+            alone=not self.batch_size,
+        )
+        with error_note(f"of the contender {contender!r}"):
             try:
-                return learners_plan(
-                    simulation, policies, points, options, all_points=True, alone=alone
-                )
+                return make_plan(points=self._points, all_points=True)
             except (AgentError, UnknownPointError) as error:
-                if points is not None:
+                if self._points is not None:
                     raise
-                # The points are not known: those that the contenders name are used, if there are
-                # any.
-                keys = dict.fromkeys(key for own in self.contenders.values() for key in own)
+                keys = dict.fromkeys(chain.from_iterable(self.contenders.values()))
                 points = [key for key in keys if not isinstance(key, str) or "." in key] or None
                 with suppress(AgentError, UnknownPointError):
-                    plan = learners_plan(
-                        simulation,
-                        policies,
-                        points,
-                        options,
-                        all_points=points is not None,
-                        alone=alone,
-                    )
+                    plan = make_plan(points=points, all_points=points is not None)
                     if points is None and decision_points():
                         warn_user(
                             "returns are not counted, because the decision points are not known:"
@@ -204,30 +217,16 @@ class Runner:
                     return plan
                 raise
 
-    def unproven_agents(self, plan: Plan, contender: str) -> set[str]:
-        """Return the names in a contender of which only episodes tell whether they are agents'."""
-        known = {point.agent for point in plan.points}.union(
-            declared_agents(plan.options.possible_agents)
-        )
-        return {
-            name
-            for name in self.contenders[contender]
-            if name in plan.policies and name not in known
-        }
+    def undeclared_agents(self, plan: Plan, contender: str) -> set[str]:
+        """Return the agents that a contender names, but neither points nor ``possible_agents``."""
+        by_option = declared_agents(plan.options.possible_agents)
+        declared_names = {*by_option, *(point.agent for point in plan.points)}
+        return (self.contenders[contender].keys() & plan.policies.keys()) - declared_names
 
-    def check_agents(self, contender: str, names: set[str], present: Collection[str]) -> None:
-        """Check that agents of these names have decided."""
-        for name in sorted(names.difference(present)):
-            raise AgentError(
-                f"the contender {contender!r} has a policy for {name!r}, but no agent of that name"
-                " has decided; declare it in possible_agents= if it may appear later; these have"
-                f" decided: {', '.join(present) or 'none'}{did_you_mean(name, present)}"
-            )
-
-    def together(self, contender: str) -> int:
-        """Return how many episodes of a contender run together."""
-        waiting = any(map(waits, self.contenders[contender].values()))
-        return self.batch_size or (self._concurrency if waiting else 1)
+    def episodes_at_once(self, contender: str) -> int:
+        """Return how many episodes of a contender run at once."""
+        is_awaited = any(map(waits, self.contenders[contender].values()))
+        return self.batch_size or (self._concurrency if is_awaited else 1)
 
     def run(
         self,
@@ -238,155 +237,196 @@ class Runner:
     ) -> None:
         """Run one episode for each seed.
 
-        ``report`` gets the seed and its results when the simulation is closed.
+        ``report`` gets the seed and the results after the simulation is closed.
         """
         tally = Tally()
 
-        def finish(place: int, simulation: Any) -> Callable[[], None]:
-            return partial(report, seeds[place], tally.outcome(place, simulation, self.metrics))
+        def finish(place: int, simulation: Model) -> Callable[[], None]:
+            seed = seeds[place]
+            outcome = tally.outcomes.pop(seed)
+            if TEAM in outcome.returns:
+                raise AgentError(
+                    f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
+                    " agent"
+                )
+            for name, metric in self.metrics.items():
+                value = metric(simulation)
+                outcome.metrics[name] = plain_value(f"the metric {name!r}", value)
+            return partial(report, seed, outcome)
 
-        run(plan, seeds, self.together(contender), finish, tally, self._concurrency)
+        with error_note(f"of the contender {contender!r}"):
+            run(
+                plan,
+                seeds,
+                self.episodes_at_once(contender),
+                finish,
+                tally,
+                self._concurrency,
+            )
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of ``rows``, with those of contender and seed before them."""
-        return (*RUN_COLUMNS, *self._fallbacks, *self.metrics)
+        """The columns of ``rows``."""
+        return (*RUN_COLUMNS, *([FALLBACKS] if self._counts_fallbacks else []), *self.metrics)
 
-    def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
-        """Return agent, return, length, fallbacks and metrics for each agent and for the team."""
-        metrics = [outcome.metrics.get(name) for name in self.metrics]
-        rows = []
-        for agent, of_agent in outcome.returns.items():
-            own = [outcome.fallbacks.get(agent, 0) for _ in self._fallbacks]
-            rows.append((agent, of_agent, outcome.lengths[agent], *own, *metrics))
-        value: Any = (
-            sum(outcome.returns.values())
-            if self._team is None
-            else self._team(Returns(outcome.returns))
-        )
-        fallbacks = [sum(outcome.fallbacks.values()) for _ in self._fallbacks]
+    def rows(
+        self,
+        contender: str,
+        seed: int,
+        outcome: Outcome,
+    ) -> list[Row]:
+        """Return a row of the table for each agent, and one for the team."""
+        value = self._team(Returns(outcome.returns))
         try:
-            return [
-                *rows,
-                (TEAM, float(value), sum(outcome.lengths.values()), *fallbacks, *metrics),
-            ]
+            returns = {**outcome.returns, TEAM: float(value)}
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
+        lengths = {**outcome.lengths, TEAM: sum(outcome.lengths.values())}
+        fallbacks = {**outcome.fallbacks, TEAM: sum(outcome.fallbacks.values())}
+        metrics = list(map(outcome.metrics.get, self.metrics))
+        rows = []
+        for agent, length in lengths.items():
+            counts = [fallbacks.get(agent, 0)] if self._counts_fallbacks else []
+            rows.append((contender, seed, agent, returns[agent], length, *counts, *metrics))
+        return rows
 
 
 class Tally:
-    """Counts the returns of agents while episodes run: a ``Watcher`` for ``run``, and for one episode alone."""
+    """Counts the decisions and rewards of agents while episodes run: a ``Watcher`` for ``run``.
+
+    Attributes:
+        outcomes: The results of the episodes, by seed.
+    """
 
     def __init__(self) -> None:
-        # by place and agent: return, length, fallbacks
-        self._accounts: dict[int, dict[str, list[Any]]] = {}
-        self._of_agents: dict[Agent, list[Any]] = {}  # the same, of agents that have not ended
+        self.outcomes = defaultdict[int, Outcome](lambda: Outcome({}, Counter(), {}, {}))
 
-    def count(self, place: int, agent: Agent) -> None:
-        """Count a decision of an agent."""
-        account = self._of_agents.get(agent)
-        if account is None:
-            accounts = self._accounts.setdefault(place, {})
-            account = self._of_agents[agent] = accounts.setdefault(agent.name, [0.0, 0, 0])
-        account[1] += 1
-
-    def record(self, group: Group, places: list[int], waiting: list[Any], *_: Any) -> None:
+    def record(
+        self,
+        group: Group,
+        places: list[int],
+        waiting: list[Any],
+        *_: object,
+    ) -> None:
         """Count decisions: see ``Watcher``."""
-        for place, episode in zip(places, waiting, strict=True):
-            self.count(place, episode.pending)
+        for episode in waiting:
+            outcome = self.outcomes[episode.seed]
+            name = episode.pending.name
+            outcome.returns.setdefault(name, 0.0)
+            outcome.lengths[name] += 1
 
     def pay(self, episode: Episode) -> None:
-        """Add the rewards: see ``Watcher``."""
-        ended = [*episode.take_ended(), *(episode.agents.values() if episode.over else ())]
-        for agent in ended:
-            self._pay(agent, self._of_agents.pop(agent, None))
-        pending = episode.pending
-        if pending is not None:
-            self._pay(pending, self._of_agents.get(pending))
+        """Add the rewards: see ``Watcher``.
 
-    def _pay(self, agent: Agent, account: list[Any] | None) -> None:
-        if account is not None:
-            account[0] += agent.reward
-            account[2] = agent.fallbacks
+        Agents that end before the simulation get their last reward when it is over.
+        """
+        outcome = self.outcomes[episode.seed]
+        agents = [*episode.ended.values(), *episode.agents.values()]
+        for agent in agents if episode.pending is None else [episode.pending]:
+            if agent.name in outcome.returns:
+                outcome.returns[agent.name] += agent.reward
+                if agent.fallbacks:
+                    outcome.fallbacks[agent.name] = agent.fallbacks
 
-    def outcome(
-        self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]
-    ) -> Outcome:
-        """Return the results of an episode that is over."""
-        accounts = self._accounts.pop(place, {})
-        if TEAM in accounts:
-            raise AgentError(
-                f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
-                " agent"
+
+# -- checks ---------------------------------------------------------------------------------------
+
+
+def check_contenders(contenders: Contenders, *, batched: bool) -> None:
+    """Check that contenders are a dict from names to policies."""
+    if not isinstance(contenders, Mapping):
+        raise OptionValueError(
+            f"contenders must be a dict from a name to policies, not {short_repr(contenders)}"
+        )
+    for name, policies in contenders.items():
+        if not isinstance(name, str) or not name:
+            raise OptionValueError(
+                f"the name of a contender must be a string, not {short_repr(name)}"
             )
-        returns = {name: float(account[0]) for name, account in accounts.items()}
-        lengths = {name: account[1] for name, account in accounts.items()}
-        values = {
-            name: plain_value(f"the metric {name!r}", metric(simulation))
-            for name, metric in metrics.items()
-        }
-        fallbacks = {name: account[2] for name, account in accounts.items() if account[2]}
-        return Outcome(returns, lengths, values, fallbacks)
+        if not isinstance(policies, Mapping):
+            raise OptionValueError(
+                f"the contender {name!r} must be a dict from agents or points to policies,"
+                f" {{}} for the model as it is, not {short_repr(policies)}"
+            )
+        for key, policy in {} if batched else policies.items():
+            if policy is not RULE and callable(policy) and takes_identities(policy):
+                raise OptionValueError(
+                    f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)},"
+                    " answers many decisions at once, as mixtures do; pass batched=True, and"
+                    " only policies as simulate_many takes them"
+                )
 
 
-# -- seeds, values and tables ---------------------------------------------------------------------
+def check_agents(
+    contender: str,
+    names: set[str],
+    present: Collection[str],
+) -> None:
+    """Check that agents of these names have decided."""
+    for name in sorted(names.difference(present)):
+        raise AgentError(
+            f"the contender {contender!r} has a policy for {name!r}, but no agent of that name"
+            " has decided; declare it in possible_agents= if it may appear later; these have"
+            f" decided: {', '.join(present) or 'none'}{did_you_mean(name, present)}"
+        )
 
 
 def distinct_seeds(seeds: Iterable[int]) -> list[int]:
     """Return the seeds as a list: at least one, and all different."""
-    checked = checked_seeds(seeds)
-    if not checked:
+    all_seeds = checked_seeds(seeds)
+    if not all_seeds:
         raise OptionValueError("seeds must be integers, such as range(32), but there are none")
-    seed, number = Counter(checked).most_common(1)[0]
+    seed, number = Counter(all_seeds).most_common(1)[0]
     if number > 1:
         raise OptionValueError(f"the seed {seed} occurs twice: its result would be counted twice")
-    return checked
+    return all_seeds
 
 
-def plain_value(what: str, value: Any, advice: str = "") -> Any:
-    """Return a number, a string, a bool or None as an object of Python; refuse any other value."""
-    if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
+def plain_value(name: str, value: Any, advice: str = "") -> Any:
+    """Return the named value without NumPy's types, or raise an error with some advice."""
+    if getattr(value, "ndim", None) == 0:
         value = value.item()
-    # 4,214 digits
-    plain = type(value) in (bool, float, str) or (
-        type(value) is int and value.bit_length() < 14_000
-    )
-    if value is not None and not plain:
-        what += " must be a number of no more than 4,200 digits, a string or None"
-        raise OptionValueError(f"{what}, not {short_repr(value)}{advice}")
+    is_short = type(value) is int and value.bit_length() < 14_000  # 4,214 digits
+    if not is_short and type(value) not in (bool, float, str, NoneType):
+        raise OptionValueError(
+            f"{name} must be a number of no more than 4,200 digits, a string or None, not"
+            f" {short_repr(value)}{advice}"
+        )
     return value
 
 
-def make_table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> DataFrame:
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def make_table(names: Sequence[str], rows: Iterable[Row]) -> DataFrame:
     """Return a table whose columns keep the types of their values.
 
     A numeric column with missing values is float.
     """
-    pandas = import_extra("pandas", "a table")
-    columns = dict(zip(names, zip(*rows, strict=True), strict=True))
-    table: DataFrame = pandas.DataFrame(
+    import pandas
+
+    columns = zip(*rows, strict=True)
+    return pandas.DataFrame(
         {
             name: pandas.Series(values, dtype=dtype_of(values, missing=True))
-            for name, values in columns.items()
+            for name, values in zip(names, columns, strict=True)
         }
     )
-    return table
 
 
-def dtype_of(values: Collection[Any], *, missing: bool) -> Any:
+def dtype_of(values: Collection[Any], *, missing: bool) -> str:
     """Return the dtype of a column that keeps the types of its values.
 
-    With ``missing``, None is a missing number, and numbers of both types become floats where that
-    is exact.
+    With ``missing``, None is a missing number, and numbers of both types become floats if that is
+    exact.
     """
     kinds = set(map(type, values))
     if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
-        return np.int64
-    if missing and kinds & {int, float} and kinds <= {int, float, type(None)}:
-        exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
-        return np.float64 if exact else object
-    return (
-        {str: "str", float: np.float64, bool: np.bool_}.get(kinds.pop(), object)
-        if len(kinds) == 1
-        else object
-    )
+        return "int64"
+    if missing and kinds & {int, float} and kinds <= {int, float, NoneType}:
+        is_exact = all(type(value) is not int or abs(value) <= EXACT for value in values)
+        return "float64" if is_exact else "object"
+    for kind, dtype in ((str, "str"), (float, "float64"), (bool, "bool")):
+        if kinds == {kind}:
+            return dtype
+    return "object"

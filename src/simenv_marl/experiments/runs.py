@@ -12,13 +12,12 @@ from concurrent.futures import BrokenExecutor
 from contextlib import closing, suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial, wraps
-from itertools import groupby, product
+from itertools import groupby, product, starmap
 from math import nan
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import time_ns
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 from uuid import uuid4
 
 from ..core import (
@@ -38,39 +37,60 @@ from ..errors import (
     SimulationError,
     StoreError,
     describe_error,
+    name_of,
     short_repr,
 )
 from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
-from ..simulation import make_simulation
+from ..runs import check_options
+from ..simulation import Model, make_simulation
 from .runner import (
-    FALLBACKS,
+    RESERVED,
     RUN_COLUMNS,
     STATUS_COLUMNS,
     TEAM,
-    Returns,
+    Contenders,
+    Metrics,
+    Outcome,
+    Row,
     Runner,
+    Team,
+    Value,
+    check_agents,
+    check_contenders,
     distinct_seeds,
     make_table,
     plain_value,
 )
-from .store import Provenance, Result, Run, Store, Writer, to_json
+from .store import (
+    Entry,
+    Provenance,
+    Result,
+    Run,
+    Store,
+    Writer,
+    make_entry,
+    to_json,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-BY_RULE: Final = "rule"
+BY_RULE = "rule"
 """The contender that is always present: the model as it is."""
+
+DEATH = "WorkerError: the worker died in this run, twice; see retry_errors="
+"""The result of a run that has killed its worker."""
 
 
 def run_experiment(
-    make: Any,
-    design: Any,
+    make: "Callable[..., Model] | Variant",
+    design: "DataFrame | Iterable[Any]",
     *,
-    contenders: Mapping[str, Mapping[Any, Any]] | None = None,
+    contenders: Contenders | None = None,
     seeds: Iterable[int],
     points: Points = None,
-    metric: Any = None,
-    team: Callable[[Returns], Any] | None = None,
+    metric: Metrics = None,
+    team: Team | None = None,
     store: str | os.PathLike[str],
     batched: bool = False,
     batch_size: int = 1024,
@@ -115,30 +135,39 @@ def run_experiment(
     Raises:
         OptionValueError: An argument has an invalid value, or the store belongs to another
             experiment. Nothing has run.
-        StoreError: The store cannot be read or written. What was stored before stays.
+        StoreError: The store cannot be read or written. Stored runs stay.
         MissingExtraError: pandas, joblib or tqdm is missing.
-        SimEnvError: Something else cannot work. The subclass tells what.
+        SimEnvError: Another argument does not work. The subclass and the message say which.
     """
     import_extra("pandas", "run_experiment")
-    table, rows = _checked_design(design)
-    keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
-    runner = Runner(
-        contenders or {}, points, options, metric, team, batched=bool(batched), batch_size=batch_size,
-        concurrency=concurrency, workers=workers,
-        factors=rows[0],
-    )  # fmt: skip
-    if runner.contenders.get(BY_RULE):
+    table, rows = _read_design(design)
+    keys = [to_json(row) for row in rows]
+    all_seeds = distinct_seeds(seeds)
+    check_options(batch_size, workers, None, concurrency)
+    check_contenders(contenders or {}, batched=batched)
+    contenders = {BY_RULE: {}, **(contenders or {})}
+    if contenders[BY_RULE]:
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another"
             " name"
         )
-    runner.contenders = {BY_RULE: {}, **runner.contenders}
+    batch_size = batch_size if batched else 0
+    runner = Runner(
+        contenders,
+        points,
+        options,
+        metric,
+        team,
+        batch_size,
+        concurrency,
+        rows[0],
+    )
     if isinstance(make, Variant):
-        _source(make, rows[0])  # a variant checks its parameters
-    else:
-        what = "make must be a callable of the factors, such as a class, or a Variant"
-        check_call(
-            make, rows[0], OptionValueError, what, f"the factors {', '.join(rows[0]) or '(none)'}"
+        _source_of_row(make, rows[0])  # a variant checks its parameters
+    elif problem := find_call_problem(make, rows[0]):
+        raise OptionValueError(
+            f"{name_of(make)} cannot be called with the factors {', '.join(rows[0]) or '(none)'}:"
+            f" {problem}; make must be a callable of the factors, such as a class, or a Variant"
         )
     try:
         folder = Path(store).absolute()  # other processes may have another working directory
@@ -146,60 +175,46 @@ def run_experiment(
         raise OptionValueError(
             f"store must be the path of a folder, not {short_repr(store)}"
         ) from error
-    storage = Store(folder, rows[0], runner.metrics)
-    storage.read(keys)
-    storage.check_rows(keys)
-    # of all processes that do runs now; later ones sort after it
-    session = f"{time_ns():016x}{uuid4().hex[:8]}"
+    storage = Store(folder, keys, rows[0], runner.metrics)
+    storage.read()
+    storage.check_rows()
+    session = f"{time_ns():016x}{uuid4().hex[:8]}"  # later sessions sort after it
+    job = Job(make, runner, folder, session)
     if workers:
-        # errors of pickling come before any run, and so do those of contenders
-        pack((make, runner))
-    row, prepared = _try_contenders(
-        make, runner, sorted(keys, key=lambda key: key != storage.sample)
-    )
+        pack(job)  # errors of pickling come before any run
+    row, provenances, agents = job.try_contenders([storage.sample or keys[0], *keys])
     storage.create()
-    storage.warn_of_changes(
-        row, {contender: provenance for contender, (_, provenance) in prepared.items()}
-    )
-    finished = {
-        run
-        for run, result in storage.runs.items()
-        if not (retry_errors and isinstance(result, str))
-    }
+    storage.warn_of_changes(row, provenances)
     # A row that occurs twice has the same results.
-    runs = list(product(dict.fromkeys(keys), runner.contenders, all_seeds))
-    missing = [run for run in runs if run not in finished]
-    with (
-        progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar,
-        TemporaryDirectory() as notes,
-    ):
-        work = make, runner, folder, session, notes if workers else ""
-        # for each contender whose agents are not known: these, and the runs of its first row
-        firsts = []
-        for contender, (names, _) in prepared.items():
-            own = [run for run in missing if run[1] == contender]
-            unseen = {name for name in names if (contender, name) not in storage.seen}
-            if own and unseen:
-                firsts.append((unseen, [run for run in own if run[0] == own[0][0]]))
-        if firsts:
-            with suppress(BrokenExecutor):  # a run that has killed its worker does so again below
-                spread(_run_first, work, firsts, workers, 1, NO_BAR)
-            storage.read(keys, session)
+    runs = list(starmap(Run, product(dict.fromkeys(keys), contenders, all_seeds)))
+    final_results = Outcome if retry_errors else (Outcome, str)
+    missing = [run for run in runs if not isinstance(storage.runs.get(run), final_results)]
+    with progress_bar(len(runs), progress, "run", len(runs) - len(missing)) as bar:
+        trials = []
+        for (_, contender), group in groupby(missing, lambda run: run[:2]):
+            names = agents.pop(contender, set()) - storage.agents[contender]
+            if names:
+                trials.append((names, list(group)))
+        if trials:
+            with suppress(BrokenExecutor):  # a run that kills its worker does so again below
+                spread(job.try_agents, (), trials, workers, 1, NO_BAR)
+            storage.read(session)
             missing = [run for run in missing if run not in storage.runs]
             bar.update(len(storage.runs))
-        _run_all(work, missing, workers, len(all_seeds) if batched else 1, bar, storage, keys)
-    storage.read(keys)
+        job.run_all(missing, storage, workers, len(all_seeds) if batched else 1, bar)
+    storage.read()
     return _make_frame(table, keys, all_seeds, storage.runs, runner)
 
 
-# -- checks before anything runs ------------------------------------------------------------------
+# -- the checks before any run --------------------------------------------------------------------
 
 
-def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
+def _read_design(design: "DataFrame | Iterable[Any]") -> "tuple[DataFrame, list[dict[str, Value]]]":
     """Return a design as a table, and its rows as values for JSON."""
-    pandas = import_extra("pandas", "a design")
+    import pandas
+
     try:
-        table = design if isinstance(design, pandas.DataFrame) else pandas.DataFrame(design)
+        table = pandas.DataFrame(design)
     except (TypeError, ValueError) as error:
         raise OptionValueError(
             f"design must be a DataFrame, or data to make one from, not {short_repr(design)}"
@@ -208,7 +223,7 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
     for name in names:
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
-        if name in (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS):
+        if name in RESERVED:
             raise OptionValueError(
                 f"the factor {name!r} has the name of another column of the table; rename it"
             )
@@ -217,43 +232,30 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
     if not len(table):
         raise OptionValueError("the design has no rows")
     advice = "; other values cannot be stored: use a name as the value, and look it up in make"
-    levels = {
-        name: [plain_value(f"the factor {name!r}", value, advice) for value in table[name]]
-        for name in names
-    }
-    return table, [{name: levels[name][place] for name in names} for place in range(len(table))]
+    rows = table.to_dict("records") or [{}] * len(table)  # no records without columns
+    for row in rows:
+        for name, value in row.items():
+            row[name] = plain_value(f"the factor {name!r}", value, advice)
+    return table, rows
 
 
-def _try_contenders(
-    make: Any, runner: Runner, keys: Sequence[str]
-) -> tuple[str, dict[str, tuple[set[str], Provenance]]]:
-    """Check that all contenders can be set up.
-
-    Return a row, as JSON, and their unproven agents and provenance.
-
-    Both are empty if the simulations of the first ten rows cannot be made: the runs of all rows
-    tell why.
-    """
-    for key in keys[:10]:
-        try:
-            prepared = {
-                contender: _prepare(make, runner, key, contender) for contender in runner.contenders
-            }
-            return key, {
-                name: (runner.unproven_agents(plan, name), made)
-                for name, (plan, made) in prepared.items()
-            }
-        except SimEnvError:
-            raise
-        except Exception:  # this row fails; another may not
-            continue
-    return "", {}
+def find_call_problem(source: Model, arguments: Mapping[str, Any]) -> str:
+    """Return why a class or factory cannot be called with some arguments; empty if it can."""
+    if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
+        return "it is neither a class nor a factory"
+    try:
+        inspect.signature(source).bind(**arguments)
+    except TypeError as problem:
+        return str(problem)
+    except ValueError:  # a builtin without a signature
+        pass
+    return ""
 
 
 # -- runs -----------------------------------------------------------------------------------------
 
 
-def _source(make: Any, row: Mapping[str, Any]) -> Any:
+def _source_of_row(make: "Callable[..., Model] | Variant", row: Mapping[str, Value]) -> Model:
     """Return the variant, class or factory of a row's simulations."""
     if isinstance(make, Variant):
         return replace(make, parameters={**make.parameters, **row})
@@ -262,162 +264,192 @@ def _source(make: Any, row: Mapping[str, Any]) -> Any:
     first = make(**row)
     if isinstance(first, (Variant, type)) or not hasattr(first, "run"):
         return first
-    ready = [first]
+    unused = [first]
 
-    @wraps(type(first), updated=())  # provenance names it after the class that it makes
-    def factory() -> Any:
-        if ready:
-            return ready.pop()
-        made = make(**row)
-        # each run has a simulation of its own
-        return make_simulation(first) if made is first else made
+    @wraps(type(first), updated=())  # because provenance names a source after its class
+    def factory() -> Model:
+        if unused:
+            return unused.pop()
+        simulation = make(**row)
+        # Each run has another simulation, even if make always returns the same object.
+        return make_simulation(first) if simulation is first else simulation
 
     return factory
 
 
-def _prepare(make: Any, runner: Runner, key: str, contender: str) -> tuple[Plan, dict[str, Any]]:
-    """Return the plan of runs of a row with a contender, and their provenance."""
-    source = _source(make, json.loads(key))
-    plan = runner.plan(source, contender)
-    name = make.name if isinstance(make, Variant) else source_name(make)
-    policies = {
-        **(source.policies if isinstance(source, Variant) else {}),
-        **runner.contenders[contender],
-    }
-    return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
+@dataclass(frozen=True)
+class Job:
+    """The work of an experiment, as its workers get it.
 
-
-def _run_all(
-    work: tuple[Any, ...],
-    missing: list[Run],
-    workers: int,
-    least: int,
-    bar: Any,
-    storage: Store,
-    keys: Sequence[str],
-) -> None:
-    """Do all runs.
-
-    A run that has killed its worker, and does so again while nothing else runs, becomes an error.
+    Attributes:
+        make: Makes the simulations of a row.
+        runner: Runs the episodes.
+        folder: The store.
+        session: The id of this call of ``run_experiment``, for the names of files.
     """
-    _, runner, folder, session, notes = work
-    while missing:
-        try:
-            # few parts cost nothing
-            spread(_run_part, work, missing, workers, least, bar, share=16)
-            return
-        except BrokenExecutor:  # a worker has died, and joblib has ended all others
-            suspects: list[Run] = []
-            storage.read(keys, session)
-            for path in sorted(Path(notes).iterdir()):
-                with suppress(ValueError):  # its process was killed while it wrote
-                    left = [
-                        run
-                        for run in map(tuple, json.loads(path.read_bytes()))
-                        if run not in storage.runs
-                    ]
-                    suspects += left[: max(runner.batch_size, 1)]
-                path.unlink()
-            if not suspects:
-                raise
-        for run in suspects:
+
+    make: "Callable[..., Model] | Variant"
+    runner: Runner
+    folder: Path
+    session: str
+
+    def prepare(self, row: str, contender: str) -> tuple[Plan, Provenance]:
+        """Return the plan of runs of a row with a contender, and their provenance."""
+        source = _source_of_row(self.make, json.loads(row))
+        plan = self.runner.plan(source, contender)
+        name = self.make.name if isinstance(self.make, Variant) else source_name(self.make)
+        variant = plan.subject.variant
+        own_policies = (variant.policies if variant is not None else None) or {}
+        policies = {**own_policies, **self.runner.contenders[contender]}
+        return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
+
+    def try_contenders(
+        self, rows: Sequence[str]
+    ) -> tuple[str, dict[str, Provenance], dict[str, set[str]]]:
+        """Check that all contenders can be set up.
+
+        Returns:
+            The first row whose simulations can be made and, by contender, provenances and
+            undeclared agents. All three are empty if the simulations of the first ten rows cannot
+            be made, because the runs of all rows tell why.
+        """
+        for row in rows[:10]:
+            provenances = {}
+            agents = {}
             try:
-                spread(_run_part, work, [run], max(workers, 2), 1, bar)
-            except BrokenExecutor:
-                with closing(Writer(folder, session)) as writer:
-                    writer.write(
-                        run,
-                        "WorkerError: the worker died in this run, twice; see retry_errors=",
-                        {},
-                    )
-        storage.read(keys, session)
-        missing = [run for run in missing if run not in storage.runs]
+                for contender in self.runner.contenders:
+                    plan, provenances[contender] = self.prepare(row, contender)
+                    agents[contender] = self.runner.undeclared_agents(plan, contender)
+            except SimEnvError:
+                raise
+            except Exception:  # this row fails; another may not
+                continue
+            return row, provenances, agents
+        return "", {}, {}
 
+    def run_all(
+        self,
+        runs: Sequence[Run],
+        storage: Store,
+        workers: int,
+        least: int,
+        bar: Any,
+        is_retry: bool = False,
+    ) -> None:
+        """Do runs in workers, in parts of at least ``least`` runs.
 
-def _note(notes: str, runs: Sequence[Run]) -> None:
-    """Note the runs that a worker does next, for the case that it dies."""
-    if notes:
-        with suppress(OSError):  # another machine does not see the folder
-            Path(notes, uuid4().hex).write_text(to_json(runs), encoding="ascii")
+        If a worker dies, joblib ends all others. Each half of the missing runs is then tried
+        separately. A single run that kills its worker twice becomes an error.
 
-
-def _run_first(
-    make: Any, runner: Runner, folder: Path, session: str, notes: str, firsts: list[Any], bar: Any
-) -> None:
-    """Run the first row of contenders, until the agents that they name have appeared.
-
-    Only then store the results.
-
-    Each item consists of these names and of the runs of the row. An agent that has not appeared is
-    an ``AgentError``.
-    """
-    for names, runs in firsts:
-        _note(notes, runs)
-        held: list[Any] = []
-        present: dict[str, float] = {}
-        for key, contender, seed in runs:
-            _run_seeds(
-                make,
-                runner,
-                lambda *entry, held=held: held.append(entry),
-                key,
-                contender,
-                [seed],
-                bar,
-            )
-            result = held[-1][1]
-            present |= {} if isinstance(result, str) else result.returns
-            if present.keys() >= names:
-                break
-        if not all(isinstance(result, str) for _, result, *_ in held):
-            runner.check_agents(runs[0][1], names, present)
-        with closing(Writer(folder, session)) as writer:
-            for entry in held:
-                writer.write(*entry)
-
-
-def _run_part(
-    make: Any, runner: Runner, folder: Path, session: str, notes: str, runs: Sequence[Run], bar: Any
-) -> None:
-    """Do runs and store their results."""
-    _note(notes, runs)
-    with closing(Writer(folder, session)) as writer, reuse_resources():
-        for (key, contender), group in groupby(runs, lambda run: run[:2]):
-            _run_seeds(
-                make, runner, writer.write, key, contender, [seed for *_, seed in group], bar
-            )
-
-
-def _run_seeds(
-    make: Any, runner: Runner, write: Any, key: str, contender: str, seeds: Sequence[int], bar: Any
-) -> None:
-    """Run seeds of a row with a contender, and ``write`` the result of each.
-
-    An error is a result, too.
-    """
-    remaining = dict.fromkeys(seeds)
-
-    def report(seed: int, result: Result, trace: str | None = None) -> None:
-        write((key, contender, seed), result, {**provenance, "seed": seed}, trace)
-        del remaining[seed]
-        bar.update()
-
-    while remaining:
-        provenance: dict[str, Any] = {}  # unknown if the simulation cannot be made
+        Raises:
+            BrokenExecutor: The workers have died before one of them opened its file.
+        """
+        if not runs:
+            return
         try:
-            plan, provenance = _prepare(make, runner, key, contender)
-            runner.run(plan, contender, list(remaining), report)
-        except (KeyboardInterrupt, StoreError):
-            raise
-        except BaseException as error:
-            if (
-                runner.together(contender) > 1 and len(remaining) > 1
-            ):  # running them one by one shows which of them failed
-                for seed in remaining:
-                    _run_seeds(make, runner, write, key, contender, [seed], bar)
+            # Small parts cost nothing.
+            spread(
+                self.run_part,
+                (),
+                runs,
+                workers,
+                least,
+                bar,
+                share=16,
+            )
+        except BrokenExecutor:
+            if not any(self.folder.glob(f"runs-{self.session}-*")):
+                raise
+            if is_retry and len(runs) == 1:
+                with closing(Writer(self.folder, self.session)) as writer:
+                    writer.write(make_entry(runs[0], DEATH, {}))
                 return
-            trace = "".join(traceback.format_exception(error))[-4000:]
-            report(next(iter(remaining)), describe_error(error), trace)
+            storage.read(self.session)
+            missing = [run for run in runs if run not in storage.runs]
+            middle = len(missing) // 2
+            for half in (missing[:middle], missing[middle:]):
+                self.run_all(
+                    half,
+                    storage,
+                    workers,
+                    least,
+                    bar,
+                    is_retry=True,
+                )
+
+    def run_part(self, runs: Sequence[Run], bar: Any) -> None:
+        """Do runs and store their results."""
+        with closing(Writer(self.folder, self.session)) as writer, reuse_resources():
+            for _, group in groupby(runs, lambda run: run[:2]):
+                self._run_group(list(group), writer.write, bar)
+
+    def try_agents(
+        self,
+        trials: Sequence[tuple[set[str], list[Run]]],
+        bar: Any,
+    ) -> None:
+        """Run the first row of contenders until all agents that they name have decided.
+
+        Store the results only then.
+
+        Args:
+            trials: For each contender: the names of the agents, and the runs of its first row.
+            bar: The progress bar.
+
+        Raises:
+            AgentError: An agent has not decided.
+        """
+        for names, runs in trials:
+            entries: list[Entry] = []
+            present: dict[str, float] = {}
+            for run in runs:
+                self._run_group([run], entries.append, bar)
+                present |= entries[-1].get("returns", {})
+                if present.keys() >= names:
+                    break
+            if any(entry["status"] == "ok" for entry in entries):
+                check_agents(runs[0].contender, names, present)
+            with closing(Writer(self.folder, self.session)) as writer:
+                for entry in entries:
+                    writer.write(entry)
+
+    def _run_group(
+        self,
+        runs: Sequence[Run],
+        write: Callable[[Entry], None],
+        bar: Any,
+    ) -> None:
+        """Do runs of one row and one contender, and ``write`` the result of each.
+
+        An error is a result, too.
+        """
+        row, contender, _ = runs[0]
+        remaining = {run.seed: run for run in runs}
+        number = len(runs)
+
+        def report(
+            seed: int,
+            result: Result,
+            trace: str | None = None,
+        ) -> None:
+            run = remaining.pop(seed)
+            write(make_entry(run, result, {**provenance, "seed": seed}, trace))
+            bar.update()
+
+        while remaining:
+            seeds = list(remaining)[:number]
+            provenance: Provenance = {}  # unknown if the simulation cannot be made
+            try:
+                plan, provenance = self.prepare(row, contender)
+                self.runner.run(plan, contender, seeds, report)
+            except (KeyboardInterrupt, StoreError):
+                raise
+            except BaseException as error:
+                if self.runner.episodes_at_once(contender) > 1 and len(remaining) > 1 < number:
+                    number = 1  # running them one by one shows which of them failed
+                    continue
+                trace = "".join(traceback.format_exception(error))[-4000:]
+                report(next(iter(remaining)), describe_error(error), trace)
 
 
 # -- the table ------------------------------------------------------------------------------------
@@ -432,22 +464,28 @@ def _make_frame(
 ) -> "DataFrame":
     """Return the table of all runs, in the order of the design, the contenders and the seeds."""
     places: list[int] = []
-    rows: list[tuple[Any, ...]] = []
+    rows: list[Row] = []
     for (place, key), contender, seed in product(enumerate(keys), runner.contenders, seeds):
-        result = results.get((key, contender, seed), "its result is no longer stored")
-        own: list[tuple[Any, ...]] = []
-        if not isinstance(result, str):
-            try:
-                own = [(*row, "ok", None) for row in runner.rows(result)]
-            except Exception as error:  # raised by team=, which is called for stored runs, too
-                result = describe_error(error)
-        for row in own or [
-            (TEAM, nan, 0, *[None] * (len(runner.columns) - len(RUN_COLUMNS)), "error", result)
-        ]:
-            places.append(place)
-            rows.append((contender, seed, *row))
+        result = results.get(Run(key, contender, seed), "its result is no longer stored")
+        rows += _rows_of_run(contender, seed, result, runner)
+        places += [place] * (len(rows) - len(places))
     factors = table.iloc[places].reset_index(drop=True)
     return factors.join(make_table((*runner.columns, *STATUS_COLUMNS), rows))
+
+
+def _rows_of_run(
+    contender: str,
+    seed: int,
+    result: Result,
+    runner: Runner,
+) -> list[Row]:
+    if isinstance(result, Outcome):
+        try:
+            return [(*row, "ok", None) for row in runner.rows(contender, seed, result)]
+        except Exception as error:  # raised by team=, which is called for stored runs, too
+            result = describe_error(error)
+    missing = [None] * (len(runner.columns) - len(RUN_COLUMNS))
+    return [(contender, seed, TEAM, nan, 0, *missing, "error", result)]
 
 
 # -- variants -------------------------------------------------------------------------------------
@@ -471,7 +509,7 @@ class Variant:
     """
 
     name: str
-    simulation: Any
+    simulation: Model
     _: KW_ONLY
     parameters: Mapping[str, Any] = field(default_factory=dict)
     points: Points = None
@@ -497,72 +535,54 @@ class Variant:
             # Copied, so that later changes of the arguments do not change the variant.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         object.__setattr__(self, "plugins", tuple(self.plugins))
-        twice = [name for name in ("plugins", "policies") if name in self.options]
-        if twice:
+        misplaced_options = {"plugins", "policies"} & self.options.keys()
+        if misplaced_options:
             raise OptionValueError(
-                f"{' and '.join(twice)} must be arguments of the variant {self.name!r} itself, not"
-                " among its options"
+                f"{' and '.join(sorted(misplaced_options))} must be arguments of the variant"
+                f" {self.name!r} itself, not among its options"
             )
-        if self.parameters:
-            what = f"the variant {self.name!r} has parameters, so its simulation must be a class or a factory"
-            check_call(
-                source,
-                self.parameters,
-                SimulationError,
-                what,
-                f"the parameters of the variant {self.name!r}",
+        if self.parameters and (problem := find_call_problem(source, self.parameters)):
+            raise SimulationError(
+                f"{name_of(source)} cannot be called with the parameters of the variant"
+                f" {self.name!r}: {problem}; its simulation must be a class or a factory that takes"
+                " them"
             )
 
-    def __reduce__(self) -> Any:
-        # Functions are pickled by name: while environments are in use, hooks may stand in their
-        # places.
+    def __reduce__(self) -> tuple[Callable[..., "Variant"], tuple[()]]:
+        # Functions are pickled by name, because hooks replace them while environments are in use.
         points = self.points
         if isinstance(points, Mapping):
             points = {portable(key): definition for key, definition in points.items()}
-        elif points is not None and not isinstance(points, str):
-            points = [
-                portable(key) for key in (points if isinstance(points, Iterable) else [points])
-            ]
-        return partial(
-            Variant,
-            self.name,
-            self.simulation,
-            parameters=dict(self.parameters),
-            points=points,
-            plugins=[(handler, portable(target), *rest) for handler, target, *rest in self.plugins],
-            policies={portable(key): policy for key, policy in self.policies.items()},
-            options=dict(self.options),
-        ), ()
+        elif isinstance(points, Iterable) and not isinstance(points, str):
+            points = list(map(portable, points))
+        else:
+            points = portable(points)
+        arguments = {
+            **vars(self),
+            "parameters": dict(self.parameters),
+            "points": points,
+            "plugins": [
+                (handler, portable(target), *rest) for handler, target, *rest in self.plugins
+            ],
+            "policies": {portable(key): policy for key, policy in self.policies.items()},
+            "options": dict(self.options),
+        }
+        return partial(Variant, **arguments), ()
 
     def environment_arguments(
-        self, points: Any, options: Mapping[str, Any]
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        """Return simulation, points and options of an environment of this variant, with those that are given to it."""
-        source = partial(self.simulation, **self.parameters) if self.parameters else self.simulation
-        merged = {**self.options, **options}
-        policies = {**self.policies, **(options.get("policies") or {})}
-        plugins = (*self.plugins, *options.get("plugins", ()))
-        if policies:
-            merged["policies"] = policies
-        if plugins:
-            merged["plugins"] = plugins
-        return source, self.points if points is None else points, merged
+        self, points: Points, options: Mapping[str, Any]
+    ) -> tuple[Model, Points, dict[str, Any]]:
+        """Return simulation, points and options of an environment of this variant.
 
-
-def check_call(
-    source: Any,
-    arguments: Mapping[str, Any],
-    error: type[SimEnvError],
-    requirement: str,
-    described: str,
-) -> None:
-    """Check that something is a class or a factory, as ``requirement`` says, and takes the described arguments."""
-    if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
-        raise error(f"{requirement}, not {short_repr(source)}")
-    try:
-        inspect.signature(source).bind(**arguments)
-    except TypeError as problem:
-        name = getattr(source, "__qualname__", None) or short_repr(source)
-        raise error(f"{name} cannot be called with {described}: {problem}") from problem
-    except ValueError:  # a builtin without a signature
-        pass
+        The arguments of the environment precede the variant's.
+        """
+        source = self.simulation
+        if self.parameters:
+            source = partial(source, **self.parameters)
+        all_options = {
+            **self.options,
+            **options,
+            "policies": {**self.policies, **(options.get("policies") or {})},
+            "plugins": (*self.plugins, *options.get("plugins", ())),
+        }
+        return source, self.points if points is None else points, all_options

@@ -452,8 +452,9 @@ def step_all(
         return
     agents: list[Any] = [episode.pending for episode in episodes]
     callers = {episode.driver.caller for episode in episodes}
+    first = episodes[0]
     together = callers == {getcurrent()} and not (
-        EVALUATING or None in agents or episodes[0].in_rounds
+        EVALUATING or None in agents or first.in_rounds or first.plan.plugins is not None
     )
     number = 0
     event: Any = None

@@ -175,8 +175,10 @@ def _reduce_function(function: FunctionType) -> Reduced | None:
     named = _import(*place)
     if named is function:
         return None
+    if getattr(named, "__func__", None) is function:
+        return _function_at, (*place, False)
     if named is not None and unwrap(named) is function:  # a patch has wrapped it
-        return _rule_at, place
+        return _function_at, (*place, True)
     hook = hook_of(function)
     return None if hook is None else _by_token(function, hook.make_wrapper, made_with(function))
 
@@ -191,9 +193,10 @@ def _import(module: str | None, path: str) -> Any:
         return None
 
 
-def _rule_at(module: str, path: str) -> Any:
-    """Return the function behind the wrapper, or the binding, with a dotted name."""
-    return unwrap(_import(module, path))
+def _function_at(module: str, path: str, is_wrapped: bool) -> Any:
+    """Return the function of the method, or behind the wrapper, with a dotted name."""
+    named = _import(module, path)
+    return unwrap(named) if is_wrapped else named.__func__
 
 
 def _by_token(thing: FunctionType | Hook, make: Callable[..., Any], *args: object) -> Reduced:

@@ -86,6 +86,7 @@ class Variant(Protocol):
 
     name: str
     parameters: Mapping[str, object]
+    policies: Mapping[Any, Policy] | None
 
     def environment_arguments(
         self, points: Points, options: Mapping[str, Any]

@@ -492,7 +492,7 @@ def test_the_generators_of_the_process_are_seeded_for_each_future(method):
     env = trip(simulation=Lucky, global_rng=True)
 
     def base(twin, number):
-        with twin._session.context():
+        with twin.session.context():
             own = drawn(twin, number)
         return drawn(twin, number), own, twin.simulation.random.random()
 

@@ -324,6 +324,15 @@ class View:
         """Return what is in the same state in a copy."""
         return {name: value for name, value in vars(self).items() if name not in _OWN}
 
+    def export_state(self) -> dict[str, Any]:
+        """Return the state of the view, for its twin in the process of a clone."""
+        return self._state()
+
+    def import_state(self, state: dict[str, Any]) -> None:
+        """Take over the state of the twin."""
+        vars(self).update(state)
+        self.set_up()  # there may be another episode
+
     def _recipe(self) -> dict[str, Any]:
         """Return what a copy is made of."""
         return self._state() | {"_plan": self._plan, "session": self.session.snapshot()}

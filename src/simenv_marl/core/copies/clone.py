@@ -167,12 +167,7 @@ def branch(
             " decides in the branches, and branches them again; use action_values or RolloutPolicy,"
             " which let a base policy decide there"
         )
-    if isinstance(view.session, RemoteSession):
-        if env is not view:
-            raise ViewError(
-                "the wrappers of a clone are not in the clone's process; branch its unwrapped"
-                " environment: branch(env.unwrapped, ...)"
-            )
+    if isinstance(view.session, RemoteSession) and env is view:
         branch_there = partial(
             branch, function=function, n=n, method=method, seeds=seeds, time_limit=time_limit
         )
@@ -192,11 +187,13 @@ def branch(
         finally:
             DEPTH.reset(token)
 
+    if isinstance(view.session, RemoteSession):  # whose wrappers are in this process
+        return [_call_on_clone(env, call, number, method) for number in range(n)]
     separate = separator_of(view, method)
     if separate is not None:
         return _call_in_forks(partial(call, env), n, separate, time_limit)
     with reuse_resources():
-        return [_call_in_replay(env, call, number) for number in range(n)]
+        return [_call_on_clone(env, call, number, "replay") for number in range(n)]
 
 
 def pending_view(env: Any, user: str) -> Any:
@@ -271,12 +268,14 @@ def _fork_of(original: BaseSession, view: Any, method: str | None) -> Fork | Non
 # -- branches: clones for one call ----------------------------------------------------------------
 
 
-def _call_in_replay(env: Any, function: Callable[[Any, int], Result], number: int) -> Result:
-    """Call a function on a clone of this process."""
+def _call_on_clone(
+    env: Any, function: Callable[[Any, int], Result], number: int, method: str | None
+) -> Result:
+    """Call a function in this process on a clone."""
     twin: Any = None
     with preserve_generators():  # the function and the model may draw from those of the process
         try:
-            twin = clone(env, method="replay")
+            twin = clone(env, method=method)
             result = function(twin, number)
         except BaseException as error:
             annotate(error, f"simenv_marl: in branch {number}")

@@ -12,8 +12,8 @@ import struct
 import sys
 import warnings
 import weakref
-from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Final
@@ -200,7 +200,7 @@ class Fork:
         if seconds < _LONGEST:
             whole, part = divmod(max(seconds, 1e-6), 1)
             limit = _TIME.pack(int(whole), int(part * 1e6))
-        with socket.socket(fileno=os.dup(self.connection.fileno())) as same:
+        with _as_socket(self.connection) as same:
             same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
 
     def receive(self) -> bytes:
@@ -297,6 +297,27 @@ def _await_separation(process: int, here: Connection, there: Connection) -> None
             os.waitpid(process, 0)
     if not separated:
         raise BranchError("the forked process died before it was separated from this one")
+
+
+@contextmanager
+def _as_socket(connection: Connection) -> Iterator[socket.socket]:
+    """Use a connection as the socket that it is."""
+    with socket.socket(fileno=os.dup(connection.fileno())) as same:
+        same.setblocking(True)  # whatever the default time limit of sockets is
+        yield same
+
+
+def send_connection(through: Connection, connection: Connection) -> None:
+    """Send a connection through another one."""
+    with _as_socket(through) as same:
+        socket.send_fds(same, [b"."], [connection.fileno()])
+
+
+def receive_connection(through: Connection) -> Connection | None:
+    """Receive a connection. None if there are no more descriptors."""
+    with _as_socket(through) as same:
+        descriptors = socket.recv_fds(same, 1, 1)[1]
+    return Connection(descriptors[0]) if descriptors else None
 
 
 def receive(connection: Connection) -> bytes:

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from contextvars import ContextVar
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import send_handle
 from operator import attrgetter
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -17,8 +16,9 @@ from ...simulation import Action, Model
 from ..episodes.episode import Episode
 from ..episodes.session import Recording, ResetOptions, Session, Snapshot
 from ..episodes.state import Outcome
+from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals
-from .forks import CAN_FORK, Fork, flush
+from .forks import CAN_FORK, Fork, flush, send_connection
 from .packing import unpack
 from .peer import serve
 from .separation import obstacles_of, separator
@@ -55,6 +55,12 @@ class HostedView(Protocol):
 
     def set_up(self) -> None:
         """Complete what the view reads of an episode."""
+
+    def export_state(self) -> dict[str, Any]:
+        """Return the state of the view."""
+
+    def import_state(self, state: dict[str, Any]) -> None:
+        """Take over the state of its twin."""
 
 
 class AgentReport(NamedTuple):
@@ -189,20 +195,28 @@ class Host:
         self._session.close()
 
     def call(
-        self, function: bytes, snapshot: Snapshot, unreported_end: bool
-    ) -> tuple[Any, Snapshot, Report | None]:
-        """Call a function with the view. Return its result, and how it leaves the session."""
+        self, function: bytes, state: dict[str, Any], snapshot: Snapshot, unreported_end: bool
+    ) -> tuple[Any, dict[str, Any], Snapshot, Report | None]:
+        """Call a function with the view, in the state that its twin has.
+
+        Return the result, and the states of the view, the session and the episode.
+        """
         called, args = unpack(function)
         session = self._session
         session.restore(snapshot)
         if session.episode is not None and not unreported_end:
             session.episode.mark_reported()
+        self._view.import_state(state)
         token = DEPTH.set(DEPTH.get() + 1)
         try:
             result = called(self._view, *args)
         finally:
             DEPTH.reset(token)
-        return result, session.snapshot(), self.report(True)
+        return result, self._view.export_state(), session.snapshot(), self.report(True)
+
+    def move_to(self, where: Where) -> None:
+        """Note where the episodes are played from now on."""
+        self._session.move_to(where)
 
     # -- the simulation ---------------------------------------------------------------------------
 
@@ -238,7 +252,7 @@ class Host:
         forked, self._forked = self._forked, None
         if forked is not None and self._connection is not None:
             with forked.connection as connection:
-                send_handle(self._connection, connection.fileno(), None)
+                send_connection(self._connection, connection)
 
     def reap(self, process: int) -> None:
         """Wait for the end of a fork that was killed."""

@@ -9,7 +9,6 @@ from contextlib import suppress
 from errno import EMFILE
 from functools import partial
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import recv_handle
 from typing import Any
 
 from ...errors import BranchError, ClosedError, SimEnvError, annotate, short_repr, warn_user
@@ -20,7 +19,7 @@ from ..episodes.events import PointHandler
 from ..episodes.session import BaseSession, Recording, ResetOptions
 from ..episodes.state import EpisodeState, State
 from ..plans.policies import Where
-from .forks import Fork, exhausted
+from .forks import Fork, exhausted, receive_connection
 from .host import FIELDS, AgentReport, HostedView, Report, report_of
 from .packing import pack
 from .peer import Outcome, Peer, PeerLostError
@@ -187,9 +186,7 @@ class RemoteSession(BaseSession):
     def _receive_connection(self) -> Connection | None:
         """Receive the connection of a fork. None if there are no more descriptors."""
         self._peer.send("hand_over", ())
-        connection: Connection | None = None
-        with suppress(OSError, EOFError, RuntimeError):
-            connection = Connection(recv_handle(self._fork.connection))
+        connection = receive_connection(self._fork.connection)
         self._peer.receive()
         return connection
 
@@ -229,6 +226,11 @@ class RemoteSession(BaseSession):
         else:
             self.episode.load(report)
 
+    def move_to(self, where: Where) -> None:
+        """Note that its episodes are played in a clone or a branch from now on."""
+        super().move_to(where)
+        self.request("move_to", where)
+
     # -- the simulation ----------------------------------------------------------------------------
 
     def ask(self, name: str, *args: Any) -> Model:
@@ -263,8 +265,8 @@ class RemoteSession(BaseSession):
         self._is_renewed = True  # the function may reset the environment
         message = pack((function, args))
         try:
-            result, snapshot, report = self.request(
-                "call", message, self.snapshot(), unreported_end, limit=limit
+            result, state, snapshot, report = self.request(
+                "call", message, view.export_state(), self.snapshot(), unreported_end, limit=limit
             )
         except BaseException:
             if self._gone is None:
@@ -273,7 +275,7 @@ class RemoteSession(BaseSession):
             raise
         self.restore(snapshot)
         self._mirror(report, whole=True)
-        view.set_up()  # there may be another episode
+        view.import_state(state)
         return result
 
     # -- episodes ----------------------------------------------------------------------------------

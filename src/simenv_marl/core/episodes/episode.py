@@ -354,7 +354,8 @@ class Episode(EpisodeState):
                 action = agent.answer_by_policy(self)
             finally:
                 self.consulted = None
-        self.record(_copied(action))
+        if self.is_recorded:
+            self.record(_copied(action))
         return action
 
     def record(self, action: Action) -> None:
@@ -394,7 +395,9 @@ class Episode(EpisodeState):
         self._split = None
         if call.handler.report is not None:
             self._items = [weaken(item) for item in call.items]
-        return self.driver.resume(call.reply())
+        reply = call.reply()
+        del call  # it has the items, which the model may free
+        return self.driver.resume(reply)
 
     def take_items(self) -> list[Model]:
         """Return the items of the latest call that was split, for the decision of its rule."""
@@ -614,7 +617,9 @@ class Episode(EpisodeState):
 
     def fail(self, error: BaseException) -> None:
         """End the episode because of an error, and note in the error where it arose."""
-        self.stop()  # first, because the next call may come to the end of the stack
+        self.pending = None  # first, because the next call may come to the end of the stack
+        if self.outcome is Outcome.RUNNING:
+            self.outcome = Outcome.STOPPED
         self.annotate(error)
         try:
             problems = self._unwind()

@@ -396,7 +396,7 @@ def _labels(space: Space, labels: Labels) -> Labels:
         texts = labels if isinstance(labels, Mapping) else dict(enumerate(labels or (), start))
         return {action: str(texts.get(action, action)) for action in range(start, start + space.n)}
     if isinstance(space, gym_spaces.Dict):
-        return labels if isinstance(labels, Mapping) else {key: key for key in space.spaces}
+        return dict(labels) if isinstance(labels, Mapping) else {key: key for key in space.spaces}
     if space.shape is None or len(space.shape) != 1:
         return None
     places = range(space.shape[0])

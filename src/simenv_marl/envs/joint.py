@@ -93,9 +93,10 @@ class Joint:
     def inform(self, episode: EpisodeState, before: float | None) -> dict[str, Any]:
         """Return the info of a step or a reset. ``before``: the time of the previous one."""
         agents = self.agents(episode)
+        acted = () if episode.round is None else episode.round.acted
         info: dict[str, Any] = {
             "deciding": episode.pending.name if episode.pending is not None else "",
-            "acted": {name: agent.acted for name, agent in agents.items()},
+            "acted": {name: name in acted for name in agents},
         }
         masks = {
             name: duplicate(agent.mask) for name, agent in agents.items() if agent.mask is not None

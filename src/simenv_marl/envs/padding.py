@@ -40,6 +40,7 @@ def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
 def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any]) -> tuple[Any, ...]:
     """Return the rewards, terminations, truncations and infos of all possible agents, from those of the live ones."""
     episode, roster, padded = view.episode, view.possible_agents, {}
+    acted = () if episode.round is None else episode.round.acted
     for name in roster:
         agent: Any = episode.agent(name)
         present = agent.present and not agent.ended
@@ -49,7 +50,7 @@ def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any]) -> 
             agent.clear_observation()
             agent.take_observation()  # so that ``observe`` and ``state`` have blanks
             info = agent.info | (
-                {"deciding": False, "acted": agent.acted} if view._in_rounds else {}
+                {"deciding": False, "acted": name in acted} if view._in_rounds else {}
             )
         padded[name] = {**info, "present": present}
     terminations, truncations = (

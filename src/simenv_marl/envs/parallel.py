@@ -105,12 +105,13 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         observations: dict[str, Observation] = {}
         rewards: dict[str, float] = {}
         infos: dict[str, Info] = {}
+        acted = () if episode.round is None else episode.round.acted
         for name, agent in agents.items():
             observations[name] = self._hand_out(agent)
             rewards[name] = agent.reward
             infos[name] = info = agent.info
             info["deciding"] = agent is pending
-            info["acted"] = agent.acted
+            info["acted"] = name in acted
         for agent in ended:
             terminations[agent.name] = True
             truncations[agent.name] = False

@@ -30,7 +30,7 @@ DEPTH: Final[ContextVar[int]] = ContextVar("simenv_marl.core.host", default=0)
 """The depth of this branch."""
 
 FIELDS: Final = (
-    "observation", "reward", "info", "mask", "acted", "decided", "ended", "present", "answered",
+    "observation", "reward", "info", "mask", "decided", "ended", "present", "answered",
 )  # fmt: skip
 """The fields of an agent that views read."""
 
@@ -75,6 +75,7 @@ class Report(NamedTuple):
     """What views read of an episode after a request.
 
     Attributes:
+        acted: The agents whose action the latest round has used. None where it is played in turns.
         agents: The agents that have changed.
         others: The names of the agents for which policies answer, where all agents are sent.
         just_ended: The names of the agents whose end is not reported yet.
@@ -82,7 +83,7 @@ class Report(NamedTuple):
         unpickled: The keys that infos have lost, because their values cannot be pickled.
     """
 
-    in_rounds: bool
+    acted: set[str] | None
     pending: str | None
     outcome: Outcome
     turns: int
@@ -106,7 +107,7 @@ def report_of(episode: Episode, *, whole: bool) -> Report:
         agents.append(pending)
     numbers = {point.hook: number for number, point in enumerate(episode.plan.points)}
     return Report(
-        episode.in_rounds,
+        None if episode.round is None else episode.round.acted,
         None if pending is None else pending.name,
         episode.outcome,
         episode.turns,

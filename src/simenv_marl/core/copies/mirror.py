@@ -36,7 +36,9 @@ class Mirror(EpisodeState):
         clock: Clock | None = None
         if report.time is not None:
             clock = Clock(partial(getattr, session, "time"), plan.options.discount_rate)
-        super().__init__(plan, session.seed or 0, clock, session.where, in_rounds=report.in_rounds)
+        super().__init__(
+            plan, session.seed or 0, clock, session.where, in_rounds=report.acted is not None
+        )
         self._session = session
         self.unreported_end = report.unreported_end
         self.load(report)
@@ -45,6 +47,8 @@ class Mirror(EpisodeState):
         """Take over a report. What the view itself notes in an episode stays."""
         self.outcome = report.outcome
         self.turns = report.turns
+        if self.round is not None and report.acted is not None:
+            self.round.acted = report.acted
         for agent in report.agents:
             self._load_agent(agent)
         for name in report.others:

@@ -84,20 +84,29 @@ class Arguments:
         """Prepare to hold the arguments of decisions at a point."""
         self._number = point.taken_places
         self._keys = point.taken_keys
-        self.clear()
-
-    def clear(self) -> None:
-        """Hold nothing."""
         self.first: Callable[[], Model] = _nothing
         self.is_single = False
         self.is_empty = True
         self._args: tuple[Model, ...] = ()
         self._kwargs: Kwargs = BOUND
 
+    def clear(self) -> None:
+        """Hold nothing."""
+        self.first = _nothing
+        self.is_single = False
+        self.is_empty = True
+        self._args = ()
+        self._kwargs = BOUND
+
     def store(self, args: Args, kwargs: Kwargs) -> None:
         """Hold the arguments of a call."""
         self.is_empty = False
-        self._note_first(args)
+        self.first = _nothing
+        if args and type(args[0]) not in _ATOMS:
+            try:
+                self.first = ref(args[0])
+            except TypeError:  # of a class without weak references
+                self.first = partial(_same, args[0])
         if self._number is not None:
             args = args[: self._number]
         self._args = tuple(map(weaken, args))
@@ -109,15 +118,6 @@ class Arguments:
                 if self._keys is None or key in self._keys
             }
         self.is_single = self._args == (self.first,) and self._kwargs is BOUND
-
-    def _note_first(self, args: Args) -> None:
-        self.first = _nothing
-        if not args or type(args[0]) in _ATOMS:
-            return
-        try:
-            self.first = ref(args[0])
-        except TypeError:  # of a class without weak references
-            self.first = partial(_same, args[0])
 
     def recall(self) -> Recalled:
         """Return the arguments that are held, with those that are gone."""

@@ -64,9 +64,10 @@ from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent
 from .arguments import restore, weaken
+from .clock import Clock
 from .decision import Decision, decision_of
 from .round import Round, checked_actions
-from .state import EpisodeState, Outcome
+from .state import RUNNING, EpisodeState, Outcome
 
 if TYPE_CHECKING:
     from ..plans.point import Args, Kwargs
@@ -110,13 +111,21 @@ class Episode(EpisodeState):
     )  # fmt: skip
 
     def __init__(
-        self, session: Session, driver: Driver, seed: int, replay: Replay | None, *, in_rounds: bool
+        self,
+        session: Session,
+        simulation: Model,
+        clock: Clock | None,
+        driver: Driver,
+        seed: int,
+        replay: Replay | None,
+        *,
+        in_rounds: bool,
     ) -> None:
         """Prepare the run of a simulation that has been reset. The next ``resume`` begins it."""
         plan = session.plan
-        super().__init__(plan, seed, session.make_clock(), session.where, in_rounds=in_rounds)
+        super().__init__(plan, seed, clock, session.where, in_rounds=in_rounds)
         self.session: Callable[[], Session | None] = ref(session)
-        self.simulation = session.simulation
+        self.simulation = simulation
         self.driver = driver
         self._context = session.context
         self._handlers = session.handlers
@@ -132,8 +141,8 @@ class Episode(EpisodeState):
         self.replay = replay
         self._split: SplitCall | None = None
         self._items: list[Model] = []
-        for name, point in plan.roster.items():
-            self.agents[name] = self._make_agent(name, self._handlers.by_point[point])
+        for name, prepared in self._handlers.roster.items():
+            self.agents[name] = Agent(name, *prepared, self.clock, self._plugins)
 
     def context(self) -> environment_context:
         """Return the context in which the environment's code must run."""
@@ -151,26 +160,30 @@ class Episode(EpisodeState):
     # -- steps ------------------------------------------------------------------------------------
 
     def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
-        """Run the simulation to its first decision. Call a function when it has sent an event.
+        """Run the simulation to its first decision, in its context.
+
+        Call a function when the simulation has sent an event.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
         """
-        with self.context():
-            try:
-                handler, args, kwargs = self.driver.resume(None)
-                if at_first_event is not None:
-                    at_first_event()
-                reply = handler.handle(self, args, kwargs)
-                del handler, args, kwargs
-                if not self.has_to_wait(reply):
-                    self.advance(reply)
-                if not self.over and self.consulted is None and self.agents:
-                    self.update_all()
-            except BaseException as error:
-                self.fail(error)
-                raise
-        self.unreported_end = self.over or (self.in_rounds and bool(self.just_ended))
+        try:
+            handler, args, kwargs = self.driver.resume(None)
+            if at_first_event is not None:
+                at_first_event()
+            reply = handler.handle(self, args, kwargs)
+            del handler, args, kwargs
+            if type(reply) is Agent:
+                self.latest = self.pending = reply
+            elif reply is not WAIT:
+                self.advance(reply)
+            is_over = self.outcome is not RUNNING
+            if not is_over and self.consulted is None and self.agents:
+                self.update_all()
+        except BaseException as error:
+            self.fail(error)
+            raise
+        self.unreported_end = is_over or (self.round is not None and bool(self.just_ended))
         if self.pending is None and self.plan.has_user and not self._has_only_forced_moves():
             raise self._without_decision()
 
@@ -233,28 +246,35 @@ class Episode(EpisodeState):
         self.pending = None
         try:
             if len(self.tape) < self._tape_size:
-                self.tape.append({name: _copied(action) for name, action in checked.items()})
+                self.tape.append(
+                    {
+                        name: action if type(action) is int else duplicate(action)
+                        for name, action in checked.items()
+                    }
+                )
             self.turns += bool(checked)
             is_last = bool(checked) and self.turns == self._most_steps
             played.begin(checked)
-            for agent in (*self.agents.values(), *self.just_ended):
-                agent.begin_round()
             if self.unreported_end:
                 self.unreported_end = False
             else:
                 self.just_ended = []
             reply = self._use_action(played, pending)
-            moved = not self.has_to_wait(reply)
-            if moved:
+            if reply is pending:
+                self.pending = pending
+                played.note_stalled(pending)
+            else:
                 self.advance(reply)
-            if not self.skips:  # else forced moves have used none
+                if played.stalled:
+                    played.note_moved()
+            if played.actions and not self.skips:  # else forced moves have used none
                 played.count_unused()
-            if not self.over and self.consulted is None:  # it is set where a replay ends
+            # ``consulted`` is set where a replay ends.
+            if self.outcome is RUNNING and self.consulted is None:
                 self.update_all(truncated=is_last)
         except BaseException as error:
             self.fail(error)
             raise
-        played.warn_if_stalled(pending, moved)
 
     def advance(self, reply: Model) -> None:
         """Resume the simulation with a reply, and run to the user's next decision, or to the end.
@@ -317,7 +337,7 @@ class Episode(EpisodeState):
         self.latest = agent
         if not agent.decided:  # it acts before it was ever updated
             call = agent.arguments.recall()
-            agent.update_fully(call.args, call.kwargs, observe=False)
+            agent.update(call.args, call.kwargs, observe=False)
         return agent.answer(action, forced is not None)
 
     def answer(self, agent: Agent, action: Action) -> Model:
@@ -477,7 +497,7 @@ class Episode(EpisodeState):
             agent.refresh(reward=in_rounds)
             if in_rounds and self.skips and agent.present:
                 agent.carry_reward(not self.turns)
-            if agent is not pending:
+            if agent.choices is not None and agent is not pending:
                 agent.forget_choices()  # ``legal`` returns them again when it decides
         self.pending = pending
 
@@ -528,7 +548,7 @@ class Episode(EpisodeState):
         if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
             call = agent.arguments.recall()
             with self.context():
-                agent.update_fully(call.args, call.kwargs, observe=False)
+                agent.update(call.args, call.kwargs, observe=False)
         self.consulted = None
         self.pending = agent
 
@@ -618,7 +638,7 @@ class Episode(EpisodeState):
     def fail(self, error: BaseException) -> None:
         """End the episode because of an error, and note in the error where it arose."""
         self.pending = None  # first, because the next call may come to the end of the stack
-        if self.outcome is Outcome.RUNNING:
+        if self.outcome is RUNNING:
             self.outcome = Outcome.STOPPED
         self.annotate(error)
         try:
@@ -635,7 +655,7 @@ class Episode(EpisodeState):
     def stop(self) -> None:
         """Note that nothing happens any more."""
         self.pending = None
-        if self.outcome is Outcome.RUNNING:
+        if self.outcome is RUNNING:
             self.outcome = Outcome.STOPPED
 
     def close(self) -> None:
@@ -655,7 +675,9 @@ class Episode(EpisodeState):
                 for problem in self._unwind():
                     self.annotate(problem)
                     raise problem
-        self.stop()
+        self.pending = None
+        if self.outcome is RUNNING:
+            self.outcome = Outcome.STOPPED
 
     def _unwind(self) -> list[BaseException]:
         """Unwind the simulation if it is suspended. Return the errors that it raised."""
@@ -666,7 +688,7 @@ class Episode(EpisodeState):
             return []
         before = self.outcome
         self.pending = None
-        self.outcome = Outcome.RUNNING  # it moves until it is unwound
+        self.outcome = RUNNING  # it moves until it is unwound
         problems: list[BaseException] = []
         try:
             stop = getattr(self.simulation, "stop", None)
@@ -678,7 +700,7 @@ class Episode(EpisodeState):
             problems += self.driver.unwind()
             self.running = False
         finally:
-            self.outcome = Outcome.STOPPED if before is Outcome.RUNNING else before
+            self.outcome = Outcome.STOPPED if before is RUNNING else before
         if self.driver.given_up is not None:
             warn_user(f"{type(self.simulation).__name__} {self.driver.given_up}.", ResourceWarning)
         return problems

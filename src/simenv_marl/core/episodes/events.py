@@ -15,7 +15,7 @@ from ...hooks.hook import Hook
 from ...simulation import RULE, Action, Model
 from ..plans.mappings import adapt
 from ..plans.plan import Plan, Remover
-from ..plans.point import Args, Kwargs, Point, warn_of_several
+from ..plans.point import Args, Kwargs, Point, Policy, warn_of_several
 from ..switching.driver import AnyHandler
 from ..values.actions import ILLEGAL
 from .arguments import Recalled, restore
@@ -223,10 +223,13 @@ class Handlers:
     Attributes:
         by_point: The handler of the decisions at each point of the plan.
         by_hook: The handler of the events of each hook.
+        roster: For each agent that is known beforehand, the handler of its decisions, its policy,
+            and whether that answers.
     """
 
     by_point: Mapping[Point, PointHandler]
     by_hook: Mapping[Hook, AnyHandler]
+    roster: Mapping[str, tuple[PointHandler, Policy, bool]]
 
 
 _HANDLERS: Final[WeakKeyDictionary[Plan, Handlers]] = WeakKeyDictionary()
@@ -258,4 +261,8 @@ def _make_handlers(plan: Plan, simulation: Model) -> Handlers:
         removal = removals.setdefault(remover.hook, RemovalHandler())
         removal.add(None if remover.point is None else by_point[remover.point], remover)
     by_hook.update(removals)
-    return Handlers(by_point, by_hook)
+    roster: dict[str, tuple[PointHandler, Policy, bool]] = {}
+    for name, point in plan.roster.items():
+        policy = plan.policy_of(name, point)
+        roster[name] = by_point[point], policy, plan.is_delegated(policy)
+    return Handlers(by_point, by_hook, roster)

@@ -22,17 +22,21 @@ class Round:
     """The present round of an episode. It uses each action once, up to a decision without one.
 
     Attributes:
+        actions: The actions that no decision has used yet, by agent.
+        acted: The names of the agents whose action was used in this round.
         used: The number of actions in the episode, other than ``RULE``, that decisions have used.
         unused: The number of actions that no decision has used.
+        stalled: The number of rounds in a row without an action for the pending agent.
     """
 
-    __slots__ = ("_actions", "_stalled", "unused", "used")
+    __slots__ = ("acted", "actions", "stalled", "unused", "used")
 
     def __init__(self) -> None:
-        self._actions: dict[str, Action] = {}
-        self._stalled = 0  # rounds without an action for the pending agent
+        self.actions: dict[str, Action] = {}
+        self.acted: set[str] = set()
         self.used = 0
         self.unused = 0
+        self.stalled = 0
 
     @property
     def given(self) -> int:
@@ -41,27 +45,34 @@ class Round:
 
     def begin(self, actions: dict[str, Action]) -> None:
         """Begin a round with checked actions."""
-        self._actions = actions
+        self.actions = actions
+        self.acted = set()
 
     def take(self, agent: Agent) -> Action:
         """Return the action for a decision. ``WAIT`` if there is none, or if it is illegal by now."""
-        action = self._actions.pop(agent.name, WAIT)
-        if action is WAIT or action is RULE:
-            return action
-        if agent.mask is not None and not agent.point.allows(agent.mask, action):
+        action = self.actions.pop(agent.name, WAIT)
+        if action is WAIT:
             return WAIT
-        self.used += 1
+        if action is not RULE:
+            if agent.mask is not None and not agent.point.allows(agent.mask, action):
+                return WAIT
+            self.used += 1
+        self.acted.add(agent.name)
         return action
 
     def count_unused(self) -> None:
         """Count the actions that the round has not used."""
-        for action in self._actions.values():
+        for action in self.actions.values():
             self.unused += action is not RULE
 
-    def warn_if_stalled(self, pending: Agent, moved: bool) -> None:
-        """Warn if the simulation has not moved for many rounds."""
-        self._stalled = 0 if moved else self._stalled + 1
-        if self._stalled == MANY_ROUNDS:
+    def note_moved(self) -> None:
+        """Note that the simulation has moved."""
+        self.stalled = 0
+
+    def note_stalled(self, pending: Agent) -> None:
+        """Note that the simulation has not moved. Warn if that is so for many rounds."""
+        self.stalled += 1
+        if self.stalled == MANY_ROUNDS:
             warn_user(
                 f"the simulation stands still: {short_repr(pending.name)} must decide, but"
                 f" {MANY_ROUNDS} rounds in a row had no action for it; the info of the agent that"

@@ -232,7 +232,7 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_close", "_driver", "_installed", "_reset", "_rng", "_simulation", "context", "episode",
+        "_check", "_clock", "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation", "context", "episode",
         "handlers", "unmatched_names",
     )  # fmt: skip
 
@@ -256,6 +256,9 @@ class Session(BaseSession):
         )
         # Closes the simulation, if it was reset since the last time.
         self._close: Callable[[bool], None] | None = None
+        self._check: Callable[[], None] | None = (
+            None  # warns if it has drawn from global generators
+        )
         self._installed: Installation | None = Installation(plan.patches)
         prototype = plan.claim_prototype()
         if prototype is not None:
@@ -282,13 +285,15 @@ class Session(BaseSession):
     def _take_simulation(self, simulation: Model) -> None:
         self._simulation = simulation
         self._reset = resetter(simulation)
+        self._closer = closer(simulation)
+        self._clock = self._make_clock()
         self.handlers = handlers_of(self.plan, simulation)
 
-    def _run(self, job: Callable[[], Model], context: Context | None = None) -> Model:
+    def _run(self, job: Callable[[], Model]) -> Model:
         """Run a job on the simulation's stack. A stack that cannot run it is replaced."""
         self._driver = self._driver.ready()
-        with self.context():
-            return self._driver.run(job, context)
+        with self.context(self._driver):
+            return self._driver.run(job)
 
     def _close_simulation(self, *, last: bool) -> None:
         """Close the simulation, once for each reset. ``last``: no reset follows."""
@@ -317,36 +322,50 @@ class Session(BaseSession):
         self.end()
         self._state = State.MOVING
         try:
-            self._close_simulation(last=False)
+            if self._close is not None:
+                self._close_simulation(last=False)
             if self._installed is None or not self._installed.complete:
                 self._installed = Installation(self.plan.patches)
             self.options = options
             self.seed = seed = self.seed_for(seed)
-            self._driver = self._driver.ready()
-            if self._driver.stale:  # code that still uses it must not meet another episode
+            self._driver = driver = self._driver.ready()
+            if driver.stale:  # code that still uses it must not meet another episode
                 self._make_simulation()
-                self._driver.renew()
-            return self._begin(seed, in_rounds, replay)
+                driver.renew()
+            context = copy_context()
+            with self.context(driver):
+                self._reset_simulation(seed, context)
+                return self._begin(seed, context, in_rounds, replay)
         finally:
             self._state = State.NEW if self.episode is None else State.OVER
 
-    def _begin(self, seed: int, in_rounds: bool, replay: Replay | None) -> Episode:
-        """Reset the simulation, and run it to its first decision."""
-        context = copy_context()
-        check = None
+    def _reset_simulation(self, seed: int, context: Context) -> None:
+        """Reset the simulation on its stack."""
         if self._rng is None:
-            check = draws_check(self._simulation, in_thread=self.lock is not None)
+            self._check = draws_check(self._simulation, in_thread=self.lock is not None)
         try:
             if self._rng is not None:
-                with self.context():
-                    self._rng.begin(seed)
-            self._run(partial(self._reset, seed, self.options), context)
+                self._rng.begin(seed)
+            self._driver.run(partial(self._reset, seed, self.options), context)
         except BaseException as error:
             annotate(error, f"simenv_marl: while the simulation was reset; seed {seed}")
             raise
-        self._close = closer(self._simulation)
-        episode = Episode(self, self._driver, seed, replay, in_rounds=in_rounds)
-        self._driver.begin(self._simulation.run, episode.handlers_by_hook(), context)
+        self._close = self._closer
+
+    def _begin(
+        self, seed: int, context: Context, in_rounds: bool, replay: Replay | None
+    ) -> Episode:
+        """Run the simulation to its first decision."""
+        simulation = self._simulation
+        if self._clock is None and self.plan.options.discount_rate is not None:
+            raise OptionValueError(
+                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no"
+                " method time(); add one that returns its clock, or leave out discount_rate"
+            )
+        driver = self._driver
+        episode = Episode(self, simulation, self._clock, driver, seed, replay, in_rounds=in_rounds)
+        driver.begin(simulation.run, episode.handlers_by_hook(), context)
+        check, self._check = self._check, None
         try:
             self.episode = episode  # from now on it will be ended, even after an interrupt
             episode.begin(check)
@@ -357,20 +376,14 @@ class Session(BaseSession):
             raise
         return episode
 
-    def make_clock(self) -> Clock | None:
-        """Make the clock of an episode. None if the simulation has no time."""
-        options = self.plan.options
+    def _make_clock(self) -> Clock | None:
+        """Make the clock of the simulation. None if it has no time."""
         time = getattr(self._simulation, "time", None)
-        if time is not None:
-            if self.plan.plugins is not None or self._rng is not None:
-                time = _within(self.context, time)  # because views read the clock, too
-            return Clock(time, options.discount_rate)
-        if options.discount_rate is not None:
-            raise OptionValueError(
-                f"discount_rate needs the times of decisions, but {short_repr(self._simulation)}"
-                " has no method time(); add one that returns its clock, or leave out discount_rate"
-            )
-        return None
+        if time is None:
+            return None
+        if self.plan.plugins is not None or self._rng is not None:
+            time = _within(self.context, time)  # because views read the clock, too
+        return Clock(time, self.plan.options.discount_rate)
 
     def end(self) -> None:
         """End the current episode, or raise a ``ReentrancyError`` if that is not possible here."""

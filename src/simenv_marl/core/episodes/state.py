@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ...errors import (
     ClosedError,
@@ -39,6 +39,12 @@ class Outcome(Enum):
 
     STOPPED = "stopped"
     """An error has ended it, or it was closed."""
+
+
+RUNNING: Final = Outcome.RUNNING
+TERMINATED: Final = Outcome.TERMINATED
+TRUNCATED: Final = Outcome.TRUNCATED
+"""The outcomes as names of this module, because Python finds members of an enum slowly."""
 
 
 class State(Enum):
@@ -148,7 +154,7 @@ class EpisodeState:
         self.just_ended: list[Agent] = []
         self.pending: Agent | None = None
         self.consulted: Agent | None = None
-        self.outcome = Outcome.RUNNING
+        self.outcome = RUNNING
         self.unreported_end = False
         self.turns = 0
 
@@ -162,17 +168,17 @@ class EpisodeState:
     @property
     def over(self) -> bool:
         """Whether nothing happens any more."""
-        return self.outcome is not Outcome.RUNNING
+        return self.outcome is not RUNNING
 
     @property
     def terminated(self) -> bool:
         """Whether the simulation's ``run`` has returned."""
-        return self.outcome is Outcome.TERMINATED
+        return self.outcome is TERMINATED
 
     @property
     def truncated(self) -> bool:
         """Whether the episode has reached a limit of time."""
-        return self.outcome is Outcome.TRUNCATED
+        return self.outcome is TRUNCATED
 
     @property
     def in_rounds(self) -> bool:

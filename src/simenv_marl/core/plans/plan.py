@@ -114,6 +114,7 @@ class Prototype:
         self._end = finalize(self, made.end)
         try:
             with outside_simulation():
+                made.enter()
                 simulation = made.run(partial(make_simulation, source))
         except BaseException:
             self._end()

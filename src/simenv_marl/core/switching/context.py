@@ -69,7 +69,7 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
     ``getcurrent()`` is the driver's ``caller`` and ``EVALUATING`` is empty do without it.
     """
 
-    __slots__ = ("_driver", "_lock", "_rng")
+    __slots__ = ("_lock", "_rng", "_simulation")
 
     def __init__(
         self,
@@ -82,16 +82,16 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
         super().__init__(plugins)
         self._rng = rng
         self._lock = lock
-        self._driver = driver
+        self._simulation = driver
 
     def __enter__(self) -> None:
         if self._lock is not None:
             self._lock.__enter__()
         try:
             super().__enter__()
-            if self._driver is not None:
+            if self._simulation is not None:
                 # With generators of its own, each step must enter this context.
-                self._driver.enter(direct=self._rng is None)
+                self._simulation.enter(direct=self._rng is None)
             if self._rng is not None:
                 self._rng.enter()
         except BaseException:

@@ -222,7 +222,7 @@ class Driver(ABC):
 
     def ready(self) -> Driver:
         """Return this driver if it can run another job from here, else one that replaces it."""
-        if not self.ended and self.idle and self.reachable:
+        if self.idle and not self.ended and self.reachable:
             return self
         self.end()  # before there is another, so that an interrupt leaves no unknown stack behind
         return type(self)(self.plugins, self)
@@ -232,9 +232,8 @@ class Driver(ABC):
         self.stale = False
 
     def run(self, job: Callable[[], Model], context: Context | None = None) -> Model:
-        """Run a job to its end. Decision functions run their rule. Return the result of the job."""
+        """Run a job to its end, after ``enter``; return its result. Decisions follow the rule."""
         try:
-            self.enter()
             self.begin(job, context=context)
             self.resume(None)
         except BaseException:
@@ -245,7 +244,7 @@ class Driver(ABC):
     def take_outcome(self) -> Model:
         """Return the result of the job that has ended, or raise its error."""
         outcome = self._outcome
-        if self.failed:
+        if len(outcome) > 1:
             raise outcome.pop()  # the waiting stack must not keep the error
         return outcome.pop()
 
@@ -266,11 +265,10 @@ class Driver(ABC):
         return len(self._outcome) > 1
 
     def unwind(self) -> list[BaseException]:
-        """Raise ``SimulationExit`` in the job until it ends, or give it up.
+        """Raise ``SimulationExit`` in the job until it ends, or give it up, after ``enter``.
 
         Return the errors that the job raised instead.
         """
-        self.enter()
         if self.idle or self.ended:
             self._job = None  # an interrupt may have come before it began
             return []
@@ -334,19 +332,13 @@ class Driver(ABC):
             self.enter_hooks()
             result = None if job is None else job()
         except BaseException as error:
-            self._note_error(self._explain(error))
+            self._outcome = [None, self._explain(error)]
             return
         finally:
             job = None
             self.leave_hooks(self._stack)
             self.events = {}
-        if self._refused is not None:
-            self._note_error(self.refusal())
-            return
-        self._outcome = [result]
-
-    def _note_error(self, error: BaseException) -> None:
-        self._outcome = [None, error]
+        self._outcome = [result] if self._refused is None else [None, self.refusal()]
 
     def _explain(self, error: BaseException) -> BaseException:
         """Return the error to raise on the user's side for an error of the simulation."""
@@ -402,10 +394,11 @@ class Driver(ABC):
         handler = self.events.get(hook)
         if handler is None:
             return None
-        obstacle = self._obstacle(away)
-        if obstacle is not None:
-            return partial(self.refuse, hook, obstacle)
-        self._spawned |= away
+        if away or self.forked:
+            obstacle = self._obstacle(away)
+            if obstacle is not None:
+                return partial(self.refuse, hook, obstacle)
+            self._spawned = True
         rule = hook.rule
         if handler.report is not None:
             report = _report if hook.kind == "function" else _report_later

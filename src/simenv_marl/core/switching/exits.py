@@ -12,6 +12,7 @@ from greenlet import getcurrent, greenlet
 
 from ...errors import error_text
 from ...hooks.stacks import STACKS
+from ...simulation import Model
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
@@ -65,11 +66,11 @@ def make_exit() -> SimulationExit:
     A ``LoopExit`` ends a loop at once. Where asyncio already closes its loop, the exit must not end
     it, so that the other tasks end, too.
     """
-    hub = _hub_of_gevent()
-    if hub is not None:
-        known: tuple[type[BaseException], ...] = getattr(hub, "NOT_ERROR", ())
-        # The hub prints all other exceptions.
-        vars(hub)["NOT_ERROR"] = (*{*known, SimulationExit},)
+    here: greenlet | None = getcurrent()
+    while here is not None and here not in STACKS and not hasattr(here, "NOT_ERROR"):
+        here = here.parent
+    if hasattr(here, "NOT_ERROR"):  # gevent's hub, which has spawned this greenlet
+        _spare_hub(here)
         return LoopExit()
     loop = modules[ASYNCIO]._get_running_loop() if ASYNCIO in modules else None
     if loop is None:
@@ -78,14 +79,9 @@ def make_exit() -> SimulationExit:
     return SimulationExit() if _is_closing_loop() else LoopExit()
 
 
-def _hub_of_gevent() -> greenlet | None:
-    """Return gevent's hub if it has spawned this greenlet."""
-    here: greenlet | None = getcurrent()
-    while here is not None and here not in STACKS:
-        if hasattr(here, "NOT_ERROR"):
-            return here
-        here = here.parent
-    return here if hasattr(here, "NOT_ERROR") else None
+def _spare_hub(hub: Model) -> None:
+    """Let gevent's hub not print the exits of greenlets."""
+    setattr(hub, "NOT_ERROR", (*{*hub.NOT_ERROR, SimulationExit},))  # noqa: B010 - it has no type
 
 
 def _is_closing_loop() -> bool:

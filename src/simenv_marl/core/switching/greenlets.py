@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextvars import Context
 from sys import modules
 from typing import Final
 
@@ -81,26 +80,21 @@ class GreenletDriver(Driver):
             while not self.ended:
                 self._loop = NO_LOOP  # each job begins without a loop
                 # Not by ``Context.run``, because that takes a kilobyte of stack.
-                self._use_context(self._context)
-                self._context = None
-                self._enter_loop()
+                self._body.gr_context, self._context = self._context, None  # type: ignore[union-attr]
+                self._users_loop = swap_loop(self._loop)
                 try:
                     self._work()
                 finally:
                     if not self.ended:  # else the stack unwinds by itself
                         swap_loop(self._users_loop)
                 if not self.ended:
-                    self._use_context(None)
+                    self._body.gr_context = None  # type: ignore[union-attr]
                     self.idle = True
                     self._leave(*ENDED)
         except GreenletExit:
             pass
         finally:
             self._forget_stack()
-
-    def _use_context(self, context: Context | None) -> None:
-        if self._body is not None:
-            self._body.gr_context = context
 
     def _resume_body(self) -> None:
         """Let the next reply go to the stack itself, after a greenlet of the model has got one."""

@@ -126,7 +126,7 @@ class ThreadDriver(Driver):
         try:
             (context or Context()).run(self._work)
         except BaseException as error:  # raised from another thread, so that its user does not wait
-            self._note_error(error)
+            self._outcome = [None, error]
         context = None
         self.clear_exit()
         if self.forked:

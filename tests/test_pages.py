@@ -109,12 +109,6 @@ def test_the_map_has_few_pages_and_each_is_short():
     assert len(pages) <= 7
     assert len(others) <= BUDGETS["pages"]
     assert sum(others.values()) <= BUDGETS["words_of_pages"], others
-    assert {
-        page: words for page, words in others.items() if words > BUDGETS["words_of_a_page"]
-    } == {}
-    assert {
-        page: words for page, words in studies.items() if words > BUDGETS["words_of_a_study"]
-    } == {}
 
 
 @pytest.mark.parametrize("room", ["simenv_marl", *simenv_marl.ROOMS])

@@ -28,6 +28,7 @@ from ..core import (
     Where,
     action_check,
     checked_actions,
+    is_planner,
     is_seed,
     pending_view,
     policy_for,
@@ -122,12 +123,10 @@ class Player:
             )
 
     def check_base(self) -> None:
-        """Refuse a base that is not a policy, or that names an agent that does not exist."""
+        """Refuse a base that cannot decide in branches, or names an agent that does not exist."""
         bases = self.base if isinstance(self.base, Mapping) else {self.agent: self.base}
-        if any(policy is not RULE and not callable(policy) for policy in bases.values()):
-            raise OptionValueError(
-                f"base must be RULE, a policy, or policies by agent, not {short_repr(self.base)}"
-            )
+        for policy in bases.values():
+            _check_policy(policy)
         for name in bases if bases is self.base else ():
             if not self.may_be(name):
                 known = [*self.episode.agents, *self.episode.others]
@@ -219,6 +218,24 @@ class Player:
             and space == agent.point.definition.action_space
         )
         return space.sample(agent.mask) if masked else space.sample()
+
+
+def _check_policy(policy: Any) -> None:
+    """Refuse a base that cannot decide in branches: no policy, or a planner without a base."""
+    if isinstance(policy, Mapping):
+        for part in policy.values():
+            _check_policy(part)
+    elif policy is not RULE and not callable(policy):
+        raise OptionValueError(
+            f"base must be RULE, a policy, or policies by agent, not {short_repr(policy)}"
+        )
+    elif is_planner(policy):
+        if not hasattr(policy, "base"):
+            raise OptionValueError(
+                f"the base {short_repr(policy)} asks for _environment, which no policy receives in"
+                " a branch; set its attribute base to the policy that decides there, or to RULE"
+            )
+        _check_policy(policy.base)
 
 
 class JointPlayer(Player):

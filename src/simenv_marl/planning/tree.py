@@ -79,6 +79,8 @@ class TreeSearchPolicy(RolloutPolicy):
         """Begin to keep states, if there is one exact future and this saves more steps than a fork costs."""
         if rollouts.reseeds or self.method == "replay" or self.depth == 1:
             return None
+        if rollouts.env is not rollouts.env.unwrapped:  # wrappers are not in a clone's process
+            return None
         began = perf_counter()
         try:
             root = clone(rollouts.env, method="fork", time_limit=self.time_limit)

@@ -64,12 +64,14 @@ class Player:
         latest: The observations and infos of the latest step, by agent. Empty before a step.
     """
 
-    env: Environment
-    view: Any
-
-    def __init__(self, env: Environment, base: Policy, name: str | None = None) -> None:
-        self.env = env
-        self.view = pending_view(env, "planning")
+    def __init__(
+        self,
+        env: Environment,
+        base: Policy,
+        name: str | None = None,
+    ) -> None:
+        self.env: Any = env
+        self.view: Any = pending_view(env, "planning")
         self.episode: Episode = self.view.episode
         self.agent: Agent = self.view.episode.deciding
         self.name = name or self.agent.name
@@ -85,7 +87,12 @@ class Player:
 
     # -- checks, before anything moves ------------------------------------------------------------
 
-    def candidates(self, actions: Iterable[Action] | None, *, legal: bool = False) -> list[Action]:
+    def candidates(
+        self,
+        actions: Iterable[Action] | None,
+        *,
+        legal: bool = False,
+    ) -> list[Action]:
         """Check the candidates for the pending decision.
 
         Args:
@@ -93,7 +100,7 @@ class Player:
             legal: Whether to leave out masked candidates. Otherwise they are refused.
 
         Returns:
-            A new list of the candidates.
+            The candidates.
 
         Raises:
             OptionValueError: There is no list of candidates.
@@ -107,7 +114,8 @@ class Player:
                     f" {short_repr(space)}"
                 )
             legal = True
-            actions = list(range(int(space.start), int(space.start + space.n)))
+            first = int(space.start)
+            actions = list(range(first, first + int(space.n)))
         if not isinstance(actions, list) or not actions:
             raise OptionValueError(
                 f"actions must be a list of candidates, not {short_repr(actions)}"
@@ -115,7 +123,9 @@ class Player:
         mask = self.agent.mask
         for action in actions:
             self._check(action, None if legal else mask)
-        candidates = [action for action in actions if not legal or self.allows(action)]
+        candidates = actions
+        if legal:
+            candidates = [action for action in actions if self.allows(action)]
         if not candidates:
             raise InvalidActionError(
                 f"all candidates of {self.name!r} are masked; its mask is {short_repr(mask)}"
@@ -130,7 +140,11 @@ class Player:
             return False
         return True
 
-    def _check(self, action: Action, mask: Mask | None) -> None:
+    def _check(
+        self,
+        action: Action,
+        mask: Mask | None,
+    ) -> None:
         """Refuse an illegal action. The mask counts unless wrappers have replaced the space."""
         point = self.agent.point
         space = self._space_of(self.name)
@@ -167,7 +181,9 @@ class Player:
     def time(self) -> float:
         """Return the simulation's time. 0.0 if it has no clock."""
         clock = self.episode.clock
-        return 0.0 if clock is None else float(clock.time())
+        if clock is None:
+            return 0.0
+        return float(clock.time())
 
     def step(self, action: Action) -> float:
         """Take an action, run to the agent's next decision or its end, and return the reward."""
@@ -209,33 +225,40 @@ class Player:
             space = space(name)
         return space  # type: ignore[no-any-return]
 
-    def _step_env(self, action: Action, name: str) -> Any:
+    def _step_env(
+        self,
+        action: Action,
+        name: str,
+    ) -> Any:
         """Step the environment with an agent's action, or with actions by agent.
 
         ``RULE`` reaches the view, also as a part of a dict. Wrappers receive a sample instead.
         """
         view = self.view
-        sample = self._without_rule(action, name)
-        if self.env is view or sample is action:
+        samples = {} if self.env is view else self._samples(action, name)
+        if not samples:
             return self.env.step(action)
 
         def step(filtered: Action) -> Any:
             if action is RULE:
                 return type(view).step(view, RULE)
-            return type(view).step(view, {**filtered, **_rules_in(action)})
+            return type(view).step(view, {**filtered, **dict.fromkeys(samples, RULE)})
 
+        sample = samples[name] if action is RULE else {**action, **samples}
         vars(view)["step"] = step  # because the innermost wrapper calls it with a legal action
         try:
             return self.env.step(sample)
         finally:
             del vars(view)["step"]
 
-    def _without_rule(self, action: Action, name: str) -> Action:
-        """Return an action with samples for ``RULE``. The action itself if it has no ``RULE``."""
-        if action is RULE:
-            return self._sample(name)
-        samples = {agent: self._sample(agent) for agent in _rules_in(action)}
-        return {**action, **samples} if samples else action
+    def _samples(
+        self,
+        action: Action,
+        name: str,
+    ) -> dict[str, Action]:
+        """Sample legal actions in place of ``RULE``, by agent."""
+        parts = action if isinstance(action, Mapping) else {name: action}
+        return {agent: self._sample(agent) for agent, part in parts.items() if part is RULE}
 
     def _sample(self, name: str) -> Action:
         """Sample a legal action of an agent."""
@@ -244,13 +267,6 @@ class Player:
         if agent is None or agent.mask is None or space != agent.point.definition.action_space:
             return space.sample()
         return space.sample(agent.mask)
-
-
-def _rules_in(action: Action) -> dict[str, Action]:
-    """Return the parts of a dict of actions that are ``RULE``."""
-    if not isinstance(action, Mapping):
-        return {}
-    return {agent: part for agent, part in action.items() if part is RULE}
 
 
 def _check_policy(policy: Policy) -> None:
@@ -277,7 +293,11 @@ class JointPlayer(Player):
 
     view: SimulationJointEnv
 
-    def __init__(self, env: Environment, base: Policy) -> None:
+    def __init__(
+        self,
+        env: Environment,
+        base: Policy,
+    ) -> None:
         super().__init__(env, base, "all agents")
         self.latest = {self.name: (self.view.joint.observe(self.episode), {})}
         if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
@@ -292,11 +312,16 @@ class JointPlayer(Player):
             space = space[name]
         return space  # type: ignore[no-any-return]
 
-    def _check(self, action: Action, mask: Mask | None) -> None:
+    def _check(
+        self,
+        action: Action,
+        mask: Mask | None,
+    ) -> None:
         if self._space_of(self.name) == self.view.action_space:
             checked_actions(self.episode, self.view.joint.actions(self.episode, action))
         elif action is not RULE:
-            super()._check(self._without_rule(action, self.name), mask)
+            samples = self._samples(action, self.name)
+            super()._check({**action, **samples} if samples else action, mask)
 
     def decide(self) -> Action:
         """Return the actions of all agents by the base."""
@@ -312,10 +337,13 @@ class JointPlayer(Player):
 class AECPlayer(Player):
     """An agent of an AEC view."""
 
-    env: AECEnv[str, Observation, Action]
     view: SimulationAECEnv
 
-    def __init__(self, env: Environment, base: Policy) -> None:
+    def __init__(
+        self,
+        env: Environment,
+        base: Policy,
+    ) -> None:
         super().__init__(env, base)
         selected = self.view.agent_selection
         if selected != self.name:
@@ -330,12 +358,15 @@ class AECPlayer(Player):
         self._step_env(action, self.name)
         while env.agents:
             name = env.agent_selection
+            _, reward, terminated, truncated, _ = env.last(observe=False)
+            ended = terminated or truncated
             if name == self.name:
-                _, reward, terminated, truncated, _ = env.last(observe=False)
-                self.over = terminated or truncated
+                self.over = ended
                 return float(reward)
-            ended = env.terminations[name] or env.truncations[name]
-            self._step_env(None if ended else self._decide_for(name), name)
+            if ended:
+                self._step_env(None, name)
+            else:
+                self._step_env(self._decide_for(name), name)
         self.over = True
         return 0.0
 
@@ -366,7 +397,10 @@ class ParallelPlayer(Player):
         return float(rewards.get(self.name, 0.0))
 
 
-def player_of(env: Environment, base: Policy) -> Player:
+def player_of(
+    env: Environment,
+    base: Policy,
+) -> Player:
     """Make the player of the agent whose decision is pending.
 
     Raises:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from math import ceil, isfinite, log2
+from math import ceil, inf, isfinite, log2
 from numbers import Real
 from time import perf_counter
 from typing import Any, Final, TypeGuard
@@ -19,6 +19,7 @@ from zlib import crc32
 import numpy as np
 
 from ..core import (
+    Agent,
     AskingPolicy,
     Info,
     Policy,
@@ -31,7 +32,7 @@ from ..core import (
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
-from .player import Environment, Player, player_of
+from .player import Environment, player_of
 from .values import ActionValues, estimate, warn_of_futures, warn_of_times
 
 _KEY: Final = 0x706C616E
@@ -101,48 +102,51 @@ def try_out(
     """
     indices, future = tries[number]
     path = [actions[index] for index in indices]
+    began = perf_counter()
     pending_view(env, "planning").session.move_to(Where.PLAN)
     try:
         player = player_of(env, policy.base)
         player.start()
-        return _continue(begun, player, path, policy, stop)
+        rewards = list(begun.rewards)
+        times = list(begun.times)
+        now = player.time()
+        start = now if begun.start is None else begun.start
+        horizon = inf if policy.horizon is None else policy.horizon
+        while not player.over and len(rewards) != stop:
+            number = len(rewards)
+            elapsed = {"decision": number, "time": now - start}
+            weight = policy.discount ** elapsed[policy.discount_by]
+            if number > 0 and elapsed[policy.horizon_by] >= horizon:
+                if policy.terminal_value is not None and stop is None:
+                    rewards[-1] += weight * _terminal_value(policy.terminal_value, env)
+                break
+            if number == 0 or (number < len(path) and player.allows(path[number])):
+                action = path[number]
+            else:
+                action = player.decide()
+            rewards.append(weight * player.step(action))
+            if not player.over:
+                times.append(player.time() - now)
+                now += times[-1]
     except BaseException as error:
         tried = ", ".join(map(short_repr, path))
         annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
         raise
-
-
-def _continue(
-    begun: Rollout, player: Player, path: list[Action], policy: RolloutPolicy, stop: int | None
-) -> Rollout:
-    began = perf_counter()
-    rewards = [*begun.rewards]
-    times = [*begun.times]
-    now = player.time()
-    start = now if begun.start is None else begun.start
-    while not player.over and len(rewards) != stop:
-        number = len(rewards)
-        elapsed = now - start
-        weight = policy.discount ** (elapsed if policy.discount_by == "time" else number)
-        reached = elapsed if policy.horizon_by == "time" else number
-        if number and policy.horizon is not None and reached >= policy.horizon:
-            if policy.terminal_value is not None and stop is None:
-                rewards[-1] += weight * _terminal_value(policy.terminal_value, player.env)
-            break
-        if number == 0 or (number < len(path) and player.allows(path[number])):
-            action = path[number]
-        else:
-            action = player.decide()
-        rewards.append(weight * player.step(action))
-        if not player.over:
-            times.append(player.time() - now)
-            now += times[-1]
-    digest = _digest((player.agent.observation, player.agent.info))
     seconds = (perf_counter() - began) / max(1, len(rewards))
-    return Rollout(rewards, times, start, player.over, digest, seconds)
+    return Rollout(
+        rewards,
+        times,
+        start,
+        player.over,
+        _digest(player.agent),
+        seconds,
+    )
 
 
-def _terminal_value(function: Callable[[Any], float], env: Environment) -> float:
+def _terminal_value(
+    function: Callable[[Any], float],
+    env: Environment,
+) -> float:
     value = function(env)
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
@@ -153,7 +157,8 @@ def _terminal_value(function: Callable[[Any], float], env: Environment) -> float
     return float(value)
 
 
-def _digest(last: tuple[Observation, Info]) -> int:
+def _digest(agent: Agent) -> int:
+    last = (agent.observation, agent.info)
     try:
         return crc32(pickle.dumps(last, 5))  # much faster than a text
     except Exception:
@@ -265,7 +270,10 @@ def _is_planned(env: Environment) -> bool:
     return where is Where.PLAN
 
 
-def _base_value(env: Environment, base: Policy) -> ActionValues:
+def _base_value(
+    env: Environment,
+    base: Policy,
+) -> ActionValues:
     """Return the base's answer as the best action, as planners act in branches."""
     return estimate([player_of(env, base).decide()], [[]], 0)
 
@@ -285,7 +293,13 @@ class Rollouts:
         reseeds: Whether chance can be drawn anew. Otherwise there is one exact future.
     """
 
-    def __init__(self, env: Environment, policy: RolloutPolicy, *, planner: bool = False) -> None:
+    def __init__(
+        self,
+        env: Environment,
+        policy: RolloutPolicy,
+        *,
+        planner: bool = False,
+    ) -> None:
         """Check the candidates and the base of a policy.
 
         For a ``planner``, leave out masked candidates, and add ``RULE``.
@@ -333,7 +347,11 @@ class Rollouts:
         sequence = np.random.SeedSequence(self._entropy)
         return [int(seed) for seed in sequence.generate_state(number)]
 
-    def add(self, candidates: Iterable[int], number: int) -> None:
+    def add(
+        self,
+        candidates: Iterable[int],
+        number: int,
+    ) -> None:
         """Try candidates, given by their indices, in some more futures, or in the exact one."""
         tries: list[Try] = []
         for index in candidates:
@@ -346,18 +364,29 @@ class Rollouts:
         """Make rollouts, each in a branch."""
         seeds: list[int] | None = None
         if self.reseeds:
-            known = self.seeds(1 + max((future for _, future in tries), default=0))
-            seeds = [known[future] for _, future in tries]
+            futures = [future for _, future in tries]
+            known = self.seeds(1 + max(futures, default=0))
+            seeds = [known[future] for future in futures]
+        function = partial(
+            try_out,
+            tries=tries,
+            actions=self.actions,
+            policy=self.policy,
+        )
         return branch(
             self.env,
-            partial(try_out, tries=tries, actions=self.actions, policy=self.policy),
+            function,
             len(tries),
             method=self.policy.method,
             seeds=seeds,
             time_limit=self.policy.time_limit,
         )
 
-    def record(self, tries: Sequence[Try], rollouts: Sequence[Rollout]) -> None:
+    def record(
+        self,
+        tries: Sequence[Try],
+        rollouts: Sequence[Rollout],
+    ) -> None:
         """Record the results of tries."""
         for (indices, _), rollout in zip(tries, rollouts, strict=True):
             self.returns[indices[0]].append(sum(rollout.rewards))
@@ -375,7 +404,8 @@ class Rollouts:
             return self.exact_return(indices) > self.exact_return(rule)
         begin = max(map(len, self.returns))
         futures = range(begin, begin + max(_FRESH, self.policy.futures))
-        tries = [(compared, future) for compared in (indices, rule) for future in futures]
+        tries: list[Try] = [(indices, future) for future in futures]
+        tries += [(rule, future) for future in futures]
         returns = np.array([sum(rollout.rewards) for rollout in self.make(tries)])
         gains = returns[: len(futures)] - returns[len(futures) :]
         error = gains.std(ddof=1) / np.sqrt(len(gains))
@@ -509,7 +539,9 @@ class RolloutPolicy:
             return _base_value(env, self.base)
         rollouts = Rollouts(env, self, planner=True)
         number = len(rollouts.actions)
-        budget = number * self.futures if self.budget is None else self.budget
+        budget = self.budget
+        if budget is None:
+            budget = number * self.futures
         if budget < number:
             raise OptionValueError(
                 f"a budget of {budget} branches is too small to try {number} candidates once"
@@ -521,16 +553,21 @@ class RolloutPolicy:
             return rollouts.values(best[0])
         return rollouts.values(rollouts.rule)
 
-    def _search(self, rollouts: Rollouts, budget: int) -> Indices:
+    def _search(
+        self,
+        rollouts: Rollouts,
+        budget: int,
+    ) -> Indices:
         """Try candidates; return the best ones for the next decisions."""
-        left = [*range(len(rollouts.actions))]
+        left = list(range(len(rollouts.actions)))
         for rounds in range(ceil(log2(len(left))), 0, -1):
-            number = min(max(1, budget // (len(left) * rounds)), budget // len(left))
+            most = budget // len(left)
+            number = min(max(1, most // rounds), most)
             budget -= number * len(left)
             rollouts.add(left, number)
             if rounds > 1:
-                better = sorted(left, key=rollouts.mean, reverse=True)
-                left = sorted(better[: (len(left) + 1) // 2])
+                left.sort(key=rollouts.mean, reverse=True)
+                left = sorted(left[: (len(left) + 1) // 2])
         return (max(left, key=rollouts.mean),)
 
     def __call__(

@@ -75,7 +75,11 @@ class TreeSearchPolicy(RolloutPolicy):
             }
         )
 
-    def _search(self, rollouts: Rollouts, budget: int) -> Indices:
+    def _search(
+        self,
+        rollouts: Rollouts,
+        budget: int,
+    ) -> Indices:
         tree = _Tree(rollouts, self)
         checkpoints: Checkpoints | None = None
         try:
@@ -110,7 +114,8 @@ class TreeSearchPolicy(RolloutPolicy):
         except (BranchError, OptionValueError):  # only a replay is possible
             return None
         cost = perf_counter() - began
-        step = max(rollout.seconds for rollout in chain(*rollouts.rollouts.values()))
+        made = chain(*rollouts.rollouts.values())
+        step = max(rollout.seconds for rollout in made)
         if step * self.depth / 2 > cost:
             return Checkpoints(root, rollouts)
         root.close()
@@ -123,7 +128,11 @@ class _Tree:
     If ``RULE`` was added to the candidates, as the last one, it is a leaf.
     """
 
-    def __init__(self, rollouts: Rollouts, policy: TreeSearchPolicy) -> None:
+    def __init__(
+        self,
+        rollouts: Rollouts,
+        policy: TreeSearchPolicy,
+    ) -> None:
         number = len(rollouts.actions)
         self._candidates = range(number)
         self._inner = range(number - rollouts.added)
@@ -138,24 +147,38 @@ class _Tree:
         """Choose the next try: descend to an untried node, or to the depth."""
         node: Indices = ()
         while len(node) < self._depth and (not node or node[0] in self._inner):
-            children = [(*node, index) for index in (self._inner if node else self._candidates)]
-            new = [child for child in children if child not in self._returns]
-            if new:
-                node = min(new, key=self._visits.__getitem__)
+            indices = self._inner if node else self._candidates
+            children = [(*node, index) for index in indices]
+            untried = [child for child in children if child not in self._returns]
+            if untried:
+                node = min(untried, key=self._visits.__getitem__)
                 break
             visits = sum(self._visits[child] for child in children)
-            node = max(children, key=partial(self._bound, doubt=sqrt(log(visits))))
-        self._visits.update(node[:length] for length in range(1, len(node) + 1))
-        return node, self._visits[node[:1]] - 1 if self._has_futures else 0
+            upper = partial(self._bound, doubt=sqrt(log(visits)))
+            node = max(children, key=upper)
+        for length in range(1, len(node) + 1):
+            self._visits[node[:length]] += 1
+        future = 0
+        if self._has_futures:
+            future = self._visits[node[:1]] - 1
+        return node, future
 
-    def _bound(self, node: Indices, doubt: float) -> float:
+    def _bound(
+        self,
+        node: Indices,
+        doubt: float,
+    ) -> float:
         """Return the bound of a node's value: upper for a positive doubt, else lower."""
         returns = self._returns[node]
         spread = max(self._totals) - min(self._totals)
         error = self._exploration * spread / sqrt(self._visits[node])
         return sum(returns) / len(returns) + doubt * error
 
-    def learn(self, node: Indices, rewards: Sequence[float]) -> None:
+    def learn(
+        self,
+        node: Indices,
+        rewards: Sequence[float],
+    ) -> None:
         """Add the rewards of a try, by decision. The agent may have ended before the node."""
         for depth in range(min(len(node), len(rewards))):
             self._returns.setdefault(node[: depth + 1], []).append(sum(rewards[depth:]))
@@ -195,7 +218,11 @@ class Checkpoint:
 class Checkpoints:
     """The checkpoints of one search, by the candidates that they have taken."""
 
-    def __init__(self, root: Environment, rollouts: Rollouts) -> None:
+    def __init__(
+        self,
+        root: Environment,
+        rollouts: Rollouts,
+    ) -> None:
         """Begin with a clone of the environment, which is the root."""
         self._search = rollouts
         self._root = Checkpoint(root, BEGIN)
@@ -207,16 +234,22 @@ class Checkpoints:
         nodes = [node for node, _ in tries]
         new = dict.fromkeys(node for node in nodes if node not in self._rollouts)
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # they wait for processes
-            self._rollouts |= zip(new, pool.map(self._make, new), strict=True)
+            results = pool.map(self._make, new)
+            self._rollouts |= zip(new, results, strict=True)
         return [self._rollouts[node] for node in nodes]
 
     def _make(self, node: Indices) -> Rollout:
         """Make a rollout, and a checkpoint after its candidates."""
-        prefixes = [node[:length] for length in range(len(node))]
-        nearest = [self._checkpoints[part] for part in prefixes if part in self._checkpoints][-1]
+        lengths = [length for length in range(len(node)) if node[:length] in self._checkpoints]
+        nearest = self._checkpoints[node[: lengths[-1]]]
         search = self._search
         limit = search.policy.time_limit
-        function = partial(try_out, tries=[(node, 0)], actions=search.actions, policy=search.policy)
+        function = partial(
+            try_out,
+            tries=[(node, 0)],
+            actions=search.actions,
+            policy=search.policy,
+        )
         try:
             with nearest.lock:
                 env = clone(nearest.env, method="fork", time_limit=limit)
@@ -226,10 +259,12 @@ class Checkpoints:
             return rollout
         is_kept = False
         try:
-            begun = env.call(partial(function, begun=nearest.begun, stop=len(node)), 0)
+            start = partial(function, begun=nearest.begun, stop=len(node))
+            begun = env.call(start, 0)
             rollout = begun
             if not begun.over:
-                [rollout] = branch(env, partial(function, begun=begun), time_limit=limit)
+                finish = partial(function, begun=begun)
+                [rollout] = branch(env, finish, time_limit=limit)
             is_kept = len(self._checkpoints) < _MOST
         finally:
             if not is_kept:

@@ -82,10 +82,21 @@ def estimate(
         if len(values) > 1:
             errors[index] = np.std(values, ddof=1) / np.sqrt(len(values))
     correlation = correlation_of(table)
-    return ActionValues(tuple(actions), means, errors, counts, actions[best], table, correlation)
+    return ActionValues(
+        tuple(actions),
+        means,
+        errors,
+        counts,
+        actions[best],
+        table,
+        correlation,
+    )
 
 
-def correlation_of(returns: NDArray[np.float64], least: int = 3) -> float:
+def correlation_of(
+    returns: NDArray[np.float64],
+    least: int = 3,
+) -> float:
     """Return the mean correlation of pairs of rows over their common columns.
 
     Only pairs of rows that vary count, and only those with the ``least`` number of common columns.
@@ -97,7 +108,9 @@ def correlation_of(returns: NDArray[np.float64], least: int = 3) -> float:
         pair = np.array([first[common], second[common]])
         if common.sum() >= least and np.ptp(pair, axis=1).all():
             correlations.append(np.corrcoef(pair)[0, 1])
-    return float(np.mean(correlations)) if correlations else np.nan
+    if not correlations:
+        return np.nan
+    return float(np.mean(correlations))
 
 
 def warn_of_futures(
@@ -136,7 +149,10 @@ def warn_of_futures(
         )
 
 
-def warn_of_times(name: str, rollouts: Sequence[Sequence[float]]) -> None:
+def warn_of_times(
+    name: str,
+    rollouts: Sequence[Sequence[float]],
+) -> None:
     """Warn of a horizon in decisions that ends at different times, because decisions do.
 
     Args:
@@ -144,10 +160,12 @@ def warn_of_times(name: str, rollouts: Sequence[Sequence[float]]) -> None:
         rollouts: For each rollout, the simulation's times between its decisions.
     """
     times = np.array([*zip_longest(*rollouts, fillvalue=np.nan)])  # (decisions, rollouts)
-    if np.isfinite(times).sum() < _MANY or np.nanmean(times) <= 0:
+    if np.isfinite(times).sum() < _MANY:
         return
+    mean = np.nanmean(times)
     deviations = times - np.nanmean(times, axis=1, keepdims=True)
-    if np.sqrt(np.nanmean(deviations**2)) > _VARIATION * np.nanmean(times):
+    spread = np.sqrt(np.nanmean(deviations**2))
+    if spread > _VARIATION * mean > 0:
         _warn_once(
             name,
             "times",
@@ -156,7 +174,11 @@ def warn_of_times(name: str, rollouts: Sequence[Sequence[float]]) -> None:
         )
 
 
-def _warn_once(name: str, kind: str, message: str) -> None:
+def _warn_once(
+    name: str,
+    kind: str,
+    message: str,
+) -> None:
     """Warn of a simulation, once for each kind of warning."""
     if (name, kind) not in _SETTLED:
         _SETTLED.add((name, kind))

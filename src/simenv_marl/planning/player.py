@@ -8,7 +8,7 @@ environment knows ``RULE``, so wrappers receive a legal sample in its place.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
 from gymnasium import Env, spaces
@@ -78,7 +78,7 @@ class Player:
         self.base = base
         self.over = False
         self.latest: dict[str, tuple[Observation, Info]] = {}
-        self._policies: dict[str, Callable[[Observation, Info], Action]] = {}
+        self._policies: dict[str, Policy] = {}
         bases = base if isinstance(base, Mapping) else {self.name: base}
         for each in bases:
             policy = policy_for(bases, each, Where.PLAN)
@@ -106,19 +106,15 @@ class Player:
             OptionValueError: There is no list of candidates.
             InvalidActionError: A candidate is not legal, or all of them are masked.
         """
-        if actions is None:
-            space = self._space_of(self.name)
-            if not isinstance(space, spaces.Discrete):
-                raise OptionValueError(
-                    "actions=None needs a Discrete action space; list candidates of"
-                    f" {short_repr(space)}"
-                )
+        space = self._space_of(self.name)
+        if actions is None and isinstance(space, spaces.Discrete):
             legal = True
             first = int(space.start)
             actions = list(range(first, first + int(space.n)))
         if not isinstance(actions, list) or not actions:
             raise OptionValueError(
-                f"actions must be a list of candidates, not {short_repr(actions)}"
+                "actions must be a list of candidates, or None for all legal actions of a"
+                f" Discrete, not {short_repr(actions)}; the action space is {short_repr(space)}"
             )
         mask = self.agent.mask
         for action in actions:
@@ -164,7 +160,10 @@ class Player:
             return
         for name in self.base:
             if not self.episode.may_have(name):
-                known = [*self.episode.agents, *self.episode.others]
+                known = [
+                    *self.episode.agents,
+                    *self.episode.others,
+                ]
                 raise UnknownAgentError(
                     f"base names {short_repr(name)}, which is not an agent here; the agents are:"
                     f" {known}{did_you_mean(name, known)}"
@@ -202,10 +201,10 @@ class Player:
         if policy is None:
             return RULE
         observation, info = self._observe(name)
-        if isinstance(policy, EpisodePolicy):
-            agent = self.episode.agents.get(name, self.agent)
-            return policy.answer(self.episode, agent, observation, info)
-        return policy(observation, info)
+        if not isinstance(policy, EpisodePolicy):
+            return policy(observation, info)
+        agent = self.episode.agents.get(name, self.agent)
+        return policy.answer(self.episode, agent, observation, info)
 
     def _observe(self, name: str) -> tuple[Observation, Info]:
         """Return the latest observation and info of an agent."""
@@ -242,7 +241,8 @@ class Player:
         def step(filtered: Action) -> Any:
             if action is RULE:
                 return type(view).step(view, RULE)
-            return type(view).step(view, {**filtered, **dict.fromkeys(samples, RULE)})
+            rules = dict.fromkeys(samples, RULE)
+            return type(view).step(view, {**filtered, **rules})
 
         sample = samples[name] if action is RULE else {**action, **samples}
         vars(view)["step"] = step  # because the innermost wrapper calls it with a legal action
@@ -264,7 +264,9 @@ class Player:
         """Sample a legal action of an agent."""
         space = copy.deepcopy(self._space_of(name))  # so that its generator stays as it is
         agent = self.episode.agents.get(name)
-        if agent is None or agent.mask is None or space != agent.point.definition.action_space:
+        if agent is None or agent.mask is None:
+            return space.sample()
+        if space != agent.point.definition.action_space:  # wrappers have replaced it
             return space.sample()
         return space.sample(agent.mask)
 
@@ -299,7 +301,8 @@ class JointPlayer(Player):
         base: Policy,
     ) -> None:
         super().__init__(env, base, "all agents")
-        self.latest = {self.name: (self.view.joint.observe(self.episode), {})}
+        observation = self.view.joint.observe(self.episode)
+        self.latest = {self.name: (observation, {})}
         if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
             raise OptionValueError(
                 "a base by agent needs a joint view without flatten=True; pass one policy for all"
@@ -321,7 +324,9 @@ class JointPlayer(Player):
             checked_actions(self.episode, self.view.joint.actions(self.episode, action))
         elif action is not RULE:
             samples = self._samples(action, self.name)
-            super()._check({**action, **samples} if samples else action, mask)
+            if samples:
+                action = {**action, **samples}
+            super()._check(action, mask)
 
     def decide(self) -> Action:
         """Return the actions of all agents by the base."""
@@ -386,12 +391,12 @@ class ParallelPlayer(Player):
         return reward
 
     def _play(self, actions: dict[str, Action]) -> float:
-        """Play a round in which the other agents follow their bases. Return the agent's reward."""
+        """Play a round. The other agents follow their bases. Return the agent's reward."""
         for name in self.episode.agents:
             if name != self.name:
                 actions[name] = self._decide_for(name)
         observations, rewards, terminations, truncations, infos = self._step_env(actions, self.name)
-        self.latest = {name: (observations[name], infos.get(name, {})) for name in observations}
+        self.latest = {name: (observations[name], infos[name]) for name in observations}
         over = terminations.get(self.name, True) or truncations[self.name]
         self.over = over or self.agent.ended  # pad_agents keeps ended agents
         return float(rewards.get(self.name, 0.0))

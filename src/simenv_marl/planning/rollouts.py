@@ -39,7 +39,7 @@ _KEY: Final = 0x706C616E
 """Separates the seeds of futures from other seeds that follow from the episode's seed."""
 
 _FRESH: Final = 8
-"""The least number of fresh futures in which a candidate is compared with the rule."""
+"""The least number of fresh futures for the comparison of a candidate with the rule."""
 
 Indices = tuple[int, ...]
 """The indices of the candidates at the agent's next decisions, beginning with the pending one."""
@@ -98,7 +98,7 @@ def try_out(
         actions: The candidates.
         policy: The planner.
         begun: The rollout to continue.
-        stop: The index of the decision before which it stops. None: at its end.
+        stop: The index of the decision where it stops. None: it runs to its end.
     """
     indices, future = tries[number]
     path = [actions[index] for index in indices]
@@ -110,24 +110,32 @@ def try_out(
         rewards = list(begun.rewards)
         times = list(begun.times)
         now = player.time()
-        start = now if begun.start is None else begun.start
-        horizon = inf if policy.horizon is None else policy.horizon
+        start = begun.start
+        if start is None:
+            start = now
+        horizon = policy.horizon
+        if horizon is None:
+            horizon = inf
         while not player.over and len(rewards) != stop:
-            number = len(rewards)
-            elapsed = {"decision": number, "time": now - start}
+            decision = len(rewards)
+            elapsed = {
+                "decision": decision,
+                "time": now - start,
+            }
             weight = policy.discount ** elapsed[policy.discount_by]
-            if number > 0 and elapsed[policy.horizon_by] >= horizon:
+            if decision > 0 and elapsed[policy.horizon_by] >= horizon:
                 if policy.terminal_value is not None and stop is None:
                     rewards[-1] += weight * _terminal_value(policy.terminal_value, env)
                 break
-            if number == 0 or (number < len(path) and player.allows(path[number])):
-                action = path[number]
+            if decision == 0 or (decision < len(path) and player.allows(path[decision])):
+                action = path[decision]
             else:
                 action = player.decide()
             rewards.append(weight * player.step(action))
             if not player.over:
-                times.append(player.time() - now)
-                now += times[-1]
+                before = now
+                now = player.time()
+                times.append(now - before)
     except BaseException as error:
         tried = ", ".join(map(short_repr, path))
         annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
@@ -202,8 +210,7 @@ def action_values(
     Args:
         env: An environment of one simulation with a pending decision, in any view, with or without
             wrappers. In the parallel view, the agent is the one that is ``"deciding"``, and the
-            others play the same rounds. In the joint view, there is one agent, which acts
-            for all.
+            others play the same rounds. In the joint view, one agent acts for all.
         actions: The candidates; ``RULE`` may be among them. None: all legal actions of a
             ``Discrete``.
         base: The policy that decides after the candidate: ``RULE``, a callable of the observation,
@@ -261,13 +268,14 @@ def action_values(
         for number in [1] * futures if progress else [futures]:
             rollouts.add(candidates, number)
             bar.update(number * len(candidates))
-    return rollouts.values(max(candidates, key=rollouts.mean))
+    best = max(candidates, key=rollouts.mean)
+    return rollouts.values(best)
 
 
 def _is_planned(env: Environment) -> bool:
     """Return whether a planner already tries a candidate in an environment."""
-    where: Where = pending_view(env, "planning").episode.where
-    return where is Where.PLAN
+    episode = pending_view(env, "planning").episode
+    return episode.where is Where.PLAN
 
 
 def _base_value(
@@ -316,7 +324,9 @@ class Rollouts:
             )
         self.actions = player.candidates(policy.actions, legal=planner)
         rules = [index for index, action in enumerate(self.actions) if action is RULE]
-        self.rule = rules[0] if rules else len(self.actions)
+        self.rule = len(self.actions)
+        if rules:
+            self.rule = rules[0]
         self.added = planner and not rules and len(self.actions) > 1
         if self.added:
             self.actions.append(RULE)
@@ -326,7 +336,12 @@ class Rollouts:
         if isinstance(player.agent.policy, AskingPolicy):
             number = player.agent.answered
         name = crc32(player.name.encode(errors="surrogatepass"))
-        self._entropy = [episode.seed, number, name, _KEY]
+        self._entropy = [
+            episode.seed,
+            number,
+            name,
+            _KEY,
+        ]
         if policy.seed is not None:
             self._entropy.append(policy.seed)
         self._name = episode.plan.name
@@ -356,7 +371,9 @@ class Rollouts:
         tries: list[Try] = []
         for index in candidates:
             begin = len(self.returns[index])
-            end = begin + number if self.reseeds else 1
+            end = 1
+            if self.reseeds:
+                end = begin + number
             tries += [((index,), future) for future in range(begin, end)]
         self.record(tries, self.make(tries))
 
@@ -403,11 +420,13 @@ class Rollouts:
         if not self.reseeds:
             return self.exact_return(indices) > self.exact_return(rule)
         begin = max(map(len, self.returns))
-        futures = range(begin, begin + max(_FRESH, self.policy.futures))
+        number = max(_FRESH, self.policy.futures)
+        futures = range(begin, begin + number)
         tries: list[Try] = [(indices, future) for future in futures]
         tries += [(rule, future) for future in futures]
         returns = np.array([sum(rollout.rewards) for rollout in self.make(tries)])
-        gains = returns[: len(futures)] - returns[len(futures) :]
+        planned, ruled = np.split(returns, 2)
+        gains = planned - ruled
         error = gains.std(ddof=1) / np.sqrt(len(gains))
         return bool(gains.mean() > self.policy.margin * error)
 
@@ -568,7 +587,8 @@ class RolloutPolicy:
             if rounds > 1:
                 left.sort(key=rollouts.mean, reverse=True)
                 left = sorted(left[: (len(left) + 1) // 2])
-        return (max(left, key=rollouts.mean),)
+        best = max(left, key=rollouts.mean)
+        return (best,)
 
     def __call__(
         self, observation: Observation, info: Info, *, _environment: Environment

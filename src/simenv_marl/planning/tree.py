@@ -101,16 +101,21 @@ class TreeSearchPolicy(RolloutPolicy):
     def _states_of(self, rollouts: Rollouts) -> Checkpoints | None:
         """Begin to keep checkpoints, if there is one exact future and they save time.
 
-        A checkpoint spares a try half of the depth in the mean.
+        A checkpoint spares a try half of the depth in the mean, and costs a fork. Processes of
+        clones have neither the wrappers of an environment nor the infos of joint views.
         """
         if rollouts.reseeds or self.method == "replay" or self.depth == 1:
             return None
         view = pending_view(rollouts.env, "planning")
         if view is not rollouts.env or isinstance(view, SimulationJointEnv):
-            return None  # neither wrappers nor the infos of joint views are in a clone's process
+            return None
         began = perf_counter()
         try:
-            root = clone(rollouts.env, method="fork", time_limit=self.time_limit)
+            root = clone(
+                rollouts.env,
+                method="fork",
+                time_limit=self.time_limit,
+            )
         except (BranchError, OptionValueError):  # only a replay is possible
             return None
         cost = perf_counter() - began
@@ -136,7 +141,7 @@ class _Tree:
         number = len(rollouts.actions)
         self._candidates = range(number)
         self._inner = range(number - rollouts.added)
-        self._has_futures = rollouts.reseeds
+        self._reseeds = rollouts.reseeds
         self._depth = policy.depth
         self._exploration = policy.exploration
         self._visits: Counter[Indices] = Counter()  # also by tries that are running
@@ -147,7 +152,9 @@ class _Tree:
         """Choose the next try: descend to an untried node, or to the depth."""
         node: Indices = ()
         while len(node) < self._depth and (not node or node[0] in self._inner):
-            indices = self._inner if node else self._candidates
+            indices = self._candidates
+            if node:
+                indices = self._inner
             children = [(*node, index) for index in indices]
             untried = [child for child in children if child not in self._returns]
             if untried:
@@ -159,7 +166,7 @@ class _Tree:
         for length in range(1, len(node) + 1):
             self._visits[node[:length]] += 1
         future = 0
-        if self._has_futures:
+        if self._reseeds:
             future = self._visits[node[:1]] - 1
         return node, future
 
@@ -187,7 +194,8 @@ class _Tree:
     def best(self) -> Indices:
         """Return the best node without the added ``RULE``: by lower bound, then by visits."""
         lower = partial(self._bound, doubt=-1.0)
-        node: Indices = max([(index,) for index in self._inner], key=lower)
+        first = [(index,) for index in self._inner]
+        node: Indices = max(first, key=lower)
         while len(node) < self._depth:
             children = [(*node, index) for index in self._inner]
             tried = [child for child in children if child in self._returns]
@@ -252,10 +260,18 @@ class Checkpoints:
         )
         try:
             with nearest.lock:
-                env = clone(nearest.env, method="fork", time_limit=limit)
-        except BranchError:  # the model has opened something since, or there are no more processes
+                env = clone(
+                    nearest.env,
+                    method="fork",
+                    time_limit=limit,
+                )
+        except BranchError:  # the model has opened something since
             with self._root.lock:
-                [rollout] = branch(self._root.env, function, time_limit=limit)
+                [rollout] = branch(
+                    self._root.env,
+                    function,
+                    time_limit=limit,
+                )
             return rollout
         is_kept = False
         try:

@@ -68,10 +68,10 @@ def estimate(
 
     Args:
         actions: The candidates.
-        returns: For each candidate, its return in each future in which it was tried.
+        returns: For each candidate, its returns, in the order of the futures.
         best: The index of the best candidate.
     """
-    counts = np.array([len(values) for values in returns], np.int64)
+    counts = np.array([*map(len, returns)], np.int64)
     table = np.full((len(counts), counts.max()), np.nan)
     means = np.full(len(counts), np.nan)
     errors = np.full(len(counts), np.nan)

@@ -520,6 +520,41 @@ def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
     assert plain == planned
 
 
+def without_base(observation, info, *, _environment):
+    return 1
+
+
+def with_base(base):
+    def policy(observation, info, *, _environment):
+        return 1
+
+    policy.base = base
+    return policy
+
+
+@pytest.mark.parametrize(
+    "base",
+    [
+        without_base,
+        {"right": without_base},
+        RolloutPolicy(base=without_base),
+        {"right": with_base({"right": with_base(without_base)})},
+    ],
+)
+@pytest.mark.parametrize("view", [*VIEWS, "joint"])
+def test_planners_without_a_base_are_refused_as_bases(view, base):
+    env = made(view)
+    if view == "single" and isinstance(base, dict):
+        base = {"left": base["right"]}  # the only agent
+    actions = [{"left": 1, "right": 1}] if view == "joint" else [1]
+    for plan in (
+        action_values,
+        lambda *args, **given: RolloutPolicy(*args[1:], **given).choose(env),
+    ):
+        with pytest.raises(OptionValueError, match="set its attribute base"):
+            plan(env, actions, base=base, futures=1)
+
+
 @METHODS
 def test_errors_come_as_themselves_and_say_which_candidate_was_tried_in_which_future(method):
     class Fragile(Duel):

@@ -10,6 +10,7 @@ from itertools import count
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import TransformReward
 
 from simenv_marl import (
     RULE,
@@ -403,6 +404,18 @@ def test_states_that_a_search_keeps_change_no_value_and_are_closed(model, most, 
     for twin in twins:
         with pytest.raises(ClosedError):
             twin.step(1)
+
+
+@pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
+def test_tree_searches_count_the_rewards_of_wrappers(monkeypatch):
+    monkeypatch.setattr(tree, "perf_counter", partial(next, count(0, 0)))  # forks cost nothing
+    env = begun(TransformReward(made("single", Unseeded), lambda reward: -reward))
+    found, replayed = (
+        TreeSearchPolicy(depth=4, futures=8, method=method).choose(env)
+        for method in (None, "replay")
+    )
+    np.testing.assert_array_equal(found.returns, replayed.returns)
+    assert found.best == replayed.best
 
 
 def test_agents_that_end_before_the_depth():

@@ -1,41 +1,196 @@
 """The values of candidate actions for a pending decision, from rollouts in branches.
 
-Policies that decide by them.
+Policies that decide by these values.
 """
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from math import ceil, log2
-from typing import Any, Final
+from itertools import chain
+from math import ceil, inf, isfinite, log2
+from numbers import Real
+from time import perf_counter
+from typing import Any, Final, TypeGuard
 from zlib import crc32
 
 import numpy as np
 
-from ..core import AskingPolicy, Where, branch, checked_seed, pending_view
-from ..errors import BranchError, OptionValueError, short_repr, warn_user
+from ..core import (
+    Agent,
+    AskingPolicy,
+    Info,
+    Policy,
+    Where,
+    branch,
+    checked_seed,
+    is_seed,
+    pending_view,
+)
+from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..many.parallel import progress_bar
-from ..simulation import RULE
-from .player import Outcome, is_count, is_number, player_of, try_out
-from .values import ActionValues, correlation_of, warn_of_futures, warn_of_times
+from ..simulation import RULE, Action, Observation
+from .player import Environment, player_of
+from .values import ActionValues, estimate, warn_of_futures, warn_of_times
 
-# separates the seeds of futures from others that are derived from the episode's seed
 _KEY: Final = 0x706C616E
+"""Separates the seeds of futures from other seeds that follow from the episode's seed."""
 
 _FRESH: Final = 8
-"""The least number of fresh futures in which a candidate is compared with the rule."""
+"""The least number of fresh futures for the comparison of a candidate with the rule."""
 
-Plan = tuple[int, ...]
-"""The places of the candidates to take at the agent's next decisions, beginning with the pending one."""
+Indices = tuple[int, ...]
+"""The indices of the candidates at the agent's next decisions, beginning with the pending one."""
+
+Try = tuple[Indices, int]
+"""A rollout to make: its candidates, and the number of its future."""
+
+
+# -- rollouts, in branches ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A rollout at its end, or where it can be continued.
+
+    Attributes:
+        rewards: The discounted reward of each decision of the agent.
+        times: The simulation's times between the agent's decisions.
+        start: The simulation's time at its begin. None before that.
+        over: Whether the agent's episode has ended.
+        digest: A digest of the agent's last observation and info.
+        seconds: The mean real time for a step, in seconds.
+    """
+
+    rewards: Sequence[float] = ()
+    times: Sequence[float] = ()
+    start: float | None = None
+    over: bool = False
+    digest: int = 0
+    seconds: float = 0.0
+
+
+BEGIN: Final = Rollout()
+"""A rollout before its first decision."""
+
+
+def try_out(
+    env: Environment,
+    number: int,
+    tries: Sequence[Try],
+    actions: Sequence[Action],
+    policy: RolloutPolicy,
+    begun: Rollout = BEGIN,
+    stop: int | None = None,
+) -> Rollout:
+    """In a branch, make one of several rollouts.
+
+    The agent takes the actions, one at each decision, and then follows the base. If an action is
+    illegal when its decision arises, the base decides. The terminal value is added to the last
+    reward.
+
+    Args:
+        env: The environment of the branch.
+        number: The number of the rollout.
+        tries: The rollouts to make.
+        actions: The candidates.
+        policy: The planner.
+        begun: The rollout to continue.
+        stop: The index of the decision where it stops. None: it runs to its end.
+    """
+    indices, future = tries[number]
+    path = [actions[index] for index in indices]
+    began = perf_counter()
+    pending_view(env, "planning").session.move_to(Where.PLAN)
+    try:
+        player = player_of(env, policy.base)
+        player.start()
+        rewards = list(begun.rewards)
+        times = list(begun.times)
+        now = player.time()
+        start = begun.start
+        if start is None:
+            start = now
+        horizon = policy.horizon
+        if horizon is None:
+            horizon = inf
+        while not player.over and len(rewards) != stop:
+            decision = len(rewards)
+            elapsed = {
+                "decision": decision,
+                "time": now - start,
+            }
+            weight = policy.discount ** elapsed[policy.discount_by]
+            if decision > 0 and elapsed[policy.horizon_by] >= horizon:
+                if policy.terminal_value is not None and stop is None:
+                    rewards[-1] += weight * _terminal_value(policy.terminal_value, env)
+                break
+            if decision == 0 or (decision < len(path) and player.allows(path[decision])):
+                action = path[decision]
+            else:
+                action = player.decide()
+            rewards.append(weight * player.step(action))
+            if not player.over:
+                before = now
+                now = player.time()
+                times.append(now - before)
+    except BaseException as error:
+        tried = ", ".join(map(short_repr, path))
+        annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
+        raise
+    seconds = (perf_counter() - began) / max(1, len(rewards))
+    return Rollout(
+        rewards,
+        times,
+        start,
+        player.over,
+        _digest(player.agent),
+        seconds,
+    )
+
+
+def _terminal_value(
+    function: Callable[[Any], float],
+    env: Environment,
+) -> float:
+    value = function(env)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if not is_number(value):
+        raise OptionValueError(
+            f"terminal_value must return a finite number, not {short_repr(value)}"
+        )
+    return float(value)
+
+
+def _digest(agent: Agent) -> int:
+    last = (agent.observation, agent.info)
+    try:
+        return crc32(pickle.dumps(last, 5))  # much faster than a text
+    except Exception:
+        return crc32(repr(last).encode(errors="replace"))
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a value is one finite number."""
+    return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
+
+
+def is_count(value: object) -> TypeGuard[int]:
+    """Return whether a value is a positive integer."""
+    return is_seed(value) and value != 0
+
+
+# -- values ---------------------------------------------------------------------------------------
 
 
 def action_values(
-    env: Any,
-    actions: Any = None,
+    env: Environment,
+    actions: Iterable[Action] | None = None,
     *,
-    base: Any = RULE,
+    base: Policy = RULE,
     futures: int = 16,
     horizon: float | None = None,
     horizon_by: str = "decision",
@@ -55,20 +210,20 @@ def action_values(
     Args:
         env: An environment of one simulation with a pending decision, in any view, with or without
             wrappers. In the parallel view, the agent is the one that is ``"deciding"``, and the
-            others play the same rounds. In the joint view, it is the one agent that stands for all.
+            others play the same rounds. In the joint view, one agent acts for all.
         actions: The candidates; ``RULE`` may be among them. None: all legal actions of a
             ``Discrete``.
-        base: What decides after the candidate: ``RULE``, a policy of the agent (a callable of the
-            observation, or of the observation and the info), or a dict of these by agent. Other
-            agents of the environment follow their entry in the dict, else their rule. Agents in the
-            option ``policies`` keep their policies.
+        base: The policy that decides after the candidate: ``RULE``, a callable of the observation,
+            or of the observation and the info, or a dict of these by agent. Other agents of the
+            environment follow their entry in the dict, else their rule. Agents in the option
+            ``policies`` keep their policies. A planner is replaced by its attribute ``base``.
         futures: The number of futures in which each candidate is tried.
         horizon: The number of the agent's decisions whose rewards count, including the candidate.
             With ``horizon_by="time"``: a duration; rewards count up to the agent's first decision
             after at least that time. None: up to the agent's end.
         horizon_by: The unit of the horizon: "decision", or "time" for the simulation's time.
-        terminal_value: The value of what comes after the horizon: a callable of the environment. It
-            is called in the branch if the agent still lives at the horizon.
+        terminal_value: A callable of the environment that returns the value of the time after the
+            horizon. It is called in the branch if the agent still lives at the horizon.
         discount: The discount factor, from 0 to 1.
         discount_by: The unit of discounting: "decision" for each decision of the agent before the
             rewarded one, or "time" for each unit of the simulation's time between the candidate and
@@ -93,71 +248,103 @@ def action_values(
         BaseException: Any exception of the model, a mapping or the base in a branch.
     """
     policy = RolloutPolicy(
-        actions, base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
-        discount=discount, discount_by=discount_by, seed=seed, method=method, time_limit=time_limit,
-    )  # fmt: skip
+        actions,
+        base=base,
+        futures=futures,
+        horizon=horizon,
+        horizon_by=horizon_by,
+        terminal_value=terminal_value,
+        discount=discount,
+        discount_by=discount_by,
+        seed=seed,
+        method=method,
+        time_limit=time_limit,
+    )
     if _is_planned(env):
-        return base_value(env, base)
+        return _base_value(env, base)
     rollouts = Rollouts(env, policy)
     candidates = range(len(rollouts.actions))
     with progress_bar(len(candidates) * futures, progress, "branch") as bar:
         for number in [1] * futures if progress else [futures]:
             rollouts.add(candidates, number)
             bar.update(number * len(candidates))
-    return rollouts.values(candidates)
+    best = max(candidates, key=rollouts.mean)
+    return rollouts.values(best)
 
 
-def _is_planned(env: Any) -> bool:
-    """Return whether a planner already tries a candidate in this environment."""
-    return pending_view(env, "planning").episode.where is Where.PLAN
+def _is_planned(env: Environment) -> bool:
+    """Return whether a planner already tries a candidate in an environment."""
+    episode = pending_view(env, "planning").episode
+    return episode.where is Where.PLAN
 
 
-def base_value(env: Any, base: Any) -> ActionValues:
-    """Return the base's answer as the best action, without rollouts.
-
-    In branches, planners act as their bases.
-    """
-    action, unknown = player_of(env, base).decide(), np.full(1, np.nan)
-    return ActionValues(
-        (action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)), np.nan
-    )
+def _base_value(
+    env: Environment,
+    base: Policy,
+) -> ActionValues:
+    """Return the base's answer as the best action, as planners act in branches."""
+    return estimate([player_of(env, base).decide()], [[]], 0)
 
 
 class Rollouts:
     """The rollouts of the candidates for a pending decision.
 
-    Future number i is the same for all candidates.
+    A future is the same for all candidates. It is given by its number, from 0.
+
+    Attributes:
+        env: The environment.
+        actions: The candidates.
+        rule: The index of ``RULE``. Only planners need it.
+        added: Whether ``RULE`` was added to them, as the last one.
+        returns: For each candidate, the returns of its rollouts.
+        rollouts: For each sequence of candidates, its rollouts.
+        reseeds: Whether chance can be drawn anew. Otherwise there is one exact future.
     """
 
-    def __init__(self, env: Any, policy: RolloutPolicy, *, planner: bool = False) -> None:
+    def __init__(
+        self,
+        env: Environment,
+        policy: RolloutPolicy,
+        *,
+        planner: bool = False,
+    ) -> None:
         """Check the candidates and the base of a policy.
 
-        For a ``planner``, leave out masked ones, and add ``RULE``.
+        For a ``planner``, leave out masked candidates, and add ``RULE``.
         """
-        self.env, self._policy = env, policy
+        self.env = env
+        self.policy = policy
         player = player_of(env, policy.base)
         player.check_base()
-        if policy.timed and player.episode.clock is None:
+        episode = player.episode
+        is_timed = "time" in (policy.discount_by, policy.horizon_by)
+        if is_timed and episode.clock is None:
             raise OptionValueError(
                 'discount_by="time" and horizon_by="time" need a simulation with a method time()'
             )
         self.actions = player.candidates(policy.actions, legal=planner)
-        self.added = (
-            planner and len(self.actions) > 1 and not any(action is RULE for action in self.actions)
-        )
+        rules = [index for index, action in enumerate(self.actions) if action is RULE]
+        self.rule = len(self.actions)
+        if rules:
+            self.rule = rules[0]
+        self.added = planner and not rules and len(self.actions) > 1
         if self.added:
             self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
-        self.outcomes: dict[Plan, list[Any]] = {}  # what was seen in the futures of each plan
-        self.states: Any = None  # those that are kept, if a search keeps some: see ``tree``
-        self.seconds = 0.0  # for a step
-        # the simulation's times between decisions, in each rollout
-        self._times: list[list[float]] = []
-        consulted = isinstance(player.record.policy, AskingPolicy)
-        number = player.record.answered if consulted else player.episode.turns
-        decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
-        self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
-        self._name = player.view._plan.name
+        self.rollouts: dict[Indices, list[Rollout]] = {}
+        number = episode.turns
+        if isinstance(player.agent.policy, AskingPolicy):
+            number = player.agent.answered
+        name = crc32(player.name.encode(errors="surrogatepass"))
+        self._entropy = [
+            episode.seed,
+            number,
+            name,
+            _KEY,
+        ]
+        if policy.seed is not None:
+            self._entropy.append(policy.seed)
+        self._name = episode.plan.name
         try:
             player.view.session.check_reseed()
             self.reseeds = True
@@ -172,91 +359,95 @@ class Rollouts:
 
     def seeds(self, number: int) -> list[int]:
         """Return the seeds of the first futures."""
-        return [int(word) for word in np.random.SeedSequence(self._entropy).generate_state(number)]
+        sequence = np.random.SeedSequence(self._entropy)
+        return [int(seed) for seed in sequence.generate_state(number)]
 
-    def add(self, candidates: Iterable[int], number: int) -> None:
-        """Try candidates, given by their places, in some more futures.
+    def add(
+        self,
+        candidates: Iterable[int],
+        number: int,
+    ) -> None:
+        """Try candidates, given by their indices, in some more futures, or in the exact one."""
+        tries: list[Try] = []
+        for index in candidates:
+            begin = len(self.returns[index])
+            end = 1
+            if self.reseeds:
+                end = begin + number
+            tries += [((index,), future) for future in range(begin, end)]
+        self.record(tries, self.make(tries))
 
-        At most in one if there is only one.
-        """
-        rollouts = [
-            ((place,), future)
-            for place in candidates
-            for future in range(len(self.returns[place]), len(self.returns[place]) + number)
-            if self.reseeds or future == 0
-        ]
-        self.run(rollouts)
-
-    def run(self, rollouts: Sequence[tuple[Plan, int]]) -> list[list[float]]:
-        """Run rollouts, given by their plans and the numbers of their futures.
-
-        Note and return the rewards of each.
-        """
-        outcomes = self._outcomes_of(rollouts)
-        for (plan, _), outcome in zip(rollouts, outcomes, strict=True):
-            self.returns[plan[0]].append(sum(outcome.rewards))
-            self.outcomes.setdefault(plan, []).append((outcome.rewards, outcome.seen))
-            self._times.append(outcome.times)
-            self.seconds = max(self.seconds, outcome.seconds)
-        return [outcome.rewards for outcome in outcomes]
-
-    def _outcomes_of(self, rollouts: Sequence[tuple[Plan, int]]) -> list[Outcome]:
-        policy, seeds = self._policy, None
-        if self.states is not None:
-            kept: list[Outcome] = self.states.run([plan for plan, _ in rollouts])
-            return kept
+    def make(self, tries: Sequence[Try]) -> list[Rollout]:
+        """Make rollouts, each in a branch."""
+        seeds: list[int] | None = None
         if self.reseeds:
-            numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
-            seeds = [numbers[future] for _, future in rollouts]
-        tries = [([self.actions[place] for place in plan], future) for plan, future in rollouts]
+            futures = [future for _, future in tries]
+            known = self.seeds(1 + max(futures, default=0))
+            seeds = [known[future] for future in futures]
+        function = partial(
+            try_out,
+            tries=tries,
+            actions=self.actions,
+            policy=self.policy,
+        )
         return branch(
-            self.env, partial(try_out, tries=tries, policy=policy), len(tries), method=policy.method, seeds=seeds,
-            time_limit=policy.time_limit,
-        )  # fmt: skip
-
-    def is_better_than_rule(self, plan: Plan) -> bool:
-        """Return whether a plan brings more than the rule, on fresh futures, which have not selected it."""
-        rule = next(place for place, action in enumerate(self.actions) if action is RULE)
-        if plan[0] == rule:
-            return False
-        if not self.reseeds:
-            return self.certain(plan) > self.certain((rule,))
-        begin = max(map(len, self.returns))
-        futures = range(begin, begin + max(_FRESH, self._policy.futures))
-        outcomes = self._outcomes_of(
-            [(tried, future) for tried in (plan, (rule,)) for future in futures]
+            self.env,
+            function,
+            len(tries),
+            method=self.policy.method,
+            seeds=seeds,
+            time_limit=self.policy.time_limit,
         )
-        returns = np.array([sum(outcome.rewards) for outcome in outcomes]).reshape(2, -1)
-        gains = returns[0] - returns[1]
-        return bool(gains.mean() > self._policy.margin * gains.std(ddof=1) / np.sqrt(len(gains)))
 
-    def certain(self, plan: Plan) -> float:
-        """Return what a plan has brought in the one exact future."""
-        return float(sum(self.outcomes[plan][0][0]))
+    def record(
+        self,
+        tries: Sequence[Try],
+        rollouts: Sequence[Rollout],
+    ) -> None:
+        """Record the results of tries."""
+        for (indices, _), rollout in zip(tries, rollouts, strict=True):
+            self.returns[indices[0]].append(sum(rollout.rewards))
+            self.rollouts.setdefault(indices, []).append(rollout)
 
-    def values(self, finalists: Sequence[int]) -> ActionValues:
-        """Estimate the values.
+    def is_better_than_rule(self, indices: Indices) -> bool:
+        """Return whether candidates have a larger return than the rule.
 
-        The best candidate is one of the finalists, which are given by their places.
+        They are compared on fresh futures, because the others have selected them.
         """
-        counts = np.array([len(values) for values in self.returns], np.int64)
-        returns = np.full((len(counts), counts.max()), np.nan)
-        means, errors = np.full((2, len(counts)), np.nan)
-        for place, values in enumerate(self.returns):
-            returns[place, : len(values)] = values
-            if values:
-                means[place] = np.mean(values)
-            if len(values) > 1:
-                errors[place] = np.std(values, ddof=1) / np.sqrt(len(values))
-        best = max(finalists, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
+        if indices[0] == self.rule:
+            return False
+        rule = (self.rule,)
+        if not self.reseeds:
+            return self.exact_return(indices) > self.exact_return(rule)
+        begin = max(map(len, self.returns))
+        number = max(_FRESH, self.policy.futures)
+        futures = range(begin, begin + number)
+        tries: list[Try] = [(indices, future) for future in futures]
+        tries += [(rule, future) for future in futures]
+        returns = np.array([sum(rollout.rewards) for rollout in self.make(tries)])
+        planned, ruled = np.split(returns, 2)
+        gains = planned - ruled
+        error = gains.std(ddof=1) / np.sqrt(len(gains))
+        return bool(gains.mean() > self.policy.margin * error)
+
+    def exact_return(self, indices: Indices) -> float:
+        """Return the return of candidates in the one exact future."""
+        return sum(self.rollouts[indices][0].rewards)
+
+    def mean(self, index: int) -> float:
+        """Return the mean return of a candidate."""
+        return float(np.mean(self.returns[index]))
+
+    def values(self, best: int) -> ActionValues:
+        """Estimate the values. The best candidate is given by its index."""
+        values = estimate(self.actions, self.returns, best)
+        rollouts = self.rollouts.values()
         if self.reseeds:
-            warn_of_futures(self._name, self.outcomes.values(), returns)
-        if self._policy.horizon is not None and self._policy.horizon_by == "decision":
-            warn_of_times(self._name, self._times)
-        correlation = correlation_of(returns)
-        return ActionValues(
-            tuple(self.actions), means, errors, counts, self.actions[best], returns, correlation
-        )
+            futures = [[(each.rewards, each.digest) for each in same] for same in rollouts]
+            warn_of_futures(self._name, futures, values.returns)
+        if self.policy.horizon is not None and self.policy.horizon_by == "decision":
+            warn_of_times(self._name, [each.times for each in chain(*rollouts)])
+        return values
 
 
 # -- policies -------------------------------------------------------------------------------------
@@ -264,7 +455,7 @@ class Rollouts:
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class RolloutPolicy:
-    """A policy that looks one decision ahead: it tries candidate actions in branches and takes the best one.
+    """A policy that looks one decision ahead: it takes the candidate that is best in branches.
 
     It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds.
     In each round, all remaining candidates are tried on the same futures, and the better half of
@@ -277,7 +468,7 @@ class RolloutPolicy:
     The policy can be used like any policy that answers one decision at a time; it gets the
     environment as ``_environment``. In a branch of a planner it acts as its own base.
 
-    Its attributes are its arguments. ``action_values`` describes those that are not described here.
+    Its attributes are its arguments. ``action_values`` describes the others.
 
     Attributes:
         actions: The candidates. Candidates that are masked at a decision are left out there. None:
@@ -286,14 +477,14 @@ class RolloutPolicy:
             ``futures``. The comparison with the rule comes on top.
         margin: By how many standard errors a candidate must be better than ``RULE`` to be taken.
         futures: The mean number of futures per candidate, if there is no ``budget``.
-        seed: A number that distinguishes the futures from those of another planner.
+        seed: A number that distinguishes the futures from the ones of another planner.
 
     Raises:
         OptionValueError: An argument has an invalid value.
     """
 
-    actions: Any = field(default=None, kw_only=False)
-    base: Any = RULE
+    actions: Iterable[Action] | None = field(default=None, kw_only=False)
+    base: Policy = RULE
     futures: int = 16
     horizon: float | None = None
     horizon_by: str = "decision"
@@ -307,37 +498,49 @@ class RolloutPolicy:
     margin: float = 1.0
 
     def __post_init__(self) -> None:
-        self.timed = "time" in (self.discount_by, self.horizon_by)
-        for name in ("horizon_by", "discount_by"):
-            self.require(name, getattr(self, name) in ("decision", "time"), '"decision" or "time"')
-        self.require("futures", is_count(self.futures), "a positive integer")
-        horizon: Any = self.horizon
+        horizon = self.horizon
         if self.horizon_by == "time":
-            fine, kind = is_number(horizon) and horizon > 0, "a positive time or None"
+            has_horizon = is_number(horizon) and horizon > 0
         else:
-            fine, kind = is_count(horizon), "a number of decisions, 1 or more, or None"
-        self.require("horizon", horizon is None or fine, kind)
-        self.require(
-            "discount", is_number(self.discount) and 0 <= self.discount <= 1, "a number from 0 to 1"
+            has_horizon = is_count(horizon)
+        units = ("decision", "time")
+        has_value = self.terminal_value is None or callable(self.terminal_value)
+        self._check_options(
+            {
+                "horizon_by": (self.horizon_by in units, '"decision" or "time"'),
+                "discount_by": (self.discount_by in units, '"decision" or "time"'),
+                "futures": (is_count(self.futures), "a positive integer"),
+                "horizon": (
+                    horizon is None or has_horizon,
+                    'a number of decisions, a positive time with horizon_by="time", or None',
+                ),
+                "discount": (
+                    is_number(self.discount) and 0 <= self.discount <= 1,
+                    "a number from 0 to 1",
+                ),
+                "terminal_value": (has_value, "a callable of the environment"),
+                "margin": (
+                    is_number(self.margin) and self.margin >= 0,
+                    "a number that is not negative",
+                ),
+                "budget": (
+                    self.budget is None or is_count(self.budget),
+                    "a number of branches or None",
+                ),
+            }
         )
-        fine = self.terminal_value is None or callable(self.terminal_value)
-        self.require("terminal_value", fine, "a callable of the environment")
         self.seed = checked_seed(self.seed)
-        self.require(
-            "margin", is_number(self.margin) and self.margin >= 0, "a number that is not negative"
-        )
-        self.require(
-            "budget", self.budget is None or is_count(self.budget), "a number of branches or None"
-        )
         if isinstance(self.actions, Iterable) and not isinstance(self.actions, (str, Mapping)):
-            self.actions = list(self.actions)  # an iterator would be used up by the first decision
+            self.actions = list(self.actions)  # the first decision would use up an iterator
 
-    def require(self, name: str, fine: bool, kind: str) -> None:
-        """Refuse the value of an option unless it is fine."""
-        if not fine:
-            raise OptionValueError(f"{name} must be {kind}, not {short_repr(getattr(self, name))}")
+    def _check_options(self, options: dict[str, tuple[bool, str]]) -> None:
+        """Refuse options. For each there is whether it is valid, and the kind of valid values."""
+        for name, (is_valid, kind) in options.items():
+            if not is_valid:
+                value = short_repr(getattr(self, name))
+                raise OptionValueError(f"{name} must be {kind}, not {value}")
 
-    def choose(self, env: Any) -> ActionValues:
+    def choose(self, env: Environment) -> ActionValues:
         """Find the best candidate for the pending decision of an environment.
 
         Args:
@@ -352,37 +555,43 @@ class RolloutPolicy:
             BaseException: As ``action_values``.
         """
         if _is_planned(env):
-            return base_value(env, self.base)
+            return _base_value(env, self.base)
         rollouts = Rollouts(env, self, planner=True)
         number = len(rollouts.actions)
-        budget = number * self.futures if self.budget is None else self.budget
+        budget = self.budget
+        if budget is None:
+            budget = number * self.futures
         if budget < number:
             raise OptionValueError(
                 f"a budget of {budget} branches is too small to try {number} candidates once"
             )
         if number == 1:
-            return rollouts.values([0])
-        finalists = self._search(rollouts, budget)
-        values = rollouts.values([plan[0] for plan in finalists])
-        plan = next(plan for plan in finalists if rollouts.actions[plan[0]] is values.best)
-        return values if rollouts.is_better_than_rule(plan) else replace(values, best=RULE)
+            return rollouts.values(0)
+        best = self._search(rollouts, budget)
+        if rollouts.is_better_than_rule(best):
+            return rollouts.values(best[0])
+        return rollouts.values(rollouts.rule)
 
-    def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
-        """Try candidates; return the plans that are left."""
-        left: Sequence[int] = range(len(rollouts.actions))
+    def _search(
+        self,
+        rollouts: Rollouts,
+        budget: int,
+    ) -> Indices:
+        """Try candidates; return the best ones for the next decisions."""
+        left = list(range(len(rollouts.actions)))
         for rounds in range(ceil(log2(len(left))), 0, -1):
-            more = min(max(1, budget // (len(left) * rounds)), budget // len(left))
-            budget -= more * len(left)
-            rollouts.add(left, more)
+            most = budget // len(left)
+            number = min(max(1, most // rounds), most)
+            budget -= number * len(left)
+            rollouts.add(left, number)
             if rounds > 1:
-                means = [np.mean(rollouts.returns[place]) for place in left]
-                better = np.argsort(-np.array(means), kind="stable")[: (len(left) + 1) // 2]
-                left = [left[place] for place in sorted(better.tolist())]
-        return [(place,) for place in left]
+                left.sort(key=rollouts.mean, reverse=True)
+                left = sorted(left[: (len(left) + 1) // 2])
+        best = max(left, key=rollouts.mean)
+        return (best,)
 
-    def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
-        """Answer a decision, as policies do, with the best action.
-
-        Within a branch, with the answer of the base.
-        """
+    def __call__(
+        self, observation: Observation, info: Info, *, _environment: Environment
+    ) -> Action:
+        """Answer a decision with the best action. In a branch, with the answer of the base."""
         return self.choose(_environment).best

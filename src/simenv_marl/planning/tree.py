@@ -1,40 +1,53 @@
-"""The tree search: a policy that looks several decisions ahead, and the states that it keeps."""
+"""The tree search: a policy that looks several decisions ahead, and its checkpoints."""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
-from math import inf, log, sqrt
+from itertools import chain
+from math import log, sqrt
 from threading import Lock
 from time import perf_counter
 from typing import Any, Final
 
-from ..core import branch, clone
+from ..core import branch, clone, pending_view
+from ..envs import SimulationJointEnv
 from ..errors import BranchError, OptionValueError
-from .player import Progress, is_count, is_number, rollout_from, try_out
-from .rollouts import Plan, RolloutPolicy, Rollouts
+from .player import Environment
+from .rollouts import (
+    BEGIN,
+    Indices,
+    Rollout,
+    RolloutPolicy,
+    Rollouts,
+    Try,
+    is_count,
+    is_number,
+    try_out,
+)
 
 _AT_ONCE: Final = 8
 """The number of branches that run before a tree is updated.
 
-It does not depend on the number of cores.
+It does not depend on the number of cores, so that results do not.
 """
 
 _MOST: Final = 200
-"""The largest number of states that are kept. Each takes some megabytes."""
+"""The largest number of checkpoints that are kept. Each takes some megabytes."""
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class TreeSearchPolicy(RolloutPolicy):
     """A policy that looks several decisions ahead, by open-loop UCT over branches.
 
-    At each of the next ``depth`` decisions it tries the candidates that seem best, and those of
-    which it knows little (UCB1); then the base decides. A node of the tree is a sequence of
-    candidates, whatever chance events lie between them. All candidates for the pending decision
-    meet the same futures in the same order.
+    At each of the next ``depth`` decisions it tries the candidates that seem best, or that were
+    tried little (UCB1); then the base decides. A node of the tree is a sequence of candidates,
+    for any chance events between them. All candidates for the pending decision meet the same
+    futures in the same order.
 
     It needs more branches than ``RolloutPolicy``. They pay off if an action is only good with the
     right actions after it.
@@ -54,175 +67,230 @@ class TreeSearchPolicy(RolloutPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        fine = is_number(self.exploration) and self.exploration >= 0
-        self.require("depth", is_count(self.depth), "a number of decisions")
-        self.require("exploration", fine, "a number that is not negative")
+        explores = is_number(self.exploration) and self.exploration >= 0
+        self._check_options(
+            {
+                "depth": (is_count(self.depth), "a number of decisions"),
+                "exploration": (explores, "a number that is not negative"),
+            }
+        )
 
-    def _search(self, rollouts: Rollouts, budget: int) -> list[Plan]:
-        tree = _Tree(len(rollouts.actions), self.depth, self.exploration, rollouts.added)
+    def _search(
+        self,
+        rollouts: Rollouts,
+        budget: int,
+    ) -> Indices:
+        tree = _Tree(rollouts, self)
+        checkpoints: Checkpoints | None = None
         try:
             for begin in range(0, budget, _AT_ONCE):
-                batch: list[tuple[Plan, int]] = []
-                for _ in range(min(_AT_ONCE, budget - begin)):
-                    plan = tree.descend()
-                    batch.append((plan, tree.visits[plan[:1]] - 1 if rollouts.reseeds else 0))
-                for (plan, _), rewards in zip(batch, rollouts.run(batch), strict=True):
-                    tree.learn(plan, rewards)
+                tries = [tree.next_try() for _ in range(min(_AT_ONCE, budget - begin))]
+                results = (checkpoints or rollouts).make(tries)
+                rollouts.record(tries, results)
+                for (node, _), rollout in zip(tries, results, strict=True):
+                    tree.learn(node, rollout.rewards)
                 if begin == 0:
-                    rollouts.states = self._states_of(rollouts)
+                    checkpoints = self._states_of(rollouts)
         finally:
-            if rollouts.states is not None:
-                rollouts.states.close()
-        return [tree.best() if rollouts.reseeds else max(rollouts.outcomes, key=rollouts.certain)]
+            if checkpoints is not None:
+                checkpoints.close()
+        if rollouts.reseeds:
+            return tree.best()
+        return max(rollouts.rollouts, key=rollouts.exact_return)
 
-    def _states_of(self, rollouts: Rollouts) -> States | None:
-        """Begin to keep states, if there is one exact future and this saves more steps than a fork costs."""
+    def _states_of(self, rollouts: Rollouts) -> Checkpoints | None:
+        """Begin to keep checkpoints, if there is one exact future and they save time.
+
+        A checkpoint spares a try half of the depth in the mean, and costs a fork. Processes of
+        clones have neither the wrappers of an environment nor the infos of joint views.
+        """
         if rollouts.reseeds or self.method == "replay" or self.depth == 1:
+            return None
+        view = pending_view(rollouts.env, "planning")
+        if view is not rollouts.env or isinstance(view, SimulationJointEnv):
             return None
         began = perf_counter()
         try:
-            root = clone(rollouts.env, method="fork", time_limit=self.time_limit)
+            root = clone(
+                rollouts.env,
+                method="fork",
+                time_limit=self.time_limit,
+            )
         except (BranchError, OptionValueError):  # only a replay is possible
             return None
-        # a try repeats half of the depth in the mean
-        if rollouts.seconds * self.depth / 2 > perf_counter() - began:
-            return States(root, self, rollouts.actions)
+        cost = perf_counter() - began
+        made = chain(*rollouts.rollouts.values())
+        step = max(rollout.seconds for rollout in made)
+        if step * self.depth / 2 > cost:
+            return Checkpoints(root, rollouts)
         root.close()
         return None
 
 
 class _Tree:
-    """The results of sequences of candidates.
+    """The returns of sequences of candidates, which are the nodes.
 
-    If ``RULE`` was ``added`` as the last one, it is a leaf.
+    If ``RULE`` was added to the candidates, as the last one, it is a leaf.
     """
 
-    def __init__(self, candidates: int, depth: int, exploration: float, added: bool) -> None:
-        self._first, self._others = range(candidates), range(candidates - added)
-        self._depth, self._exploration = depth, exploration
-        # the tries of each node, including those that are running
-        self.visits: dict[Plan, int] = {}
-        self._returns: dict[Plan, list[float]] = {}  # returns from the node's own decision on
-        self._least, self._most = inf, -inf
+    def __init__(
+        self,
+        rollouts: Rollouts,
+        policy: TreeSearchPolicy,
+    ) -> None:
+        number = len(rollouts.actions)
+        self._candidates = range(number)
+        self._inner = range(number - rollouts.added)
+        self._reseeds = rollouts.reseeds
+        self._depth = policy.depth
+        self._exploration = policy.exploration
+        self._visits: Counter[Indices] = Counter()  # also by tries that are running
+        self._returns: dict[Indices, list[float]] = {}  # from the node's own decision on
+        self._totals: list[float] = []
 
-    def descend(self) -> Plan:
-        """Choose the sequence to try next: descend to an untried node, or to the depth."""
-        node: Plan = ()
-        while len(node) < self._depth and (not node or node[0] in self._others):
-            below = [(*node, place) for place in (self._others if node else self._first)]
-            new = [child for child in below if child not in self._returns]
-            if new:
-                node = min(new, key=lambda child: self.visits.get(child, 0))
+    def next_try(self) -> Try:
+        """Choose the next try: descend to an untried node, or to the depth."""
+        node: Indices = ()
+        while len(node) < self._depth and (not node or node[0] in self._inner):
+            indices = self._candidates
+            if node:
+                indices = self._inner
+            children = [(*node, index) for index in indices]
+            untried = [child for child in children if child not in self._returns]
+            if untried:
+                node = min(untried, key=self._visits.__getitem__)
                 break
-            doubt = sqrt(log(sum(self.visits[child] for child in below)))
-            node = max(below, key=lambda child: self._bound(child, doubt))
-        for depth in range(1, len(node) + 1):
-            self.visits[node[:depth]] = self.visits.get(node[:depth], 0) + 1
-        return node
+            visits = sum(self._visits[child] for child in children)
+            upper = partial(self._bound, doubt=sqrt(log(visits)))
+            node = max(children, key=upper)
+        for length in range(1, len(node) + 1):
+            self._visits[node[:length]] += 1
+        future = 0
+        if self._reseeds:
+            future = self._visits[node[:1]] - 1
+        return node, future
 
-    def _bound(self, node: Plan, doubt: float) -> float:
-        """Return the confidence bound of a node's value: upper for a positive ``doubt``, lower for a negative one."""
-        returns, spread = self._returns[node], self._most - self._least
-        return sum(returns) / len(returns) + doubt * self._exploration * spread / sqrt(
-            self.visits[node]
-        )
+    def _bound(
+        self,
+        node: Indices,
+        doubt: float,
+    ) -> float:
+        """Return the bound of a node's value: upper for a positive doubt, else lower."""
+        returns = self._returns[node]
+        spread = max(self._totals) - min(self._totals)
+        error = self._exploration * spread / sqrt(self._visits[node])
+        return sum(returns) / len(returns) + doubt * error
 
-    def learn(self, node: Plan, rewards: list[float]) -> None:
-        """Add the rewards of a try, decision by decision.
-
-        The agent may have ended before the node.
-        """
+    def learn(
+        self,
+        node: Indices,
+        rewards: Sequence[float],
+    ) -> None:
+        """Add the rewards of a try, by decision. The agent may have ended before the node."""
         for depth in range(min(len(node), len(rewards))):
             self._returns.setdefault(node[: depth + 1], []).append(sum(rewards[depth:]))
-        self._least, self._most = min(self._least, sum(rewards)), max(self._most, sum(rewards))
+        self._totals.append(sum(rewards))
 
-    def best(self) -> Plan:
-        """Return the best plan, which the added ``RULE`` is compared with later: by lower bound, then by visits."""
-        plan: Plan = (max(self._others, key=lambda place: self._bound((place,), -1.0)),)
-        while len(plan) < self._depth:
-            below = [child for place in self._others if (child := (*plan, place)) in self._returns]
-            if not below:
+    def best(self) -> Indices:
+        """Return the best node without the added ``RULE``: by lower bound, then by visits."""
+        lower = partial(self._bound, doubt=-1.0)
+        first = [(index,) for index in self._inner]
+        node: Indices = max(first, key=lower)
+        while len(node) < self._depth:
+            children = [(*node, index) for index in self._inner]
+            tried = [child for child in children if child in self._returns]
+            if not tried:
                 break
-            plan = max(below, key=lambda child: (self.visits[child], self._bound(child, -1.0)))
-        return plan
+            node = max(tried, key=lambda child: (self._visits[child], lower(child)))
+        return node
 
 
-# -- states that are kept where there is one exact future: none is reached twice -------------------
+# -- checkpoints, where there is one exact future: no state is reached twice -----------------------
 
 
-class Node:
-    """A clone that has taken the candidates of a plan.
+@dataclass(frozen=True)
+class Checkpoint:
+    """A clone that has taken candidates. It is never stepped again.
 
     Attributes:
-        env: The clone, which is never stepped again; None if there were too many already.
-        progress: What the candidates have brought.
-        outcome: What they bring in the end, if the base decides from there.
-        lock: Held while the clone, or one of its clones, is used here.
+        env: The clone.
+        begun: The rollout up to there.
+        lock: Held while the clone is cloned, or a clone of it ends.
     """
 
-    def __init__(self, env: Any, progress: Progress, outcome: Any = None) -> None:
-        self.env, self.progress, self.outcome, self.lock = env, progress, outcome, Lock()
+    env: Any
+    begun: Rollout
+    lock: Lock = field(default_factory=Lock)
 
 
-class States:
-    """The states of one search, by plan."""
+class Checkpoints:
+    """The checkpoints of one search, by the candidates that they have taken."""
 
-    def __init__(self, root: Any, policy: Any, actions: Sequence[Any]) -> None:
+    def __init__(
+        self,
+        root: Environment,
+        rollouts: Rollouts,
+    ) -> None:
         """Begin with a clone of the environment, which is the root."""
-        self._policy, self._actions = policy, actions
-        self._nodes: dict[Plan, Node] = {(): Node(root, Progress())}
+        self._search = rollouts
+        self._root = Checkpoint(root, BEGIN)
+        self._checkpoints: dict[Indices, Checkpoint] = {(): self._root}
+        self._rollouts: dict[Indices, Rollout] = {}
 
-    def run(self, plans: Sequence[Plan]) -> list[Any]:
-        """Return the outcome of each plan."""
-        new = [plan for plan in dict.fromkeys(plans) if plan not in self._nodes]
+    def make(self, tries: Sequence[Try]) -> list[Rollout]:
+        """Make rollouts, each from the nearest checkpoint."""
+        nodes = [node for node, _ in tries]
+        new = dict.fromkeys(node for node in nodes if node not in self._rollouts)
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # they wait for processes
-            self._nodes.update(zip(new, pool.map(self._reach, new), strict=True))
-        return [self._nodes[plan].outcome for plan in plans]
+            results = pool.map(self._make, new)
+            self._rollouts |= zip(new, results, strict=True)
+        return [self._rollouts[node] for node in nodes]
 
-    def _reach(self, plan: Plan) -> Node:
-        """Reach the state of a plan from that of its longest part that was reached before."""
-        parts = (self._nodes.get(plan[:length]) for length in range(len(plan) - 1, -1, -1))
-        parent = next(node for node in parts if node is not None and node.env is not None)
-        root, actions = self._nodes[()], [self._actions[place] for place in plan]
-        node = Node(None, parent.progress)
+    def _make(self, node: Indices) -> Rollout:
+        """Make a rollout, and a checkpoint after its candidates."""
+        lengths = [length for length in range(len(node)) if node[:length] in self._checkpoints]
+        nearest = self._checkpoints[node[: lengths[-1]]]
+        search = self._search
+        limit = search.policy.time_limit
+        function = partial(
+            try_out,
+            tries=[(node, 0)],
+            actions=search.actions,
+            policy=search.policy,
+        )
         try:
-            with parent.lock:
-                env = clone(parent.env, method="fork", time_limit=self._policy.time_limit)
-        # it has opened something since; a replay belongs to the thread that makes it
-        except BranchError:
-            once = partial(try_out, tries=[(actions, 0)], policy=self._policy)
-            with root.lock:
-                [node.outcome] = branch(root.env, once, time_limit=self._policy.time_limit)
-            return node
+            with nearest.lock:
+                env = clone(
+                    nearest.env,
+                    method="fork",
+                    time_limit=limit,
+                )
+        except BranchError:  # the model has opened something since
+            with self._root.lock:
+                [rollout] = branch(
+                    self._root.env,
+                    function,
+                    time_limit=limit,
+                )
+            return rollout
+        is_kept = False
         try:
-            node.progress, node.outcome = env.unwrapped.call(
-                _take, actions, self._policy, parent.progress
-            )
-            if len(self._nodes) < _MOST:
-                node.env = env
-            return node
+            start = partial(function, begun=nearest.begun, stop=len(node))
+            begun = env.call(start, 0)
+            rollout = begun
+            if not begun.over:
+                finish = partial(function, begun=begun)
+                [rollout] = branch(env, finish, time_limit=limit)
+            is_kept = len(self._checkpoints) < _MOST
         finally:
-            if node.env is None:
-                with parent.lock:  # whose process waits for it
+            if not is_kept:
+                with nearest.lock:  # because its process waits for the clone's end
                     env.close()
+        if is_kept:
+            self._checkpoints[node] = Checkpoint(env, begun)
+        return rollout
 
     def close(self) -> None:
-        """End all clones."""
-        for node in self._nodes.values():
-            if node.env is not None:
-                node.env.close()
-
-
-def _take(env: Any, actions: list[Any], policy: Any, progress: Progress) -> tuple[Progress, Any]:
-    """In a clone, take the actions that are still to take.
-
-    Return the progress, and the outcome with the base.
-    """
-    progress, outcome = rollout_from(env, actions, policy, progress, stop=len(actions))
-    if not progress.over:
-        [outcome] = branch(
-            env,
-            lambda twin, number: rollout_from(twin, actions, policy, progress)[1],
-            time_limit=policy.time_limit,
-        )
-    return progress, outcome
+        """Close all clones."""
+        for checkpoint in self._checkpoints.values():
+            checkpoint.env.close()

@@ -1,34 +1,35 @@
-"""The values of candidate actions, and warnings of simulations whose futures tell little about them."""
+"""The estimated values of candidate actions, and warnings of futures that tell little."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import warn_user
+from ..simulation import Action
 
 _SEVERAL: Final = 4
-"""The number of futures of a plan that are compared to find out whether they are all the same."""
+"""The number of futures that must be the same before the user is warned."""
 
 _MANY: Final = 16
-"""The number of futures, or of times between decisions, from which on their statistics are trusted."""
+"""The least number of futures, or of times between decisions, for statistics of them."""
 
 _UNRELATED: Final = (-0.5, 0.1)
-"""Between these correlations of returns, the user is warned.
+"""The user is warned if returns correlate by a number in this interval.
 
-Far below, the same chance meets all candidates, too.
+A strong negative correlation shows a common chance, too.
 """
 
 _VARIATION: Final = 0.1
 """The coefficient of variation of times above which the user is warned."""
 
 _SETTLED: Final[set[tuple[str, str]]] = set()
-"""The simulations of which the user was warned, or need not be, and of what."""
+"""The names of simulations and the kinds of warnings that were issued, or need not be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,43 +52,83 @@ class ActionValues:
             to see.
     """
 
-    actions: tuple[Any, ...]
+    actions: tuple[Action, ...]
     means: NDArray[np.float64]
     standard_errors: NDArray[np.float64]
     counts: NDArray[np.int64]
-    best: Any
+    best: Action
     returns: NDArray[np.float64]
     correlation: float
 
 
-def correlation_of(returns: NDArray[np.float64], least: int = 3) -> float:
+def estimate(
+    actions: Sequence[Action], returns: Sequence[Sequence[float]], best: int
+) -> ActionValues:
+    """Estimate the values of candidates.
+
+    Args:
+        actions: The candidates.
+        returns: For each candidate, its returns, in the order of the futures.
+        best: The index of the best candidate.
+    """
+    counts = np.array([*map(len, returns)], np.int64)
+    table = np.full((len(counts), counts.max()), np.nan)
+    means = np.full(len(counts), np.nan)
+    errors = np.full(len(counts), np.nan)
+    for index, values in enumerate(returns):
+        table[index, : len(values)] = values
+        if values:
+            means[index] = np.mean(values)
+        if len(values) > 1:
+            errors[index] = np.std(values, ddof=1) / np.sqrt(len(values))
+    correlation = correlation_of(table)
+    return ActionValues(
+        tuple(actions),
+        means,
+        errors,
+        counts,
+        actions[best],
+        table,
+        correlation,
+    )
+
+
+def correlation_of(
+    returns: NDArray[np.float64],
+    least: int = 3,
+) -> float:
     """Return the mean correlation of pairs of rows over their common columns.
 
-    Nan if no pair has the ``least`` number.
-
-    Rows that do not vary do not count.
+    Only pairs of rows that vary count, and only those with the ``least`` number of common columns.
+    Nan without such a pair.
     """
-    found = []
-    for one, other in combinations(returns, 2):
-        both = ~np.isnan(one + other)
-        if both.sum() >= least and np.ptp(one[both]) > 0 and np.ptp(other[both]) > 0:
-            found.append(np.corrcoef(one[both], other[both])[0, 1])
-    return float(np.mean(found)) if found else float("nan")
+    correlations: list[float] = []
+    for first, second in combinations(returns, 2):
+        common = ~np.isnan(first + second)
+        pair = np.array([first[common], second[common]])
+        if common.sum() >= least and np.ptp(pair, axis=1).all():
+            correlations.append(np.corrcoef(pair)[0, 1])
+    if not correlations:
+        return np.nan
+    return float(np.mean(correlations))
 
 
-def warn_of_futures(name: str, outcomes: Iterable[list[Any]], returns: NDArray[np.float64]) -> None:
-    """Warn of futures that are all the same although chance was drawn anew, and of those that candidates do not share.
+def warn_of_futures(
+    name: str, outcomes: Iterable[Sequence[object]], returns: NDArray[np.float64]
+) -> None:
+    """Warn of futures that are all the same, and of futures that candidates do not share.
 
     Args:
         name: The name of the simulation.
-        outcomes: For each plan, what was seen in its futures.
+        outcomes: For each sequence of candidates, its outcomes in several futures. Chance was drawn
+            anew for each of them.
         returns: As in ``ActionValues``.
     """
-    several = [seen for seen in outcomes if len(seen) >= _SEVERAL]
-    if any(seen.count(seen[0]) != len(seen) for seen in several):
-        # it draws; by chance, or near the end, futures can be the same later
+    compared = [futures for futures in outcomes if len(futures) >= _SEVERAL]
+    if any(futures.count(futures[0]) < len(futures) for futures in compared):
+        # The simulation draws. Later futures may be the same by chance, or near the end.
         _SETTLED.add((name, "same futures"))
-    elif several:
+    elif compared:
         _warn_once(
             name,
             "same futures",
@@ -108,31 +149,36 @@ def warn_of_futures(name: str, outcomes: Iterable[list[Any]], returns: NDArray[n
         )
 
 
-def warn_of_times(name: str, rollouts: Sequence[list[float]]) -> None:
-    """Warn of a horizon in decisions, if it ends at different times: if times vary between rollouts.
+def warn_of_times(
+    name: str,
+    rollouts: Sequence[Sequence[float]],
+) -> None:
+    """Warn of a horizon in decisions that ends at different times, because decisions do.
 
     Args:
         name: The name of the simulation.
-        rollouts: The times between decisions, in each rollout.
+        rollouts: For each rollout, the simulation's times between its decisions.
     """
-    at_each = [
-        np.array([time for time in times if time is not None]) for times in zip_longest(*rollouts)
-    ]
-    times = np.concatenate([np.zeros(0), *at_each])
-    if len(times) < _MANY or times.mean() <= 0:
+    times = np.array([*zip_longest(*rollouts, fillvalue=np.nan)])  # (decisions, rollouts)
+    if np.isfinite(times).sum() < _MANY:
         return
-    spread = np.sqrt(np.mean(np.concatenate([times - times.mean() for times in at_each]) ** 2))
-    if spread > _VARIATION * times.mean():
+    mean = np.nanmean(times)
+    deviations = times - np.nanmean(times, axis=1, keepdims=True)
+    spread = np.sqrt(np.nanmean(deviations**2))
+    if spread > _VARIATION * mean > 0:
         _warn_once(
             name,
             "times",
             f"the times between the decisions of {name} vary, so that a horizon in decisions ends"
-            " at another time for"
-            ' each candidate; use horizon_by="time"',
+            ' at another time for each candidate; use horizon_by="time"',
         )
 
 
-def _warn_once(name: str, kind: str, message: str) -> None:
+def _warn_once(
+    name: str,
+    kind: str,
+    message: str,
+) -> None:
     """Warn of a simulation, once for each kind of warning."""
     if (name, kind) not in _SETTLED:
         _SETTLED.add((name, kind))

@@ -61,7 +61,7 @@ def generate_env(
     """
     plan = plan_of(simulation, points, options)
     base = view_class(plan, view)
-    base._adapt(plan)  # raises errors at once
+    base.adapt(plan)  # raises errors at once
 
     def initialise(self: Any, **changes: Any) -> None:
         current = plan_of(simulation, points, options) if plan.is_stale else plan
@@ -71,7 +71,7 @@ def generate_env(
         "__init__": initialise,
         "__doc__": f"A view of {plan.name}: {', '.join(point.hook.name for point in plan.active)}.",
         "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
-        "metadata": base._metadata_of(plan),
+        "metadata": base.metadata_of(plan),
     }
     return type(f"{plan.name}Env", (base,), attributes)
 

@@ -77,13 +77,13 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         part = range(0 if workers else self.num_envs)
         batch = SimulationBatch(simulation, points, options, view, self._mode, part)
         self.render_mode = batch.plan.options.render_mode
-        self.metadata = {**batch.view._metadata_of(batch.plan), "autoreset_mode": self._mode}
+        self.metadata = {**batch.metadata, "autoreset_mode": self._mode}
         self.single_observation_space = batch.observation_space
         self.single_action_space = batch.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         # what is legal is known here
-        self._checks_alone = batch.joint is None and batch.plan.active[0].legal is None
+        self._checks_alone = batch.checks_spaces_only
         self._begun = False
         # where the next episode begins with the next step or a reset
         self._ended: frozenset[int] = frozenset()

@@ -401,7 +401,7 @@ class View:
 
     def __deepcopy__(self, memory: dict[int, Any]) -> Self:
         """Make an environment like this one, with another simulation. It needs a reset."""
-        made = type(self).__new__(type(self))
+        made = object.__new__(type(self))
         memory[id(self)] = made
         made.__setstate__(copy.deepcopy(self.__getstate__(), memory))
         return made
@@ -420,8 +420,12 @@ class View:
         return _unpickled, (pack((view, self.__getstate__())),)
 
     def __getstate__(self) -> tuple[Any, ...]:
-        """Return the plan, the session's snapshot and the attributes of a copy."""
-        return self.session.plan, self.session.snapshot(), self._copied_attributes()
+        """Return the plan, the session's snapshot and the attributes of a copy.
+
+        The attributes include those that users have set.
+        """
+        attributes = {name: value for name, value in vars(self).items() if name not in _NOT_COPIED}
+        return self.session.plan, self.session.snapshot(), attributes
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         """Make this environment a copy of the one that has returned a state."""
@@ -431,14 +435,11 @@ class View:
         self._attach(session, attributes)
         self._clear()
 
-    def _copied_attributes(self) -> dict[str, Any]:
-        """Return the attributes that a copy takes over, also those that users have set."""
-        return {name: value for name, value in vars(self).items() if name not in _NOT_COPIED}
-
     def cloned(self, session: BaseSession) -> Self:
         """Make an environment in the same state, whose session stands at the same decision."""
-        made = type(self).__new__(type(self))
-        made._attach(session, copy.deepcopy(self._copied_attributes()))
+        *_, attributes = self.__getstate__()
+        made = object.__new__(type(self))
+        made._attach(session, copy.deepcopy(attributes))
         return made
 
     def check_pending(self) -> None:

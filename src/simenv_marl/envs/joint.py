@@ -1,11 +1,12 @@
 """The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
 
 from ..core import (
     Action,
@@ -31,21 +32,18 @@ class Joint:
         observation_space, action_space: The combined spaces.
     """
 
-    observation_space: Space
-    action_space: Space
-
     def __init__(self, roster: Mapping[str, Point], *, flatten: bool) -> None:
         """Combine the spaces, or raise ``ViewError`` if they cannot be flattened."""
         self.roster = roster
-        observations: dict[str, Space] = {}
-        actions: dict[str, Space] = {}
+        observations = {}
+        actions = {}
         for name, point in roster.items():
             observations[name] = deepcopy(point.definition.observation_space)
             actions[name] = deepcopy(point.definition.action_space)
+        self.observation_space: Space = spaces.Dict(observations)
+        self.action_space: Space = spaces.Dict(actions)
         self._flatten = flatten
         if not flatten:
-            self.observation_space = spaces.Dict(observations)
-            self.action_space = spaces.Dict(actions)
             return
         self.observation_space = _concatenate(observations.values())
         self.action_space = _concatenate(actions.values(), discrete=True)
@@ -86,7 +84,7 @@ class Joint:
 
         An agent that has ended keeps its last observation.
         """
-        observations: dict[str, Observation] = {}
+        observations = {}
         for name, agent in self.agents(episode).items():
             observation = agent.observation
             if observation is None:
@@ -228,19 +226,23 @@ class SimulationJointEnv(OneAgentView):
         return actions
 
 
-def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
+def _concatenate(parts: Iterable[Any], *, discrete: bool = False) -> Space:
     """Return the space of concatenated vectors. ``discrete``: they may all be discrete, too."""
-    kinds = (spaces.Discrete, spaces.MultiDiscrete)
-    if discrete and all(isinstance(space, kinds) and np.ndim(space.start) < 2 for space in parts):
-        sizes = [
-            np.atleast_1d(space.nvec if isinstance(space, kinds[1]) else space.n) for space in parts
-        ]
-        starts = [np.atleast_1d(space.start) for space in parts]
-        return spaces.MultiDiscrete(np.concatenate(sizes), start=np.concatenate(starts))
-    for space in parts:
-        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+    kind: type[Space] = spaces.Box
+    vectors = list(parts)
+    if discrete and isinstance(vectors[0], (spaces.Discrete, spaces.MultiDiscrete)):
+        kind = spaces.MultiDiscrete
+        for place, space in enumerate(vectors):
+            if isinstance(space, spaces.Discrete):
+                vectors[place] = batch_space(space, 1)
+    for space in vectors:
+        if not isinstance(space, kind) or len(space.shape or ()) != 1:
             raise ViewError(
                 "flatten=True needs one-dimensional Box spaces, and actions that are all"
                 f" continuous or all discrete, not {space}"
             )
-    return spaces.flatten_space(spaces.Tuple(parts))
+    if kind is spaces.Box:
+        return spaces.flatten_space(spaces.Tuple(vectors))
+    sizes = np.concatenate([space.nvec for space in vectors])
+    starts = np.concatenate([space.start for space in vectors])
+    return spaces.MultiDiscrete(sizes, start=starts)

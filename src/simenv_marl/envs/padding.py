@@ -38,22 +38,37 @@ def pad_agents(env: Model) -> PaddedAECEnv | PaddedParallelEnv:
     return PaddedAECEnv(env) if isinstance(env, AECEnv) else PaddedParallelEnv(env)
 
 
-def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Info]) -> tuple[Any, ...]:
-    """Return the rewards, terminations, truncations and infos of all possible agents."""
+def _pad(
+    view: AgentsView,
+    observations: dict[str, Observation],
+    rewards: dict[str, float],
+    infos: dict[str, Info],
+) -> Results:
+    """Return the results of all possible agents, from the results of live and ended ones."""
     episode = view.episode
-    padded: dict[str, Info] = {}
+    padded_observations = {}
+    padded_infos = {}
     for agent in view.known_agents():
-        info = infos.get(agent.name)
-        if info is None or agent.ended or not agent.present:
+        name = agent.name
+        present = agent.present and not agent.ended
+        if present:
+            info = infos[name]
+            padded_observations[name] = observations.get(name)
+        else:
             agent.clear_observation()
             agent.take_observation()  # so that ``observe`` and ``state`` have blanks
-            info = {**agent.info, "present": False}
+            info = agent.info
             if view.in_rounds:
-                info |= {"deciding": False, "acted": agent.acted}
-        padded[agent.name] = {"present": True, **info}
-    terminations = dict.fromkeys(padded, episode.terminated)
-    truncations = dict.fromkeys(padded, episode.truncated)
-    return dict.fromkeys(padded, 0.0) | rewards, terminations, truncations, padded
+                info = {**info, "deciding": False, "acted": agent.acted}
+            padded_observations[name] = agent.point.blank()
+        padded_infos[name] = {**info, "present": present}
+    return (
+        padded_observations,
+        dict.fromkeys(padded_infos, 0.0) | rewards,
+        dict.fromkeys(padded_infos, episode.terminated),
+        dict.fromkeys(padded_infos, episode.truncated),
+        padded_infos,
+    )
 
 
 class PaddedParallelEnv(BaseParallelWrapper[str, Observation, Action]):
@@ -70,8 +85,8 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Observation, Action]):
     ) -> tuple[dict[str, Observation], dict[str, Info]]:
         """Reset the environment; return the observations and infos of all possible agents."""
         observations, infos = super().reset(seed=seed, options=options)
-        *_, infos = _pad(self.unwrapped, {}, infos)
-        return self._observe(observations, infos), infos
+        observations, *_, infos = _pad(self.unwrapped, observations, {}, infos)
+        return observations, infos
 
     def step(self, actions: Mapping[str, Action]) -> Results:
         """Play a round; return the results of all possible agents."""
@@ -82,17 +97,7 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Observation, Action]):
         observations, rewards, *_, infos = super().step(actions)
         if not observations:  # after the end of the episode
             return {}, {}, {}, {}, {}
-        rewards, terminations, truncations, infos = _pad(self.unwrapped, rewards, infos)
-        return self._observe(observations, infos), rewards, terminations, truncations, infos
-
-    def _observe(
-        self, observations: dict[str, Observation], infos: dict[str, Info]
-    ) -> dict[str, Observation]:
-        """Return the observations of all possible agents, blank for absent ones."""
-        for agent in self.unwrapped.known_agents():
-            if not infos[agent.name]["present"]:
-                observations[agent.name] = agent.point.blank()
-        return {name: observations[name] for name in infos}
+        return _pad(self.unwrapped, observations, rewards, infos)
 
 
 class PaddedAECEnv(BaseWrapper[str, Observation, Action]):
@@ -132,8 +137,8 @@ class PaddedAECEnv(BaseWrapper[str, Observation, Action]):
         infos = env.infos
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
-        padded = _pad(self.unwrapped, rewards, infos)
-        self.rewards, self.terminations, self.truncations, self.infos = padded
+        results = _pad(self.unwrapped, {}, rewards, infos)
+        _, self.rewards, self.terminations, self.truncations, self.infos = results
         for name, reward in rewards.items():
             self._cumulative_rewards[name] += reward
         self.agent_selection = self.agents[0] if episode.over else env.agent_selection

@@ -112,9 +112,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
             agents = {agent.name: agent for agent in ended} | agents
         terminations = dict.fromkeys(agents, episode.terminated)
         truncations = dict.fromkeys(agents, episode.truncated)
-        observations: dict[str, Observation] = {}
-        rewards: dict[str, float] = {}
-        infos: dict[str, Info] = {}
+        observations = {}
+        rewards = {}
+        infos = {}
         for name, agent in agents.items():
             observations[name] = self._hand_out(agent)
             rewards[name] = agent.reward

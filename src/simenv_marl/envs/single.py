@@ -83,8 +83,11 @@ class SimulationEnv(OneAgentView):
                 "desired_goal": definition.desired_goal_mapping,
             }
             asking = {key for key, part in mappings.items() if asks_for(part, "_simulation")}
-            parts = dict.fromkeys(mappings, goal)
-            parts["observation"] = definition.observation_space
+            parts = {
+                "observation": definition.observation_space,
+                "achieved_goal": goal,
+                "desired_goal": goal,
+            }
             changed = replace(
                 definition,
                 observation_space=spaces.Dict(parts),
@@ -121,10 +124,14 @@ class SimulationEnv(OneAgentView):
         agent = self.own_agent
         if agent.ended:
             return agent.observation, agent.reward, True, False, agent.info
-        outcome = episode.outcome  # its properties would each take as long as a comparison
-        terminated = outcome is Outcome.TERMINATED
-        truncated = outcome is Outcome.TRUNCATED
-        return agent.observation, agent.reward, terminated, truncated, agent.info
+        outcome = episode.outcome  # compared here, because properties take as long as a step
+        return (
+            agent.observation,
+            agent.reward,
+            outcome is Outcome.TERMINATED,
+            outcome is Outcome.TRUNCATED,
+            agent.info,
+        )
 
     def read(self, episode: EpisodeState) -> tuple[Observation, float, Info]:
         """Return the observation, the reward and the info of a step."""
@@ -143,9 +150,7 @@ class SimulationEnv(OneAgentView):
         return episode.terminated, episode.truncated
 
     @property
-    def compute_reward(
-        self,
-    ) -> Callable[[Observation, Observation, Model], float | NDArray[np.float64]]:
+    def compute_reward(self) -> Callable[..., float | NDArray[np.float64]]:
         """A function that returns the rewards for other goals, if the decision point has a goal.
 
         Its arguments are the achieved goals, of shape ``goal_space.shape``, or
@@ -179,7 +184,7 @@ def _observe_with_goals(
     **kwargs: Model,
 ) -> dict[str, Observation]:
     """Observe a call. ``asking``: the keys of the mappings that ask for the simulation."""
-    observation: dict[str, Observation] = {}
+    observation = {}
     for key, mapping in mappings.items():
         named = {**kwargs, "_simulation": _simulation} if key in asking else kwargs
         observation[key] = mapping(*args, **named)

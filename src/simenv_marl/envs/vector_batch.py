@@ -64,10 +64,9 @@ class SimulationBatch:
         sub-environments.
         """
         plan = plan_of(simulation, points, options)
-        if points is None:
-            registered = decision_points()
-            if [point.name for point in plan.subject.named] == registered:
-                points = registered
+        names = [point.name for point in plan.subject.named]
+        if points is None and names == decision_points():
+            points = names
         if view is None:
             view = "joint" if plan.one_agent is None else "single"
         kind: type[SimulationEnv | SimulationJointEnv] = SimulationEnv
@@ -148,22 +147,23 @@ class SimulationBatch:
             Observations, rewards, terminations, truncations, the numbers of the sub-environments
             that have ended now, and infos.
         """
-        places: Sequence[int] = range(len(self.views))
-        begun = [place for place in places if self._part[place] in ended] if ended else []
+        begun: list[int] = []
+        moving: list[int] = []
+        for place, number in enumerate(self._part):
+            (begun if number in ended else moving).append(place)
         self._first = None if begun else 0
         for place in begun:
             self._begin(place)
-        episodes: list[Episode] = []
+        episodes = []
         for session in self._sessions:
             if session.episode is None:  # its view was closed
                 raise session.refusal()
             episodes.append(session.episode)
-        moving = episodes
-        if begun:
-            places = [place for place in places if place not in begun]
-            moving = [episodes[place] for place in places]
-            actions = [actions[place] for place in places]
-        step_all(moving, actions, lambda index, error: self._fail(places[index], error))
+        step_all(
+            [episodes[place] for place in moving],
+            [actions[place] for place in moving],
+            lambda index, error: self._fail(moving[index], error),
+        )
         rows = [view.read(episode) for view, episode in zip(self.views, episodes, strict=True)]
         observations, earned, infos = zip(*rows, strict=True)
         self._observations = list(observations)
@@ -177,15 +177,13 @@ class SimulationBatch:
 
     def _take_ends(self, episodes: list[Episode], infos: Sequence[Info]) -> tuple[Any, ...]:
         """Return terminations, truncations, the numbers of ended sub-environments, and infos."""
-        terminations = np.zeros(len(episodes), np.bool_)
-        truncations = np.zeros(len(episodes), np.bool_)
+        terminations, truncations = np.zeros((2, len(episodes)), np.bool_)
         ended: list[int] = []
         numbered: Infos = []
-        if not any(infos) and None not in [episode.pending for episode in episodes]:
-            return terminations, truncations, ended, numbered
-        for place, (episode, info) in enumerate(zip(episodes, infos, strict=True)):
-            number = self._part[place]
-            if episode.over and not episode.unreported_end:  # the next step reports such an end
+        for place, number in enumerate(self._part):
+            episode = episodes[place]
+            info = infos[place]
+            if episode.pending is None and not episode.unreported_end:  # else a later step ends it
                 terminations[place], truncations[place] = self.views[place].has_ended(episode)
                 if self._mode == AutoresetMode.SAME_STEP:
                     final = {"final_obs": self._observations[place], "final_info": info}

@@ -157,7 +157,7 @@ class Rollouts:
         number = player.record.answered if consulted else player.episode.turns
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if policy.seed is None else (policy.seed,))]
-        self._name = player.view._plan.name
+        self._name = player.view.session.plan.name
         try:
             player.view.session.check_reseed()
             self.reseeds = True

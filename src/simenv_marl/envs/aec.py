@@ -1,6 +1,4 @@
-"""The AEC view: it selects agents in the order in which the simulation asks for decisions."""
-
-from typing import Any
+"""The AEC view: it selects agents in the order of the simulation's decisions."""
 
 from numpy import ndarray
 from pettingzoo import AECEnv
@@ -8,11 +6,11 @@ from pettingzoo import AECEnv
 from ..core import Action, Agent, EpisodeState, Info, Observation, duplicate
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
-from .base import AgentsView
+from .base import AgentsView, ResetOptions, StepResult
 
 
 class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
-    """A simulation as a PettingZoo AEC environment. Made by ``aec_env`` and ``generate_env``.
+    """A simulation as a PettingZoo AEC environment. ``aec_env`` and ``generate_env`` make it.
 
     ``possible_agents`` exists only if all agents are known beforehand. The time for a step does not
     depend on the number of agents: PettingZoo's helpers for rewards and dead steps, which loop over
@@ -30,7 +28,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
             observed, its mask has all actions legal.
     """
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> None:
         """Reset the simulation and run it to its first decision.
 
         Args:
@@ -78,8 +76,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
         if self._shows:
             self.show_step()
 
-    def last(self, observe: bool = True) -> tuple[Observation, float, bool, bool, Info]:
-        """Return the results of the latest step for ``agent_selection``.
+    def last(self, observe: bool = True) -> StepResult:
+        """Return the latest results of ``agent_selection``.
 
         Args:
             observe: Whether to return the observation, or None instead.
@@ -184,14 +182,12 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
     def _record_ends(self, episode: EpisodeState) -> None:
         """Record the agents that have ended, in the order of their None steps."""
         ended = episode.take_ended()
-        for agent in ended:
-            self._note(agent, agent.reward, terminated=True)
         if episode.over:
             # Those that have never decided come last.
-            others = sorted(episode.agents.values(), key=lambda agent: not agent.decided)
-            for agent in others:
-                self._note(agent, agent.reward, episode.terminated, episode.truncated)
-            ended += others
+            ended += sorted(episode.agents.values(), key=lambda agent: not agent.decided)
+        for agent in ended:
+            truncated = episode.truncated and not agent.ended
+            self._note(agent, agent.reward, not truncated, truncated)
         self._rewarded = [agent.name for agent in ended]
         self._leaving = self._rewarded[::-1]
 

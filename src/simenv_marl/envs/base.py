@@ -7,7 +7,7 @@ import pickle
 import weakref
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Self, SupportsIndex, TypeVar
+from typing import Any, Self, SupportsIndex, TypeAlias, TypeVar
 from zlib import crc32
 
 import gymnasium as gym
@@ -44,6 +44,12 @@ from ..errors import (
 from ..plugins import Entry
 
 Result = TypeVar("Result")
+
+ResetOptions: TypeAlias = dict[str, Any] | None
+"""The options of a reset."""
+
+StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
+"""Observation, reward, terminated, truncated, info."""
 
 _NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session"))
 """The attributes that each view makes for itself."""
@@ -296,7 +302,7 @@ class View:
     def _start(
         self,
         seed: int | None,
-        options: dict[str, Any] | None,
+        options: ResetOptions,
         begin: Callable[[EpisodeState], Result],
     ) -> Result:
         """Begin another episode, and return the results of ``begin`` at its first decision.
@@ -339,8 +345,8 @@ class View:
             if episode is None or episode.over:
                 self._clear()
             if self._finalizer is not None and session.idle:
-                # It would keep the session alive, and with it an environment to which its own
-                # parts refer.
+                # It would keep the session alive, and with it an environment that its own options
+                # refer to.
                 self._finalizer.detach()
 
     def _clear(self) -> None:
@@ -386,7 +392,7 @@ class View:
         return point
 
     def _seed_spaces(self, agent: str, seed: int | None) -> None:
-        """Seed the spaces of an agent by its name, and not by the order in which agents join."""
+        """Seed the spaces of an agent by its name, because agents may join in any order."""
         if seed is None:
             return
         sequence = np.random.SeedSequence([seed, crc32(agent.encode(errors="surrogatepass"))])
@@ -422,7 +428,7 @@ class View:
     def __getstate__(self) -> tuple[Any, ...]:
         """Return the plan, the session's snapshot and the attributes of a copy.
 
-        The attributes include those that users have set.
+        The attributes include all that users have set.
         """
         attributes = {name: value for name, value in vars(self).items() if name not in _NOT_COPIED}
         return self.session.plan, self.session.snapshot(), attributes
@@ -565,11 +571,11 @@ class OneAgentView(View, gym.Env[Any, Any]):
         raise NotImplementedError
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: ResetOptions = None
     ) -> tuple[Observation, Info]:
         """Reset the simulation and run it to its first decision.
 
-        The arguments and errors are those of ``SimulationAECEnv.reset``.
+        For the arguments and errors, see ``SimulationAECEnv.reset``.
 
         Returns:
             The observation and the info.

@@ -1,16 +1,14 @@
 """The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
 
 from ..core import (
     Action,
-    Agent,
     EpisodeState,
     Info,
     Observation,
@@ -21,7 +19,7 @@ from ..core import (
 )
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE
-from .base import OneAgentView
+from .base import OneAgentView, StepResult
 
 
 class Joint:
@@ -85,7 +83,8 @@ class Joint:
         An agent that has ended keeps its last observation.
         """
         observations = {}
-        for name, agent in self.agents(episode).items():
+        for name in self.roster:
+            agent = episode.agents.get(name) or episode.ended[name]
             observation = agent.observation
             if observation is None:
                 observations[name] = agent.point.blank()
@@ -102,21 +101,19 @@ class Joint:
             reward += agent.reward
         return reward
 
-    def agents(self, episode: EpisodeState) -> dict[str, Agent]:
-        """Return the agents of an episode, live or ended, in the order of the roster."""
-        return {name: episode.agents.get(name) or episode.ended[name] for name in self.roster}
-
     def inform(self, episode: EpisodeState, before: float | None) -> Info:
         """Return the info of a step or a reset. ``before``: the time of the previous one."""
+        acted = {}
+        masks = {}
+        for name in self.roster:
+            agent = episode.agents.get(name) or episode.ended[name]
+            acted[name] = agent.acted
+            if agent.mask is not None:
+                masks[name] = duplicate(agent.mask)
         pending = episode.pending
-        agents = self.agents(episode)
-        info: Info = {
-            "deciding": "" if pending is None else pending.name,
-            "acted": {name: agent.acted for name, agent in agents.items()},
-        }
-        masks = {name: agent.mask for name, agent in agents.items() if agent.mask is not None}
+        info: Info = {"deciding": "" if pending is None else pending.name, "acted": acted}
         if masks:
-            info["action_mask"] = duplicate(masks)
+            info["action_mask"] = masks
         if episode.clock is not None:
             info |= episode.clock.read(before)
         return info
@@ -126,9 +123,9 @@ class SimulationJointEnv(OneAgentView):
     """A simulation as a Gymnasium environment with one agent that takes all decisions.
 
     ``joint_env`` makes it. A step is a round of the parallel view with an action for each agent.
-    The reward is the sum of their rewards. The agents are those that are known when the environment
-    is made: agents with strings as names, those in ``possible_agents``, and those that the
-    simulation's ``expected_calls`` announces after a reset.
+    The reward is the sum of their rewards. All agents must be known when the environment is made:
+    agents with strings as names, agents in ``possible_agents``, and agents that the simulation's
+    ``expected_calls`` announces after a reset.
 
     Attributes:
         observation_space, action_space: ``Dict`` spaces by agent. With ``flatten=True``:
@@ -148,8 +145,9 @@ class SimulationJointEnv(OneAgentView):
         session = self.session
         if not session.plan.complete:
             if not hasattr(session.simulation, "expected_calls"):
-                hooks = [point.hook for point in session.plan.active if point.agent is None]
-                points = ", ".join(hook.name for hook in hooks)
+                points = ", ".join(
+                    point.hook.name for point in session.plan.active if point.agent is None
+                )
                 raise ViewError(
                     "all agents must be known when the environment is made, and a callable names"
                     f" those of {points}; declare them with possible_agents=, let the simulation"
@@ -166,13 +164,13 @@ class SimulationJointEnv(OneAgentView):
     def _original_spaces(self, agent: str) -> tuple[Space, Space]:
         return self.joint.observation_space, self.joint.action_space
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
+    def step(self, action: Action) -> StepResult:
         """Play a round with an action for each agent.
 
         Args:
-            action: An action in the action space, with an action for each agent (those of ended
-                agents are not used). ``RULE``, or ``RULE`` instead of an agent's action, lets the
-                rule decide.
+            action: An action in the action space, with an action for each agent (actions of
+                ended agents are not used). ``RULE``, or ``RULE`` instead of an agent's action, lets
+                the rule decide.
 
         Returns:
             Observation, sum of the rewards (a Python float), terminated, truncated, info. An agent
@@ -226,23 +224,19 @@ class SimulationJointEnv(OneAgentView):
         return actions
 
 
-def _concatenate(parts: Iterable[Any], *, discrete: bool = False) -> Space:
+def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
     """Return the space of concatenated vectors. ``discrete``: they may all be discrete, too."""
-    kind: type[Space] = spaces.Box
-    vectors = list(parts)
-    if discrete and isinstance(vectors[0], (spaces.Discrete, spaces.MultiDiscrete)):
-        kind = spaces.MultiDiscrete
-        for place, space in enumerate(vectors):
-            if isinstance(space, spaces.Discrete):
-                vectors[place] = batch_space(space, 1)
-    for space in vectors:
-        if not isinstance(space, kind) or len(space.shape or ()) != 1:
+    kinds = (spaces.Discrete, spaces.MultiDiscrete)
+    if discrete and all(isinstance(space, kinds) and np.ndim(space.start) < 2 for space in parts):
+        sizes = [
+            np.atleast_1d(space.nvec if isinstance(space, kinds[1]) else space.n) for space in parts
+        ]
+        starts = [np.atleast_1d(space.start) for space in parts]
+        return spaces.MultiDiscrete(np.concatenate(sizes), start=np.concatenate(starts))
+    for space in parts:
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ViewError(
                 "flatten=True needs one-dimensional Box spaces, and actions that are all"
                 f" continuous or all discrete, not {space}"
             )
-    if kind is spaces.Box:
-        return spaces.flatten_space(spaces.Tuple(vectors))
-    sizes = np.concatenate([space.nvec for space in vectors])
-    starts = np.concatenate([space.start for space in vectors])
-    return spaces.MultiDiscrete(sizes, start=starts)
+    return spaces.flatten_space(spaces.Tuple(parts))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
 from ..core import Action, Info, Model, Observation
 from ..errors import ViewError, short_repr
-from .base import AgentsView
+from .base import AgentsView, ResetOptions
 from .parallel import Results
 
 
@@ -81,7 +80,7 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Observation, Action]):
         return [] if episode is None or episode.over else list(self.possible_agents)
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
+        self, seed: int | None = None, options: ResetOptions = None
     ) -> tuple[dict[str, Observation], dict[str, Info]]:
         """Reset the environment; return the observations and infos of all possible agents."""
         observations, infos = super().reset(seed=seed, options=options)
@@ -109,10 +108,10 @@ class PaddedAECEnv(BaseWrapper[str, Observation, Action]):
 
     @property
     def agents(self) -> list[str]:
-        """All possible agents without those that have taken their None step."""
+        """All possible agents that have not taken their None step."""
         return self._left if self.unwrapped.agents else []
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> None:
         """Reset the environment."""
         super().reset(seed=seed, options=options)
         self._left = list(self.possible_agents)

@@ -1,14 +1,14 @@
-"""The parallel view: rounds, in which every agent has at most one action."""
+"""The parallel view: each step is a round with at most one action of every agent."""
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from pettingzoo import ParallelEnv
 
 from ..core import Action, Agent, EpisodeState, Info, Observation, Round, duplicate
 from ..errors import warn_user
 from ..simulation import Sentinel
-from .base import AgentsView
+from .base import AgentsView, ResetOptions
 
 Results: TypeAlias = tuple[
     dict[str, Observation],
@@ -38,11 +38,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
     _warned_of_unused_actions = False
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
+        self, seed: int | None = None, options: ResetOptions = None
     ) -> tuple[dict[str, Observation], dict[str, Info]]:
         """Reset the simulation and run it to its first decision.
 
-        The arguments and errors are those of ``SimulationAECEnv.reset``.
+        For the arguments and errors, see ``SimulationAECEnv.reset``.
 
         Returns:
             The observations and the infos, by agent.

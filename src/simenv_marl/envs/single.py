@@ -1,6 +1,6 @@
 """The single view: a Gymnasium environment of one agent.
 
-A planner gets it for the agent for which it decides.
+A planner gets the view of the agent that it decides for.
 """
 
 from __future__ import annotations
@@ -24,12 +24,11 @@ from ..core import (
     Outcome,
     Plan,
     Points,
-    Source,
     make_plan,
 )
 from ..errors import CopyError, ReentrancyError, ViewError
 from ..simulation import asks_for
-from .base import OneAgentView
+from .base import OneAgentView, ResetOptions, StepResult
 
 _REFUSAL = (
     "a policy cannot move the environment that it is given: it must return an action; branch tries"
@@ -37,9 +36,7 @@ _REFUSAL = (
 )
 
 
-def plan_of(
-    simulation: Source, points: Points, options: Mapping[str, Any], **settings: Any
-) -> Plan:
+def plan_of(simulation: Model, points: Points, options: Mapping[str, Any], **settings: Any) -> Plan:
     """Make a plan, as ``make_plan`` does. Its planners get the view of their agent."""
     return make_plan(simulation, points, options, planner_view=PlannerEnv.of_session, **settings)
 
@@ -106,7 +103,7 @@ class SimulationEnv(OneAgentView):
     def _clear(self) -> None:
         vars(self).pop("own_agent", None)  # because it holds arguments of the model
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
+    def step(self, action: Action) -> StepResult:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
 
         Returns:
@@ -229,12 +226,12 @@ class PlannerEnv(SimulationEnv):
         if episode.deciding is not self.own_agent:
             raise episode.refusal()
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
+    def step(self, action: Action) -> StepResult:
         """In a branch, answer the pending decision and run to the agent's next one."""
         self._check_branched()
         return super().step(action)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
+    def reset(self, *, seed: int | None = None, options: ResetOptions = None) -> NoReturn:
         """Refuse the reset: this is the environment of one decision."""
         raise ReentrancyError(_REFUSAL)
 

@@ -19,7 +19,6 @@ from ..core import (
     Model,
     Observation,
     Points,
-    Source,
     checked_seed,
     duplicate,
     is_seed,
@@ -37,7 +36,7 @@ from ..errors import (
 )
 from ..many.parallel import WorkerPool
 from ..simulation import RULE
-from .base import OneAgentView
+from .base import OneAgentView, ResetOptions
 from .vector_batch import Infos, SimulationBatch
 
 
@@ -58,7 +57,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
 
     def __init__(
         self,
-        simulation: Source,
+        simulation: Model,
         points: Points,
         options: Mapping[str, Any],
         view: str | None = None,
@@ -69,7 +68,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         context: Any = None,
     ) -> None:
-        """Make the environment; the arguments are those of ``vector_env``.
+        """Make the environment. ``vector_env`` explains the arguments.
 
         Raises:
             SimEnvError: An argument is invalid. The message says which.
@@ -114,7 +113,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        options: ResetOptions = None,
     ) -> tuple[Observation, Info]:
         """Reset all simulations, or some of them, and run them to their first decisions.
 
@@ -126,7 +125,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
                 bool array of shape ``(num_envs,)``, selects the simulations to reset.
 
         Returns:
-            The observations of all simulations, and the infos of those that were reset.
+            The observations of all simulations, and the infos of the ones that were reset.
 
         Raises:
             OptionValueError: The seeds or the mask are invalid.
@@ -172,9 +171,8 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
                     ' with reset(options={"reset_mask": ...})'
                 )
             results = self._simulations.ask("step", self._split(actions), self._ended)
-            *columns, ended, infos = self._join(results)
+            observations, rewards, terminations, truncations, ended, infos = self._join(results)
             self._ended = set(ended)
-        observations, rewards, terminations, truncations = columns
         return observations, rewards, terminations, truncations, self._merge(infos)
 
     def _check_begun(self) -> None:
@@ -183,8 +181,8 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             raise NotResetError("there is no episode yet; call reset() without a reset_mask")
         if self._simulations.failed:
             raise EpisodeOverError(
-                "an error has ended the episodes; call reset() without a reset_mask to begin the next"
-                " ones"
+                "an error has ended the episodes; call reset() without a reset_mask to begin the"
+                " next ones"
             )
 
     def _join(self, results: list[Any]) -> tuple[Any, ...]:
@@ -217,16 +215,12 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             )
         space = self.single_action_space
         if type(actions) is np.ndarray and self._checks_spaces_only:
-            if not isinstance(space, spaces.Discrete):
-                if actions.dtype == space.dtype and self.action_space.contains(actions):
-                    return list(actions.copy())  # so that the caller cannot change them
-            elif (
-                actions.dtype.kind in "iu"
-                and actions.shape == (self.num_envs,)
-                and actions.min() >= space.start
-                and actions.max() < space.start + space.n
-            ):
-                return list(actions.tolist())
+            is_legal = self.action_space.contains(actions)
+            if isinstance(space, spaces.Discrete):
+                if is_legal and actions.dtype.kind in "iu":
+                    return list(actions.tolist())
+            elif is_legal and actions.dtype == space.dtype:
+                return list(actions.copy())  # so that the caller cannot change them
         try:
             parts = list(iterate(self.action_space, actions))
         except Exception as error:
@@ -253,9 +247,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         if len(items) != self.num_envs:
             raise OptionValueError(f"there are {len(items)} {noun} for {self.num_envs} simulations")
 
-    def _chosen(
-        self, options: dict[str, Any] | None
-    ) -> tuple[NDArray[np.bool_], dict[str, Any] | None]:
+    def _chosen(self, options: ResetOptions) -> tuple[NDArray[np.bool_], ResetOptions]:
         """Return the mask of the simulations to reset, and the options for them."""
         if options is None or "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_), options

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -19,7 +19,6 @@ from ..core import (
     Observation,
     Points,
     Session,
-    Source,
     UnmatchedNames,
     close_all,
     stacker,
@@ -27,11 +26,12 @@ from ..core import (
 from ..decision import decision_points
 from ..errors import InvalidActionError, OptionValueError, annotate, short_repr
 from ..many.batch import step_all
+from .base import ResetOptions
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, plan_of
 
 Infos = list[tuple[int, Info]]
-"""Infos, each with the number of its sub-environment, in the order in which they must be merged."""
+"""Infos with the numbers of their sub-environments. They must be merged in this order."""
 
 
 class SimulationBatch:
@@ -51,7 +51,7 @@ class SimulationBatch:
 
     def __init__(
         self,
-        simulation: Source,
+        simulation: Model,
         points: Points,
         options: Mapping[str, Any],
         view: str | None,
@@ -117,7 +117,7 @@ class SimulationBatch:
     # -- episodes ---------------------------------------------------------------------------------
 
     def reset(
-        self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: NDArray[np.bool_]
+        self, seeds: Sequence[int | None], options: ResetOptions, chosen: NDArray[np.bool_]
     ) -> tuple[Observation, Infos]:
         """Begin new episodes of the chosen sub-environments.
 
@@ -125,11 +125,14 @@ class SimulationBatch:
         """
         places = chosen.nonzero()[0].tolist()
         self._first = places[0] if places else None
-        infos = [(self._part[place], self._begin(place, seeds[place], options)) for place in places]
+        infos = []
+        for place in places:
+            info = self._begin(place, seeds[place], options)
+            infos.append((self._part[place], info))
         self.failed = False
         return self._stack_observations(), infos
 
-    def check(self, actions: list[Action], ended: Set[int]) -> list[Action]:
+    def check(self, actions: list[Action], ended: set[int]) -> list[Action]:
         """Check the actions that will be used; return them in the form that mappings take."""
         for place, number in enumerate(self._part):
             if number in ended:
@@ -140,7 +143,7 @@ class SimulationBatch:
                 raise InvalidActionError(f"sub-environment {number}: {error}") from None
         return actions
 
-    def step(self, actions: Sequence[Action], ended: Set[int]) -> tuple[Any, ...]:
+    def step(self, actions: Sequence[Action], ended: set[int]) -> tuple[Any, ...]:
         """Answer all pending decisions by checked actions, or begin the next episode after an end.
 
         Returns:
@@ -164,10 +167,11 @@ class SimulationBatch:
             [actions[place] for place in moving],
             lambda index, error: self._fail(moving[index], error),
         )
-        rows = [view.read(episode) for view, episode in zip(self.views, episodes, strict=True)]
-        observations, earned, infos = zip(*rows, strict=True)
-        self._observations = list(observations)
-        rewards = np.array(earned, np.float64)
+        rewards = np.zeros(len(episodes))
+        infos = []
+        for place, view in enumerate(self.views):
+            self._observations[place], rewards[place], info = view.read(episodes[place])
+            infos.append(info)
         rewards[begun] = 0.0
         ends = self._take_ends(episodes, infos)
         if self._shows:
@@ -195,9 +199,7 @@ class SimulationBatch:
                 numbered.append((number, info))
         return terminations, truncations, ended, numbered
 
-    def _begin(
-        self, place: int, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> Info:
+    def _begin(self, place: int, seed: int | None = None, options: ResetOptions = None) -> Info:
         """Begin an episode, note its first observation, and return its first info."""
         view = self.views[place]
         try:
@@ -232,7 +234,7 @@ class SimulationBatch:
         values = [getattr(view, name) for view in self.views]
         return [value(*args, **kwargs) if callable(value) else value for value in values]
 
-    def set_attr(self, name: str, values: Iterable[Model]) -> None:
+    def set_attr(self, name: str, values: Sequence[Model]) -> None:
         """Set an attribute of each view."""
         for view, value in zip(self.views, values, strict=True):
             setattr(view, name, value)

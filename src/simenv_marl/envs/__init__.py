@@ -5,7 +5,13 @@ from typing import Any, Final, Unpack
 
 from gymnasium.vector import AutoresetMode
 
-from ..core import Model, Plan, Points, ViewOptions, explain_arguments
+from ..core import (
+    Model,
+    Plan,
+    Points,
+    ViewOptions,
+    explain_arguments,
+)
 from ..errors import OptionValueError, did_you_mean, short_repr
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
@@ -67,18 +73,23 @@ def generate_env(
         base.__init__(self, current.amended(changes))
 
     names = ", ".join(point.hook.name for point in plan.active)
-    attributes = {
-        "__init__": initialise,
-        "__doc__": f"A view of {plan.name}: {names}.",
-        "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
-        "metadata": base.metadata_of(plan),
-    }
-    return type(f"{plan.name}Env", (base,), attributes)
+    return type(
+        f"{plan.name}Env",
+        (base,),
+        {
+            "__init__": initialise,
+            "__doc__": f"A view of {plan.name}: {names}.",
+            "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
+            "metadata": base.metadata_of(plan),
+        },
+    )
 
 
 @explain_arguments
 def aec_env(
-    simulation: Model, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationAECEnv:
     """Make a PettingZoo AEC environment whose agents decide at the decision points.
 
@@ -90,7 +101,9 @@ def aec_env(
 
 @explain_arguments
 def parallel_env(
-    simulation: Model, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationParallelEnv:
     """Make a PettingZoo parallel environment whose agents decide at the decision points.
 
@@ -102,7 +115,9 @@ def parallel_env(
 
 @explain_arguments
 def single_env(
-    simulation: Model, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationEnv:
     """Make a Gymnasium environment for the one active agent.
 
@@ -118,7 +133,9 @@ def single_env(
 
 @explain_arguments
 def joint_env(
-    simulation: Model, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationJointEnv:
     """Make a Gymnasium environment with one agent that takes all decisions.
 

@@ -3,10 +3,18 @@
 from numpy import ndarray
 from pettingzoo import AECEnv
 
-from ..core import Action, Agent, EpisodeState, Info, Observation, duplicate
+from ..core import (
+    Action,
+    Agent,
+    EpisodeState,
+    Info,
+    Observation,
+    duplicate,
+)
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
-from .base import AgentsView, ResetOptions, StepResult
+from .agents import AgentsView
+from .base import ResetOptions, StepResult
 
 
 class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
@@ -146,7 +154,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
         episode.mark_reported()
 
     def _note(
-        self, agent: Agent, reward: float, terminated: bool = False, truncated: bool = False
+        self,
+        agent: Agent,
+        reward: float,
+        terminated: bool = False,
+        truncated: bool = False,
     ) -> None:
         """Record an agent's reward, info and flags. Let a new agent join."""
         name = agent.name

@@ -1,4 +1,4 @@
-"""The parts that all views share: session, spaces, state, rendering, copies and branches."""
+"""The parts that views share: session, spaces, state, rendering, copies and branches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ import pickle
 import weakref
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Self, SupportsIndex, TypeAlias, TypeVar
+from typing import (
+    Any,
+    Self,
+    SupportsIndex,
+    TypeAlias,
+    TypeVar,
+)
 from zlib import crc32
 
 import gymnasium as gym
@@ -100,7 +106,11 @@ class View:
         return view
 
     def _attach(
-        self, session: BaseSession, attributes: dict[str, Any], *, owned: bool = True
+        self,
+        session: BaseSession,
+        attributes: dict[str, Any],
+        *,
+        owned: bool = True,
     ) -> None:
         """Take over a session, and the attributes of another view.
 
@@ -337,14 +347,13 @@ class View:
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode, and forget its records unless that was refused."""
-        session = self.session
         try:
             end()
         finally:
-            episode = session.episode
+            episode = self.session.episode
             if episode is None or episode.over:
                 self._clear()
-            if self._finalizer is not None and session.idle:
+            if self._finalizer is not None and self.session.idle:
                 # It would keep the session alive, and with it an environment that its own options
                 # refer to.
                 self._finalizer.detach()
@@ -480,74 +489,6 @@ def _unpickled(parcel: bytes) -> View:
     return made
 
 
-class AgentsView(View):
-    """A view with several agents: a PettingZoo environment.
-
-    Attributes:
-        agents: The names of the current agents.
-    """
-
-    agents: list[str]
-
-    @classmethod
-    def adapt(cls, plan: Plan) -> Plan:
-        """Check that a plan allows this view."""
-        if isinstance(plan.options.state_space, str) and not plan.complete:
-            raise ViewError(
-                'state_space="observations" needs to know all agents beforehand: declare them in'
-                " possible_agents="
-            )
-        return super().adapt(plan)
-
-    @classmethod
-    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
-        """Return the metadata of a plan's environments.
-
-        The order of agents is an order of rounds only in rounds.
-        """
-        return super().metadata_of(plan) | {"is_parallelizable": cls.in_rounds}
-
-    @cached_property
-    def possible_agents(self) -> list[str]:
-        """The names of all agents. It exists only if they are known beforehand."""
-        names = self.session.plan.possible_agents
-        if names is None:
-            raise AttributeError(
-                "there is no possible_agents, because not all agents are known beforehand; declare"
-                " them with the option possible_agents=, or name them by strings"
-            )
-        return names
-
-    def observation_space(self, agent: str) -> Space:
-        """Return the observation space of an agent.
-
-        It is always the same object, and no other environment shares it.
-
-        Raises:
-            UnknownAgentError: There is no such agent.
-        """
-        return self._spaces_of(agent)[0]
-
-    def action_space(self, agent: str) -> Space:
-        """Return the action space of an agent, as ``observation_space`` returns the other one."""
-        return self._spaces_of(agent)[1]
-
-    @property
-    def observation_spaces(self) -> dict[str, Space]:
-        """The observation spaces of all possible agents, for learners that read all at once.
-
-        Raises:
-            AttributeError: Not all agents are known beforehand, so that there is no
-                ``possible_agents`` either.
-        """
-        return {agent: self.observation_space(agent) for agent in self.possible_agents}
-
-    @property
-    def action_spaces(self) -> dict[str, Space]:
-        """The action spaces of all possible agents. For errors, see ``observation_spaces``."""
-        return {agent: self.action_space(agent) for agent in self.possible_agents}
-
-
 class OneAgentView(View, gym.Env[Any, Any]):
     """A view with one agent: a Gymnasium environment."""
 
@@ -571,7 +512,10 @@ class OneAgentView(View, gym.Env[Any, Any]):
         raise NotImplementedError
 
     def reset(
-        self, *, seed: int | None = None, options: ResetOptions = None
+        self,
+        *,
+        seed: int | None = None,
+        options: ResetOptions = None,
     ) -> tuple[Observation, Info]:
         """Reset the simulation and run it to its first decision.
 

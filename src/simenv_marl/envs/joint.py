@@ -53,7 +53,11 @@ class Joint:
             self._places[name] = slice(begin, end) if space.shape else begin
             begin = end
 
-    def actions(self, episode: EpisodeState, action: Action) -> dict[str, Action]:
+    def actions(
+        self,
+        episode: EpisodeState,
+        action: Action,
+    ) -> dict[str, Action]:
         """Return the actions of the live agents.
 
         Raises:
@@ -191,7 +195,13 @@ class SimulationJointEnv(OneAgentView):
         if self._shows:
             self.show_step()
         observation, reward, info = self.read(episode)
-        return observation, reward, episode.terminated, episode.truncated, info
+        return (
+            observation,
+            reward,
+            episode.terminated,
+            episode.truncated,
+            info,
+        )
 
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Return the observation and the info of a reset."""

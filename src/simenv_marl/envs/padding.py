@@ -9,7 +9,8 @@ from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
 from ..core import Action, Info, Model, Observation
 from ..errors import ViewError, short_repr
-from .base import AgentsView, ResetOptions
+from .agents import AgentsView
+from .base import ResetOptions
 from .parallel import Results
 
 
@@ -80,7 +81,9 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Observation, Action]):
         return [] if episode is None or episode.over else list(self.possible_agents)
 
     def reset(
-        self, seed: int | None = None, options: ResetOptions = None
+        self,
+        seed: int | None = None,
+        options: ResetOptions = None,
     ) -> tuple[dict[str, Observation], dict[str, Info]]:
         """Reset the environment; return the observations and infos of all possible agents."""
         observations, infos = super().reset(seed=seed, options=options)

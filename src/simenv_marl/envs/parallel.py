@@ -5,10 +5,19 @@ from typing import TypeAlias
 
 from pettingzoo import ParallelEnv
 
-from ..core import Action, Agent, EpisodeState, Info, Observation, Round, duplicate
+from ..core import (
+    Action,
+    Agent,
+    EpisodeState,
+    Info,
+    Observation,
+    Round,
+    duplicate,
+)
 from ..errors import warn_user
 from ..simulation import Sentinel
-from .base import AgentsView, ResetOptions
+from .agents import AgentsView
+from .base import ResetOptions
 
 Results: TypeAlias = tuple[
     dict[str, Observation],
@@ -38,7 +47,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
     _warned_of_unused_actions = False
 
     def reset(
-        self, seed: int | None = None, options: ResetOptions = None
+        self,
+        seed: int | None = None,
+        options: ResetOptions = None,
     ) -> tuple[dict[str, Observation], dict[str, Info]]:
         """Reset the simulation and run it to its first decision.
 
@@ -125,7 +136,13 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         for agent in ended:
             terminations[agent.name] = True
             truncations[agent.name] = False
-        return observations, rewards, terminations, truncations, infos
+        return (
+            observations,
+            rewards,
+            terminations,
+            truncations,
+            infos,
+        )
 
     def _hand_out(self, agent: Agent) -> Observation:
         """Return an observation that the caller may change."""

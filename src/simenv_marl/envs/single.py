@@ -36,9 +36,20 @@ _REFUSAL = (
 )
 
 
-def plan_of(simulation: Model, points: Points, options: Mapping[str, Any], **settings: Any) -> Plan:
+def plan_of(
+    simulation: Model,
+    points: Points,
+    options: Mapping[str, Any],
+    **settings: Any,
+) -> Plan:
     """Make a plan, as ``make_plan`` does. Its planners get the view of their agent."""
-    return make_plan(simulation, points, options, planner_view=PlannerEnv.of_session, **settings)
+    return make_plan(
+        simulation,
+        points,
+        options,
+        planner_view=PlannerEnv.of_session,
+        **settings,
+    )
 
 
 class SimulationEnv(OneAgentView):
@@ -120,7 +131,13 @@ class SimulationEnv(OneAgentView):
             self.show_step()
         agent = self.own_agent
         if agent.ended:
-            return agent.observation, agent.reward, True, False, agent.info
+            return (
+                agent.observation,
+                agent.reward,
+                True,
+                False,
+                agent.info,
+            )
         outcome = episode.outcome  # compared here, because properties take as long as a step
         return (
             agent.observation,
@@ -165,7 +182,9 @@ class SimulationEnv(OneAgentView):
             )
 
         def compute_reward(
-            achieved_goal: Observation, desired_goal: Observation, info: Model
+            achieved_goal: Observation,
+            desired_goal: Observation,
+            info: Model,
         ) -> float | NDArray[np.float64]:
             reward = np.asarray(compute(achieved_goal, desired_goal, info), np.float64)
             return float(reward) if reward.ndim == 0 else reward

@@ -83,9 +83,15 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             raise OptionValueError(
                 f"autoreset_mode must be one of {modes}, not {short_repr(autoreset_mode)}"
             ) from None
-        self._copy = bool(copy)
-        part = range(0 if workers else self.num_envs)
-        batch = SimulationBatch(simulation, points, options, view, self._mode, part)
+        self._copy = copy
+        batch = SimulationBatch(
+            simulation,
+            points,
+            options,
+            view,
+            self._mode,
+            range(0 if workers else self.num_envs),
+        )
         self.render_mode = batch.plan.options.render_mode
         self.metadata = {**batch.metadata, "autoreset_mode": self._mode}
         self.single_observation_space = batch.observation_space
@@ -173,7 +179,13 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             results = self._simulations.ask("step", self._split(actions), self._ended)
             observations, rewards, terminations, truncations, ended, infos = self._join(results)
             self._ended = set(ended)
-        return observations, rewards, terminations, truncations, self._merge(infos)
+        return (
+            observations,
+            rewards,
+            terminations,
+            truncations,
+            self._merge(infos),
+        )
 
     def _check_begun(self) -> None:
         """Check that all simulations have begun, and that no error has ended them."""
@@ -239,7 +251,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         if seed is None:
             return [None] * self.num_envs
         if isinstance(seed, (int, np.integer)):
-            seed = range(seed, seed + self.num_envs)
+            seed = [seed, *range(seed + 1, seed + self.num_envs)]
         self._check_number(seed, "seeds")
         return [checked_seed(part) for part in seed]
 
@@ -276,7 +288,12 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             )
         return list(self._simulations.views)
 
-    def call(self, name: str, *args: Model, **kwargs: Model) -> tuple[Model, ...]:
+    def call(
+        self,
+        name: str,
+        *args: Model,
+        **kwargs: Model,
+    ) -> tuple[Model, ...]:
         """Call a method of each sub-environment, or get its attribute.
 
         Args:

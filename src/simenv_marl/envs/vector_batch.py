@@ -73,8 +73,8 @@ class SimulationBatch:
         if view == "single":
             plan = SimulationEnv.adapt(plan)
             definition = plan.active[0].definition
-            both = deepcopy((definition.observation_space, definition.action_space))
-            self.observation_space, self.action_space = both
+            self.observation_space = deepcopy(definition.observation_space)
+            self.action_space = deepcopy(definition.action_space)
         elif view == "joint":
             kind = SimulationJointEnv
             first = SimulationJointEnv(plan)
@@ -117,7 +117,10 @@ class SimulationBatch:
     # -- episodes ---------------------------------------------------------------------------------
 
     def reset(
-        self, seeds: Sequence[int | None], options: ResetOptions, chosen: NDArray[np.bool_]
+        self,
+        seeds: Sequence[int | None],
+        options: ResetOptions,
+        chosen: NDArray[np.bool_],
     ) -> tuple[Observation, Infos]:
         """Begin new episodes of the chosen sub-environments.
 
@@ -132,7 +135,11 @@ class SimulationBatch:
         self.failed = False
         return self._stack_observations(), infos
 
-    def check(self, actions: list[Action], ended: set[int]) -> list[Action]:
+    def check(
+        self,
+        actions: list[Action],
+        ended: set[int],
+    ) -> list[Action]:
         """Check the actions that will be used; return them in the form that mappings take."""
         for place, number in enumerate(self._part):
             if number in ended:
@@ -143,7 +150,11 @@ class SimulationBatch:
                 raise InvalidActionError(f"sub-environment {number}: {error}") from None
         return actions
 
-    def step(self, actions: Sequence[Action], ended: set[int]) -> tuple[Any, ...]:
+    def step(
+        self,
+        actions: Sequence[Action],
+        ended: set[int],
+    ) -> tuple[Any, ...]:
         """Answer all pending decisions by checked actions, or begin the next episode after an end.
 
         Returns:
@@ -179,7 +190,11 @@ class SimulationBatch:
                 view.show_step()
         return self._stack_observations(), rewards, *ends
 
-    def _take_ends(self, episodes: list[Episode], infos: Sequence[Info]) -> tuple[Any, ...]:
+    def _take_ends(
+        self,
+        episodes: list[Episode],
+        infos: Sequence[Info],
+    ) -> tuple[Any, ...]:
         """Return terminations, truncations, the numbers of ended sub-environments, and infos."""
         terminations, truncations = np.zeros((2, len(episodes)), np.bool_)
         ended: list[int] = []
@@ -190,16 +205,27 @@ class SimulationBatch:
             if episode.pending is None and not episode.unreported_end:  # else a later step ends it
                 terminations[place], truncations[place] = self.views[place].has_ended(episode)
                 if self._mode == AutoresetMode.SAME_STEP:
-                    final = {"final_obs": self._observations[place], "final_info": info}
-                    numbered.append((number, final))
+                    numbered.append(
+                        (number, {"final_obs": self._observations[place], "final_info": info})
+                    )
                     info = self._begin(place)
                 else:
                     ended.append(number)
             if info:
                 numbered.append((number, info))
-        return terminations, truncations, ended, numbered
+        return (
+            terminations,
+            truncations,
+            ended,
+            numbered,
+        )
 
-    def _begin(self, place: int, seed: int | None = None, options: ResetOptions = None) -> Info:
+    def _begin(
+        self,
+        place: int,
+        seed: int | None = None,
+        options: ResetOptions = None,
+    ) -> Info:
         """Begin an episode, note its first observation, and return its first info."""
         view = self.views[place]
         try:
@@ -229,7 +255,12 @@ class SimulationBatch:
 
     # -- views ------------------------------------------------------------------------------------
 
-    def call(self, name: str, args: tuple[Model, ...], kwargs: dict[str, Model]) -> list[Model]:
+    def call(
+        self,
+        name: str,
+        args: tuple[Model, ...],
+        kwargs: dict[str, Model],
+    ) -> list[Model]:
         """Call a method of each view, or get an attribute of each."""
         values = [getattr(view, name) for view in self.views]
         return [value(*args, **kwargs) if callable(value) else value for value in values]

@@ -56,7 +56,7 @@ def generate_env(
 ) -> type[Any]:
     """Make an environment class for a simulation (paper, section 3.3).
 
-    The constructor of the class takes options as keyword arguments, which override those given
+    The constructor of the class takes options as keyword arguments, which override the options
     here.
 
     {arguments}

@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import (
     Any,
     Self,
-    SupportsIndex,
     TypeAlias,
     TypeVar,
 )
@@ -71,7 +70,7 @@ class View:
         adapt             with the plan, before the session         several agents, single, planner
         set_up            when a view is made or cloned, and when   single, joint, planner
                           another process may have reset it
-        _original_spaces  when somebody reads an agent's spaces     View, joint
+        _original_spaces  when an agent's spaces are first read     View, joint
         reset             by the user                               all
         begin             at the first decision of a reset          AEC, parallel, single, joint
         step              by the user                               all
@@ -127,7 +126,8 @@ class View:
         self._roster = plan.roster  # the decision points of the agents that are known beforehand
         self._spaces: dict[str, tuple[Space, Space]] = {}  # of observations and of actions
         self._clear()
-        vars(self).update(attributes)
+        if attributes:  # because ``vars`` makes the attributes of an object slower
+            vars(self).update(attributes)
         self.set_up()
 
     @classmethod
@@ -421,7 +421,7 @@ class View:
         made.__setstate__(copy.deepcopy(self.__getstate__(), memory))
         return made
 
-    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+    def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
         """Pickle an environment like this one, with another simulation. It needs a reset.
 
         Functions without names, such as lambdas, are pickled by value, also by the standard

@@ -55,7 +55,7 @@ def plan_of(
 class SimulationEnv(OneAgentView):
     """A simulation as a Gymnasium environment of one agent.
 
-    Made by ``single_env`` and ``generate_env``.
+    ``single_env`` and ``generate_env`` make it.
 
     Attributes:
         own_agent: The agent, during an episode.
@@ -112,7 +112,8 @@ class SimulationEnv(OneAgentView):
         return agent.observation, agent.info
 
     def _clear(self) -> None:
-        vars(self).pop("own_agent", None)  # because it holds arguments of the model
+        if hasattr(self, "own_agent"):
+            del self.own_agent  # because it holds arguments of the model
 
     def step(self, action: Action) -> StepResult:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
@@ -138,7 +139,7 @@ class SimulationEnv(OneAgentView):
                 False,
                 agent.info,
             )
-        outcome = episode.outcome  # compared here, because properties take as long as a step
+        outcome = episode.outcome  # compared here, because its properties would take a call each
         return (
             agent.observation,
             agent.reward,

@@ -41,7 +41,7 @@ from .vector_batch import Infos, SimulationBatch
 
 
 class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
-    """Many simulations as one ``gymnasium.vector.VectorEnv``. Made by ``vector_env``.
+    """Many simulations as one ``gymnasium.vector.VectorEnv``. ``vector_env`` makes it.
 
     It behaves like ``gymnasium.vector.SyncVectorEnv`` with as many single (or joint) views, step by
     step.
@@ -190,7 +190,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
     def _check_begun(self) -> None:
         """Check that all simulations have begun, and that no error has ended them."""
         if not self._begun:
-            raise NotResetError("there is no episode yet; call reset() without a reset_mask")
+            raise NotResetError("there is no episode yet; call reset() first, without a reset_mask")
         if self._simulations.failed:
             raise EpisodeOverError(
                 "an error has ended the episodes; call reset() without a reset_mask to begin the"

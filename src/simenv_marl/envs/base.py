@@ -74,8 +74,7 @@ class View:
         reset             by the user                               all
         begin             at the first decision of a reset          AEC, parallel, single, joint
         step              by the user                               all
-        read, validate,   by vector environments, which replace     single, joint
-        has_ended         reset and step
+        read, validate    by vector environments, in place of step  single, joint
         _clear            when an episode ends                      AEC, parallel, single
         check_pending     before a branch or a clone is made        View, planner
         begin_branch      in a new branch or clone                  planner

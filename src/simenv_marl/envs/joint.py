@@ -216,10 +216,6 @@ class SimulationJointEnv(OneAgentView):
         self._last_time = info.get("time")
         return joint.observe(episode), joint.reward(episode), info
 
-    def has_ended(self, episode: EpisodeState) -> tuple[bool, bool]:
-        """Return whether the episode has terminated, and whether it was truncated."""
-        return episode.terminated, episode.truncated
-
     def validate(self, action: Action) -> Action:
         """Validate a joint action, as far as possible before the simulation moves."""
         episode = self.episode

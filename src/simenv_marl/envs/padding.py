@@ -93,8 +93,11 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Observation, Action]):
     def step(self, actions: Mapping[str, Action]) -> Results:
         """Play a round; return the results of all possible agents."""
         if isinstance(actions, Mapping) and self.agents:
-            known = self.unwrapped.known_agents()
-            absent = {agent.name for agent in known if agent.ended or not agent.present}
+            absent = {
+                agent.name
+                for agent in self.unwrapped.known_agents()
+                if agent.ended or not agent.present
+            }
             actions = {name: action for name, action in actions.items() if name not in absent}
         observations, rewards, *_, infos = super().step(actions)
         if not observations:  # after the end of the episode

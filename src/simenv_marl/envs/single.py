@@ -158,12 +158,6 @@ class SimulationEnv(OneAgentView):
         pending = self.episode.pending
         return action if pending is None else pending.validate(action)
 
-    def has_ended(self, episode: EpisodeState) -> tuple[bool, bool]:
-        """Return whether the agent's episode has terminated, and whether it was truncated."""
-        if self.own_agent.ended:
-            return True, False
-        return episode.terminated, episode.truncated
-
     @property
     def compute_reward(self) -> Callable[..., float | NDArray[np.float64]]:
         """A function that returns the rewards for other goals, if the decision point has a goal.

@@ -213,10 +213,15 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         return duplicate(observations) if self._copy else observations, *columns
 
     def _merge(self, infos: Infos) -> Info:
-        """Merge the infos of sub-environments, as Gymnasium does."""
+        """Merge the infos of sub-environments, as Gymnasium does. Known keys take less time."""
         merged: Info = {}
         for number, info in infos:
-            merged = self._add_info(merged, info, number)
+            for key, value in info.items():
+                if key in merged and not isinstance(value, dict):
+                    merged[key][number] = value
+                    merged[f"_{key}"][number] = True
+                else:
+                    merged = self._add_info(merged, {key: value}, number)
         return merged
 
     def _split(self, actions: Action) -> list[Action]:
@@ -227,12 +232,16 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             )
         space = self.single_action_space
         if type(actions) is np.ndarray and self._checks_spaces_only:
-            is_legal = self.action_space.contains(actions)
-            if isinstance(space, spaces.Discrete):
-                if is_legal and actions.dtype.kind in "iu":
-                    return list(actions.tolist())
-            elif is_legal and actions.dtype == space.dtype:
-                return list(actions.copy())  # so that the caller cannot change them
+            if not isinstance(space, spaces.Discrete):
+                if actions.dtype == space.dtype and self.action_space.contains(actions):
+                    return list(actions.copy())  # so that the caller cannot change them
+            elif (
+                actions.dtype.kind in "iu"
+                and actions.shape == (self.num_envs,)
+                and actions.min() >= space.start
+                and actions.max() < space.start + space.n
+            ):
+                return list(actions.tolist())
         try:
             parts = list(iterate(self.action_space, actions))
         except Exception as error:

@@ -161,64 +161,58 @@ class SimulationBatch:
             Observations, rewards, terminations, truncations, the numbers of the sub-environments
             that have ended now, and infos.
         """
-        begun: list[int] = []
-        moving: list[int] = []
-        for place, number in enumerate(self._part):
-            (begun if number in ended else moving).append(place)
+        begun = [place for place, number in enumerate(self._part) if number in ended]
         self._first = None if begun else 0
         for place in begun:
             self._begin(place)
+        episodes = self._move(actions, ended)
+        rewards = []
+        terminations, truncations = np.zeros((2, len(episodes)), np.bool_)
+        ends = []
+        infos = []
+        for place, number in enumerate(self._part):
+            episode = episodes[place]
+            self._observations[place], reward, info = self.views[place].read(episode)
+            rewards.append(0.0 if number in ended else reward)
+            if episode.pending is None and not episode.unreported_end:  # else a later step ends it
+                removed = not episode.in_rounds and self.plan.one_agent in episode.ended
+                terminations[place] = removed or episode.terminated
+                truncations[place] = episode.truncated and not removed
+                if self._mode == AutoresetMode.SAME_STEP:
+                    infos.append(
+                        (number, {"final_obs": self._observations[place], "final_info": info})
+                    )
+                    info = self._begin(place)
+                else:
+                    ends.append(number)
+            if info:
+                infos.append((number, info))
+        if self._shows:
+            for view in self.views:
+                view.show_step()
+        return (
+            self._stack_observations(),
+            np.array(rewards, np.float64),
+            terminations,
+            truncations,
+            ends,
+            infos,
+        )
+
+    def _move(self, actions: Sequence[Action], ended: set[int]) -> list[Episode]:
+        """Step all episodes that have not just begun after an end; return all."""
         episodes = []
         for session in self._sessions:
             if session.episode is None:  # its view was closed
                 raise session.refusal()
             episodes.append(session.episode)
+        places = [place for place, number in enumerate(self._part) if number not in ended]
         step_all(
-            [episodes[place] for place in moving],
-            [actions[place] for place in moving],
-            lambda index, error: self._fail(moving[index], error),
+            [episodes[place] for place in places],
+            [actions[place] for place in places],
+            lambda index, error: self._fail(places[index], error),
         )
-        rewards = np.zeros(len(episodes))
-        infos = []
-        for place, view in enumerate(self.views):
-            self._observations[place], rewards[place], info = view.read(episodes[place])
-            infos.append(info)
-        rewards[begun] = 0.0
-        ends = self._take_ends(episodes, infos)
-        if self._shows:
-            for view in self.views:
-                view.show_step()
-        return self._stack_observations(), rewards, *ends
-
-    def _take_ends(
-        self,
-        episodes: list[Episode],
-        infos: Sequence[Info],
-    ) -> tuple[Any, ...]:
-        """Return terminations, truncations, the numbers of ended sub-environments, and infos."""
-        terminations, truncations = np.zeros((2, len(episodes)), np.bool_)
-        ended: list[int] = []
-        numbered: Infos = []
-        for place, number in enumerate(self._part):
-            episode = episodes[place]
-            info = infos[place]
-            if episode.pending is None and not episode.unreported_end:  # else a later step ends it
-                terminations[place], truncations[place] = self.views[place].has_ended(episode)
-                if self._mode == AutoresetMode.SAME_STEP:
-                    numbered.append(
-                        (number, {"final_obs": self._observations[place], "final_info": info})
-                    )
-                    info = self._begin(place)
-                else:
-                    ended.append(number)
-            if info:
-                numbered.append((number, info))
-        return (
-            terminations,
-            truncations,
-            ended,
-            numbered,
-        )
+        return episodes
 
     def _begin(
         self,

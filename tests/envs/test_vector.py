@@ -150,7 +150,7 @@ def test_some_can_be_reset_with_options_for_them():
     envs = vector_env(Counter, Counter.decide, num_envs=3)
     with pytest.raises(NotResetError, match="no episode yet"):
         envs.step([1, 1, 1])
-    with pytest.raises(NotResetError, match="no episodes yet"):
+    with pytest.raises(NotResetError, match="no episode yet"):
         envs.reset(options={"reset_mask": np.array([True, False, False])})
     envs.reset(seed=0, options={"reset_mask": np.ones(3, np.bool_)})
     envs.step([1, 1, 1])

@@ -5,7 +5,13 @@ from typing import Any, Final, Unpack
 
 from gymnasium.vector import AutoresetMode
 
-from ..core import Plan, Points, ViewOptions, explain_arguments
+from ..core import (
+    Model,
+    Plan,
+    Points,
+    ViewOptions,
+    explain_arguments,
+)
 from ..errors import OptionValueError, did_you_mean, short_repr
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
@@ -19,7 +25,7 @@ __all__ = [
     "SimulationVectorEnv", "pad_agents",
 ]  # fmt: skip
 
-VIEWS: Final[dict[str, Any]] = {
+VIEWS: Final = {
     "aec": SimulationAECEnv,
     "parallel": SimulationParallelEnv,
     "single": SimulationEnv,
@@ -28,7 +34,7 @@ VIEWS: Final[dict[str, Any]] = {
 """The classes of the views of one simulation."""
 
 
-def view_class(plan: Plan, view: str | None) -> Any:
+def view_class(plan: Plan, view: str | None) -> type[Any]:
     """Return the class of a view. None: single if one point with one agent is active, else AEC."""
     if view is None:
         view = "aec" if plan.one_agent is None else "single"
@@ -42,43 +48,48 @@ def view_class(plan: Plan, view: str | None) -> Any:
 
 @explain_arguments
 def generate_env(
-    simulation: Any,
+    simulation: Model,
     points: Points = None,
     *,
     view: str | None = None,
     **options: Unpack[ViewOptions],
-) -> Any:
+) -> type[Any]:
     """Make an environment class for a simulation (paper, section 3.3).
 
-    The constructor of the class takes options as keyword arguments, which override those given
+    The constructor of the class takes options as keyword arguments, which override the options
     here.
 
     {arguments}
         view: "aec", "parallel", "single" or "joint". None: single if one point with one agent is
-        active, or if
-            ``agent=`` names one agent; else AEC.
+            active, or if ``agent=`` names one agent; else AEC.
         {options}
     """
     plan = plan_of(simulation, points, options)
     base = view_class(plan, view)
-    base._adapt(plan)  # raises errors at once
+    base.adapt(plan)  # raises errors at once
 
-    def initialise(self: Any, **changes: Any) -> None:
+    def initialise(self: object, **changes: Any) -> None:
         current = plan_of(simulation, points, options) if plan.is_stale else plan
         base.__init__(self, current.amended(changes))
 
-    attributes = {
-        "__init__": initialise,
-        "__doc__": f"A view of {plan.name}: {', '.join(point.hook.name for point in plan.active)}.",
-        "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
-        "metadata": base._metadata_of(plan),
-    }
-    return type(f"{plan.name}Env", (base,), attributes)
+    names = ", ".join(point.hook.name for point in plan.active)
+    return type(
+        f"{plan.name}Env",
+        (base,),
+        {
+            "__init__": initialise,
+            "__doc__": f"A view of {plan.name}: {names}.",
+            "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
+            "metadata": base.metadata_of(plan),
+        },
+    )
 
 
 @explain_arguments
 def aec_env(
-    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationAECEnv:
     """Make a PettingZoo AEC environment whose agents decide at the decision points.
 
@@ -90,7 +101,9 @@ def aec_env(
 
 @explain_arguments
 def parallel_env(
-    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationParallelEnv:
     """Make a PettingZoo parallel environment whose agents decide at the decision points.
 
@@ -102,12 +115,15 @@ def parallel_env(
 
 @explain_arguments
 def single_env(
-    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationEnv:
-    """Make a Gymnasium environment for the one active agent. If there are several, ``agent=`` names it.
+    """Make a Gymnasium environment for the one active agent.
 
-    If its decision point has a goal, the environment is goal-based: its observations are dicts of
-    ``observation``, ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
+    If there are several agents, ``agent=`` names it. If its decision point has a goal, the
+    environment is goal-based: its observations are dicts of ``observation``, ``achieved_goal`` and
+    ``desired_goal``, and it has ``compute_reward``.
 
     {arguments}
         {options}
@@ -117,12 +133,14 @@ def single_env(
 
 @explain_arguments
 def joint_env(
-    simulation: Any, points: Points = None, **options: Unpack[ViewOptions]
+    simulation: Model,
+    points: Points = None,
+    **options: Unpack[ViewOptions],
 ) -> SimulationJointEnv:
     """Make a Gymnasium environment with one agent that takes all decisions.
 
-    All agents must be known beforehand. With ``flatten=True``, their spaces must be ones that can
-    be concatenated.
+    All agents must be known beforehand. With ``flatten=True``, it must be possible to concatenate
+    their spaces.
 
     {arguments}
         {options}
@@ -132,7 +150,7 @@ def joint_env(
 
 @explain_arguments
 def vector_env(
-    simulation: Any,
+    simulation: Model,
     points: Points = None,
     *,
     num_envs: int,
@@ -145,7 +163,7 @@ def vector_env(
 ) -> SimulationVectorEnv:
     """Make a Gymnasium vector environment: many copies of a simulation, stepped together.
 
-    Each step returns what ``gymnasium.vector.SyncVectorEnv`` would return for as many single (or
+    Each step returns the same results as a ``gymnasium.vector.SyncVectorEnv`` of as many single (or
     joint) views.
 
     {arguments}
@@ -153,13 +171,11 @@ def vector_env(
         workers: The number of worker processes. 0: all simulations are suspended in this process.
         view: "single" or "joint". None: single if one point with one agent is active, else joint.
         copy: Whether ``reset`` and ``step`` return new arrays of observations. Otherwise they
-        return the same arrays
-            every time, and the next call overwrites them.
+            return the same arrays every time, and the next call overwrites them.
         autoreset_mode: When a simulation is reset after its episode has ended, as in Gymnasium:
             ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
         context: The start method of workers: "spawn" (the default), "forkserver", "fork", or a
-        context of
-            ``multiprocessing``.
+            context of ``multiprocessing``.
         {options}
     """
     return SimulationVectorEnv(

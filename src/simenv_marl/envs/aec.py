@@ -1,18 +1,24 @@
-"""The AEC view: agents are selected in the order in which the simulation calls their decision functions."""
-
-from typing import Any
+"""The AEC view: it selects agents in the order of the simulation's decisions."""
 
 from numpy import ndarray
 from pettingzoo import AECEnv
 
-from ..core import Agent, EpisodeState, duplicate
+from ..core import (
+    Action,
+    Agent,
+    EpisodeState,
+    Info,
+    Observation,
+    duplicate,
+)
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
-from .base import AgentsView
+from .agents import AgentsView
+from .base import ResetOptions, StepResult
 
 
-class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
-    """A simulation as a PettingZoo AEC environment. Made by ``aec_env`` and ``generate_env``.
+class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
+    """A simulation as a PettingZoo AEC environment. ``aec_env`` and ``generate_env`` make it.
 
     ``possible_agents`` exists only if all agents are known beforehand. The time for a step does not
     depend on the number of agents: PettingZoo's helpers for rewards and dead steps, which loop over
@@ -30,7 +36,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             observed, its mask has all actions legal.
     """
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> None:
         """Reset the simulation and run it to its first decision.
 
         Args:
@@ -42,9 +48,9 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        self._start(seed, options)
+        self._start(seed, options, self.begin)
 
-    def step(self, action: Any) -> None:
+    def step(self, action: Action) -> None:
         """Answer the decision of ``agent_selection`` and run to the next one.
 
         Args:
@@ -56,10 +62,9 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        session = self.session
-        episode = session.episode
-        if episode is None or (session.lock is not None and not session.lock.held):
-            self._step_alone(SimulationAECEnv.step, action)
+        episode = self.session.episode
+        if episode is None or (self._lock and not self._lock.held):
+            self._step_in_lock(SimulationAECEnv.step, action)
             return
         if self._leaving:
             self._dead_step(episode, action)
@@ -71,15 +76,16 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                 self._clear()
             raise
         selected = self.agent_selection
-        self.rewards[selected] = self._cumulative_rewards[selected] = 0.0
+        self.rewards[selected] = 0.0
+        self._cumulative_rewards[selected] = 0.0
         if self._rewarded:
             self._clear_rewards()
         self._record(episode)
         if self._shows:
-            self._show()
+            self.show_step()
 
-    def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Return what ``agent_selection`` needs to decide.
+    def last(self, observe: bool = True) -> StepResult:
+        """Return the latest results of ``agent_selection``.
 
         Args:
             observe: Whether to return the observation, or None instead.
@@ -91,104 +97,119 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         Raises:
             ResetNeededError: There is no episode, or all agents have taken their final step.
         """
-        episode, observation = self.session.episode, None
+        name = self.agent_selection
+        episode = self.session.episode
+        observation: Observation = None
         if self._leaving:
-            observation = self.observe(self.agent_selection) if observe else None
+            if observe:
+                observation = self.observe(name)
         elif episode is None or episode.pending is None:
             raise self.session.refusal()
         elif observe:
             observation = episode.pending.observation
-            observation = (
-                observation.copy() if type(observation) is ndarray else duplicate(observation)
-            )
-        name = self.agent_selection
-        reward = self._cumulative_rewards[name]
+            if type(observation) is ndarray:  # spares it a call
+                observation = observation.copy()
+            else:
+                observation = duplicate(observation)
         return (
             observation,
-            reward,
+            self._cumulative_rewards[name],
             self.terminations[name],
             self.truncations[name],
             self.infos[name],
         )
 
-    def observe(self, agent: str) -> Any:
+    def observe(self, agent: str) -> Observation:
         """Return the latest observation of an agent of this episode, as a new copy.
 
         Raises:
             UnknownAgentError: There is no such agent.
             ResetNeededError: There is no episode.
         """
-        found = self.episode.agent(agent)
-        if found is None or found.observation is None:
-            return self._point(agent).blank()
-        return duplicate(found.observation)
+        record = self.episode.agent(agent)
+        if record is None or record.observation is None:
+            return self._point_of(agent).blank()
+        return duplicate(record.observation)
 
-    # -- PettingZoo's books -----------------------------------------------------------------------
+    # -- attributes of PettingZoo -----------------------------------------------------------------
 
     def _clear(self) -> None:
         self.agents = []
-        self._places: dict[str, int] = {}  # of the agents, in the list of agents
-        # agents that have ended, and whose None step is to come, the next one last
+        self._places: dict[str, int] = {}  # the index of each agent in ``agents``
+        # Agents that have ended and must take their None step, the next one last.
         self._leaving: list[str] = []
-        # agents besides the selected one that the latest step has rewarded
+        # Agents besides the selected one that the latest step has rewarded.
         self._rewarded: list[str] = []
         self.rewards: dict[str, float] = {}
         self._cumulative_rewards: dict[str, float] = {}
         self.terminations: dict[str, bool] = {}
         self.truncations: dict[str, bool] = {}
-        self.infos: dict[str, dict[str, Any]] = {}
+        self.infos: dict[str, Info] = {}
 
-    def _begin(self, episode: EpisodeState) -> None:
+    def begin(self, episode: EpisodeState) -> None:
+        """Record the agents of a new episode, and its first decision."""
         for agent in episode.agents.values():
-            self._join(agent)
+            self._note(agent, 0.0)
         self._record(episode)
         episode.mark_reported()
 
-    def _join(self, agent: Agent) -> None:
+    def _note(
+        self,
+        agent: Agent,
+        reward: float,
+        terminated: bool = False,
+        truncated: bool = False,
+    ) -> None:
+        """Record an agent's reward, info and flags. Let a new agent join."""
         name = agent.name
-        self._places[name] = len(self.agents)
-        self.agents.append(name)
-        self.rewards[name] = self._cumulative_rewards[name] = 0.0
-        self.terminations[name] = self.truncations[name] = False
+        if name not in self.rewards:
+            self._places[name] = len(self.agents)
+            self.agents.append(name)
+            self._cumulative_rewards[name] = 0.0
+        self.rewards[name] = reward
+        self._cumulative_rewards[name] += reward
         self.infos[name] = agent.info
+        self.terminations[name] = terminated
+        self.truncations[name] = truncated
 
     def _record(self, episode: EpisodeState) -> None:
         """Record the ends and the pending decision of a reset or a step."""
         pending = episode.pending
         if pending is None or episode.just_ended:
-            ended = [(agent, True, False) for agent in episode.take_ended()]
-            if episode.over:
-                # Those that have never decided come last.
-                others = sorted(episode.agents.values(), key=lambda agent: not agent.decided)
-                ended += [(agent, episode.terminated, episode.truncated) for agent in others]
-            for agent, terminated, truncated in ended:
-                name = agent.name
-                if name not in self.rewards:
-                    self._join(agent)
-                self.rewards[name] = agent.reward
-                self._cumulative_rewards[name] += agent.reward
-                self.infos[name] = agent.info
-                self.terminations[name], self.truncations[name] = terminated, truncated
-                self._rewarded.append(name)
-            self._leaving = self._rewarded[::-1]
+            self._record_ends(episode)
         if pending is not None:
             name = pending.name
             if name not in self.rewards:
-                self._join(pending)
+                self._note(pending, 0.0)
             # It has had no other reward since its last step.
-            self.rewards[name] = self._cumulative_rewards[name] = pending.reward
+            self.rewards[name] = pending.reward
+            self._cumulative_rewards[name] = pending.reward
             self.infos[name] = pending.info
+            self.agent_selection = name
         if self._leaving:
-            self._rewarded.append(name)
-            name = self._leaving[-1]
-        self.agent_selection = name
+            if pending is not None:
+                self._rewarded.append(pending.name)
+            self.agent_selection = self._leaving[-1]
+
+    def _record_ends(self, episode: EpisodeState) -> None:
+        """Record the agents that have ended, in the order of their None steps."""
+        ended = episode.take_ended()
+        if episode.over:
+            # Those that have never decided come last.
+            ended += sorted(episode.agents.values(), key=lambda agent: not agent.decided)
+        for agent in ended:
+            truncated = episode.truncated and not agent.ended
+            self._note(agent, agent.reward, not truncated, truncated)
+        self._rewarded = [agent.name for agent in ended]
+        self._leaving = self._rewarded[::-1]
 
     def _clear_rewards(self) -> None:
         for name in self._rewarded:
             self.rewards[name] = 0.0
         self._rewarded = []
 
-    def _dead_step(self, episode: EpisodeState, action: Any) -> None:
+    def _dead_step(self, episode: EpisodeState, action: Action) -> None:
+        """Remove an agent that has ended, and select the next one."""
         if action is not None and action is not RULE:
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is"
@@ -196,19 +217,18 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             )
         self._clear_rewards()
         name = self._leaving.pop()
-        for book in (
-            self.rewards,
-            self._cumulative_rewards,
-            self.terminations,
-            self.truncations,
-            self.infos,
-        ):
-            del book[name]
-        # The last agent takes its place in the list, so that this takes the same time for any
+        del self.rewards[name]
+        del self._cumulative_rewards[name]
+        del self.terminations[name]
+        del self.truncations[name]
+        del self.infos[name]
+        # The last agent moves to its place in the list, so that this takes the same time for any
         # number of agents.
-        place, mover = self._places.pop(name), self.agents.pop()
-        if mover != name:
-            self.agents[place], self._places[mover] = mover, place
+        place = self._places.pop(name)
+        last = self.agents.pop()
+        if last != name:
+            self.agents[place] = last
+            self._places[last] = place
         if self._leaving:
             self.agent_selection = self._leaving[-1]
         elif episode.pending is not None:

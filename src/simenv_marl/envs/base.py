@@ -1,14 +1,18 @@
-"""What views have in common: the session, spaces, the state, rendering, copies, and what branches and planners need."""
+"""The parts that views share: session, spaces, state, rendering, copies and branches."""
 
 from __future__ import annotations
 
 import copy
 import pickle
 import weakref
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import (
+    Any,
+    Self,
+    TypeAlias,
+    TypeVar,
+)
 from zlib import crc32
 
 import gymnasium as gym
@@ -17,12 +21,17 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..core import (
+    Action,
     Agent,
     BaseSession,
     EpisodeState,
+    Info,
+    Model,
+    Observation,
     Plan,
     Point,
     Session,
+    Space,
     checked_seed,
     describe,
     observation_cast,
@@ -39,50 +48,89 @@ from ..errors import (
 )
 from ..plugins import Entry
 
-_OWN = frozenset(
-    ("_definition", "_finalizer", "_own", "_plan", "_roster", "joint", "metadata", "session")
-)
-"""The attributes that no copy takes over."""
+Result = TypeVar("Result")
+
+ResetOptions: TypeAlias = dict[str, Any] | None
+"""The options of a reset."""
+
+StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
+"""Observation, reward, terminated, truncated, info."""
+
+_NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session"))
+"""The attributes that each view makes for itself."""
 
 
 class View:
     """A view of a simulation's episodes.
 
+    Subclasses fill these methods::
+
+        method            is called                                 is filled by
+        ------            ---------                                 ------------
+        adapt             with the plan, before the session         several agents, single, planner
+        set_up            when a view is made or cloned, and when   single, joint, planner
+                          another process may have reset it
+        _original_spaces  when an agent's spaces are first read     View, joint
+        reset             by the user                               all
+        begin             at the first decision of a reset          AEC, parallel, single, joint
+        step              by the user                               all
+        read, validate    by vector environments, in place of step  single, joint
+        _clear            when an episode ends                      AEC, parallel, single
+        check_pending     before a branch or a clone is made        View, planner
+        begin_branch      in a new branch or clone                  planner
+
     Attributes:
+        session: The session of the simulation.
         metadata: Its name, and the render modes of its simulation.
-        render_mode: What ``render`` returns.
+        render_mode: The form of the result of ``render``.
+        in_rounds: Whether all agents are updated when a step returns.
+        waits_for_one: Whether its branches wait for one agent only.
     """
 
-    metadata: dict[str, Any]
-    render_mode: str | None
-    _option: ClassVar[str | None] = None  # the option that only this view takes
-    _in_rounds: ClassVar[bool] = False  # whether all agents are updated when a step returns
-    waits_for_one: ClassVar[bool] = False  # whether its branches wait for one agent only
-    _finalizer: Any = None
-    set_up: Callable[[], None]  # completes what is made
-    # makes the records of a new episode, and returns the results of its reset
-    _begin: Callable[[EpisodeState], Any]
+    in_rounds = False
+    waits_for_one = False
+    _option = ""  # the option that only this view takes
 
-    def __init__(self, plan: Plan, session: BaseSession | None = None) -> None:
-        """Make the view of a plan, of a session that its owner closes, or else of a new session."""
+    def __init__(self, plan: Plan) -> None:
+        """Make the view of a plan, with a new session."""
         super().__init__()
-        self._plan = plan
-        self.session: BaseSession = session or Session(self._adapt(plan))
-        if session is None:
-            self._finalizer = weakref.finalize(self, self.session.abandon)
-        self.metadata = self._metadata_of(plan)
+        self._attach(Session(self.adapt(plan)), {})
+
+    @classmethod
+    def of_session(cls, session: BaseSession) -> Self:
+        """Make the view of a session that its owner closes."""
+        view = cls.__new__(cls)
+        view._attach(session, {}, owned=False)
+        return view
+
+    def _attach(
+        self,
+        session: BaseSession,
+        attributes: dict[str, Any],
+        *,
+        owned: bool = True,
+    ) -> None:
+        """Take over a session, and the attributes of another view.
+
+        ``owned``: the session ends with this view.
+        """
+        plan = session.plan
+        self.session = session
+        self._lock = session.lock
+        self._finalizer = weakref.finalize(self, session.abandon) if owned else None
+        self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
-        self._picture_mode, self._shows = plan.options.picture_mode, plan.options.shows
-        self._frames: list[Any] = []
-        # of agents that are known beforehand
-        self._roster: Mapping[str, Point] = self.session.plan.roster
-        # of observations and of actions, by agent
-        self._spaces: dict[str, tuple[spaces.Space[Any], ...]] = {}
+        self._shows = plan.options.shows
+        self._frames: list[Model] = []
+        self._roster = plan.roster  # the decision points of the agents that are known beforehand
+        self._spaces: dict[str, tuple[Space, Space]] = {}  # of observations and of actions
         self._clear()
+        if attributes:  # because ``vars`` makes the attributes of an object slower
+            vars(self).update(attributes)
         self.set_up()
 
     @classmethod
-    def _adapt(cls, plan: Plan) -> Plan:
+    def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
         for option, view in (("flatten", "joint"), ("agent", "single")):
             if getattr(plan.options, option) and option != cls._option:
@@ -90,39 +138,47 @@ class View:
         return plan
 
     @classmethod
-    def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
+    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
-        modes = list(
-            dict.fromkeys(filter(None, [*plan.subject.render_modes, plan.options.render_mode]))
-        )
+        modes = [*plan.subject.render_modes, plan.options.render_mode]
         return {
             "name": f"{plan.name.lower()}_v0",
-            "render_modes": modes,
+            "render_modes": list(dict.fromkeys(filter(None, modes))),
             "render_fps": plan.subject.render_fps,
         }
 
+    def set_up(self) -> None:
+        """Derive further attributes from the session."""
+
     @property
-    def simulation(self) -> Any:
+    def simulation(self) -> Model:
         """The simulation that this environment runs."""
         return self.session.simulation
 
     @property
     def driver(self) -> str:
         """The name of the driver: "greenlet" or "thread"."""
-        return self._plan.options.driver
+        return self.session.plan.options.driver
 
     @property
     def plugins(self) -> list[Entry]:
-        """The handlers of the option ``plugins``: tuples of handler, dotted name of the target, and position."""
-        return [] if self._plan.plugins is None else self._plan.plugins.entries
+        """The handlers of the option ``plugins``.
+
+        They are tuples of the handler, the dotted name of the target, and the position.
+        """
+        plugins = self.session.plan.plugins
+        return [] if plugins is None else plugins.entries
 
     def provenance(self) -> dict[str, Any]:
-        """Return what ``simenv_marl.experiments.provenance`` describes, with the seed of the latest episode."""
-        return describe(self._plan, self.session.seed)
+        """Return the provenance of this environment, with the seed of its latest episode.
+
+        ``simenv_marl.experiments.provenance`` explains the items.
+        """
+        return describe(self.session.plan, self.session.seed)
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The generator that was seeded with the last given seed, and from which other seeds are drawn."""
+        """The generator that the last given seed has seeded. It draws all other seeds."""
         return self.session.np_random
 
     @np_random.setter
@@ -139,23 +195,29 @@ class View:
     # -- the state --------------------------------------------------------------------------------
 
     @cached_property
-    def state_space(self) -> spaces.Space[Any] | None:
+    def _all_observations(self) -> Space:
+        """The space of the observations of all possible agents."""
+        points = self._roster.values()
+        return spaces.Tuple([point.definition.observation_space for point in points])
+
+    @cached_property
+    def state_space(self) -> Space | None:
         """The space of ``state()``, if the environment was made with one."""
-        space = self._plan.options.state_space
+        space = self.session.plan.options.state_space
         if not isinstance(space, str):
             return space
-        parts = spaces.Tuple(
-            [point.definition.observation_space for point in self._roster.values()]
-        )
-        together = spaces.flatten_space(parts)
-        if not isinstance(together, spaces.Box):
+        flat = spaces.flatten_space(self._all_observations)
+        if not isinstance(flat, spaces.Box):
             raise ViewError(
-                f'state_space="observations" needs spaces that can be flattened, not {parts}'
+                'state_space="observations" needs spaces that can be flattened, not'
+                f" {self._all_observations}"
             )
-        return together
+        return flat
 
-    def state(self) -> Any:
-        """Return the state of the simulation, for centralised critics, from the simulation's own ``state()``.
+    def state(self) -> Model:
+        """Return the state of the simulation, for centralised critics.
+
+        It comes from the simulation's own ``state()``.
 
         Returns:
             A new array, in the dtype of ``state_space`` if the environment was made with one. With
@@ -166,19 +228,17 @@ class View:
             NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
-        if isinstance(self._plan.options.state_space, str):
-            parts: list[Any] = []
-            for agent in self._agents():
-                seen = agent.point.blank() if agent.observation is None else agent.observation
-                parts.append(spaces.flatten(agent.point.definition.observation_space, seen))
-            value: Any = np.concatenate(parts)
+        if isinstance(self.session.plan.options.state_space, str):
+            observations = [
+                agent.point.blank() if agent.observation is None else agent.observation
+                for agent in self.known_agents()
+            ]
+            value = spaces.flatten(self._all_observations, tuple(observations))
         else:
             value = self.session.ask("state")
-        return (
-            np.array(value)
-            if self.state_space is None
-            else observation_cast(self.state_space)(value)
-        )
+        if self.state_space is None:
+            return np.array(value)
+        return observation_cast(self.state_space)(value)
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -193,37 +253,51 @@ class View:
             raise self.session.refusal()
         return episode
 
-    def _agents(self) -> list[Agent]:
-        """The agents of the roster; raise ``ResetNeededError`` if there is no episode."""
+    def known_agents(self) -> list[Agent]:
+        """Return the agents that are known beforehand.
+
+        Raises:
+            ResetNeededError: There is no episode.
+        """
         episode = self.episode
         return [episode.agent(name) or episode.others[name] for name in self._roster]
 
-    def render(self) -> Any:
+    def render(self) -> Model:
         """Render the simulation in ``render_mode``. Without a render mode, warn and return None.
 
-        In the mode "human", every ``reset`` and ``step`` renders by itself. With ``_list`` at the
-        end of a mode, these are collected; return the list of those since the last ``render`` or
+        In the mode "human", every ``reset`` and ``step`` renders by itself. A mode that ends with
+        ``_list`` collects the images. Then this returns those since the last ``render`` or
         ``reset``.
         """
+        plan = self.session.plan
         if self.render_mode is None:
             warn_user(
                 "render() shows nothing without a render_mode; the simulation's render modes are"
-                f" {self._plan.subject.render_modes}"
+                f" {plan.subject.render_modes}"
             )
             return None
-        if self._picture_mode != self.render_mode:
-            frames, self._frames = self._frames, []
-            return frames
-        return self.session.ask("render", self._picture_mode)
+        mode = plan.options.picture_mode
+        if mode == self.render_mode:
+            return self.session.ask("render", mode)
+        frames, self._frames = self._frames, []
+        return frames
 
-    def _show(self, *, begins: bool = False) -> None:
-        """Render after a step, or after the reset with which an episode ``begins``."""
-        if begins:
-            self._frames = []
-        if self._picture_mode == self.render_mode:
+    def show_step(self) -> None:
+        """Render for people, or collect an image, after a step."""
+        mode = self.session.plan.options.picture_mode
+        if mode == self.render_mode:
             self.render()
-            return
-        self._frames.append(self.session.ask("render", self._picture_mode))
+        else:
+            self._frames.append(self.session.ask("render", mode))
+
+    def show_reset(self) -> None:
+        """Forget the images of the last episode, and render as after a step."""
+        self._frames = []
+        self.show_step()
+
+    def stop_showing(self) -> None:
+        """Do not render at steps and resets any more."""
+        self._shows = False
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins a new one.
@@ -234,10 +308,15 @@ class View:
         with self.session.exclusive:
             self._end(self.session.close)
 
-    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
-        """Begin another episode, which ends if the environment is abandoned.
+    def _start(
+        self,
+        seed: int | None,
+        options: ResetOptions,
+        begin: Callable[[EpisodeState], Result],
+    ) -> Result:
+        """Begin another episode, and return the results of ``begin`` at its first decision.
 
-        Return the results of the reset.
+        The episode ends if the environment is abandoned.
         """
         session = self.session
         with session.exclusive:
@@ -245,23 +324,24 @@ class View:
             self._end(session.end)
             if self._finalizer is not None and not self._finalizer.alive:
                 self._finalizer = weakref.finalize(self, session.abandon)
-            results = self._begin(session.start(seed, options, in_rounds=self._in_rounds))
-            if not self._plan.complete:  # the agents of the last episode may never appear again
+            results = begin(session.start(seed, options, in_rounds=self.in_rounds))
+            if not session.plan.complete:  # the agents of the last episode may never appear again
                 self._spaces = {}
             for agent in self._spaces:
                 self._seed_spaces(agent, seed)
             if self._shows:
-                self._show(begins=True)
+                self.show_reset()
             return results
 
-    def _step_alone(self, step: Callable[..., Any], action: Any) -> Any:
-        """Take a step with the lock, which also covers reading the results.
+    def _step_in_lock(self, step: Callable[..., Result], action: Action) -> Result:
+        """Take a step with the lock of the thread driver, or refuse it without an episode.
 
-        Refuse it if there is no episode.
+        The lock also covers the reading of the results. No other method takes it for a step.
         """
-        if self.session.episode is None:
-            raise self.session.refusal()
-        with self.session.lock or nullcontext():
+        session = self.session
+        if session.episode is None:
+            raise session.refusal()
+        with session.exclusive:
             return step(self, action)
 
     def _end(self, end: Callable[[], None]) -> None:
@@ -273,95 +353,132 @@ class View:
             if episode is None or episode.over:
                 self._clear()
             if self._finalizer is not None and self.session.idle:
-                # It would keep the session alive, and with it an environment that its own parts
+                # It would keep the session alive, and with it an environment that its own options
                 # refer to.
                 self._finalizer.detach()
 
     def _clear(self) -> None:
         """Forget the records of the episode."""
 
-    def _make_spaces(self, agent: str, definition: Any) -> tuple[spaces.Space[Any], ...]:
-        """Make the spaces of an agent, which no other environment shares, on demand: many may never need them."""
-        made = self._spaces[agent] = copy.deepcopy(
-            (definition.observation_space, definition.action_space)
-        )
-        given = self.session.np_random_seed if self._plan.complete else -1
-        self._seed_spaces(agent, self.session.seed if given == -1 else given)
-        return made
+    # -- spaces -----------------------------------------------------------------------------------
+
+    def _spaces_of(self, agent: str) -> tuple[Space, Space]:
+        """Return the observation space and the action space of an agent.
+
+        No other environment shares them. They are made on demand, because many agents may never
+        need them.
+        """
+        if agent not in self._spaces:
+            self._spaces[agent] = copy.deepcopy(self._original_spaces(agent))
+            session = self.session
+            seed = session.np_random_seed
+            if seed == -1 or not session.plan.complete:
+                seed = session.seed
+            self._seed_spaces(agent, seed)
+        return self._spaces[agent]
+
+    def _original_spaces(self, agent: str) -> tuple[Space, Space]:
+        """Return the spaces of an agent's definition."""
+        definition = self._point_of(agent).definition
+        return definition.observation_space, definition.action_space
+
+    def _point_of(self, agent: str) -> Point:
+        """Return the decision point of an agent.
+
+        Raises:
+            UnknownAgentError: There is no such agent.
+        """
+        episode = self.session.episode
+        live = None if episode is None else episode.agent(agent)
+        point = self._roster.get(agent) if live is None else live.point
+        if point is None:
+            names = [] if episode is None else list(episode.agents)
+            raise UnknownAgentError(
+                f"there is no agent {short_repr(agent)}; the agents now are {names[:10]}"
+                f"{did_you_mean(agent, names)}"
+            )
+        return point
 
     def _seed_spaces(self, agent: str, seed: int | None) -> None:
-        """Seed the spaces of an agent by its name, and not by the order in which agents join."""
-        if seed is not None:
-            sequence = np.random.SeedSequence([seed, crc32(agent.encode(errors="surrogatepass"))])
-            for space in self._spaces[agent]:
-                space.seed(int(sequence.generate_state(1)[0]))
+        """Seed the spaces of an agent by its name, because agents may join in any order."""
+        if seed is None:
+            return
+        sequence = np.random.SeedSequence([seed, crc32(agent.encode(errors="surrogatepass"))])
+        number = int(sequence.generate_state(1)[0])
+        for space in self._spaces[agent]:
+            space.seed(number)
 
     # -- copies, branches and planners ------------------------------------------------------------
 
-    def __copy__(self) -> Any:
+    def __copy__(self) -> Self:
         return copy.deepcopy(self)
 
-    def __deepcopy__(self, memory: dict[int, Any]) -> Any:
-        """Make an environment like this one, with a simulation of its own. It needs a reset."""
-        made = memory[id(self)] = type(self).__new__(type(self))
-        made.__setstate__(copy.deepcopy(self._recipe(), memory))
+    def __deepcopy__(self, memory: dict[int, Any]) -> Self:
+        """Make an environment like this one, with another simulation. It needs a reset."""
+        made = object.__new__(type(self))
+        memory[id(self)] = made
+        made.__setstate__(copy.deepcopy(self.__getstate__(), memory))
         return made
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset.
+    def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
+        """Pickle an environment like this one, with another simulation. It needs a reset.
 
         Functions without names, such as lambdas, are pickled by value, also by the standard
         library's ``pickle``.
         """
-        view: Any = type(self)
+        view: type = type(self)
         try:
             pickle.dumps(view)
-        except Exception:  # a class that generate_env made and that its name does not lead to
+        except Exception:  # generate_env made the class, and its name does not lead to it
             view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-        return _unpickled, (pack((view, self._recipe())),)
+        return _unpickled, (pack((view, self.__getstate__())),)
 
-    def _state(self) -> dict[str, Any]:
-        """Return what is in the same state in a copy."""
-        return {name: value for name, value in vars(self).items() if name not in _OWN}
+    def __getstate__(self) -> tuple[Any, ...]:
+        """Return the plan, the session's snapshot and the attributes of a copy.
 
-    def export_state(self) -> dict[str, Any]:
-        """Return the state of the view, for its twin in the process of a clone."""
-        return self._state()
+        The attributes include all that users have set.
+        """
+        return self.session.plan, self.session.snapshot(), self.export_state()
 
-    def import_state(self, state: dict[str, Any]) -> None:
-        """Take over the state of the twin."""
-        vars(self).update(state)
-        self.set_up()  # there may be another episode
-
-    def _recipe(self) -> dict[str, Any]:
-        """Return what a copy is made of."""
-        return self._state() | {"_plan": self._plan, "session": self.session.snapshot()}
-
-    def __setstate__(self, recipe: dict[str, Any]) -> None:
-        """Make this environment like the one with a recipe."""
-        View.__init__(self, recipe.pop("_plan"))
-        self.session.restore(recipe.pop("session"))
-        vars(self).update(recipe)
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        """Make this environment a copy of the one that has returned a state."""
+        plan, snapshot, attributes = state
+        session = Session(plan)
+        session.restore(snapshot)
+        self._attach(session, attributes)
         self._clear()
 
+    def cloned(self, session: BaseSession) -> Self:
+        """Make an environment in the same state, whose session stands at the same decision."""
+        made = object.__new__(type(self))
+        made._attach(session, copy.deepcopy(self.export_state()))
+        return made
+
+    def export_state(self) -> dict[str, Any]:
+        """Return the attributes of a copy, or of the twin in the process of a clone."""
+        return {name: value for name, value in vars(self).items() if name not in _NOT_COPIED}
+
+    def import_state(self, state: dict[str, Any]) -> None:
+        """Take over the attributes of the twin."""
+        vars(self).update(state)
+        self.set_up()  # because another episode may have begun there
+
     def check_pending(self) -> None:
-        """Check that a decision is pending, or raise ``ResetNeededError`` or ``ReentrancyError``."""
+        """Check that a decision is pending.
+
+        Raises:
+            ResetNeededError, ReentrancyError: None is.
+        """
         if self.episode.pending is None:
             raise self.session.refusal()
 
-    def cloned(self, session: BaseSession) -> Any:
-        """Make an environment in the same state in mid-episode, with a session that stands at the same decision."""
-        made = type(self).__new__(type(self))
-        View.__init__(made, self._plan, session)
-        vars(made).update(copy.deepcopy(self._state()))
-        made._finalizer = weakref.finalize(made, session.abandon)
-        made.set_up()
-        return made
+    def begin_branch(self) -> None:
+        """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
 
-    def call(self, function: Callable[..., Any], *args: Any) -> Any:
+    def call(self, function: Callable[..., Model], *args: Model) -> Model:
         """Return ``function(environment, *args)``.
 
-        For a clone from its process, with its unwrapped view there.
+        For a clone, its process calls the function, with the unwrapped view there.
 
         Raises:
             BaseException: Any exception of the function; a ``BranchError`` if the clone's process
@@ -369,140 +486,54 @@ class View:
         """
         return self.session.call(self, function, args)
 
-    def begin_branch(self) -> None:
-        """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
-
 
 def _unpickled(parcel: bytes) -> View:
     """Make the environment that ``View.__reduce_ex__`` has pickled."""
     view, state = unpack(parcel)
-    made: View = object.__new__(view)
+    made: View = view.__new__(view)
     made.__setstate__(state)
     return made
-
-
-class _Undeclared:
-    """In place of ``possible_agents`` where not all are known.
-
-    A ``__getattr__`` would make each attribute slower.
-    """
-
-    def __get__(self, view: Any, kind: Any) -> Any:
-        raise AttributeError(
-            "there is no possible_agents, because not all agents are known beforehand; declare"
-            " them with the option possible_agents=, or name them by strings"
-        )
-
-
-class AgentsView(View):
-    """A view with several agents: a PettingZoo environment.
-
-    Attributes:
-        agents: The names of the current agents.
-        possible_agents: The names of all agents. It exists only if they are known beforehand.
-    """
-
-    agents: list[str]
-    possible_agents: Any = _Undeclared()
-
-    def set_up(self) -> None:
-        if self._plan.possible_agents is not None:
-            self.possible_agents = self._plan.possible_agents
-        elif isinstance(self._plan.options.state_space, str):
-            raise ViewError(
-                'state_space="observations" needs to know all agents beforehand: declare them in'
-                " possible_agents="
-            )
-
-    @classmethod
-    def _metadata_of(cls, plan: Plan) -> dict[str, Any]:
-        """Return the metadata of a plan's environments.
-
-        The order of agents is an order of rounds only in rounds.
-        """
-        return super()._metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
-
-    def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The observation space of an agent. It is always the same object, and no other environment shares it.
-
-        Raises:
-            UnknownAgentError: There is no such agent.
-        """
-        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[
-            0
-        ]
-
-    def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The action space of an agent, as ``observation_space`` returns the observation space."""
-        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[
-            1
-        ]
-
-    @property
-    def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """The observation spaces of all possible agents, by name, for learners that read all at once.
-
-        Raises:
-            AttributeError: Not all agents are known beforehand, and so there is no
-                ``possible_agents`` either.
-        """
-        return {agent: self.observation_space(agent) for agent in self.possible_agents}
-
-    @property
-    def action_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """The action spaces of all possible agents, as ``observation_spaces`` has the observation spaces."""
-        return {agent: self.action_space(agent) for agent in self.possible_agents}
-
-    def _point(self, agent: str) -> Point:
-        """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
-        episode = self.session.episode
-        found = None if episode is None else episode.agent(agent)
-        point = self._roster.get(agent) if found is None else found.point
-        if point is None:
-            raise UnknownAgentError(
-                f"there is no agent {short_repr(agent)}; the agents now are {self.agents[:10]}"
-                f"{did_you_mean(agent, self.agents)}"
-            )
-        return point
 
 
 class OneAgentView(View, gym.Env[Any, Any]):
     """A view with one agent: a Gymnasium environment."""
 
-    _agent: str
-    _definition: Any  # has the spaces, of which this environment has copies
-    # where Gymnasium's checks look
-    _np_random, _np_random_seed = View.np_random, View.np_random_seed
+    _agent_name: str
+    # Gymnasium's checks look here.
+    _np_random = View.np_random
+    _np_random_seed = View.np_random_seed
 
     @cached_property
-    def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+    def observation_space(self) -> Space:  # type: ignore[override]
         """The observation space. No other environment shares it."""
-        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[
-            0
-        ]
+        return self._spaces_of(self._agent_name)[0]
 
     @cached_property
-    def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+    def action_space(self) -> Space:  # type: ignore[override]
         """The action space. No other environment shares it."""
-        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[
-            1
-        ]
+        return self._spaces_of(self._agent_name)[1]
+
+    def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
+        """Prepare for a new episode; return the results of its reset."""
+        raise NotImplementedError
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self,
+        *,
+        seed: int | None = None,
+        options: ResetOptions = None,
+    ) -> tuple[Observation, Info]:
         """Reset the simulation and run it to its first decision.
 
-        The arguments and errors are those of ``SimulationAECEnv.reset``.
+        For the arguments and errors, see ``SimulationAECEnv.reset``.
 
         Returns:
             The observation and the info.
         """
-        observation, info = self._start(seed, options)
-        return observation, info
+        return self._start(seed, options, self.begin)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """The mask of the legal actions, in the form that ``MaskablePPO`` of sb3-contrib expects.
+        """Return the mask of the legal actions, as ``MaskablePPO`` of sb3-contrib expects it.
 
         Returns:
             A bool array. For a ``Discrete`` it has shape ``(n,)``. For a ``MultiDiscrete`` it is
@@ -521,7 +552,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
                 " MultiDiscrete with flatten=True"
             )
         parts: list[Any] = []
-        for agent in self._agents():
+        for agent in self.known_agents():
             mask = agent.point.open_mask() if agent.mask is None else agent.mask
             parts += mask if isinstance(mask, tuple) else (mask,)
         return np.concatenate(parts).astype(np.bool_)

@@ -1,20 +1,21 @@
-"""Wrappers that pad agents to a fixed roster, for learners that need all agents from the reset to the end."""
+"""Wrappers that pad agents to a fixed roster, for learners that need all agents at all times."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
+from ..core import Action, Info, Model, Observation
 from ..errors import ViewError, short_repr
-from .base import AgentsView
+from .agents import AgentsView
+from .base import ResetOptions
 from .parallel import Results
 
 
-def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
-    """Pad the agents of an environment to its ``possible_agents``, from the reset to the end of the episode.
+def pad_agents(env: Model) -> PaddedAECEnv | PaddedParallelEnv:
+    """Pad the agents of an environment to its ``possible_agents``, from the reset to the end.
 
     ``infos[agent]["present"]`` tells whether an agent lives. Agents that are not born yet, or that
     the model has removed, do not decide. Their observations are zero with all actions legal, their
@@ -37,31 +38,42 @@ def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
     return PaddedAECEnv(env) if isinstance(env, AECEnv) else PaddedParallelEnv(env)
 
 
-def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any]) -> tuple[Any, ...]:
-    """Return the rewards, terminations, truncations and infos of all possible agents, from those of the live ones."""
-    episode, roster, padded = view.episode, view.possible_agents, {}
+def _pad(
+    view: AgentsView,
+    observations: dict[str, Observation],
+    rewards: dict[str, float],
+    infos: dict[str, Info],
+) -> Results:
+    """Return the results of all possible agents, from the results of live and ended ones."""
+    episode = view.episode
     acted = () if episode.round is None else episode.round.acted
-    for name in roster:
-        agent: Any = episode.agent(name)
+    padded_observations = {}
+    padded_infos = {}
+    for agent in view.known_agents():
+        name = agent.name
         present = agent.present and not agent.ended
         if present:
             info = infos[name]
+            padded_observations[name] = observations.get(name)
         else:
             agent.clear_observation()
             agent.take_observation()  # so that ``observe`` and ``state`` have blanks
-            info = agent.info | (
-                {"deciding": False, "acted": name in acted} if view._in_rounds else {}
-            )
-        padded[name] = {**info, "present": present}
-    terminations, truncations = (
-        dict.fromkeys(roster, episode.terminated),
-        dict.fromkeys(roster, episode.truncated),
+            info = agent.info
+            if view.in_rounds:
+                info = {**info, "deciding": False, "acted": name in acted}
+            padded_observations[name] = agent.point.blank()
+        padded_infos[name] = {**info, "present": present}
+    return (
+        padded_observations,
+        dict.fromkeys(padded_infos, 0.0) | rewards,
+        dict.fromkeys(padded_infos, episode.terminated),
+        dict.fromkeys(padded_infos, episode.truncated),
+        padded_infos,
     )
-    return {name: rewards.get(name, 0.0) for name in roster}, terminations, truncations, padded
 
 
-class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
-    """A parallel environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``."""
+class PaddedParallelEnv(BaseParallelWrapper[str, Observation, Action]):
+    """A parallel environment with all possible agents until its end: see ``pad_agents``."""
 
     @property
     def agents(self) -> list[str]:
@@ -69,39 +81,33 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
         episode = self.unwrapped.session.episode
         return [] if episode is None or episode.over else list(self.possible_agents)
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+    def reset(
+        self,
+        seed: int | None = None,
+        options: ResetOptions = None,
+    ) -> tuple[dict[str, Observation], dict[str, Info]]:
         """Reset the environment; return the observations and infos of all possible agents."""
         observations, infos = super().reset(seed=seed, options=options)
-        observations, *_, infos = self._padded((observations, {}, {}, {}, infos))
+        observations, *_, infos = _pad(self.unwrapped, observations, {}, infos)
         return observations, infos
 
-    def step(self, actions: Any) -> Results:
+    def step(self, actions: Mapping[str, Action]) -> Results:
         """Play a round; return the results of all possible agents."""
         if isinstance(actions, Mapping) and self.agents:
-            agents = self.unwrapped.episode.agents
             absent = {
-                name
-                for name in self.possible_agents
-                if name not in agents or not agents[name].present
+                agent.name
+                for agent in self.unwrapped.known_agents()
+                if agent.ended or not agent.present
             }
             actions = {name: action for name, action in actions.items() if name not in absent}
-        results: Results = super().step(actions)
-        # they are empty after the end of the episode
-        return self._padded(results) if results[0] else results
-
-    def _padded(self, results: Results) -> Results:
-        """Add the agents that are not present to the results of a round, and let all agents end together."""
-        view, (observations, rewards, _, _, infos) = self.unwrapped, results
-        *padded, infos = _pad(view, rewards, infos)
-        seen = {
-            name: observations[name] if i["present"] else view._point(name).blank()
-            for name, i in infos.items()
-        }
-        return seen, *padded, infos
+        observations, rewards, *_, infos = super().step(actions)
+        if not observations:  # after the end of the episode
+            return {}, {}, {}, {}, {}
+        return _pad(self.unwrapped, observations, rewards, infos)
 
 
-class PaddedAECEnv(BaseWrapper[str, Any, Any]):
-    """An AEC environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``.
+class PaddedAECEnv(BaseWrapper[str, Observation, Action]):
+    """An AEC environment with all possible agents until the episode ends: see ``pad_agents``.
 
     Absent agents are not selected before the end of the episode. A step takes time for each
     possible agent.
@@ -109,17 +115,17 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
 
     @property
     def agents(self) -> list[str]:
-        """All possible agents, but for those that have been stepped over at the end of the episode."""
+        """All possible agents that have not taken their None step."""
         return self._left if self.unwrapped.agents else []
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> None:
         """Reset the environment."""
         super().reset(seed=seed, options=options)
         self._left = list(self.possible_agents)
-        self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
+        self._cumulative_rewards = dict.fromkeys(self._left, 0.0)
         self._update()
 
-    def step(self, action: Any) -> None:
+    def step(self, action: Action) -> None:
         """Answer the decision of ``agent_selection``. None for an agent that has ended."""
         selected = self.agent_selection
         if self.agents and (self.terminations[selected] or self.truncations[selected]):
@@ -131,13 +137,14 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
 
     def _update(self) -> None:
         """Read the rewards, infos and ends of a reset or a step."""
-        env, episode = self.env, self.unwrapped.episode
-        rewards, infos = dict(env.rewards), env.infos
+        env = self.env
+        episode = self.unwrapped.episode
+        rewards = dict(env.rewards)
+        infos = env.infos
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
-        self.rewards, self.terminations, self.truncations, self.infos = _pad(
-            self.unwrapped, rewards, infos
-        )
-        for name, reward in self.rewards.items():
+        results = _pad(self.unwrapped, {}, rewards, infos)
+        _, self.rewards, self.terminations, self.truncations, self.infos = results
+        for name, reward in rewards.items():
             self._cumulative_rewards[name] += reward
         self.agent_selection = self.agents[0] if episode.over else env.agent_selection

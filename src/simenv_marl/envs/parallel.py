@@ -1,23 +1,38 @@
-"""The parallel view: rounds, in which every agent has at most one action."""
+"""The parallel view: each step is a round with at most one action of every agent."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TypeAlias
 
 from pettingzoo import ParallelEnv
 
-from ..core import Agent, EpisodeState, Info, Observation, duplicate
+from ..core import (
+    Action,
+    Agent,
+    EpisodeState,
+    Info,
+    Observation,
+    Round,
+    duplicate,
+)
 from ..errors import warn_user
 from ..simulation import Sentinel
-from .base import AgentsView
+from .agents import AgentsView
+from .base import ResetOptions
 
-Results = tuple[
-    dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+Results: TypeAlias = tuple[
+    dict[str, Observation],
+    dict[str, float],
+    dict[str, bool],
+    dict[str, bool],
+    dict[str, Info],
 ]
 """The results of a step: observations, rewards, terminations, truncations and infos, by agent."""
 
 
-class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
-    """A simulation as a PettingZoo parallel environment. Made by ``parallel_env`` and ``generate_env``.
+class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
+    """A simulation as a PettingZoo parallel environment.
+
+    ``parallel_env`` and ``generate_env`` make it.
 
     A step answers each decision as it arises with the action of its agent. Each action is used
     once. The step returns at the first decision whose action is missing or already used. So, giving
@@ -28,24 +43,26 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         agents: The live agents.
     """
 
-    _in_rounds = True
-    _warned = False  # of actions that no decision used
+    in_rounds = True
+    _warned_of_unused_actions = False
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        self,
+        seed: int | None = None,
+        options: ResetOptions = None,
+    ) -> tuple[dict[str, Observation], dict[str, Info]]:
         """Reset the simulation and run it to its first decision.
 
-        The arguments and errors are those of ``SimulationAECEnv.reset``.
+        For the arguments and errors, see ``SimulationAECEnv.reset``.
 
         Returns:
             The observations and the infos, by agent.
         """
-        observations, *_, infos = self._start(seed, options)
+        observations, *_, infos = self._start(seed, options, self.begin)
         self.agents = list(observations)
         return observations, infos
 
-    def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
+    def step(self, actions: Mapping[str, Action] | Sentinel) -> Results:
         """Play a round.
 
         Args:
@@ -64,12 +81,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 not change.
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
-        session = self.session
-        episode = session.episode
-        if episode is None or (session.lock is not None and not session.lock.held):
-            return self._step_alone(SimulationParallelEnv.step, actions)  # type: ignore[no-any-return]
+        episode = self.session.episode
+        if episode is None or (self._lock and not self._lock.held):
+            return self._step_in_lock(SimulationParallelEnv.step, actions)
         if not self.agents and not actions and (episode.terminated or episode.truncated):
-            return {}, {}, {}, {}, {}  # PettingZoo's own do so
+            return {}, {}, {}, {}, {}  # as PettingZoo's own environments do
         if isinstance(actions, Sentinel):
             actions = dict.fromkeys(episode.agents, actions)
         try:
@@ -79,43 +95,55 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 self.agents = []
             raise
         self.agents = [] if episode.over else list(episode.agents)
-        played: Any = episode.round
-        if episode.over and not self._warned and 10 * played.unused > played.given:
-            self._warned = True
-            warn_user(
-                f"of {played.given} actions in this episode, {played.given - played.unused} were"
-                " used: the agents do not decide in each round, and the other actions are lost."
-                " aec_env loses none; joint_env gives one"
-                ' controller all of them; infos[agent]["acted"] tells which were used'
-            )
-        results = self._begin(episode)
+        results = self.begin(episode)
+        if episode.over and episode.round is not None:
+            self._warn_of_unused_actions(episode.round)
         if self._shows:
-            self._show()
+            self.show_step()
         return results
 
-    def _begin(self, episode: EpisodeState) -> Results:
+    def _warn_of_unused_actions(self, played: Round) -> None:
+        """Warn once if an episode has used fewer than nine in ten actions."""
+        if self._warned_of_unused_actions or 10 * played.unused <= played.given:
+            return
+        self._warned_of_unused_actions = True
+        warn_user(
+            f"of {played.given} actions in this episode, {played.given - played.unused} were used:"
+            " the agents do not decide in each round, and the other actions are lost. aec_env loses"
+            " none; joint_env gives one controller all of them;"
+            ' infos[agent]["acted"] tells which were used'
+        )
+
+    def begin(self, episode: EpisodeState) -> Results:
         """Return the results of a reset or a step, by agent."""
         agents = episode.agents
         ended = episode.just_ended
         pending = episode.pending
+        acted = () if episode.round is None else episode.round.acted
         if ended:
             agents = {agent.name: agent for agent in ended} | agents
         terminations = dict.fromkeys(agents, episode.terminated)
         truncations = dict.fromkeys(agents, episode.truncated)
-        observations: dict[str, Observation] = {}
-        rewards: dict[str, float] = {}
-        infos: dict[str, Info] = {}
-        acted = () if episode.round is None else episode.round.acted
+        observations = {}
+        rewards = {}
+        infos = {}
         for name, agent in agents.items():
             observations[name] = self._hand_out(agent)
             rewards[name] = agent.reward
-            infos[name] = info = agent.info
+            info = agent.info
+            infos[name] = info
             info["deciding"] = agent is pending
             info["acted"] = name in acted
         for agent in ended:
             terminations[agent.name] = True
             truncations[agent.name] = False
-        return observations, rewards, terminations, truncations, infos
+        return (
+            observations,
+            rewards,
+            terminations,
+            truncations,
+            infos,
+        )
 
     def _hand_out(self, agent: Agent) -> Observation:
         """Return an observation that the caller may change."""

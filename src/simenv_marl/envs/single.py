@@ -1,51 +1,78 @@
 """The single view: a Gymnasium environment of one agent.
 
-A planner gets it for the agent for which it decides.
+A planner gets the view of the agent that it decides for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core import EpisodeState, Outcome, Plan, Points, Session, Source, make_plan
+from ..core import (
+    Action,
+    Agent,
+    EpisodeState,
+    Info,
+    Model,
+    Observation,
+    Plan,
+    Points,
+    make_plan,
+)
 from ..errors import CopyError, ReentrancyError, ViewError
 from ..simulation import asks_for
-from .base import OneAgentView
+from .base import OneAgentView, ResetOptions, StepResult
 
-_REFUSAL = "a policy cannot move the environment that it is given: it must return an action; branch tries actions out"
+_REFUSAL = (
+    "a policy cannot move the environment that it is given: it must return an action; branch tries"
+    " actions out"
+)
 
 
 def plan_of(
-    simulation: Source, points: Points, options: Mapping[str, Any], **settings: Any
+    simulation: Model,
+    points: Points,
+    options: Mapping[str, Any],
+    **settings: Any,
 ) -> Plan:
     """Make a plan, as ``make_plan`` does. Its planners get the view of their agent."""
-    return make_plan(simulation, points, options, planner_view=PlannerEnv.of_session, **settings)
+    return make_plan(
+        simulation,
+        points,
+        options,
+        planner_view=PlannerEnv.of_session,
+        **settings,
+    )
 
 
 class SimulationEnv(OneAgentView):
     """A simulation as a Gymnasium environment of one agent.
 
-    Made by ``single_env`` and ``generate_env``.
+    ``single_env`` and ``generate_env`` make it.
+
+    Attributes:
+        own_agent: The agent, during an episode.
     """
 
+    own_agent: Agent
     _option = "agent"
-    _own: Any = None  # its agent during an episode
 
     def set_up(self) -> None:
-        self._agent = str(self._plan.one_agent)
-        self._definition = self.session.plan.active[0].definition
-        if self.session.episode is not None:
-            self._begin(self.session.episode)
+        """Find the agent."""
+        self._agent_name = str(self.session.plan.one_agent)
+        episode = self.session.episode
+        if episode is not None:
+            self.begin(episode)
 
     @classmethod
-    def _adapt(cls, plan: Plan) -> Plan:
-        """Check that a plan allows this view, and put the goals of its point, if it has any, into the observations."""
+    def adapt(cls, plan: Plan) -> Plan:
+        """Check that a plan allows this view. Put goals, if it has any, into the observations."""
         if plan.one_agent is None:
             points = ", ".join(point.hook.name for point in plan.active)
             raise ViewError(
@@ -53,35 +80,41 @@ class SimulationEnv(OneAgentView):
                 f" or the name of one agent; active are {points}. Name the agent with agent=, name"
                 " one point in points=, answer the others with policies=, or use aec_env"
             )
-        definition = plan.active[0].definition
-        if definition.goal_space is None:
-            return super()._adapt(plan)
-        parts: dict[str, Any] = {
-            "observation": definition.observation_space_mapping,
-            "achieved_goal": definition.achieved_goal_mapping,
-            "desired_goal": definition.desired_goal_mapping,
-        }
-        asking = {key: asks_for(part, "_simulation") for key, part in parts.items()}
-
-        def observe(*args: Any, _simulation: Any, **kwargs: Any) -> dict[str, Any]:
-            given = {"_simulation": _simulation}
-            return {
-                key: part(*args, **kwargs, **given if asking[key] else {})
-                for key, part in parts.items()
+        point = plan.active[0]
+        definition = point.definition
+        goal = definition.goal_space
+        if goal is not None:
+            mappings: dict[str, Any] = {
+                "observation": definition.observation_space_mapping,
+                "achieved_goal": definition.achieved_goal_mapping,
+                "desired_goal": definition.desired_goal_mapping,
             }
-
-        goal: Any = definition.goal_space
-        space = spaces.Dict(
-            {
+            asking = {key for key, part in mappings.items() if asks_for(part, "_simulation")}
+            parts = {
                 "observation": definition.observation_space,
                 "achieved_goal": goal,
                 "desired_goal": goal,
             }
-        )
-        changed = replace(definition, observation_space=space, observation_space_mapping=observe)
-        return super()._adapt(plan).redefined(plan.active[0].hook, changed)
+            changed = replace(
+                definition,
+                observation_space=spaces.Dict(parts),
+                observation_space_mapping=partial(_observe_with_goals, mappings, asking),
+            )
+            plan = plan.redefined(point.hook, changed)
+        return super().adapt(plan)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
+        """Note the agent of a new episode; return its observation and info."""
+        name = self._agent_name
+        agent = episode.agents.get(name) or episode.ended[name]
+        self.own_agent = agent
+        return agent.observation, agent.info
+
+    def _clear(self) -> None:
+        if hasattr(self, "own_agent"):
+            del self.own_agent  # because it holds arguments of the model
+
+    def step(self, action: Action) -> StepResult:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
 
         Returns:
@@ -90,22 +123,38 @@ class SimulationEnv(OneAgentView):
         Raises:
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
-        session = self.session
-        episode = session.episode
-        if episode is None or (session.lock is not None and not session.lock.held):
-            return self._step_alone(SimulationEnv.step, action)  # type: ignore[no-any-return]
+        episode = self.session.episode
+        if episode is None or (self._lock and not self._lock.held):
+            return self._step_in_lock(SimulationEnv.step, action)
         episode.step(action)
         if self._shows:
-            self._show()
-        own = self._own
-        if own.ended:
-            return own.observation, own.reward, True, False, own.info
-        outcome = episode.outcome  # its properties would each take as long as a comparison
-        terminated = outcome is Outcome.TERMINATED
-        return own.observation, own.reward, terminated, outcome is Outcome.TRUNCATED, own.info
+            self.show_step()
+        agent = self.own_agent
+        terminated = agent.ended
+        truncated = False
+        if episode.pending is None and not terminated:
+            terminated = episode.terminated
+            truncated = episode.truncated
+        return (
+            agent.observation,
+            agent.reward,
+            terminated,
+            truncated,
+            agent.info,
+        )
+
+    def read(self, episode: EpisodeState) -> tuple[Observation, float, Info]:
+        """Return the observation, the reward and the info of a step."""
+        agent = self.own_agent
+        return agent.observation, agent.reward, agent.info
+
+    def validate(self, action: Action) -> Action:
+        """Validate an action for the pending decision, before the simulation moves."""
+        pending = self.episode.pending
+        return action if pending is None else pending.validate(action)
 
     @property
-    def compute_reward(self) -> Callable[[Any, Any, Any], float | NDArray[np.float64]]:
+    def compute_reward(self) -> Callable[..., float | NDArray[np.float64]]:
         """A function that returns the rewards for other goals, if the decision point has a goal.
 
         Its arguments are the achieved goals, of shape ``goal_space.shape``, or
@@ -115,7 +164,7 @@ class SimulationEnv(OneAgentView):
         Raises:
             AttributeError: The decision point has no goal.
         """
-        compute = self._definition.compute_reward
+        compute = self._point_of(self._agent_name).definition.compute_reward
         if compute is None:
             raise AttributeError(
                 f"{type(self).__name__} has no compute_reward: its decision point has no"
@@ -123,23 +172,33 @@ class SimulationEnv(OneAgentView):
             )
 
         def compute_reward(
-            achieved_goal: Any, desired_goal: Any, info: Any
+            achieved_goal: Observation,
+            desired_goal: Observation,
+            info: Model,
         ) -> float | NDArray[np.float64]:
             reward = np.asarray(compute(achieved_goal, desired_goal, info), np.float64)
             return float(reward) if reward.ndim == 0 else reward
 
         return compute_reward
 
-    def _begin(self, episode: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        self._own = episode.agent(self._agent)
-        return self._own.observation, self._own.info
 
-    def _clear(self) -> None:
-        self._own = None
+def _observe_with_goals(
+    mappings: Mapping[str, Callable[..., Observation]],
+    asking: set[str],
+    *args: Model,
+    _simulation: Model,
+    **kwargs: Model,
+) -> dict[str, Observation]:
+    """Observe a call. ``asking``: the keys of the mappings that ask for the simulation."""
+    observation = {}
+    for key, mapping in mappings.items():
+        named = {**kwargs, "_simulation": _simulation} if key in asking else kwargs
+        observation[key] = mapping(*args, **named)
+    return observation
 
 
 class PlannerEnv(SimulationEnv):
-    """The single view of an agent whose planner is being asked, for ``branch`` and the functions built on it.
+    """The single view of an agent whose planner is being asked, for ``branch`` and its users.
 
     The decision is pending until the planner returns an action. A branch is an ordinary environment
     of the agent, which can be stepped; policies or rules answer for all other agents.
@@ -148,21 +207,18 @@ class PlannerEnv(SimulationEnv):
     waits_for_one = True
     _branched = False  # whether it is a branch, or a clone
 
-    @classmethod
-    def of_session(cls, session: Session) -> PlannerEnv:
-        """Make the view of the agent whose planner a session is asking."""
-        return cls(session.plan, session)
-
     def set_up(self) -> None:
-        episode: Any = self.session.episode
-        if episode is not None:  # otherwise the session is going to replay one
-            self._own = episode.deciding
-            self._agent, self._definition = self._own.name, self._own.point.definition
-            self._roster = {self._agent: self._own.point}
+        """Find the agent whose planner is being asked."""
         self._shows = False
+        episode = self.session.episode
+        deciding = None if episode is None else episode.deciding
+        if deciding is not None:  # otherwise the session is going to replay an episode
+            self.own_agent = deciding
+            self._agent_name = deciding.name
+            self._roster = {deciding.name: deciding.point}
 
     @classmethod
-    def _adapt(cls, plan: Plan) -> Plan:
+    def adapt(cls, plan: Plan) -> Plan:
         """Allow every plan: the agent is the one whose planner is being asked."""
         return plan
 
@@ -171,31 +227,33 @@ class PlannerEnv(SimulationEnv):
         if not self._branched:
             self._branched = True
             self.session.leave_caller()
-            self.episode.single_out(self._own)
+            self.episode.single_out(self.own_agent)
 
     def check_pending(self) -> None:
         """Refuse a branch after the planner has returned its action."""
         episode = self.episode
-        if episode.deciding is not self._own:
+        if episode.deciding is not self.own_agent:
             raise episode.refusal()
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> StepResult:
         """In a branch, answer the pending decision and run to the agent's next one."""
-        if not self._branched:
-            raise ReentrancyError(_REFUSAL)
+        self._check_branched()
         return super().step(action)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
+    def reset(self, *, seed: int | None = None, options: ResetOptions = None) -> NoReturn:
         """Refuse the reset: this is the environment of one decision."""
         raise ReentrancyError(_REFUSAL)
 
     def close(self) -> None:
         """End a branch."""
-        if not self._branched:
-            raise ReentrancyError(_REFUSAL)
+        self._check_branched()
         super().close()
 
-    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+    def _check_branched(self) -> None:
+        if not self._branched:
+            raise ReentrancyError(_REFUSAL)
+
+    def __reduce_ex__(self, protocol: object) -> NoReturn:
         raise CopyError(
             "the environment that a policy is given cannot be copied; use branch or clone to"
             " continue it"

@@ -1,10 +1,11 @@
 """The vector view: many copies of a simulation, stepped together."""
 
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Sized
+from contextlib import contextmanager
 from itertools import chain
 from threading import Lock
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -12,7 +13,17 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from numpy.typing import NDArray
 
-from ..core import checked_seed, duplicate
+from ..core import (
+    Action,
+    Info,
+    Model,
+    Observation,
+    Points,
+    checked_seed,
+    duplicate,
+    is_seed,
+    stacker,
+)
 from ..errors import (
     ClosedError,
     CopyError,
@@ -25,12 +36,12 @@ from ..errors import (
 )
 from ..many.parallel import WorkerPool
 from ..simulation import RULE
-from .base import OneAgentView
-from .vector_batch import SimulationBatch
+from .base import OneAgentView, ResetOptions
+from .vector_batch import Infos, SimulationBatch
 
 
-class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
-    """Many simulations as one ``gymnasium.vector.VectorEnv``. Made by ``vector_env``.
+class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
+    """Many simulations as one ``gymnasium.vector.VectorEnv``. ``vector_env`` makes it.
 
     It behaves like ``gymnasium.vector.SyncVectorEnv`` with as many single (or joint) views, step by
     step.
@@ -46,8 +57,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     def __init__(
         self,
-        simulation: Any,
-        points: Any,
+        simulation: Model,
+        points: Points,
         options: Mapping[str, Any],
         view: str | None = None,
         *,
@@ -57,10 +68,10 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         context: Any = None,
     ) -> None:
-        """Make the environment; the arguments are those of ``vector_env``.
+        """Make the environment. ``vector_env`` explains the arguments.
 
         Raises:
-            SimEnvError: Something cannot work. The subclass tells what.
+            SimEnvError: An argument is invalid. The message says which.
         """
         super().__init__()
         self.num_envs = _count(num_envs, "num_envs", 1)
@@ -68,33 +79,38 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
+            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise OptionValueError(
-                "autoreset_mode must be one of"
-                f" {', '.join(repr(known.value) for known in AutoresetMode)}, not"
-                f" {short_repr(autoreset_mode)}"
+                f"autoreset_mode must be one of {modes}, not {short_repr(autoreset_mode)}"
             ) from None
-        self._copy = bool(copy)
-        part = range(0 if workers else self.num_envs)
-        batch = SimulationBatch(simulation, points, options, view, self._mode, part)
+        self._copy = copy
+        batch = SimulationBatch(
+            simulation,
+            points,
+            options,
+            view,
+            self._mode,
+            range(0 if workers else self.num_envs),
+        )
         self.render_mode = batch.plan.options.render_mode
-        self.metadata = {**batch.view._metadata_of(batch.plan), "autoreset_mode": self._mode}
+        self.metadata = {**batch.metadata, "autoreset_mode": self._mode}
         self.single_observation_space = batch.observation_space
         self.single_action_space = batch.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        # what is legal is known here
-        self._checks_alone = batch.joint is None and batch.plan.active[0].legal is None
+        self._checks_spaces_only = batch.checks_spaces_only
         self._begun = False
-        # where the next episode begins with the next step or a reset
-        self._ended: frozenset[int] = frozenset()
+        # The simulations whose next episode begins with the next step or reset.
+        self._ended: set[int] = set()
         self._simulations: SimulationBatch | WorkerPool = batch
         if workers:
             self._simulations = WorkerPool(
                 SimulationBatch, batch.arguments, self.num_envs, workers, context
             )
-            self._observations = create_empty_array(self.single_observation_space, self.num_envs)
+            self._stack = stacker(self.single_observation_space, cast=True)
+            self._stacked = create_empty_array(self.single_observation_space, self.num_envs)
         weakref.finalize(self, self._simulations.abandon)
-        self._guard = _Guard()
+        self._lock = Lock()
         self.closed = False
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -103,8 +119,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Any, dict[str, Any]]:
+        options: ResetOptions = None,
+    ) -> tuple[Observation, Info]:
         """Reset all simulations, or some of them, and run them to their first decisions.
 
         Args:
@@ -115,7 +131,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 bool array of shape ``(num_envs,)``, selects the simulations to reset.
 
         Returns:
-            The observations of all simulations, and the infos of those that were reset.
+            The observations of all simulations, and the infos of the ones that were reset.
 
         Raises:
             OptionValueError: The seeds or the mask are invalid.
@@ -123,18 +139,18 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             BaseException: Any exception of a simulation or a mapping, with a note that names the
                 simulation. Then all of them need a reset; the ones after it have not been reset.
         """
-        with self._guard:
+        with self._exclusive():
             seeds = self._seeds(seed)
             chosen, options = self._chosen(options)
-            answers = self._simulations.ask("reset", seeds, options, chosen)
+            results = self._simulations.ask("reset", seeds, options, chosen)
             self._begun = True
-            self._ended -= set(chosen.nonzero()[0].tolist())
-            observations, infos = self._joined(answers)
-        return duplicate(observations) if self._copy else observations, self._merged(infos)
+            self._ended.difference_update(chosen.nonzero()[0].tolist())
+            observations, infos = self._join(results)
+        return observations, self._merge(infos)
 
     def step(
-        self, actions: Any
-    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        self, actions: Action
+    ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
         """Answer the pending decision of each simulation and run it to its next one.
 
         Args:
@@ -152,60 +168,70 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             BaseException: Any exception of a simulation or a mapping, with a note that names the
                 simulation. Then all of them need a reset.
         """
-        with self._guard:
-            if not self._begun:
-                raise NotResetError("there is no episode yet; call reset() first")
-            if self._simulations.failed:
-                raise EpisodeOverError(
-                    "an error has ended the episodes; call reset() to begin the next ones"
-                )
+        with self._exclusive():
+            self._check_begun()
             if self._ended and self._mode == AutoresetMode.DISABLED:
                 raise EpisodeOverError(
                     f"the episodes of the sub-environments {sorted(self._ended)[:10]} are over;"
                     " begin the next ones"
                     ' with reset(options={"reset_mask": ...})'
                 )
-            answers = self._simulations.ask("step", self._split(actions), self._ended)
-            observations, rewards, terminations, truncations, ended, infos = self._joined(answers)
-            self._ended = frozenset(ended)
-        observations = duplicate(observations) if self._copy else observations
-        return observations, rewards, terminations, truncations, self._merged(infos)
+            results = self._simulations.ask("step", self._split(actions), self._ended)
+            observations, rewards, terminations, truncations, ended, infos = self._join(results)
+            self._ended = set(ended)
+        return (
+            observations,
+            rewards,
+            terminations,
+            truncations,
+            self._merge(infos),
+        )
 
-    def _joined(self, answers: list[Any]) -> Any:
-        """Join what all parts have returned: observations, which the next call overwrites, arrays and lists."""
-        if isinstance(self._simulations, SimulationBatch):
-            return answers[0]
-        observations, *columns = zip(*answers, strict=True)
-        self._observations = _join(self.single_observation_space, observations, self._observations)
-        lists = [
-            np.concatenate(p) if isinstance(p[0], np.ndarray) else [*chain.from_iterable(p)]
-            for p in columns
-        ]
-        return self._observations, *lists
+    def _check_begun(self) -> None:
+        """Check that all simulations have begun, and that no error has ended them."""
+        if not self._begun:
+            raise NotResetError("there is no episode yet; call reset() first, without a reset_mask")
+        if self._simulations.failed:
+            raise EpisodeOverError(
+                "an error has ended the episodes; call reset() without a reset_mask to begin the"
+                " next ones"
+            )
 
-    def _merged(self, infos: list[tuple[int, dict[str, Any]]]) -> dict[str, Any]:
-        """Merge infos as Gymnasium does, but key by key, which takes a third of the time."""
-        merged: dict[str, Any] = {}
-        for key in dict.fromkeys(chain.from_iterable([info for _, info in infos])):
-            own = [(number, info[key]) for number, info in infos if key in info]
-            number, value = own[0]
-            column = self._add_info(merged, {key: value}, number)[key]
-            merged[f"_{key}"][[number for number, _ in own]] = True
-            if isinstance(column, dict):
-                merged[key] = self._merged(own)
-                continue
-            for number, value in own:
-                column[number] = value
+    def _join(self, results: list[Any]) -> tuple[Any, ...]:
+        """Join the results of all parts: observations, arrays and lists."""
+        observations, *columns = results[0]
+        if isinstance(self._simulations, WorkerPool):
+            parts, *others = zip(*results, strict=True)
+            items = [iterate(self.observation_space, part) for part in parts]
+            observations = self._stack(list(chain.from_iterable(items)), self._stacked)
+            columns = [
+                np.concatenate(column)
+                if isinstance(column[0], np.ndarray)
+                else list(chain.from_iterable(column))
+                for column in others
+            ]
+        return duplicate(observations) if self._copy else observations, *columns
+
+    def _merge(self, infos: Infos) -> Info:
+        """Merge the infos of sub-environments, as Gymnasium does. Known keys take less time."""
+        merged: Info = {}
+        for number, info in infos:
+            for key, value in info.items():
+                if key in merged and not isinstance(value, dict):
+                    merged[key][number] = value
+                    merged[f"_{key}"][number] = True
+                else:
+                    merged = self._add_info(merged, {key: value}, number)
         return merged
 
-    def _split(self, actions: Any) -> list[Any]:
-        """Split a batch of actions, and check each action that will be used, before any simulation moves."""
+    def _split(self, actions: Action) -> list[Action]:
+        """Split a batch of actions. Check all that will be used, before any simulation moves."""
         if actions is RULE:
             raise InvalidActionError(
                 "RULE is not an action in vector environments; use single_env, or policies="
             )
         space = self.single_action_space
-        if type(actions) is np.ndarray and self._checks_alone:
+        if type(actions) is np.ndarray and self._checks_spaces_only:
             if not isinstance(space, spaces.Discrete):
                 if actions.dtype == space.dtype and self.action_space.contains(actions):
                     return list(actions.copy())  # so that the caller cannot change them
@@ -215,62 +241,50 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 and actions.min() >= space.start
                 and actions.max() < space.start + space.n
             ):
-                return actions.tolist()  # type: ignore[no-any-return]
-        return list(
-            chain.from_iterable(self._simulations.ask("check", self._apart(actions), self._ended))
-        )
-
-    def _apart(self, actions: Any) -> list[Any]:
+                return list(actions.tolist())
         try:
-            apart = list(iterate(self.action_space, actions))
+            parts = list(iterate(self.action_space, actions))
         except Exception as error:
             raise InvalidActionError(
                 f"{short_repr(actions)} is not a batch of {self.num_envs} actions of"
-                f" {short_repr(self.single_action_space)}"
+                f" {short_repr(space)}"
             ) from error
-        if len(apart) != self.num_envs:
+        if len(parts) != self.num_envs:
             raise InvalidActionError(
-                f"there are {len(apart)} actions for {self.num_envs} simulations:"
+                f"there are {len(parts)} actions for {self.num_envs} simulations:"
                 f" {short_repr(actions)}"
             )
-        return apart
+        return list(chain.from_iterable(self._simulations.ask("check", parts, self._ended)))
 
-    def _seeds(self, seed: Any) -> list[int | None]:
-        if seed is None or isinstance(seed, (int, np.integer)):
-            first = checked_seed(seed)
-            return [None if first is None else first + number for number in range(self.num_envs)]
-        seeds = [checked_seed(part) for part in seed]
-        if len(seeds) != self.num_envs:
-            raise OptionValueError(f"there are {len(seeds)} seeds for {self.num_envs} simulations")
-        return seeds
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, (int, np.integer)):
+            seed = [seed, *range(seed + 1, seed + self.num_envs)]
+        self._check_number(seed, "seeds")
+        return [checked_seed(part) for part in seed]
 
-    def _chosen(
-        self, options: dict[str, Any] | None
-    ) -> tuple[NDArray[np.bool_], dict[str, Any] | None]:
-        """Return which simulations to reset, and the options for them."""
+    def _check_number(self, items: Sized, noun: str) -> None:
+        if len(items) != self.num_envs:
+            raise OptionValueError(f"there are {len(items)} {noun} for {self.num_envs} simulations")
+
+    def _chosen(self, options: ResetOptions) -> tuple[NDArray[np.bool_], ResetOptions]:
+        """Return the mask of the simulations to reset, and the options for them."""
         if options is None or "reset_mask" not in options:
             return np.ones(self.num_envs, np.bool_), options
-        mask = options["reset_mask"]
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != (self.num_envs,)
-        ):
+        others = dict(options)
+        mask = others.pop("reset_mask")
+        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_
+        if not is_mask or mask.shape != (self.num_envs,):
             raise OptionValueError(
                 f"reset_mask must be a bool array of shape ({self.num_envs},), not"
                 f" {short_repr(mask)}"
             )
         if not mask.any():
             raise OptionValueError("reset_mask selects no simulation to reset")
-        if not (self._begun or mask.all()):
-            raise NotResetError(
-                "there are no episodes yet; call reset() without a reset_mask first"
-            )
-        if self._simulations.failed and not mask.all():
-            raise EpisodeOverError(
-                "an error has ended the episodes; call reset() without a reset_mask"
-            )
-        return mask, {name: value for name, value in options.items() if name != "reset_mask"}
+        if not mask.all():
+            self._check_begun()
+        return mask, others
 
     # -- the simulations --------------------------------------------------------------------------
 
@@ -283,7 +297,12 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             )
         return list(self._simulations.views)
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(
+        self,
+        name: str,
+        *args: Model,
+        **kwargs: Model,
+    ) -> tuple[Model, ...]:
         """Call a method of each sub-environment, or get its attribute.
 
         Args:
@@ -299,14 +318,14 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             ClosedError: The environment is closed.
             BaseException: Any exception of a sub-environment.
         """
-        with self._guard:
+        with self._exclusive():
             return tuple(chain.from_iterable(self._simulations.ask("call", name, args, kwargs)))
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
+    def get_attr(self, name: str) -> tuple[Model, ...]:
         """Return an attribute of each sub-environment, as a tuple."""
         return self.call(name)
 
-    def set_attr(self, name: str, values: Any) -> None:
+    def set_attr(self, name: str, values: Model) -> None:
         """Set an attribute of each sub-environment.
 
         Args:
@@ -319,14 +338,11 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if not isinstance(values, (list, tuple)):
             values = [values] * self.num_envs
-        if len(values) != self.num_envs:
-            raise OptionValueError(
-                f"there are {len(values)} values for {self.num_envs} simulations"
-            )
-        with self._guard:
+        self._check_number(values, "values")
+        with self._exclusive():
             self._simulations.ask("set_attr", name, list(values))
 
-    @property  # type: ignore[misc]  # one generator for each cannot be set as one
+    @property  # type: ignore[misc]  # it cannot be set, because each has its own
     def np_random(self) -> Any:
         """The generators of the sub-environments, as a tuple."""
         return self.get_attr("np_random")
@@ -336,7 +352,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         """The seeds of the sub-environments' generators, as a tuple."""
         return self.get_attr("np_random_seed")
 
-    def render(self) -> tuple[Any, ...]:
+    def render(self) -> tuple[Model, ...]:
         """Render each simulation in ``render_mode``.
 
         Without a render mode, warn and return a tuple of None.
@@ -353,30 +369,15 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if self.closed:
             return
-        with self._guard:
+        with self._exclusive():
             try:
                 self._simulations.close()
             finally:
-                self.closed = self._guard.closed = self._simulations.idle
+                self.closed = self._simulations.idle
 
-    # that of Gymnasium before 1.3 closes and raises; the finalizer warns
-    def __del__(self) -> None:
-        """Leave the end to the finalizer."""
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        """Refuse to be copied or pickled, since the stacks of simulations cannot be."""
-        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make a new one")
-
-
-class _Guard:
-    """The context of a call to a vector environment, in which every other call is refused."""
-
-    __slots__ = ("_lock", "closed")
-
-    def __init__(self) -> None:
-        self._lock, self.closed = Lock(), False
-
-    def __enter__(self) -> None:
+    @contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        """Refuse all other calls during a call."""
         if self.closed:
             raise ClosedError("the environment is closed; make a new one")
         if not self._lock.acquire(blocking=False):
@@ -384,31 +385,23 @@ class _Guard:
                 "the environment was used from inside its own simulations or mappings, or while"
                 " another thread was stepping, resetting or closing it"
             )
+        try:
+            yield
+        finally:
+            self._lock.release()
 
-    def __exit__(self, *error: object) -> None:
-        self._lock.release()
+    def __del__(self) -> None:
+        """Leave the end to the finalizer, which warns. Gymnasium before 1.3 raises here."""
+
+    def __reduce_ex__(self, protocol: object) -> NoReturn:
+        """Refuse to be copied or pickled, since the stacks of simulations cannot be."""
+        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make a new one")
 
 
-def _count(value: Any, name: str, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+def _count(value: int, name: str, least: int) -> int:
+    """Return an option that is an integer of at least ``least``."""
+    if not is_seed(value) or value < least:
         raise OptionValueError(
             f"{name} must be an integer of at least {least}, not {short_repr(value)}"
         )
     return int(value)
-
-
-def _join(space: spaces.Space[Any], parts: Sequence[Any], out: Any) -> Any:
-    """Join batches of a space into one, which is written into ``out`` where it consists of arrays."""
-    if isinstance(space, spaces.Dict):
-        return {
-            key: _join(inner, [part[key] for part in parts], out[key])
-            for key, inner in space.spaces.items()
-        }
-    if isinstance(space, spaces.Tuple):
-        return tuple(
-            _join(inner, [part[i] for part in parts], out[i])
-            for i, inner in enumerate(space.spaces)
-        )
-    if isinstance(out, np.ndarray):
-        return np.concatenate(parts, out=out)
-    return tuple(chain.from_iterable(parts))

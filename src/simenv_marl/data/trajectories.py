@@ -346,7 +346,7 @@ class Recorder:
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(
-                    f"{group.asked!r} returned {short_repr(name)} of shape {array.shape} for"
+                    f"{group.policy!r} returned {short_repr(name)} of shape {array.shape} for"
                     f" {len(actions)} decisions; the length of its first axis must be their number"
                 )
         log.extras.append(arrays)

@@ -90,8 +90,9 @@ class BatchPolicy:
         """Return the group of the decisions at a point."""
         group = self._groups.get(point.hook)
         if group is None:
-            alike = (known for known in self._groups.values() if known.fits(point))
-            group = next(alike, None) or Group(self, point)
+            group = Group(self, point)
+            alike = (known for known in self._groups.values() if known.spaces == group.spaces)
+            group = next(alike, group)
             self._groups[point.hook] = group
         return group
 
@@ -162,6 +163,7 @@ class Group:
     Attributes:
         policy: The policy.
         point: One of the points of the decisions; the others have the same spaces.
+        spaces: The spaces of observations and actions, and whether actions may be masked.
         stack: Stacks observations.
         waiting: The decisions that wait: the index of the episode's seed, the episode, and the
             observation. A stack of observations from many suspended episodes would miss the
@@ -171,18 +173,11 @@ class Group:
     def __init__(self, policy: BatchPolicy, point: Point) -> None:
         self.policy = policy
         self.point = point
-        self.stack = stacker(point.definition.observation_space, cast=True)
+        definition = point.definition
+        is_masked = point.legal is not None
+        self.spaces = definition.observation_space, definition.action_space, is_masked
+        self.stack = stacker(definition.observation_space, cast=True)
         self.waiting: list[tuple[int, Episode, Observation]] = []
-
-    def fits(self, point: Point) -> bool:
-        """Return whether decisions at a point can be stacked with those of this group."""
-        own = self.point.definition
-        other = point.definition
-        return (
-            own.observation_space == other.observation_space
-            and own.action_space == other.action_space
-            and (self.point.legal is None) == (point.legal is None)
-        )
 
     def ask(
         self, observations: Observation, episodes: Sequence[Episode], agents: Sequence[Agent]
@@ -343,7 +338,12 @@ class _Simulations:
     def proceed(self) -> None:
         """Have decisions answered, and run their simulations to their next decisions."""
         while self._backlog and len(self._awaited) < self.concurrency:
-            self._begin(*self._backlog.popleft())
+            place, episode, begin = self._backlog.popleft()
+            try:
+                self._awaited.add((place, episode), begin())
+            except BaseException as error:
+                episode.annotate(error)
+                raise
         # The largest group, because large batches save calls of policies.
         group = max(self._groups, key=lambda group: len(group.waiting), default=None)
         if group is not None and group.waiting and not self._awaited.ready:
@@ -383,14 +383,6 @@ class _Simulations:
                 self._backlog.append((place, episode, partial(key.begin, *arguments)))
                 return
             self._step(place, episode, partial(key.answer, *arguments))
-
-    def _begin(self, place: int, episode: Episode, begin: Callable[[], Action]) -> None:
-        """Call the policy of one decision, which is awaited."""
-        try:
-            self._awaited.add((place, episode), begin())
-        except BaseException as error:
-            episode.annotate(error)
-            raise
 
     def _answer(self, group: Group) -> None:
         """Have the decisions of a group answered, and run each simulation to its next decision."""

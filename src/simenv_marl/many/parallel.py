@@ -11,7 +11,7 @@ import os
 import signal
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from importlib import import_module
 from math import ceil
 from multiprocessing.connection import Connection
@@ -88,10 +88,8 @@ class ProgressBar:
 NO_BAR: Final = ProgressBar()
 
 
-def progress_bar(
-    total: int, progress: bool, unit: str = "simulation", done: int = 0
-) -> AbstractContextManager[ProgressBar]:
-    """Make a progress bar, as a context.
+def progress_bar(total: int, progress: bool, unit: str = "simulation", done: int = 0) -> Any:
+    """Make a context with a ``ProgressBar``.
 
     Args:
         total: The number of units.
@@ -102,8 +100,7 @@ def progress_bar(
     if not progress:
         return nullcontext(NO_BAR)
     tqdm = import_extra("tqdm.auto", "progress=True").tqdm
-    bar: AbstractContextManager[ProgressBar] = tqdm(total=total, unit=unit, initial=done)
-    return bar
+    return tqdm(total=total, unit=unit, initial=done)
 
 
 # -- processes of joblib --------------------------------------------------------------------------
@@ -272,7 +269,7 @@ class _Worker(Peer):
 
 
 class WorkerPool:
-    """Worker processes, each of which has an object with a part of the simulations.
+    """Worker processes. Each has an object with a part of the simulations.
 
     No wait lasts for ever: a wait for an answer also ends when the worker dies, and a worker's
     connection closes when its user ends.
@@ -432,7 +429,7 @@ class WorkerPool:
     def abandon(self) -> None:
         """End the workers. A finalizer may call this; it raises no errors."""
         if os.getpid() != self._home:
-            return  # the workers belong to the process of which this one is a fork
+            return  # because this process is a fork, and its parent has the workers
         workers = self._workers
         self._workers = []
         for worker in workers:

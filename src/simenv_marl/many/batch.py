@@ -62,16 +62,14 @@ class BatchPolicy:
     Attributes:
         keys: The keys of ``policies`` that have this policy.
         policy: The policy, a callable of observations and infos.
-        takes_infos: Whether it takes the infos.
-        takes_identities: Whether it takes the identities of the decisions as well.
+        takes_identities: Whether it takes the identities of the decisions, after the infos.
         alone: Whether it answers one decision at a time.
     """
 
     def __init__(self, policy: Callable[..., Action], *, alone: bool = False) -> None:
         self.keys: list[object] = []
         self.policy: Callable[..., Action] = two_arguments(policy)
-        self.takes_infos = self.policy is policy
-        self.takes_identities = self.takes_infos and takes_identities(policy)
+        self.takes_identities = self.policy is policy and takes_identities(policy)
         self.alone = alone or isinstance(self.policy, AskingPolicy)
         self._groups: dict[DecisionPoint, Group] = {}
 
@@ -119,7 +117,7 @@ class PolicyKey(DeferredPolicy):
         if self.batch_policy.alone:
             return self.batch_policy.policy(observation, info)
         group = self.batch_policy.group(agent.point)
-        actions, _ = group.ask(group.stack([observation]), [episode], [agent])
+        actions, _ = group.ask([episode], [observation], [info])
         return actions[0]
 
 
@@ -165,9 +163,9 @@ class Group:
         point: One of the points of the decisions; the others have the same spaces.
         spaces: The spaces of observations and actions, and whether actions may be masked.
         stack: Stacks observations.
-        waiting: The decisions that wait: the index of the episode's seed, the episode, and the
-            observation. A stack of observations from many suspended episodes would miss the
-            processor's caches.
+        waiting: The decisions that wait: the index of the episode's seed, the episode, the
+            observation, and the info. To read the last two from many suspended episodes would miss
+            the processor's caches.
     """
 
     def __init__(self, policy: BatchPolicy, point: Point) -> None:
@@ -177,20 +175,19 @@ class Group:
         is_masked = point.legal is not None
         self.spaces = definition.observation_space, definition.action_space, is_masked
         self.stack = stacker(definition.observation_space, cast=True)
-        self.waiting: list[tuple[int, Episode, Observation]] = []
+        self.waiting: list[tuple[int, Episode, Observation, Info]] = []
 
     def ask(
-        self, observations: Observation, episodes: Sequence[Episode], agents: Sequence[Agent]
+        self, episodes: Sequence[Episode], observations: list[Observation], infos: list[Info]
     ) -> Answers:
-        """Ask the policy about the stacked observations of the pending agents of episodes."""
+        """Ask the policy for one action for each episode."""
         policy = self.policy
-        infos = [agent.take_info() for agent in agents] if policy.takes_infos else []
         identities: list[tuple[int, int]] = []
         if policy.takes_identities:
             identities = [(episode.seed, episode.turns) for episode in episodes]
         number = len(episodes)
         try:
-            answers = policy.answers(observations, infos, identities)
+            answers = policy.answers(self.stack(observations), infos, identities)
             return read_answers(answers, policy, number)
         except BaseException as error:
             seeds = listed([str(episode.seed) for episode in episodes])
@@ -313,7 +310,7 @@ class _Simulations:
 
     def __post_init__(self) -> None:
         self.sessions: dict[int, Session] = {}  # by the index of their seed
-        self._next = 0  # the index of the next seed
+        self._unstarted = deque(enumerate(self.seeds))
         self._crowd = min(self.size, CROWD)
         self._groups: dict[Group, None] = {}
         # Decisions of policies that are awaited.
@@ -323,10 +320,8 @@ class _Simulations:
 
     def refill(self) -> None:
         """Start simulations until the limit is reached."""
-        while self._next < len(self.seeds) and len(self.sessions) < self._crowd:
-            place = self._next
-            seed = self.seeds[place]
-            self._next += 1
+        while self._unstarted and len(self.sessions) < self._crowd:
+            place, seed = self._unstarted.popleft()
             try:
                 session = Session(self.plan, self._unmatched)
             except BaseException as error:
@@ -358,8 +353,8 @@ class _Simulations:
         """Cancel policies that are awaited, and unwind all simulations, after an error."""
         self._awaited.cancel()
         sessions = [
-            (f"the simulation of seed {self.seeds[place]}", session)
-            for place, session in self.sessions.items()
+            (f"the simulation of seed {session.seed}", session)
+            for session in self.sessions.values()
         ]
         close_all(sessions, error)
 
@@ -374,7 +369,7 @@ class _Simulations:
             agent, key = _pending(episode)
             if not key.batch_policy.alone:
                 group = key.batch_policy.group(agent.point)
-                group.waiting.append((place, episode, agent.observation))
+                group.waiting.append((place, episode, agent.observation, agent.take_info()))
                 self._groups[group] = None
                 return
             arguments = episode, agent, duplicate(agent.observation), agent.take_info()
@@ -387,10 +382,9 @@ class _Simulations:
     def _answer(self, group: Group) -> None:
         """Have the decisions of a group answered, and run each simulation to its next decision."""
         start = perf_counter()
-        places, episodes, observations = map(list, zip(*group.waiting, strict=True))
+        places, episodes, observations, infos = map(list, zip(*group.waiting, strict=True))
         group.waiting.clear()
-        agents = [episode.pending for episode in episodes]
-        answers = group.ask(group.stack(observations), episodes, agents)
+        answers = group.ask(episodes, observations, infos)
         answered = perf_counter()
         actions = list(map(_validate, episodes, answers[0]))
         if self.watcher is not None:
@@ -428,7 +422,7 @@ class _Simulations:
             if after_close is not None:
                 after_close()
         except BaseException as error:
-            annotate(error, f"simenv_marl: after the simulation's end; seed {self.seeds[place]}")
+            annotate(error, f"simenv_marl: after the simulation's end; seed {session.seed}")
             raise
         del self.sessions[place]
 

@@ -9,7 +9,7 @@ import numpy as np
 from .core import EpisodeOptions, Mode, Plan, Points, Session, Source, checked_seed, reuse_resources
 from .envs.single import plan_of
 from .errors import OptionValueError, close_after, short_repr
-from .many.batch import policy_keys, run
+from .many.batch import BatchRun, policy_keys
 from .many.parallel import ProgressBar, import_extra, progress_bar, spread
 from .simulation import Model
 
@@ -155,7 +155,8 @@ def _simulate(
         results[place] = simulation if collect is None else collect(simulation)
         bar.update()
 
-    run(plan or _make_plan(*episodes), seeds, batch_size, finish, concurrency=concurrency)
+    plan = plan or _make_plan(*episodes)
+    BatchRun(plan, seeds, batch_size, finish, concurrency=concurrency).run()
     return results
 
 

@@ -23,7 +23,7 @@ from ..core import (
 )
 from ..envs.single import plan_of
 from ..errors import DefinitionError, OptionValueError, short_repr
-from ..many.batch import BatchPolicy, PolicyKey, policy_keys, read_answers, run
+from ..many.batch import BatchPolicy, BatchRun, PolicyKey, policy_keys, read_answers
 from ..many.parallel import progress_bar, spread
 from ..runs import check_options, checked_policies, checked_seeds
 from ..simulation import RULE
@@ -166,7 +166,8 @@ def _play(
             collected[place] = collect(simulation)
         bar.update()
 
-    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder, concurrency)
+    seeds = [seed for _, seed in episodes]
+    BatchRun(plan, seeds, batch_size, finish, recorder, concurrency).run()
     _, policies, *_ = arguments
     return recorder.records(plan, policies), collected
 

@@ -295,7 +295,7 @@ class _DecisionLog:
 
 
 class Recorder:
-    """Records the decisions of episodes while they run: a ``Watcher`` for ``run``."""
+    """Records the decisions of episodes while they run: a ``Watcher`` for ``BatchRun``."""
 
     def __init__(self, first_episode: int) -> None:
         self._first_episode = first_episode

@@ -22,7 +22,7 @@ from ..errors import (
     short_repr,
     warn_user,
 )  # fmt: skip
-from ..many.batch import Group, run, takes_identities
+from ..many.batch import BatchRun, Group, takes_identities
 from ..many.parallel import import_extra
 from ..runs import check_options, checked_seeds
 from ..simulation import RULE
@@ -245,7 +245,8 @@ class Runner:
         def finish(place: int, simulation: Any) -> Callable[[], None]:
             return partial(report, seeds[place], tally.outcome(place, simulation, self.metrics))
 
-        run(plan, seeds, self.together(contender), finish, tally, self._concurrency)
+        size = self.together(contender)
+        BatchRun(plan, seeds, size, finish, tally, self._concurrency).run()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -275,7 +276,7 @@ class Runner:
 
 
 class Tally:
-    """Counts the returns of agents while episodes run: a ``Watcher`` for ``run``, and for one episode alone."""
+    """Counts the returns of agents while episodes run: a ``Watcher`` for ``BatchRun``, and for one episode alone."""
 
     def __init__(self) -> None:
         # by place and agent: return, length, fallbacks

@@ -265,51 +265,29 @@ If the policy takes longer than all simulations together, more simulations pay o
 """
 
 
-def run(
-    plan: Plan,
-    seeds: Sequence[int],
-    size: int,
-    finish: Callable[[int, Model], Callable[[], None] | None],
-    watcher: Watcher | None = None,
-    concurrency: int = 1,
-) -> None:
-    """Run one simulation per seed.
+@dataclass
+class BatchRun:
+    """Runs one simulation per seed, many of them together.
 
-    After an error, policies that are awaited are cancelled, and all simulations are unwound.
-
-    Args:
+    Attributes:
         plan: The plan, with a ``PolicyKey`` for each policy.
         seeds: The seeds.
         size: The largest number of simulations that run together.
         finish: Called with the index of a seed and its simulation when that has ended. If it
             returns a callable, that is called after the simulation is closed.
-        watcher: Observes the episodes.
+        watcher: Observes the episodes. None: no observer.
         concurrency: The number of decisions that wait together for policies that are awaited.
     """
-    simulations = _Simulations(plan, seeds, size, finish, watcher, concurrency)
-    with outside_simulation(), reuse_resources():
-        try:
-            simulations.refill()
-            while simulations.sessions:
-                simulations.proceed()
-        except BaseException as error:
-            simulations.close(error)
-            raise
-
-
-@dataclass
-class _Simulations:
-    """The simulations of ``run``, and the decisions that wait."""
 
     plan: Plan
     seeds: Sequence[int]
     size: int
     finish: Callable[[int, Model], Callable[[], None] | None]
-    watcher: Watcher | None
-    concurrency: int
+    watcher: Watcher | None = None
+    concurrency: int = 1
 
     def __post_init__(self) -> None:
-        self.sessions: dict[int, Session] = {}  # by the index of their seed
+        self._sessions: dict[int, Session] = {}  # by the index of their seed
         self._unstarted = deque(enumerate(self.seeds))
         self._crowd = min(self.size, CROWD)
         self._groups: dict[Group, None] = {}
@@ -318,19 +296,36 @@ class _Simulations:
         self._awaited = PendingAnswers()
         self._unmatched = UnmatchedNames(self.plan.named_agents)
 
-    def refill(self) -> None:
+    def run(self) -> None:
+        """Run all simulations. After an error, cancel policies and unwind simulations."""
+        with outside_simulation(), reuse_resources():
+            try:
+                self._refill()
+                while self._sessions:
+                    self._proceed()
+                    self._refill()
+            except BaseException as error:
+                self._awaited.cancel()
+                sessions = [
+                    (f"the simulation of seed {session.seed}", session)
+                    for session in self._sessions.values()
+                ]
+                close_all(sessions, error)
+                raise
+
+    def _refill(self) -> None:
         """Start simulations until the limit is reached."""
-        while self._unstarted and len(self.sessions) < self._crowd:
+        while self._unstarted and len(self._sessions) < self._crowd:
             place, seed = self._unstarted.popleft()
             try:
                 session = Session(self.plan, self._unmatched)
             except BaseException as error:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
-            self.sessions[place] = session
+            self._sessions[place] = session
             self._queue(place, session.start(seed, None))
 
-    def proceed(self) -> None:
+    def _proceed(self) -> None:
         """Have decisions answered, and run their simulations to their next decisions."""
         while self._backlog and len(self._awaited) < self.concurrency:
             place, episode, begin = self._backlog.popleft()
@@ -347,16 +342,6 @@ class _Simulations:
             (place, episode), answer = self._awaited.take()
             self._step(place, episode, answer.result)
             self._queue(place, episode)
-        self.refill()
-
-    def close(self, error: BaseException) -> None:
-        """Cancel policies that are awaited, and unwind all simulations, after an error."""
-        self._awaited.cancel()
-        sessions = [
-            (f"the simulation of seed {session.seed}", session)
-            for session in self.sessions.values()
-        ]
-        close_all(sessions, error)
 
     def _queue(self, place: int, episode: Episode) -> None:
         """Queue an episode that waits at a decision, or end it if it is over."""
@@ -414,7 +399,7 @@ class _Simulations:
         episode.step(action)
 
     def _end(self, place: int) -> None:
-        session = self.sessions[place]
+        session = self._sessions[place]
         session.end()  # it may have been truncated
         try:
             after_close = self.finish(place, session.simulation)
@@ -424,7 +409,7 @@ class _Simulations:
         except BaseException as error:
             annotate(error, f"simenv_marl: after the simulation's end; seed {session.seed}")
             raise
-        del self.sessions[place]
+        del self._sessions[place]
 
 
 def _pending(episode: Episode) -> tuple[Agent, PolicyKey]:

@@ -129,7 +129,10 @@ def simulate_many(
 
 
 def _make_plan(
-    simulation: Source, policies: Mapping[Any, Any], points: Points, options: Mapping[str, Any]
+    simulation: Source,
+    policies: Mapping[Any, Any],
+    points: Points,
+    options: Mapping[str, Any],
 ) -> Plan:
     if options.get("max_steps") is not None:
         raise OptionValueError(

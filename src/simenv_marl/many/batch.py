@@ -77,9 +77,18 @@ class BatchPolicy:
         return f"the policy of {listed([name_of(key) for key in self.keys])}"
 
     def answers(
-        self, observations: Observation, infos: Sequence[Info], identities: Sequence[object]
+        self,
+        observations: Observation,
+        infos: Sequence[Info],
+        identities: Sequence[object],
     ) -> Action:
-        """Call the policy with as many of the arguments as it takes, and return its result."""
+        """Call the policy with as many of the arguments as it takes, and return its result.
+
+        Args:
+            observations: Stacked observations, of shape ``(batch, *shape)``.
+            infos: An info for each.
+            identities: The seed of the episode and the number of the decision, for each.
+        """
         if self.takes_identities:
             return self.policy(observations, infos, identities)
         return self.policy(observations, infos)
@@ -112,7 +121,13 @@ class PolicyKey(DeferredPolicy):
         self.place = place
         self.batch_policy = batch_policy
 
-    def answer(self, episode: Any, agent: Any, observation: Observation, info: Info) -> Action:
+    def answer(
+        self,
+        episode: Any,
+        agent: Any,
+        observation: Observation,
+        info: Info,
+    ) -> Action:
         """Answer one decision at once."""
         if self.batch_policy.alone:
             return self.batch_policy.policy(observation, info)
@@ -130,7 +145,10 @@ class AskingKey(AskingPolicy, PolicyKey):
 
 
 def policy_keys(
-    policies: Mapping[Any, Any], *, rewarded: bool = False, alone: bool = False
+    policies: Mapping[Any, Any],
+    *,
+    rewarded: bool = False,
+    alone: bool = False,
 ) -> dict[Any, Any]:
     """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
@@ -178,23 +196,38 @@ class Group:
         self.waiting: list[tuple[int, Episode, Observation, Info]] = []
 
     def ask(
-        self, episodes: Sequence[Episode], observations: list[Observation], infos: list[Info]
+        self,
+        episodes: Sequence[Episode],
+        observations: list[Observation],
+        infos: list[Info],
     ) -> Answers:
-        """Ask the policy for one action for each episode."""
+        """Ask the policy for one action for each episode.
+
+        Args:
+            episodes: The episodes.
+            observations: The observation of each.
+            infos: The info of each.
+
+        Raises:
+            InvalidActionError: The number of actions is wrong.
+            BaseException: Any exception of the policy, with a note that names the seeds.
+        """
         policy = self.policy
         identities: list[tuple[int, int]] = []
         if policy.takes_identities:
             identities = [(episode.seed, episode.turns) for episode in episodes]
         number = len(episodes)
         try:
-            answers = policy.answers(self.stack(observations), infos, identities)
+            stack = self.stack(observations)
+            answers = policy.answers(stack, infos, identities)
             return read_answers(answers, policy, number)
         except BaseException as error:
+            noun = "seed" if number == 1 else "seeds"
             seeds = listed([str(episode.seed) for episode in episodes])
             annotate(
                 error,
                 f"simenv_marl: in {policy!r}, called for {number} decisions at once;"
-                f" {'seed' if number == 1 else 'seeds'} {seeds}",
+                f" {noun} {seeds}",
             )
             raise
 
@@ -393,9 +426,10 @@ class BatchRun:
             raise
         action = _validate(episode, action)
         if self.watcher is not None:
-            extras = {name: np.asarray(value)[None] for name, value in extras.items()}
+            arrays = {name: np.asarray(value)[None] for name, value in extras.items()}
             group = key.batch_policy.group(agent.point)
-            self.watcher.record(group, [place], [episode], [agent.observation], ([action], extras))
+            answers = [action], arrays
+            self.watcher.record(group, [place], [episode], [agent.observation], answers)
         episode.step(action)
 
     def _end(self, place: int) -> None:
@@ -474,7 +508,7 @@ def step_all(
             try:
                 reply = handler.handle(episode, args, kwargs)
             finally:
-                del handler, args, kwargs
+                del handler, args, kwargs  # they must keep nothing alive that the model frees
             if not episode.has_to_wait(reply):
                 episode.advance(reply)
     except BaseException as error:

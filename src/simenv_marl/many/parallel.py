@@ -88,7 +88,12 @@ class ProgressBar:
 NO_BAR: Final = ProgressBar()
 
 
-def progress_bar(total: int, progress: bool, unit: str = "simulation", done: int = 0) -> Any:
+def progress_bar(
+    total: int,
+    progress: bool,
+    unit: str = "simulation",
+    done: int = 0,
+) -> Any:
     """Make a context with a ``ProgressBar``.
 
     Args:
@@ -139,10 +144,10 @@ def spread(
     parcel = pack((work, arguments))
     backend, _ = joblib.parallel.get_active_backend()
     form = "generator" if backend.supports_return_generator else "list"
-    # Errors are packed in the worker, because each backend would pass them on in its own way.
-    outcomes = joblib.Parallel(n_jobs=workers, batch_size=1, return_as=form)(
-        joblib.delayed(pack_outcome)(pack, _work, parcel, os.getpid(), part) for part in parts
-    )
+    # Outcomes are packed in the worker, because each backend passes errors on in its own way.
+    parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as=form)
+    call = joblib.delayed(pack_outcome)
+    outcomes = parallel(call(pack, _work, parcel, os.getpid(), part) for part in parts)
     results: list[Result] = []
     try:
         for part, outcome in zip(parts, outcomes, strict=True):
@@ -260,12 +265,9 @@ class _Worker(Peer):
         self.connection.close()
         process = self._process
         process.join(seconds)
-        for force in (process.terminate, process.kill):
-            if process.exitcode is None:
-                force()
-                process.join(1.0)
-        if process.exitcode is not None:
-            process.close()
+        process.kill()  # which does nothing if it has ended
+        process.join()
+        process.close()
 
 
 class WorkerPool:

@@ -6,7 +6,17 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from .core import EpisodeOptions, Mode, Plan, Points, Session, Source, checked_seed, reuse_resources
+from .core import (
+    EpisodeOptions,
+    Mode,
+    Plan,
+    Points,
+    Session,
+    Source,
+    checked_seed,
+    is_seed,
+    reuse_resources,
+)
 from .envs.single import plan_of
 from .errors import OptionValueError, close_after, short_repr
 from .many.batch import BatchRun, policy_keys
@@ -163,7 +173,7 @@ def _simulate(
     return results
 
 
-def checked_seeds(seeds: Iterable[int | None]) -> list[int]:
+def checked_seeds(seeds: Iterable[int]) -> list[int]:
     """Return seeds as a list of Python integers.
 
     Raises:
@@ -173,15 +183,11 @@ def checked_seeds(seeds: Iterable[int | None]) -> list[int]:
         raise OptionValueError(
             f"seeds must be an iterable of integers, such as range(100), not {short_repr(seeds)}"
         )
-    checked: list[int] = []
-    for seed in seeds:
-        number = checked_seed(seed)
-        if number is None:
-            raise OptionValueError(
-                "seeds must be integers, not None, because an unknown seed cannot be repeated"
-            )
-        checked.append(number)
-    return checked
+    checked = list(seeds)
+    for seed in checked:
+        if not is_seed(seed):
+            raise OptionValueError(f"seeds must be non-negative integers, not {short_repr(seed)}")
+    return list(map(int, checked))
 
 
 def checked_policies(policies: Mapping[Any, Any] | None) -> Mapping[Any, Any]:

@@ -399,9 +399,11 @@ class WorkerPool:
             own = [_share_of(argument, part) for argument in arguments]
             messages.append(pack_plainly(("call", (method, *own))))
         moves = method in ("reset", "step")
-        self.failed = self.failed or moves
+        if moves:
+            self.failed = True  # until all simulations have moved
         results = self._exchange(messages)
-        self.failed = self.failed and not moves
+        if moves:
+            self.failed = False
         return results
 
     def close(self) -> None:

@@ -6,21 +6,32 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from .core import EpisodeOptions, Mode, Plan, Points, Session, checked_seed, reuse_resources
+from .core import (
+    EpisodeOptions,
+    Mode,
+    Plan,
+    Points,
+    Session,
+    Source,
+    checked_seed,
+    is_seed,
+    reuse_resources,
+)
 from .envs.single import plan_of
 from .errors import OptionValueError, close_after, short_repr
-from .many.batch import policy_keys, run
-from .many.parallel import import_extra, progress_bar, spread
+from .many.batch import BatchRun, policy_keys
+from .many.parallel import ProgressBar, import_extra, progress_bar, spread
+from .simulation import Model
 
 
 def simulate(
-    simulation: Any,
+    simulation: Source,
     policies: Mapping[Any, Any] | None = None,
     *,
     points: Points = None,
     seed: int | None = None,
     **options: Unpack[EpisodeOptions],
-) -> Any:
+) -> Model:
     """Run a simulation's own loop to its end. Policies answer decisions.
 
     All other decisions follow the model's rule.
@@ -40,10 +51,10 @@ def simulate(
         The simulation, after its ``run``.
 
     Raises:
-        SimEnvError: Something cannot work. The subclass tells what.
+        SimEnvError: An argument is invalid. The message says which.
         BaseException: Any exception of the model, a mapping or a policy.
     """
-    plan = _draw_up(simulation, policies or {}, points, options)
+    plan = _make_plan(simulation, policies or {}, points, options)
     with reuse_resources():  # policies may branch
         session = Session(plan)
         try:
@@ -56,7 +67,7 @@ def simulate(
 
 
 def simulate_many(
-    simulation: Any,
+    simulation: Source,
     policies: Mapping[Any, Any] | None = None,
     *,
     seeds: Iterable[int],
@@ -68,7 +79,7 @@ def simulate_many(
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
 ) -> list[Any]:
-    """Run one simulation per seed, with policies that answer the decisions of many simulations in batches.
+    """Run one simulation per seed. Policies answer the decisions of many simulations in batches.
 
     Each simulation ends as it would end with ``simulate`` and the same policies. The results do not
     depend on ``batch_size``, ``concurrency`` and ``workers``, as long as a policy's answer to one
@@ -93,8 +104,8 @@ def simulate_many(
         seeds: The seeds of the simulations, non-negative integers.
         points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor
             ``policies``, there are no decision points and the plain models run.
-        collect: A callable of a simulation that has just ended. It returns what to keep of it.
-            None: keep the simulation itself.
+        collect: A callable of a simulation that has just ended, whose result is collected. None:
+            collect the simulation itself.
         batch_size: The largest number of simulations that are suspended together, in each worker
             process. At most 256 are suspended while the policies take less time than the
             simulations.
@@ -113,25 +124,25 @@ def simulate_many(
         OptionValueError: An argument has an invalid value.
         InvalidActionError: A policy did not return one legal action for each decision.
         MissingExtraError: joblib or tqdm is missing.
-        SimEnvError: Something else cannot work. The subclass tells what.
+        SimEnvError: Another argument is invalid. The message says which.
         BaseException: Any exception of a model, a mapping, a policy or ``collect``, with a note
             that names the seed. All other simulations are unwound first.
     """
-    checked, episodes = (
-        checked_seeds(seeds),
-        (simulation, checked_policies(policies), points, options),
-    )
+    all_seeds = checked_seeds(seeds)
+    episodes = simulation, policy_keys(checked_policies(policies)), points, options
     check_options(batch_size, workers, collect, concurrency)
-    plan = _draw_up_keyed(*episodes)  # errors show up before any work starts
+    plan = _make_plan(*episodes)  # errors are raised before any work starts
     arguments = episodes, None if workers else plan, collect, batch_size, concurrency
-    with progress_bar(len(checked), progress) as bar:
-        return list(
-            chain.from_iterable(spread(_simulate, arguments, checked, workers, batch_size, bar))
-        )
+    with progress_bar(len(all_seeds), progress) as bar:
+        parts = spread(_simulate, arguments, all_seeds, workers, batch_size, bar)
+    return list(chain.from_iterable(parts))
 
 
-def _draw_up(
-    simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
+def _make_plan(
+    simulation: Source,
+    policies: Mapping[Any, Any],
+    points: Points,
+    options: Mapping[str, Any],
 ) -> Plan:
     if options.get("max_steps") is not None:
         raise OptionValueError(
@@ -141,50 +152,46 @@ def _draw_up(
     return plan_of(simulation, points, {**options, "policies": policies}, mode=Mode.SIMULATE)
 
 
-def _draw_up_keyed(
-    simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
-) -> Plan:
-    return _draw_up(simulation, policy_keys(policies), points, options)
-
-
 def _simulate(
     episodes: tuple[Any, ...],
     plan: Plan | None,
-    collect: Any,
+    collect: Callable[[Model], Model] | None,
     batch_size: int,
     concurrency: int,
     seeds: list[int],
-    bar: Any,
-) -> list[Any]:
+    bar: ProgressBar,
+) -> list[Model]:
     """Simulate some of the seeds, in this process."""
-    results: list[Any] = [None] * len(seeds)
+    results: list[Model] = [None] * len(seeds)
 
-    def finish(place: int, ended: Any) -> None:
-        results[place] = ended if collect is None else collect(ended)
+    def finish(place: int, simulation: Model) -> None:
+        results[place] = simulation if collect is None else collect(simulation)
         bar.update()
 
-    run(plan or _draw_up_keyed(*episodes), seeds, batch_size, finish, concurrency=concurrency)
+    plan = plan or _make_plan(*episodes)
+    BatchRun(plan, seeds, batch_size, finish, concurrency=concurrency).run()
     return results
 
 
-def checked_seeds(seeds: Any) -> list[int]:
-    """Return seeds as a list of Python integers, or raise an error that says why they are not valid."""
+def checked_seeds(seeds: Iterable[int]) -> list[int]:
+    """Return seeds as a list of Python integers.
+
+    Raises:
+        OptionValueError: The seeds are not an iterable of non-negative integers.
+    """
     if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
         raise OptionValueError(
             f"seeds must be an iterable of integers, such as range(100), not {short_repr(seeds)}"
         )
-    checked = []
-    for seed in seeds:
-        if seed is None:
-            raise OptionValueError(
-                "seeds must be integers, not None: an unknown seed could not be repeated"
-            )
-        checked.append(checked_seed(seed))
-    return checked  # type: ignore[return-value]
+    checked = list(seeds)
+    for seed in checked:
+        if not is_seed(seed):
+            raise OptionValueError(f"seeds must be non-negative integers, not {short_repr(seed)}")
+    return list(map(int, checked))
 
 
-def checked_policies(policies: Any) -> Mapping[Any, Any]:
-    """Return policies as a mapping."""
+def checked_policies(policies: Mapping[Any, Any] | None) -> Mapping[Any, Any]:
+    """Return policies as a mapping. Raise an ``OptionValueError`` if they are none."""
     if policies is not None and not isinstance(policies, Mapping):
         raise OptionValueError(
             "policies must be a dict from agents or points to callables, not"
@@ -193,24 +200,30 @@ def checked_policies(policies: Any) -> Mapping[Any, Any]:
     return policies or {}
 
 
-def check_options(batch_size: Any, workers: Any, collect: Any = None, concurrency: Any = 1) -> None:
-    """Check the options that all functions for many simulations have."""
+def check_options(
+    batch_size: int,
+    workers: int,
+    collect: Callable[..., Model] | None = None,
+    concurrency: int = 1,
+) -> None:
+    """Check the options of functions that run many simulations: see ``simulate_many``.
+
+    Raises:
+        OptionValueError: An option has an invalid value.
+        MissingExtraError: There are workers, and joblib is missing.
+    """
     if collect is not None and not callable(collect):
         raise OptionValueError(
             f"collect must be a callable of a simulation, or None, not {short_repr(collect)}"
         )
-    for name, value, least in (
-        ("batch_size", batch_size, 1),
-        ("concurrency", concurrency, 1),
-        ("workers", workers, -1),
+    positive = "a positive integer"
+    for name, value, least, expected in (
+        ("batch_size", batch_size, 1, positive),
+        ("concurrency", concurrency, 1, positive),
+        ("workers", workers, -1, "a non-negative integer, or -1 for as many as joblib has"),
     ):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            what = (
-                "a positive integer"
-                if least == 1
-                else "a non-negative integer, or -1 for as many as joblib has"
-            )
-            raise OptionValueError(f"{name} must be {what}, not {short_repr(value)}")
+            raise OptionValueError(f"{name} must be {expected}, not {short_repr(value)}")
     if workers:
         backend, _ = import_extra("joblib.parallel", f"workers={workers}").get_active_backend()
         if type(backend).__name__ == "MultiprocessingBackend":

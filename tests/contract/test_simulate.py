@@ -136,6 +136,41 @@ def test_an_agents_own_policy_comes_before_that_of_its_point(of_point, of_agent,
     assert env.simulation.log == [expected[1], 1]
 
 
+@pytest.mark.parametrize("undeclared", ["error", "rule"])
+@pytest.mark.parametrize("declared", [["being_0"], {Being.act: ["being_0"]}])
+def test_possible_agents_may_be_declared(declared, undeclared):
+    def main(simulation):
+        simulation.log = [Being(number).act() for number in (0, 1)]
+
+    given = {"points": beings(), "possible_agents": declared, "undeclared": undeclared}
+    assert simulate(script(main), {Being.act: lambda seen: 3}, **given).log == [3, 3]
+    assert simulate(script(main), {"being_1": lambda seen: 3}, **given).log == ["rule", 3]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_many_simulations_may_declare_possible_agents(workers):
+    def main(simulation):
+        simulation.log = [Being(number).act() for number in (0, 1)]
+
+    found = simulate_many(
+        script(main),
+        {Being.act: lambda seen: [4] * len(seen), "being_1": lambda seen: [3] * len(seen)},
+        points=beings(),
+        possible_agents={Being.act: ["being_0", "being_1"]},
+        seeds=range(3),
+        workers=workers,
+    )
+    assert [simulation.log for simulation in found] == [[4, 3]] * 3
+
+
+@pytest.mark.parametrize("run", [simulate, partial(simulate_many, seeds=[1])], ids=["one", "many"])
+def test_possible_agents_that_never_decide_are_warned_of(run):
+    source = script(lambda simulation: Being(0).act())
+    declared = ["being_0", "being_7"]
+    with pytest.warns(UserWarning, match="did not appear in the episode: being_7; .*being_0"):
+        run(source, {Being.act: lambda seen: RULE}, points=beings(), possible_agents=declared)
+
+
 @pytest.mark.parametrize("action", [1, RULE])
 def test_policies_keep_no_entity_alive(action):
     def main(simulation):

@@ -600,8 +600,8 @@ SCRIPT = """
         kinds = ["plain"] * 5 + ["faulty"]
         design = pd.DataFrame({"days": range(1, 7), "price": 0.5, "kind": kinds})
         frame = run_experiment(
-            Own, design, contenders={"some": {"__main__.Own.order": some}}, seeds=range(4),
-            points={"__main__.Own.order": order, Shop.sell: sell}, metric=level, store=store,
+            Own, design, contenders={"some": {Own.order: some}}, seeds=range(4),
+            points={Own.order: order, Shop.sell: sell}, metric=level, store=store,
             workers=workers,
         )
         frame.to_pickle(f"{store}.table")

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import threading
 import time
 
 import joblib
@@ -154,13 +153,6 @@ def test_undecorated_models_variants_and_closures_reach_the_workers():
     assert vars(Creature)["act"] is before
 
 
-def test_what_a_script_names_without_defining_it_is_not_sent(monkeypatch):
-    monkeypatch.setattr(sys.modules["__main__"], "lock", threading.Lock(), raising=False)
-    source = script(lambda simulation: simulation.log.append("__main__.lock"))
-    found = simulate_many(source, seeds=[1, 2], points=POINTS, workers=2)
-    assert [simulation.log for simulation in found] == [["__main__.lock"]] * 2
-
-
 def test_errors_surface_as_themselves():
     class LocalError(Exception):
         """Of which workers cannot know by its name."""
@@ -231,7 +223,7 @@ SCRIPT = """
         try:
             for workers in (2, 2, 0):
                 define_model()  # as one does again and again in a notebook
-                policies = {"__main__.Model.decide": lambda seen: seen[:, 0].astype(int) % 5}
+                policies = {Model.decide: lambda seen: seen[:, 0].astype(int) % 5}
                 print(simulate_many(Model, policies, workers=workers, **given))
         except KeyboardInterrupt:
             print("interrupted")

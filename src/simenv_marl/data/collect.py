@@ -34,10 +34,10 @@ from ..errors import (
 )
 from ..many.batch import (
     BatchPolicy,
+    BatchRun,
     PolicyKey,
     policy_keys,
     read_answers,
-    run,
 )
 from ..many.parallel import progress_bar, spread
 from ..runs import check_options, checked_policies, checked_seeds
@@ -226,14 +226,14 @@ def _play(
             collected[place] = collect(simulation)
         bar.update()
 
-    run(
+    BatchRun(
         plan,
         [seed for _, seed in episodes],
         batch_size,
         finish,
         recorder,
         concurrency,
-    )
+    ).run()
     return recorder.records(plan, keys), collected
 
 

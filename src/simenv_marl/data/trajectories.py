@@ -298,7 +298,7 @@ class _DecisionLog:
         for name, array in arrays.items():
             if array.shape[:1] != (number,):
                 raise OptionValueError(
-                    f"{group.asked!r} returned {short_repr(name)} of shape {array.shape} for"
+                    f"{group.policy!r} returned {short_repr(name)} of shape {array.shape} for"
                     f" {number} decisions; the length of its first axis must be their number"
                 )
         self.extras.append(arrays)
@@ -375,7 +375,7 @@ class _DecisionLog:
 
 
 class Recorder:
-    """Records the decisions of episodes while they run: a ``Watcher`` for ``run``."""
+    """Records the decisions of episodes while they run: a ``Watcher`` for ``BatchRun``."""
 
     def __init__(self, first_episode: int) -> None:
         self._first_episode = first_episode

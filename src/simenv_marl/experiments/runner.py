@@ -23,7 +23,7 @@ from ..errors import (
     short_repr,
     warn_user,
 )
-from ..many.batch import Group, run, takes_identities
+from ..many.batch import BatchRun, Group, takes_identities
 from ..runs import checked_seeds
 from ..simulation import RULE, Model
 
@@ -255,14 +255,14 @@ class Runner:
             return partial(report, seed, outcome)
 
         with error_note(f"of the contender {contender!r}"):
-            run(
+            BatchRun(
                 plan,
                 seeds,
                 self.episodes_at_once(contender),
                 finish,
                 tally,
                 self._concurrency,
-            )
+            ).run()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -292,7 +292,7 @@ class Runner:
 
 
 class Tally:
-    """Counts the decisions and rewards of agents while episodes run: a ``Watcher`` for ``run``.
+    """Counts the decisions and rewards of agents while episodes run: a ``Watcher`` for ``BatchRun``.
 
     Attributes:
         outcomes: The results of the episodes, by seed.

@@ -1,1 +1,1 @@
-"""Policies in the model, in one simulation or in many at once."""
+"""Many simulations at once, in this process or in several."""

@@ -7,7 +7,7 @@ the episode waits until many decisions wait for the same policy. The number of s
 determines which decisions share a batch; it does not change the course of any simulation.
 
 In the plan, a ``PolicyKey`` stands for each key of ``policies``. Keys of the same policy share one
-``BatchPolicy``. Its decisions are asked in ``Group``s; all decisions of a group have the same
+``BatchPolicy``. Its decisions are answered in ``Group``s; all decisions of a group have the same
 spaces, so that they can be stacked.
 """
 
@@ -24,13 +24,15 @@ from typing import Any, Final, Protocol
 import numpy as np
 from greenlet import getcurrent
 
-from ..core import Answers as Awaited
 from ..core import (
+    Agent,
     AskingPolicy,
     DeferredPolicy,
     Episode,
+    Info,
     Plan,
     Point,
+    Policy,
     Session,
     UnmatchedNames,
     close_all,
@@ -42,15 +44,16 @@ from ..core import (
     two_arguments,
     waits,
 )
+from ..core import Answers as PendingAnswers
 from ..decision import DecisionPoint
-from ..errors import InvalidActionError, annotate, short_repr
+from ..errors import InvalidActionError, annotate, listed, name_of, short_repr
 from ..hooks.stacks import EVALUATING, outside_simulation
-from ..simulation import RULE, positional
+from ..simulation import RULE, Action, Model, Observation, positional
 
-Answers = tuple[list[Any], Mapping[str, Any]]
-"""The actions of a policy for many decisions, and the extras that it has returned beside them."""
+Answers = tuple[list[Action], Mapping[str, Any]]
+"""The actions of a policy for many decisions, and its extras: arrays with a row for each."""
 
-# -- who is asked ---------------------------------------------------------------------------------
+# -- batched policies -----------------------------------------------------------------------------
 
 
 class BatchPolicy:
@@ -59,166 +62,207 @@ class BatchPolicy:
     Attributes:
         keys: The keys of ``policies`` that have this policy.
         policy: The policy, a callable of observations and infos.
-        informed, identifying: Whether it takes the infos, and the identities of the decisions.
+        takes_identities: Whether it takes the identities of the decisions, after the infos.
         alone: Whether it answers one decision at a time.
     """
 
-    def __init__(self, policy: Callable[..., Any], *, alone: bool = False) -> None:
-        self.keys: list[Any] = []
-        self.policy: Callable[..., Any] = two_arguments(policy)
-        self.informed = self.policy is policy
-        self.identifying = self.informed and takes_identities(policy)
+    def __init__(self, policy: Callable[..., Action], *, alone: bool = False) -> None:
+        self.keys: list[object] = []
+        self.policy: Callable[..., Action] = two_arguments(policy)
+        self.takes_identities = self.policy is policy and takes_identities(policy)
         self.alone = alone or isinstance(self.policy, AskingPolicy)
-        self.groups: dict[DecisionPoint, Group] = {}
+        self._groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
-        return (
-            "the policy of"
-            f" {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
-        )
+        return f"the policy of {listed([name_of(key) for key in self.keys])}"
 
     def answers(
-        self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]
-    ) -> Any:
-        """Call the policy with as many of the arguments as it takes, and return what it returns."""
-        if self.identifying:
+        self,
+        observations: Observation,
+        infos: Sequence[Info],
+        identities: Sequence[object],
+    ) -> Action:
+        """Call the policy with as many of the arguments as it takes, and return its result.
+
+        Args:
+            observations: Stacked observations, of shape ``(batch, *shape)``.
+            infos: An info for each.
+            identities: The seed of the episode and the number of the decision, for each.
+        """
+        if self.takes_identities:
             return self.policy(observations, infos, identities)
         return self.policy(observations, infos)
 
     def group(self, point: Point) -> Group:
         """Return the group of the decisions at a point."""
-        group = self.groups.get(point.hook)
+        group = self._groups.get(point.hook)
         if group is None:
-            group = next(
-                (known for known in self.groups.values() if known.takes(point)), None
-            ) or Group(self, point)
-            self.groups[point.hook] = group
+            group = Group(self, point)
+            alike = (known for known in self._groups.values() if known.spaces == group.spaces)
+            group = next(alike, group)
+            self._groups[point.hook] = group
         return group
 
 
-def takes_identities(policy: Callable[..., Any]) -> bool:
+def takes_identities(policy: Callable[..., Action]) -> bool:
     """Return whether a policy requires a third argument, the identities of the decisions."""
     return sum(p.default is p.empty for p in positional(policy)) > 2
 
 
 class PolicyKey(DeferredPolicy):
-    """A batched policy in a plan, with the place of its key in ``policies``."""
+    """A batched policy in a plan.
 
-    def __init__(self, place: int, asked: BatchPolicy) -> None:
+    Attributes:
+        place: The place of its key in ``policies``.
+        batch_policy: The policy.
+    """
+
+    def __init__(self, place: int, batch_policy: BatchPolicy) -> None:
         self.place = place
-        self.asked = asked
+        self.batch_policy = batch_policy
 
-    def answer(self, episode: Any, agent: Any, observation: Any, info: Any) -> Any:
+    def answer(
+        self,
+        episode: Any,
+        agent: Any,
+        observation: Observation,
+        info: Info,
+    ) -> Action:
         """Answer one decision at once."""
-        if self.asked.alone:
-            return self.asked.policy(observation, info)
-        group = self.asked.group(agent.point)
-        actions, _ = group.ask(group.stack([observation]), [episode], [agent])
+        if self.batch_policy.alone:
+            return self.batch_policy.policy(observation, info)
+        group = self.batch_policy.group(agent.point)
+        actions, _ = group.ask([episode], [observation], [info])
         return actions[0]
 
 
 class AskingKey(AskingPolicy, PolicyKey):
-    """A ``PolicyKey`` of a policy that is asked one decision at a time, because of what it asks for."""
+    """The key of a policy that answers one decision at a time, because of its parameters."""
 
-    def __init__(self, place: int, asked: BatchPolicy, policy: Callable[..., Any]) -> None:
+    def __init__(self, place: int, batch_policy: BatchPolicy, policy: Policy) -> None:
         AskingPolicy.__init__(self, policy)
-        PolicyKey.__init__(self, place, asked)
+        PolicyKey.__init__(self, place, batch_policy)
 
 
 def policy_keys(
-    policies: Mapping[Any, Any], *, rewarded: bool = False, alone: bool = False
+    policies: Mapping[Any, Any],
+    *,
+    rewarded: bool = False,
+    alone: bool = False,
 ) -> dict[Any, Any]:
     """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
-    ``rewarded``: whether episodes wait for all policies. Otherwise, a policy that is asked one
-    decision at a time is called where it decides, unless it has to be awaited. ``alone``: all are
-    asked so.
+    Args:
+        policies: The policies, by agent or point.
+        rewarded: Whether episodes wait for all policies. Otherwise, a policy that answers one
+            decision at a time is called where it decides, unless it must be awaited.
+        alone: Whether all policies answer one decision at a time.
     """
-    known: dict[int, BatchPolicy] = {}
-    found: dict[Any, Any] = {}
+    batch_policies: dict[int, BatchPolicy] = {}
+    keys = dict(policies)
     for place, (key, policy) in enumerate(policies.items()):
-        found[key] = policy
-        asks = is_asked_alone(policy)
-        if policy is not RULE and callable(policy) and (rewarded or not asks or waits(policy)):
-            asked = known.setdefault(id(policy), BatchPolicy(policy, alone=alone))
-            asked.keys.append(key)
-            found[key] = AskingKey(place, asked, policy) if asks else PolicyKey(place, asked)
-    return found
+        is_alone = is_asked_alone(policy)
+        is_called = is_alone and not rewarded and not waits(policy)
+        if policy is RULE or not callable(policy) or is_called:
+            continue
+        batch_policy = batch_policies.setdefault(id(policy), BatchPolicy(policy, alone=alone))
+        batch_policy.keys.append(key)
+        keys[key] = PolicyKey(place, batch_policy)
+        if is_alone:
+            keys[key] = AskingKey(place, batch_policy, policy)
+    return keys
 
 
 class Group:
-    """Decisions that are answered in one batch: those of one policy in the same spaces.
+    """The decisions that one call of a policy can answer, because they have the same spaces.
 
     Attributes:
+        policy: The policy.
         point: One of the points of the decisions; the others have the same spaces.
-        waiting, places, observations: The episodes whose decisions wait, the indices of their
-            seeds, and what they see.
+        spaces: The spaces of observations and actions, and whether actions may be masked.
+        stack: Stacks observations.
+        waiting: The decisions that wait: the index of the episode's seed, the episode, the
+            observation, and the info. To read the last two from many suspended episodes would miss
+            the processor's caches.
     """
 
-    __slots__ = ("_discrete", "asked", "observations", "places", "point", "stack", "waiting")
+    def __init__(self, policy: BatchPolicy, point: Point) -> None:
+        self.policy = policy
+        self.point = point
+        definition = point.definition
+        is_masked = point.legal is not None
+        self.spaces = definition.observation_space, definition.action_space, is_masked
+        self.stack = stacker(definition.observation_space, cast=True)
+        self.waiting: list[tuple[int, Episode, Observation, Info]] = []
 
-    def __init__(self, asked: BatchPolicy, point: Point) -> None:
-        self.asked, self.point = asked, point
-        self.stack = stacker(point.definition.observation_space, cast=True)
-        self.waiting: list[Episode] = []
-        self.places: list[int] = []
-        # Kept outside the episodes: reading them from many suspended episodes would miss the
-        # processor's caches.
-        self.observations: list[Any] = []
-        self._discrete = not point.definition.action_space.shape
+    def ask(
+        self,
+        episodes: Sequence[Episode],
+        observations: list[Observation],
+        infos: list[Info],
+    ) -> Answers:
+        """Ask the policy for one action for each episode.
 
-    def takes(self, point: Point) -> bool:
-        """Return whether decisions at a point can be stacked with those of this group."""
-        own, other = self.point.definition, point.definition
-        return point is self.point or (
-            own.observation_space == other.observation_space
-            and own.action_space == other.action_space
-            and (self.point.legal is None) == (point.legal is None)
-        )
+        Args:
+            episodes: The episodes.
+            observations: The observation of each.
+            infos: The info of each.
 
-    def ask(self, observations: Any, waiting: Sequence[Episode], agents: Sequence[Any]) -> Answers:
-        """Ask the policy about the stacked observations of waiting episodes.
-
-        Return the actions, and the extras.
+        Raises:
+            InvalidActionError: The number of actions is wrong.
+            BaseException: Any exception of the policy, with a note that names the seeds.
         """
-        asked = self.asked
-        infos: list[Any] = []
-        for agent in agents if asked.informed else ():
-            infos.append(agent.take_info())
+        policy = self.policy
+        identities: list[tuple[int, int]] = []
+        if policy.takes_identities:
+            identities = [(episode.seed, episode.turns) for episode in episodes]
+        number = len(episodes)
         try:
-            identities = (
-                [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
-            )
-            answers = asked.answers(observations, infos, identities)
-            return read_answers(answers, asked, len(waiting), integers=self._discrete)
+            stack = self.stack(observations)
+            answers = policy.answers(stack, infos, identities)
+            return read_answers(answers, policy, number)
         except BaseException as error:
-            number, seeds = len(waiting), ", ".join(str(episode.seed) for episode in waiting[:5])
-            seeds = (
-                f"{'seed' if number == 1 else 'seeds'} {seeds}{' and others' if number > 5 else ''}"
-            )
+            noun = "seed" if number == 1 else "seeds"
+            seeds = listed([str(episode.seed) for episode in episodes])
             annotate(
-                error, f"simenv_marl: in {asked!r}, asked for {number} decisions at once; {seeds}"
+                error,
+                f"simenv_marl: in {policy!r}, called for {number} decisions at once;"
+                f" {noun} {seeds}",
             )
             raise
 
 
-def read_answers(answers: Any, policy: Any, number: int, *, integers: bool = False) -> Answers:
-    """Return the actions and the extras in what a policy has returned for a number of decisions."""
-    extras: Mapping[str, Any] = {}
-    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
-        answers, extras = answers
-    actions = [RULE] * number if answers is RULE else split_batch(answers, integers=integers)
+def read_answers(answers: Action, policy: object, number: int) -> Answers:
+    """Split the result of a policy into actions and extras.
+
+    Args:
+        answers: The result.
+        policy: The policy, for errors.
+        number: The number of the decisions.
+
+    Raises:
+        InvalidActionError: The number of actions is wrong.
+    """
+    answers, extras = _split_extras(answers)
+    actions = [RULE] * number if answers is RULE else split_batch(answers, integers=True)
     if actions is None or len(actions) != number:
         returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
         raise InvalidActionError(
-            f"{short_repr(policy)} was asked for {number} decisions at once and returned"
+            f"{short_repr(policy)} was called for {number} decisions at once and returned"
             f" {returned}; it must return one action for each row of the observations, in their"
             " order"
         )
     return actions, extras
 
 
-# -- all of them ----------------------------------------------------------------------------------
+def _split_extras(answer: Action) -> tuple[Action, Mapping[str, Any]]:
+    """Split the result of a policy into the action, or the actions, and the extras."""
+    if type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping):
+        return answer
+    return answer, {}
+
+
+# -- runs -----------------------------------------------------------------------------------------
 
 
 class Watcher(Protocol):
@@ -228,266 +272,255 @@ class Watcher(Protocol):
         self,
         group: Group,
         places: list[int],
-        waiting: list[Any],
-        observations: Any,
+        waiting: list[Episode],
+        observations: list[Observation],
         answers: Answers,
     ) -> None:
-        """Note what a policy has answered, before the simulations move.
+        """Record the answers of a policy, before the simulations move.
 
-        The list has an observation for each.
+        Args:
+            group: The group of the decisions.
+            places: The indices of the episodes' seeds.
+            waiting: The episodes.
+            observations: The observation of each.
+            answers: The answers.
         """
 
     def pay(self, episode: Episode) -> None:
-        """Note the rewards when an episode has reached its next decision or its end."""
+        """Record the rewards when an episode has reached its next decision or its end."""
 
 
 CROWD: Final = 256
-"""The number of simulations at first. With more, each has left the processor's caches when its turn comes again, and
-takes twice as long. If the policy takes longer than all simulations together, more simulations pay
-off."""
+"""The number of simulations at first.
 
-
-def run(
-    plan: Plan,
-    seeds: Sequence[int],
-    size: int,
-    finish: Callable[[int, Any], Callable[[], None] | None],
-    watcher: Watcher | None = None,
-    concurrency: int = 1,
-) -> None:
-    """Run one simulation per seed, ``size`` at a time, of which ``concurrency`` wait for policies that are awaited.
-
-    After an error, these policies are cancelled, and all simulations are unwound.
-
-    The plan has a ``PolicyKey`` for each policy. ``finish`` is called with the index of a seed and
-    its simulation when the simulation has ended. If it returns a callable, that is called after the
-    simulation is closed.
-    """
-    simulations = _Simulations(plan, seeds, size, finish, watcher, concurrency)
-    with outside_simulation(), reuse_resources():
-        try:
-            simulations.refill()
-            while simulations.sessions:
-                simulations.proceed()
-        except BaseException as error:
-            simulations.awaited.cancel()
-            left = simulations.sessions.items()
-            close_all(
-                ((f"the simulation of seed {seeds[place]}", session) for place, session in left),
-                error,
-            )
-            raise
+With more, each has left the processor's caches when its turn comes again, and takes twice as long.
+If the policy takes longer than all simulations together, more simulations pay off.
+"""
 
 
 @dataclass
-class _Simulations:
-    """The simulations that are running, and the decisions that wait: see ``run``."""
+class BatchRun:
+    """Runs one simulation per seed, many of them together.
+
+    Attributes:
+        plan: The plan, with a ``PolicyKey`` for each policy.
+        seeds: The seeds.
+        size: The largest number of simulations that run together.
+        finish: Called with the index of a seed and its simulation when that has ended. If it
+            returns a callable, that is called after the simulation is closed.
+        watcher: Observes the episodes. None: no observer.
+        concurrency: The number of decisions that wait together for policies that are awaited.
+    """
 
     plan: Plan
     seeds: Sequence[int]
     size: int
-    finish: Callable[[int, Any], Callable[[], None] | None]
-    watcher: Watcher | None
-    concurrency: int
+    finish: Callable[[int, Model], Callable[[], None] | None]
+    watcher: Watcher | None = None
+    concurrency: int = 1
 
     def __post_init__(self) -> None:
-        self.crowd = min(self.size, CROWD)
-        # decisions for policies that are awaited
-        self.backlog: deque[tuple[int, Episode]] = deque()
-        self.awaited = Awaited()
-        self.next = 0
-        self.sessions: dict[int, Session] = {}  # by the place of their seed
-        self.groups: dict[Group, None] = {}
-        self.unmatched = UnmatchedNames(self.plan.named_agents)
+        self._sessions: dict[int, Session] = {}  # by the index of their seed
+        self._unstarted = deque(enumerate(self.seeds))
+        self._crowd = min(self.size, CROWD)
+        self._groups: dict[Group, None] = {}
+        # Decisions of policies that are awaited.
+        self._backlog: deque[tuple[int, Episode, Callable[[], Action]]] = deque()
+        self._awaited = PendingAnswers()
+        self._unmatched = UnmatchedNames(self.plan.named_agents)
 
-    def proceed(self) -> None:
-        """Have decisions answered, and run their simulations to their next decisions."""
-        while self.backlog and len(self.awaited) < self.concurrency:
-            place, episode = self.backlog.popleft()
+    def run(self) -> None:
+        """Run all simulations. After an error, cancel policies and unwind simulations."""
+        with outside_simulation(), reuse_resources():
             try:
-                agent: Any = episode.pending
-                self.awaited.add((place, episode), agent.policy.begin(*_seen(episode)))
+                self._refill()
+                while self._sessions:
+                    self._proceed()
+                    self._refill()
             except BaseException as error:
-                episode.annotate(error)
+                self._awaited.cancel()
+                sessions = [
+                    (f"the simulation of seed {session.seed}", session)
+                    for session in self._sessions.values()
+                ]
+                close_all(sessions, error)
                 raise
-        # Waiting for large groups saves calls of policies.
-        group = max(self.groups, key=lambda group: len(group.waiting), default=None)
-        if group is not None and group.waiting and not self.awaited.ready:
-            self.answer(group)
-        elif self.awaited:
-            (place, episode), answer = self.awaited.take()
-            self.step(place, episode, answer.result)
-            self._queue(place, episode)
-        self.refill()
 
-    def answer(self, group: Group) -> None:
-        """Have the decisions of a group answered, and run each simulation to its next decision."""
-        waiting, group.waiting = group.waiting, []
-        places, group.places = group.places, []
-        observations, group.observations = group.observations, []
-        number, start = len(waiting), perf_counter()
-        answers = group.ask(
-            group.stack(observations), waiting, [episode.pending for episode in waiting]
-        )
-        asked = perf_counter()
-        actions = list(map(_checked, waiting, answers[0]))
-        if self.watcher is not None:
-            self.watcher.record(group, places, waiting, observations, answers)
-        step_all(waiting, actions)
-        waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
-        for place in places:
-            self._queue(place, waiting.pop())
-        if 2 * number > self.crowd < self.size and asked - start > perf_counter() - asked:
-            self.crowd = min(self.size, 2 * self.crowd)
-
-    def step(self, place: int, episode: Episode, ask: Callable[[], Any]) -> None:
-        """Have one decision answered, and run its simulation to the next one."""
-        agent: Any = episode.pending
-        extras: Mapping[str, Any] = {}
-        try:
-            answer = ask()
-        except BaseException as error:
-            episode.annotate(error)
-            raise
-        if type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping):
-            answer, extras = answer
-        action = _checked(episode, answer)
-        if self.watcher is not None:
-            extras = {name: np.asarray(value)[None] for name, value in extras.items()}
-            group = agent.policy.asked.group(agent.point)
-            self.watcher.record(group, [place], [episode], [agent.observation], ([action], extras))
-        episode.step(action)
-
-    def refill(self) -> None:
+    def _refill(self) -> None:
         """Start simulations until the limit is reached."""
-        while self.next < len(self.seeds) and len(self.sessions) < self.crowd:
-            place, seed = self.next, self.seeds[self.next]
-            self.next += 1
+        while self._unstarted and len(self._sessions) < self._crowd:
+            place, seed = self._unstarted.popleft()
             try:
-                session = Session(self.plan, self.unmatched)
+                session = Session(self.plan, self._unmatched)
             except BaseException as error:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
-            self.sessions[place] = session
+            self._sessions[place] = session
             self._queue(place, session.start(seed, None))
+
+    def _proceed(self) -> None:
+        """Have decisions answered, and run their simulations to their next decisions."""
+        while self._backlog and len(self._awaited) < self.concurrency:
+            place, episode, begin = self._backlog.popleft()
+            try:
+                self._awaited.add((place, episode), begin())
+            except BaseException as error:
+                episode.annotate(error)
+                raise
+        # The largest group, because large batches save calls of policies.
+        group = max(self._groups, key=lambda group: len(group.waiting), default=None)
+        if group is not None and group.waiting and not self._awaited.ready:
+            self._answer(group)
+        elif self._awaited:
+            (place, episode), answer = self._awaited.take()
+            self._step(place, episode, answer.result)
+            self._queue(place, episode)
 
     def _queue(self, place: int, episode: Episode) -> None:
         """Queue an episode that waits at a decision, or end it if it is over."""
-        if self.watcher is not None:
-            self.watcher.pay(episode)
-        agent: Any = episode.pending
-        while agent is not None and agent.policy.asked.alone and not agent.policy.waits:
-            self.step(place, episode, partial(_ask_now, episode))
+        while True:
             if self.watcher is not None:
                 self.watcher.pay(episode)
-            agent = episode.pending
-        if agent is None:
-            self._end(place)
-            return
-        if agent.policy.waits:
-            self.crowd = min(self.size, max(self.crowd, self.concurrency))
-            self.backlog.append((place, episode))
-            return
-        group = agent.policy.asked.group(agent.point)
-        self.groups[group] = None
-        group.waiting.append(episode)
-        group.places.append(place)
-        # Kept outside the episodes: reading them from many suspended episodes would miss the
-        # processor's caches.
-        is_watched = self.watcher is not None
-        group.observations.append(agent.observation if is_watched else agent.take_observation())
+            if episode.pending is None:
+                self._end(place)
+                return
+            agent, key = _pending(episode)
+            if not key.batch_policy.alone:
+                group = key.batch_policy.group(agent.point)
+                group.waiting.append((place, episode, agent.observation, agent.take_info()))
+                self._groups[group] = None
+                return
+            arguments = episode, agent, duplicate(agent.observation), agent.take_info()
+            if isinstance(key, AskingKey) and key.waits:
+                self._crowd = min(self.size, max(self._crowd, self.concurrency))
+                self._backlog.append((place, episode, partial(key.begin, *arguments)))
+                return
+            self._step(place, episode, partial(key.answer, *arguments))
+
+    def _answer(self, group: Group) -> None:
+        """Have the decisions of a group answered, and run each simulation to its next decision."""
+        start = perf_counter()
+        places, episodes, observations, infos = map(list, zip(*group.waiting, strict=True))
+        group.waiting.clear()
+        answers = group.ask(episodes, observations, infos)
+        answered = perf_counter()
+        actions = list(map(_validate, episodes, answers[0]))
+        if self.watcher is not None:
+            self.watcher.record(group, places, episodes, observations, answers)
+        step_all(episodes, actions)
+        episodes.reverse()  # popped one by one, so that nothing keeps ended episodes alive
+        for place in places:
+            self._queue(place, episodes.pop())
+        is_slow = answered - start > perf_counter() - answered
+        if is_slow and 2 * len(places) > self._crowd:
+            self._crowd = min(self.size, 2 * self._crowd)
+
+    def _step(self, place: int, episode: Episode, answer: Callable[[], Action]) -> None:
+        """Have one decision answered, and run its simulation to the next one."""
+        agent, key = _pending(episode)
+        try:
+            with episode.context() if self.plan.options.global_rng else nullcontext():
+                action, extras = _split_extras(answer())
+        except BaseException as error:
+            episode.annotate(error)
+            raise
+        action = _validate(episode, action)
+        if self.watcher is not None:
+            arrays = {name: np.asarray(value)[None] for name, value in extras.items()}
+            group = key.batch_policy.group(agent.point)
+            answers = [action], arrays
+            self.watcher.record(group, [place], [episode], [agent.observation], answers)
+        episode.step(action)
 
     def _end(self, place: int) -> None:
-        session = self.sessions[place]
+        session = self._sessions[place]
         session.end()  # it may have been truncated
         try:
-            closed = self.finish(place, session.simulation)
+            after_close = self.finish(place, session.simulation)
             session.close()
-            if closed is not None:
-                closed()
+            if after_close is not None:
+                after_close()
         except BaseException as error:
-            annotate(error, f"simenv_marl: after the simulation's end; seed {self.seeds[place]}")
+            annotate(error, f"simenv_marl: after the simulation's end; seed {session.seed}")
             raise
-        del self.sessions[place]
+        del self._sessions[place]
 
 
-def _checked(episode: Episode, action: Any) -> Any:
-    """Return the action of the pending agent, checked."""
-    agent: Any = episode.pending
+def _pending(episode: Episode) -> tuple[Agent, PolicyKey]:
+    """Return the agent whose decision waits, and its policy."""
+    agent = episode.pending
+    assert agent is not None
+    assert isinstance(agent.policy, PolicyKey)
+    return agent, agent.policy
+
+
+def _validate(episode: Episode, action: Action) -> Action:
+    """Validate an action of the pending agent."""
+    agent, _ = _pending(episode)
     try:
-        return action if action is RULE else agent.point.validate(action, agent.name, agent.mask)
+        return action if action is RULE else agent.validate(action)
     except InvalidActionError as error:
         episode.annotate(error)
         raise
 
 
-def _seen(episode: Episode) -> tuple[Any, ...]:
-    """Return the arguments of a policy of one decision."""
-    agent: Any = episode.pending
-    return episode, agent, duplicate(agent.observation), agent.take_info()
-
-
-def _ask_now(episode: Episode) -> Any:
-    """Ask this policy, and wait for its answer."""
-    agent: Any = episode.pending
-    with episode.context() if episode.plan.options.global_rng else nullcontext():
-        return agent.policy.answer(*_seen(episode))
-
-
-# -- many episodes and sessions -------------------------------------------------------------------
+# -- many episodes --------------------------------------------------------------------------------
 
 
 def step_all(
     episodes: Sequence[Episode],
-    actions: Sequence[Any],
-    blame: Callable[[int, BaseException], None] = lambda number, error: None,
+    actions: Sequence[Action],
+    blame: Callable[[int, BaseException], None] | None = None,
 ) -> None:
-    """Answer the pending decisions of episodes of one plan with checked actions, and run each to its next decision.
+    """Answer the pending decisions of episodes of one plan, and run each to its next decision.
 
     All simulations move before any agent is updated, so that the data of each loop stays in the
-    processor's caches. If an episode raises, ``blame`` is called with its number and the error. The
-    others may have moved or not; they can be closed.
+    processor's caches.
+
+    Args:
+        episodes: The episodes.
+        actions: A checked action for each.
+        blame: Called with the number of an episode that raises, and the error. The others may have
+            moved or not; they can be closed.
     """
     if not episodes:
         return
-    agents: list[Any] = [episode.pending for episode in episodes]
-    callers = {episode.driver.caller for episode in episodes}
-    first = episodes[0]
-    together = callers == {getcurrent()} and not (
-        EVALUATING or None in agents or first.in_rounds or first.plan.plugins is not None
-    )
-    number = 0
-    event: Any = None
-    events: Any = []
+    agents = [episode.pending for episode in episodes if episode.pending]
+    is_inside = {episode.driver.caller for episode in episodes} == {getcurrent()}
+    episode = episodes[0]
+    has_rounds = episode.in_rounds or len(agents) != len(episodes)
+    is_plain = not EVALUATING and episode.plan.plugins is None
+    together = is_inside and is_plain and not has_rounds
+    replies = []
+    events = []
     try:
         if not together:
-            for number, episode in enumerate(episodes):
-                episode.step(actions[number])
+            for episode, action in zip(episodes, actions, strict=True):
+                episode.step(action)
             return
-        replies: list[Any] = []
-        for number, episode in enumerate(episodes):
-            replies.append(episode.answer(agents[number], actions[number]))
-        for number, episode in enumerate(episodes):
-            events.append(episode.resume(replies[number]))
-        del replies
-        # popped one by one, so that the list keeps nothing alive that a model frees
+        for episode, agent, action in zip(episodes, agents, actions, strict=True):
+            replies.append(episode.answer(agent, action))
+        replies.reverse()  # popped one by one, so that the lists keep nothing of the models alive
+        for episode in episodes:
+            events.append(episode.resume(replies.pop()))
         events.reverse()
-        for number, episode in enumerate(episodes):  # noqa: B007 - the handler below needs it
-            event, args, kwargs = events.pop()
-            reply = event.handle(episode, args, kwargs)
-            event = args = kwargs = None
+        for episode in episodes:
+            handler, args, kwargs = events.pop()
+            try:
+                reply = handler.handle(episode, args, kwargs)
+            finally:
+                del handler, args, kwargs  # they must keep nothing alive that the model frees
             if not episode.has_to_wait(reply):
                 episode.advance(reply)
     except BaseException as error:
-        # so that the error's traceback does not keep them alive
-        events = event = args = kwargs = None
-        culprit = episodes[number]
-        for episode in episodes:
-            if episode is not culprit:
-                episode.restore_pending()
-        if culprit.pending is None and not culprit.over:
-            culprit.fail(error)
+        events.clear()  # because the error's traceback refers to it
+        for other in episodes:
+            if other is not episode:
+                other.restore_pending()
+        if episode.pending is None and not episode.over:
+            episode.fail(error)
         elif together:  # otherwise the episode has already done this
-            culprit.annotate(error)
-        blame(number, error)
+            episode.annotate(error)
+        if blame is not None:
+            blame(episodes.index(episode), error)
         raise

@@ -1,30 +1,37 @@
 """Work on many simulations in several processes.
 
 ``spread`` runs work that needs nothing from earlier work in processes of joblib, local or remote. A
-``WorkerPool`` has processes of its own, in which objects live on between calls.
+``WorkerPool`` starts processes in which objects live on between calls.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import re
 import signal
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext, suppress
 from importlib import import_module
 from math import ceil
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
 from time import monotonic
-from types import FunctionType, SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from ..core import COUNTS, count, pack, pack_outcome, pack_plainly, unpack, unpack_outcome
+from ..core import (
+    COUNTS,
+    Peer,
+    count,
+    pack,
+    pack_outcome,
+    pack_plainly,
+    serve,
+    unpack,
+    unpack_outcome,
+)
 from ..errors import (
     MissingExtraError,
     OptionValueError,
@@ -34,6 +41,8 @@ from ..errors import (
     short_repr,
     warn_user,
 )
+
+Result = TypeVar("Result")
 
 EXTRAS: Final = {
     "joblib": "many",
@@ -50,7 +59,15 @@ EXTRAS: Final = {
 
 
 def import_extra(module: str, feature: str) -> Any:
-    """Import a module that an extra installs, or raise an error that says which feature needs which extra."""
+    """Import a module that an extra installs.
+
+    Args:
+        module: The name of the module.
+        feature: The feature that needs it, for the error.
+
+    Raises:
+        MissingExtraError: The module is missing. The message names the extra.
+    """
     try:
         return import_module(module)
     except ImportError as error:
@@ -61,362 +78,374 @@ def import_extra(module: str, feature: str) -> Any:
         ) from None
 
 
-NO_BAR: Final[Any] = SimpleNamespace(update=lambda number=1: None)
-"""A progress bar that shows nothing."""
+class ProgressBar:
+    """A progress bar that shows nothing."""
+
+    def update(self, number: int = 1) -> None:
+        """Move the bar."""
 
 
-def progress_bar(total: int, progress: bool, unit: str = "simulation", done: int = 0) -> Any:
-    """Return a context with a progress bar over ``total`` units, of which some are done.
+NO_BAR: Final = ProgressBar()
 
-    Without ``progress``, none.
+
+def progress_bar(
+    total: int,
+    progress: bool,
+    unit: str = "simulation",
+    done: int = 0,
+) -> Any:
+    """Make a context with a ``ProgressBar``.
+
+    Args:
+        total: The number of units.
+        progress: Whether to show a bar, by ``tqdm``.
+        unit: The name of a unit.
+        done: The number of units that are done already.
     """
     if not progress:
         return nullcontext(NO_BAR)
-    return import_extra("tqdm.auto", "progress=True").tqdm(total=total, unit=unit, initial=done)
+    tqdm = import_extra("tqdm.auto", "progress=True").tqdm
+    return tqdm(total=total, unit=unit, initial=done)
 
 
 # -- processes of joblib --------------------------------------------------------------------------
 
 
 def spread(
-    work: Callable[..., Any],
-    arguments: tuple[Any, ...],
-    items: Sequence[Any],
+    work: Callable[..., Result],
+    arguments: tuple[object, ...],
+    items: Sequence[object],
     workers: int,
     least: int,
-    bar: Any,
+    bar: ProgressBar,
     share: int = 4,
-) -> list[Any]:
-    """Call ``work``, a function of this package, for all items in this process, or for parts of them in workers.
+) -> list[Result]:
+    """Work on items in this process, or on parts of them in processes of joblib.
 
-    It gets the arguments, the items, and a progress bar. Results have the order of the items. -1
-    workers are as many as joblib's backend has. A worker gets about ``share`` parts of at least
-    ``least`` items, unless one would get none.
+    Args:
+        work: A function of this package. It takes the arguments, the items and a progress bar.
+        arguments: Its arguments.
+        items: The items.
+        workers: The number of processes. 0: this process. -1: as many as joblib's backend has.
+        least: The smallest number of items in a part, unless a worker would get none.
+        bar: The progress bar.
+        share: About how many parts each worker gets.
+
+    Returns:
+        The result of each part, in the order of the items.
     """
     if not workers or not items:
         return [work(*arguments, items, bar)]
     joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
-    size = max(1, ceil(len(items) / (share * processes)), min(least, ceil(len(items) / processes)))
+    fewest = min(least, ceil(len(items) / processes))
+    size = max(1, ceil(len(items) / (share * processes)), fewest)
     parts = [items[start : start + size] for start in range(0, len(items), size)]
-    parcel, home = _pack_with_names((work, arguments)), os.getpid()
-    try:
-        parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
-    except ValueError:  # this backend returns nothing before all work is done
-        parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
-    # Errors are packed in the worker, because each backend would pass them on in its own way.
-    outcomes = parallel(
-        joblib.delayed(pack_outcome)(pack, _work, parcel, home, part) for part in parts
-    )
-    results = []
+    parcel = pack((work, arguments))
+    backend, _ = joblib.parallel.get_active_backend()
+    form = "generator" if backend.supports_return_generator else "list"
+    # Outcomes are packed in the worker, because each backend passes errors on in its own way.
+    parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as=form)
+    call = joblib.delayed(pack_outcome)
+    outcomes = parallel(call(pack, _work, parcel, os.getpid(), part) for part in parts)
+    results: list[Result] = []
     try:
         for part, outcome in zip(parts, outcomes, strict=True):
-            result, error = unpack_outcome(outcome)
+            returned, error = unpack_outcome(outcome)
             if error is not None:
                 raise error
-            found, counts = result
-            results.append(found)
+            result, counts = returned
+            results.append(result)
             for token, numbers in counts.items():
                 count(token, **numbers)
             bar.update(len(part))
     finally:
-        if hasattr(outcomes, "close"):  # cancels the remaining work
-            with warnings.catch_warnings():  # joblib warns that it cancels
-                warnings.simplefilter("ignore")
-                outcomes.close()
+        if form == "generator":
+            with warnings.catch_warnings(action="ignore"):  # joblib warns that it cancels
+                outcomes.close()  # cancels the remaining work
     return results
 
 
-_IN_SCRIPT: Final = re.compile(rb"__main__\.([A-Za-z_]\w*)")
+def _work(
+    parcel: bytes, home: int, items: Sequence[object]
+) -> tuple[object, dict[str, dict[str, float]]]:
+    """Work on a part of the items, in a worker.
 
-_received: Final[set[str]] = set()
-"""The names in this process's main module that came from another process's script."""
-
-
-def _pack_with_names(thing: Any) -> bytes:
-    """Pickle an object for workers, with the functions of this process's script that it refers to by dotted name."""
-    parcel, main = pack((thing, {})), sys.modules["__main__"]
-    named = {
-        name.decode(): getattr(main, name.decode(), None) for name in _IN_SCRIPT.findall(parcel)
-    }
-    named = {
-        name: found for name, found in named.items() if isinstance(found, (type, FunctionType))
-    }
-    return pack((thing, named)) if named else parcel
-
-
-def _work(parcel: bytes, home: int, items: list[Any]) -> tuple[Any, dict[str, dict[str, float]]]:
-    """Call the function, in a worker.
-
-    Return its result, and what policies have counted, unless it is at ``home``.
-
-    The functions it refers to by name are put into the main module.
+    Returns:
+        The result, and the counts of policies. In the process ``home``, no counts, because they
+        are in its ``COUNTS`` already.
     """
     is_away = os.getpid() != home
     if is_away:
         COUNTS.clear()
-    (work, arguments), named = unpack(parcel)
-    main = sys.modules["__main__"]
-    for name, found in named.items():
-        if name in _received or not hasattr(main, name):
-            setattr(main, name, found)
-            _received.add(name)
+    work, arguments = unpack(parcel)
     return work(*arguments, items, NO_BAR), COUNTS if is_away else {}
 
 
-# -- processes of their own -----------------------------------------------------------------------
+# -- processes of a pool --------------------------------------------------------------------------
 
 SECONDS_TO_CLOSE: Final = 10.0
 """The seconds that a worker may take to close its object and to end."""
 
-EXIT: Final = b""
-"""The message that asks a worker to end."""
+
+class _Host:
+    """Serves an object in a worker. The first request makes it."""
+
+    def __init__(self) -> None:
+        self._hosted: Any = None
+
+    def make(self, function: Callable[..., object], *args: object) -> None:
+        """Make the object."""
+        self._hosted = function(*args)
+
+    def call(self, method: str, *args: object) -> object:
+        """Call a method of the object."""
+        return getattr(self._hosted, method)(*args)
+
+    def abandon(self) -> None:
+        """Close the object. Warn of errors instead of raising them."""
+        if self._hosted is not None:
+            self._hosted.abandon()
 
 
-def serve(pipe: Connection, other_end: Connection | None) -> None:
-    """Answer messages in a worker, each a packed pair: a callable that makes an object, then methods, and arguments.
+def _serve(connection: Connection, other_end: Connection | None) -> None:
+    """Run a worker.
 
-    ``other_end`` is the user's end of the pipe, if a fork has copied it.
+    Args:
+        connection: The connection to the user.
+        other_end: The user's end, if a fork has copied it.
     """
-    # Ctrl-C goes to the user's process, which decides what to do
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # because the user's process handles an interrupt
     if other_end is not None:
         other_end.close()
-    made: Any = None
-
-    def answer(message: bytes) -> Any:
-        nonlocal made
-        method, arguments = unpack(message)
-        if made is not None:
-            return getattr(made, method)(*arguments)
-        made = method(*arguments)
-        return None
-
+    host = _Host()
     try:
-        while (message := pipe.recv_bytes()) != EXIT:
-            pipe.send_bytes(pack_outcome(pack_plainly, answer, message))
-    except (EOFError, OSError):  # the user's process has ended
-        pass
+        serve(connection, host)
     finally:
-        if made is not None:
-            made.abandon()
+        host.abandon()
 
 
-class Worker:
-    """A process with some of the simulations, as its user sees it, who has one end of its pipe."""
+class _Worker(Peer):
+    """A process with a part of the simulations."""
 
     def __init__(self, context: Any, number: int, part: range) -> None:
         """Start the process."""
         self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
-        self.pipe, theirs = context.Pipe()
-        copied = self.pipe if context.get_start_method() == "fork" else None
-        name = f"simenv_marl {self.name}"
-        self._process = context.Process(target=serve, args=(theirs, copied), name=name, daemon=True)
-        try:
-            self._process.start()
-        except BaseException:
-            self.pipe.close()
-            raise
-        finally:
-            theirs.close()
+        connection, theirs = context.Pipe()
+        copied = connection if context.get_start_method() == "fork" else None
+        self._process = context.Process(
+            target=_serve, args=(theirs, copied), name=f"simenv_marl {self.name}", daemon=True
+        )
+        with theirs:
+            try:
+                self._process.start()
+            except BaseException:
+                connection.close()
+                raise
+        super().__init__(connection, [self._process.sentinel])
 
-    def send(self, message: bytes) -> None:
-        """Send a message, or raise ``WorkerError`` if the worker is dead."""
-        try:
-            self.pipe.send_bytes(message)
-        except OSError:
-            raise self._died() from None
-
-    def receive(self, seconds: float | None = None) -> tuple[Any, BaseException | None] | None:
-        """Wait for the answer: a result, or None and an error.
-
-        Return None if it does not come within some seconds.
-        """
-        if not wait([self.pipe, self._process.sentinel], seconds):
-            return None
-        try:
-            if not self.pipe.poll():
-                raise EOFError
-            parcel = self.pipe.recv_bytes()
-        except (EOFError, OSError):
-            raise self._died() from None
-        result, error = unpack_outcome(parcel)
-        if error is not None:
-            annotate(error, f"simenv_marl: in {self.name}")
-        return result, error
-
-    def _died(self) -> WorkerError:
+    def lost(self) -> WorkerError:
         """Make the error that says how the worker died."""
-        self._process.join(1.0)  # the pipe closes a moment before the process ends
+        self._process.join(1.0)  # its connection closes a moment before it ends
         code = self._process.exitcode
         how = "closed its pipe" if code is None else f"died with exit code {code}"
-        script = (
-            '. In a script, make environments with workers under `if __name__ == "__main__":`,'
-            " because each worker"
-            " imports the script"
-            if code == 1  # an error has ended it before it could send a message
-            else ""
-        )
+        hint = ""
+        if code == 1:  # an error has ended it before it could send a message
+            hint = (
+                '. In a script, make environments with workers under `if __name__ == "__main__":`,'
+                " because each worker imports the script"
+            )
         return WorkerError(
             f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts"
-            f" new workers{script}"
+            f" new workers{hint}"
         )
 
     def stop(self, seconds: float) -> None:
         """End the process, by force if it does not end within some seconds."""
-        self.pipe.close()
+        self.connection.close()
         process = self._process
         process.join(seconds)
-        for force in (process.terminate, process.kill):
-            if process.exitcode is None:
-                force()
-                process.join(1.0)
-        if process.exitcode is not None:
-            process.close()
+        process.kill()  # which does nothing if it has ended
+        process.join()
+        process.close()
 
 
 class WorkerPool:
-    """Worker processes, each of which has an object with a part of the simulations.
+    """Worker processes. Each has an object with a part of the simulations.
 
-    No wait lasts for ever: a wait for an answer also ends when the worker dies, and a worker's pipe
-    closes when its user ends.
+    No wait lasts for ever: a wait for an answer also ends when the worker dies, and a worker's
+    connection closes when its user ends.
 
     Attributes:
-        broken: Whether a worker has died, or a wait for an answer was interrupted. Then a reset
-            starts all anew.
         failed: Whether an error has left the simulations at different steps, so that all of them
             need a reset.
         idle: True: no simulation runs in this process.
     """
 
-    failed, idle = False, True
+    idle = True
 
     def __init__(
         self,
-        make: Callable[..., Any],
-        arguments: tuple[Any, ...],
+        make: Callable[..., object],
+        arguments: tuple[object, ...],
         number: int,
         workers: int,
-        context: Any,
+        context: BaseContext | str | None,
     ) -> None:
-        """Start at most so many workers, each of which calls ``make`` with the arguments and a range of the numbers.
+        """Start the workers. Each makes an object.
 
-        ``make`` is a function of this package. It returns an object that has the methods ``close``
-        and ``abandon``.
+        Args:
+            make: A function of this package that returns an object with the methods ``close`` and
+                ``abandon``.
+            arguments: Its arguments, before the last one: a range of the simulations' numbers.
+            number: The number of simulations.
+            workers: The largest number of workers.
+            context: A context of multiprocessing, or the name of its start method. None: spawn.
+
+        Raises:
+            OptionValueError: The context is invalid, or the arguments cannot be pickled.
         """
         try:
-            self._context = context
             if not isinstance(context, BaseContext):
-                self._context = multiprocessing.get_context("spawn" if context is None else context)
+                context = multiprocessing.get_context("spawn" if context is None else context)
         except (TypeError, ValueError):
+            methods = ", ".join(map(repr, multiprocessing.get_all_start_methods()))
             raise OptionValueError(
-                "context must be one of"
-                f" {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
-                f" of multiprocessing, not {short_repr(context)}"
+                f"context must be one of {methods}, or a context of multiprocessing, not"
+                f" {short_repr(context)}"
             ) from None
-        cuts = [number * place // min(workers, number) for place in range(min(workers, number) + 1)]
+        workers = min(workers, number)
+        cuts = [number * place // workers for place in range(workers + 1)]
+        self._parts = list(map(range, cuts, cuts[1:]))
         try:
-            self._recipes = {
-                part: pack_plainly((make, (*arguments, part)))
-                for part in map(range, cuts, cuts[1:])
-            }
+            self._recipes = [
+                pack_plainly(("make", (make, *arguments, part))) for part in self._parts
+            ]
         except Exception as error:
             raise OptionValueError(
                 "the simulation, its points or its options cannot be sent to another process"
                 f" ({describe_error(error)}); pass a class or a factory of a module, or workers=0"
             ) from error
-        self._process = os.getpid()
-        self._workers: list[Worker] = []
+        self._context = context
+        self._home = os.getpid()
+        self._workers: list[_Worker] = []
+        self._is_broken = True  # a worker is dead, or owes an answer because of an interrupt
+        self.failed = False
         self._start()
 
     def _start(self) -> None:
         """Start all workers, and have them make their objects."""
-        self.broken = True
         try:
-            for number, part in enumerate(self._recipes):
-                self._workers.append(Worker(self._context, number, part))
-            self._exchange(self._recipes.values())
-            self.broken = False
+            for number, part in enumerate(self._parts):
+                self._workers.append(_Worker(self._context, number, part))
+            self._exchange(self._recipes)
         except BaseException:
             self.abandon()
             raise
+        self._is_broken = False
 
     def _exchange(self, messages: Iterable[bytes]) -> list[Any]:
-        """Send each worker its message, and return the answers of all, or raise the first error."""
+        """Send each worker its request. Return all results, or raise the first error."""
         try:
             for worker, message in zip(self._workers, messages, strict=True):
-                worker.send(message)
-            answers: list[Any] = [worker.receive() for worker in self._workers]
+                worker.send_packed(message)
+            outcomes = [worker.receive() for worker in self._workers]
         except BaseException:
-            self.broken = self.failed = True
+            self._is_broken = True
+            self.failed = True
             raise
-        for _, error in answers:
+        return self._results(outcomes)
+
+    def _results(self, outcomes: Iterable[tuple[Any, BaseException | None] | None]) -> list[Any]:
+        """Return the results of outcomes that have come, or raise the first error."""
+        results = []
+        for worker, outcome in zip(self._workers, outcomes, strict=False):
+            result, error = outcome or (None, None)
             if error is not None:
+                annotate(error, f"simenv_marl: in {worker.name}")
                 raise error
-        return [result for result, _ in answers]
+            results.append(result)
+        return results
 
-    def ask(self, method: str, *arguments: Any) -> list[Any]:
-        """Call a method of each worker's object; return the results, or raise the first error.
+    def ask(self, method: str, *arguments: object) -> list[Any]:
+        """Call a method of each worker's object.
 
-        Of lists and arrays, which have an item for each simulation, each worker gets its part.
+        Args:
+            method: The name of the method. ``reset`` starts new workers after a death.
+            *arguments: Its arguments. Of lists and arrays, which have an item for each simulation,
+                each worker gets its part.
+
+        Returns:
+            The result of each worker.
+
+        Raises:
+            WorkerError: A worker has died, or belongs to another process.
+            BaseException: The first error of an object.
         """
-        if os.getpid() != self._process:
+        if os.getpid() != self._home:
             raise WorkerError(
                 "the workers belong to the process from which this one was forked; make a new"
                 " environment"
             )
-        if self.broken and method == "reset":
+        if self._is_broken:
+            if method != "reset":
+                raise WorkerError(
+                    "a worker is dead, or a wait for it was interrupted; reset() starts new workers"
+                )
             self.abandon()
             self._start()
-        elif self.broken:
-            raise WorkerError(
-                "a worker is dead, or a wait for it was interrupted; reset() starts new workers"
-            )
         messages = []
-        for part in self._recipes:
-            own = [
-                a[part.start : part.stop] if isinstance(a, (list, np.ndarray)) else a
-                for a in arguments
-            ]
-            messages.append(pack_plainly((method, own)))
+        for part in self._parts:
+            own = [_share_of(argument, part) for argument in arguments]
+            messages.append(pack_plainly(("call", (method, *own))))
         moves = method in ("reset", "step")
-        self.failed = self.failed or moves
-        answers = self._exchange(messages)
-        self.failed = self.failed and not moves
-        return answers
+        if moves:
+            self.failed = True  # until all simulations have moved
+        results = self._exchange(messages)
+        if moves:
+            self.failed = False
+        return results
 
     def close(self) -> None:
         """Close the objects and end the workers, by force after some seconds.
 
-        Raise the first error of an object.
+        Raises:
+            BaseException: The first error of an object.
         """
         deadline = monotonic() + SECONDS_TO_CLOSE
-        asked = [] if self.broken or os.getpid() != self._process else self._workers
-        answers: list[Any] = []
+        workers = [] if self._is_broken or os.getpid() != self._home else self._workers
+        outcomes = []
         try:
-            with suppress(WorkerError):  # nothing is left to close in a worker that is dead
-                for worker in asked:
-                    worker.send(pack_plainly(("close", ())))
-                answers = [worker.receive(max(deadline - monotonic(), 0.0)) for worker in asked]
-            if None in answers:
+            with suppress(WorkerError):  # because a dead worker has nothing to close
+                for worker in workers:
+                    worker.send("call", ("close",))
+                for worker in workers:
+                    outcomes.append(worker.receive(max(deadline - monotonic(), 0.0)))
+            if None in outcomes:
                 warn_user(
                     f"workers did not close within {SECONDS_TO_CLOSE} s and are killed",
                     ResourceWarning,
                 )
-            for _, error in filter(None, answers):
-                if error is not None:
-                    raise error
+            self._results(outcomes)
         finally:
             self.abandon()
 
     def abandon(self) -> None:
         """End the workers. A finalizer may call this; it raises no errors."""
-        if os.getpid() != self._process:
-            return  # the workers belong to the process of which this one is a fork
-        workers, self._workers = self._workers, []
+        if os.getpid() != self._home:
+            return  # because this process is a fork, and its parent has the workers
+        workers = self._workers
+        self._workers = []
         for worker in workers:
             with suppress(OSError):
-                worker.pipe.send_bytes(EXIT)
+                worker.connection.send_bytes(b"")  # asks it to end
         deadline = monotonic() + SECONDS_TO_CLOSE
         for worker in workers:
             worker.stop(max(deadline - monotonic(), 0.0))
+
+
+def _share_of(argument: Any, part: range) -> Any:
+    """Return a worker's part of a list or an array. Other arguments are for all workers."""
+    if isinstance(argument, (list, np.ndarray)):
+        return argument[part.start : part.stop]
+    return argument

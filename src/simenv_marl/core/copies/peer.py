@@ -22,7 +22,7 @@ class Outcome(NamedTuple):
 
 
 class PeerLostError(Exception):
-    """The other process has ended. The user of the peer raises an error that says how."""
+    """The other process has ended."""
 
 
 class Peer:
@@ -38,32 +38,42 @@ class Peer:
         self._sentinels = sentinels
 
     def send(self, name: str, args: tuple[Any, ...]) -> None:
-        """Send a request, or raise a ``PeerLostError``."""
+        """Send a request. Raise the error of ``lost`` if the process has ended."""
         self.send_packed(pack_plainly((name, args)))
 
     def send_packed(self, message: bytes) -> None:
-        """Send a request that is packed, or raise a ``PeerLostError``."""
+        """Send a request that is packed. Raise the error of ``lost`` if the process has ended."""
         try:
             self.connection.send_bytes(message)
         except OSError as error:
-            raise PeerLostError("the other process has ended") from error
+            raise self.lost() from error
 
     def receive(self, seconds: float | None = None) -> Outcome | None:
         """Wait for the outcome of a request. None if it does not come within some seconds.
 
         Raises:
-            PeerLostError: The process has ended.
+            PeerLostError: The process has ended. A subclass may raise another error.
             TimeoutError: The outcome did not come within the limit of the connection.
         """
         if self._sentinels or seconds is not None:
             if not wait([self.connection, *self._sentinels], seconds):
                 return None
-            if not self.connection.poll():
-                raise PeerLostError("the other process has ended")
+            if not self._has_message():
+                raise self.lost()
         parcel = receive(self.connection)
         if not parcel:
-            raise PeerLostError("the other process has ended")
+            raise self.lost()
         return Outcome(*unpack_outcome(parcel))
+
+    def _has_message(self) -> bool:
+        try:
+            return self.connection.poll()
+        except OSError:  # on Windows, where the other end is closed
+            return False
+
+    def lost(self) -> Exception:
+        """Make the error for the end of the process. A subclass may say how it has ended."""
+        return PeerLostError("the other process has ended")
 
 
 def serve(connection: Connection, served: object, after: Callable[[], None] | None = None) -> None:

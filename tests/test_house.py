@@ -86,9 +86,9 @@ def measure(path):
     for node in ast.walk(ast.parse(source)):
         counts["names"] += isinstance(node, NAMED)
         counts["names"] += isinstance(node, ast.keyword) and node.arg is not None
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            if isinstance(node.value.value, str):
-                prose.append(node.value.value)
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                prose.append(text)
                 prose_lines.update(range(node.lineno, node.end_lineno + 1))
         for annotation in annotations_of(node):
             counts["annotations"] += 1
@@ -112,7 +112,7 @@ def counts_of(folder):
 
 
 @pytest.fixture(scope="module")
-def _sizes():
+def sizes():
     everything, heart = counts_of(PACKAGE), counts_of(PACKAGE / "core")
     return {
         "names": everything["names"],
@@ -140,8 +140,8 @@ def _sizes():
         )
     ],
 )
-def test_the_library_keeps_its_budget(budget, _sizes):
-    assert _sizes[budget] <= BUDGETS[budget]
+def test_the_library_keeps_its_budget(budget, sizes):
+    assert sizes[budget] <= BUDGETS[budget]
 
 
 def test_files_and_lines_are_short():
@@ -237,13 +237,6 @@ def private_fields(place):
 
 
 # -- directions -----------------------------------------------------------------------------------
-
-
-def chain_of(graph, module, above=()):
-    """Follow the imports of a module; fail where they lead back to it."""
-    assert module not in above, f"modules import each other: {(*above, module)}"
-    for imported in graph.find_modules_directly_imported_by(module):
-        chain_of(graph, imported, (*above, module))
 
 
 def test_folders_of_the_core_import_in_one_direction_also_for_types():

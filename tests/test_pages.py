@@ -101,7 +101,7 @@ def test_the_map_has_few_pages_and_each_is_short():
         r":caption: (.+)\n\n((?:[\w-]+\n)+)", (DOCS / "index.md").read_text(encoding="utf-8")
     )
     pages = {caption: names.split() for caption, names in captions}
-    studies = {page: words_of(page) for page in pages.pop("Studies")}
+    pages.pop("Studies")
     others = {
         page: words_of(page)
         for page in {"index", *chain(*pages.values())} - {"changelog", "reference"}

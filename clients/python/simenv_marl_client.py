@@ -54,7 +54,9 @@ class Episode(NamedTuple):
 
 
 class Client:
-    """The model's side of the wire. A process has one client. The thread that calls ``run`` makes all decisions.
+    """The model's side of the wire. A process has one client.
+
+    The thread that calls ``run`` makes all decisions.
 
     Attributes:
         connected: Whether there is an environment.
@@ -106,7 +108,7 @@ class Client:
     def run(
         self, model: Callable[[Episode], Any], seed: int = 0, options: dict[str, Any] | None = None
     ) -> Any:
-        """Run the model once for each episode that the environment requests, until the environment is gone.
+        """Run the model once for each requested episode, until the environment is gone.
 
         An exception that leaves the model is raised in the environment.
 
@@ -178,7 +180,10 @@ class Client:
             self._flush()
 
     def _refuse_thread(self, about: str) -> NoReturn:
-        """Report the use in another thread to the environment, too: libraries often catch errors of callbacks."""
+        """Report the use in another thread to the environment.
+
+        The error alone is not enough, because libraries often catch errors of callbacks.
+        """
         text = (
             f"{about} in the thread {threading.current_thread().name!r}, but the model runs in the"
             f" thread {self._thread[1]!r}; pass what the decision needs to that thread, by a"
@@ -360,7 +365,7 @@ class Client:
     # -- lines ------------------------------------------------------------------------------------
 
     def _send(self, frame: dict[str, Any]) -> None:
-        """Add a frame to those that are sent before the next wait: the whole frame, or nothing if it has no JSON."""
+        """Queue a frame for the next wait. A frame without a JSON form is refused whole."""
         if self._rule_of and "error" not in frame:
             raise RuntimeError(
                 f"the rule of {self._rule_of} has asked for a decision, or reported on an entity;"

@@ -119,8 +119,7 @@ def plain_log(source, seed):
     simulation = source()
     simulation.reset(seed)
     simulation.run()
-    log = simulation.log[:]
-    return log
+    return simulation.log[:]
 
 
 def rule_log(view, source, seed, **changes):

@@ -63,7 +63,7 @@ from .values.actions import ILLEGAL, MASK, Mask, action_check
 from .values.spaces import blank, duplicate, observation_cast, same
 from .values.stacking import Stacker, joined, split_batch, stack_masks, stacker, taken
 
-__all__ = [
+__all__ = [  # noqa: RUF022 - by subject
     # What an environment is made of, and what happens in it.
     "Agent", "BaseSession", "Clock", "Decision", "Driver", "Episode", "EpisodeState", "Mode",
     "Options", "Outcome", "Plan", "Point", "RemoteSession", "Mirror", "Round", "Session", "State",
@@ -81,10 +81,9 @@ __all__ = [
     "pending_view", "portable", "release", "reuse_resources", "serve", "unpack", "unpack_outcome",
     # Values.
     "ILLEGAL", "MASK", "WAIT", "action_check", "adapt", "as_json", "blank", "declared_agents",
-    "duplicate", "explain_arguments", "joined", "observation_cast", "same", "source_name", "split_batch",
-    "stack_masks", "stacker", "taken",
+    "duplicate", "explain_arguments", "joined", "observation_cast", "same", "source_name",
+    "split_batch", "stack_masks", "stacker", "taken",
     # Chance, and the user's side.
-    "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of",
-    "global_states", "is_seed", "preserve_generators",
-    "reseed_generators",
+    "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",
+    "is_seed", "preserve_generators", "reseed_generators",
 ]  # fmt: skip

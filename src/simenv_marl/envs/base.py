@@ -183,7 +183,7 @@ class View:
 
     @np_random.setter
     def np_random(self, generator: np.random.Generator) -> None:
-        self.session.np_random = generator
+        self.session.set_generator(generator)
 
     @property
     def np_random_seed(self) -> int:

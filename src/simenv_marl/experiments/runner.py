@@ -292,7 +292,7 @@ class Runner:
 
 
 class Tally:
-    """Counts the decisions and rewards of agents while episodes run: a ``Watcher`` for ``BatchRun``.
+    """Counts the decisions and rewards of agents during episodes: a ``Watcher`` for ``BatchRun``.
 
     Attributes:
         outcomes: The results of the episodes, by seed.

@@ -49,7 +49,7 @@ EnvType = TypeVar("EnvType")
 def clone(
     env: EnvType, *, seed: int | None = None, method: str | None = None, time_limit: float = 600.0
 ) -> EnvType:
-    """Copy an environment in mid-episode. The copy stands where ``env`` stands, and goes on from there.
+    """Copy an environment in mid-episode. The copy stands at the same decision.
 
     Neither sees the other. What the copy does with the same actions is identical, bit for bit. It
     is an environment of the same view with the same wrappers, and can be stepped, reset, rendered,
@@ -113,7 +113,7 @@ def branch(
     seeds: Sequence[int] | None = None,
     time_limit: float = 600.0,
 ) -> list[Result]:
-    """Call a function on exact continuations of an environment in mid-episode: on ``n`` clones, each for one call.
+    """Call a function on ``n`` exact continuations of an environment in mid-episode.
 
     Each continuation starts in exactly the state of ``env``: the model and its random numbers, the
     environment's generators, and its wrappers. Continuations that take the same actions are

@@ -48,7 +48,7 @@ class Mirror(EpisodeState):
         self.outcome = report.outcome
         self.turns = report.turns
         if self.round is not None and report.acted is not None:
-            self.round.acted = report.acted
+            self.round.load(report.acted)
         for agent in report.agents:
             self._load_agent(agent)
         for name in report.others:

@@ -166,7 +166,7 @@ def _rebuild_error(
 
 _tokens: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
-"""Functions and hooks that were sent or received, by token, so that they come back as themselves."""
+"""Functions and hooks that were sent or received, by token. They come back as themselves."""
 
 
 def _reduce_function(function: FunctionType) -> Reduced | None:

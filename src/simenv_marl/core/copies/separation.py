@@ -60,7 +60,7 @@ class _Opening:
 
 
 def separator(loops: Iterable[Loop] = ()) -> Callable[[], None]:
-    """Return a function that separates forked children, with their event loops, from this process."""
+    """Return a function that separates forked children, and their loops, from this process."""
     try:
         python = random.getstate()
         files = _open_files()
@@ -189,7 +189,7 @@ def _share_offset(one: int, other: int) -> bool:
 
 
 def _reopen(openings: list[_Opening]) -> None:
-    """Open a file again: itself if it is only read, else a copy that is deleted when it is closed."""
+    """Open a file again if it is only read, else a copy that is deleted at its close."""
     path = f"{_DESCRIPTORS}/{openings[0].descriptors[0]}"
     modes = {opening.flags & os.O_ACCMODE for opening in openings}
     if modes == {os.O_RDONLY}:

@@ -50,7 +50,7 @@ class Agent:
         info: The latest info.
         mask: The mask of the pending decision. None if all actions are legal.
         choices: The choices of the pending decision. None without ``choices=``.
-        offered: The choices of the latest answered decision, held weakly, until the rule has chosen.
+        offered: The choices of the latest decision, held weakly, until the rule has chosen.
         rule_action: The action that corresponds to the rule's latest decision. None if unknown.
         decided: Whether the reward mapping was called in this episode. Its first value is dropped.
         ended: Whether its episode has ended before the simulation's.

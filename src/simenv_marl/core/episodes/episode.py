@@ -37,7 +37,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from math import inf
-from threading import current_thread
 from typing import TYPE_CHECKING, Final, NoReturn
 from weakref import ref
 
@@ -45,10 +44,8 @@ from greenlet import getcurrent
 
 from ...errors import (
     AgentError,
-    NoDecisionError,
     annotate,
     clear_frames,
-    listed,
     short_repr,
     warn_user,
 )
@@ -56,7 +53,6 @@ from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
 from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel
 from ..plans.point import Policy
-from ..plans.points import overrides
 from ..plans.policies import Where, policy_for, two_arguments
 from ..switching.context import environment_context
 from ..switching.driver import WAIT, AnyHandler, Driver, Event
@@ -67,7 +63,7 @@ from .arguments import restore, weaken
 from .clock import Clock
 from .decision import Decision, decision_of
 from .round import Round, checked_actions
-from .state import RUNNING, EpisodeState, Outcome
+from .state import RUNNING, EpisodeState, Outcome, missing_decision
 
 if TYPE_CHECKING:
     from ..plans.point import Args, Kwargs
@@ -185,7 +181,7 @@ class Episode(EpisodeState):
             raise
         self.unreported_end = is_over or (self.round is not None and bool(self.just_ended))
         if self.pending is None and self.plan.has_user and not self._has_only_forced_moves():
-            raise self._without_decision()
+            raise missing_decision(self, type(self.simulation).__name__)
 
     def step(self, action: Action, entered: bool = False) -> None:
         """Answer the pending decision, and run to the user's next decision, or to the end.
@@ -301,7 +297,7 @@ class Episode(EpisodeState):
         return self._next_item(self._split, reply)
 
     def has_to_wait(self, reply: Model) -> bool:
-        """Return whether the episode waits for an answer, or is over. If it waits, note the agent."""
+        """Return whether the episode waits for an answer or is over. Note the waiting agent."""
         if type(reply) is Agent:
             self.latest = self.pending = reply
             return True
@@ -329,7 +325,7 @@ class Episode(EpisodeState):
         return agent
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
-        """Answer a decision with the agent's action of this round. Return the agent if it has none."""
+        """Answer a decision with the action of this round. Return the agent if it has none."""
         forced = agent.only_action() if self.skips else None
         action = played.take(agent) if forced is None else forced
         if action is WAIT:
@@ -401,14 +397,14 @@ class Episode(EpisodeState):
         """Make the environment that a planner gets."""
         return self.plan.planner_view(self.session())
 
-    # -- calls that are split -----------------------------------------------------------------------
+    # -- calls that are split ---------------------------------------------------------------------
 
     def begin_split(self, call: SplitCall) -> None:
         """Decide the items of a call, before the simulation moves."""
         self._split = call
 
     def _next_item(self, call: SplitCall, reply: Model) -> Event:
-        """Return the event of the next item of a call. After the last one, resume the simulation."""
+        """Return the event of a call's next item. After the last one, resume the simulation."""
         event = call.next_event(reply)
         if event is not None:
             return event
@@ -527,7 +523,7 @@ class Episode(EpisodeState):
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
 
-    # -- branches that wait for one agent -----------------------------------------------------------
+    # -- branches that wait for one agent ---------------------------------------------------------
 
     def single_out(self, agent: Agent) -> None:
         """In a branch, wait for one agent alone. Policies answer for the others, else the rule."""
@@ -553,7 +549,7 @@ class Episode(EpisodeState):
         self.pending = agent
 
     def delegate(self, policies: Mapping[str, Policy]) -> None:
-        """In a branch, let policies answer for agents that neither the user nor a policy answers."""
+        """In a branch, let policies answer for the agents that follow the rule."""
         substitutes: dict[str, Policy] = {}
         for name in policies.keys() - self.agents.keys():
             policy = policy_for(policies, name, self.where)
@@ -567,7 +563,7 @@ class Episode(EpisodeState):
     # -- ends -------------------------------------------------------------------------------------
 
     def receive_end(self) -> Sentinel:
-        """Handle the end of ``run``: end the episode of all agents, or raise the error of ``run``."""
+        """Handle the end of ``run``: end the agents' episodes, or raise the error of ``run``."""
         self.running = False
         self._failed_in_model = self.driver.failed
         result = self.driver.take_outcome()
@@ -593,34 +589,6 @@ class Episode(EpisodeState):
     def _has_only_forced_moves(self) -> bool:
         agents = (*self.agents.values(), *self.just_ended)
         return self.skips and any(agent.decided for agent in agents)
-
-    def _without_decision(self) -> NoDecisionError:
-        """Make the error for an episode that ended without a decision for the environment's user."""
-        hooks = [point.hook for point in self.plan.active]
-        expected = ", ".join(hook.name for hook in hooks)
-        overriding = listed([name for hook in hooks for name in overrides(hook)])
-        threads = {name for hook in hooks for name in hook.threads} - {current_thread().name}
-        hints: list[str] = []
-        if overriding:
-            hints.append(
-                f"these override it and are called instead: {overriding}; name them as decision"
-                " points"
-            )
-        if threads:
-            hints.append(
-                "the rule has decided in threads that are not the simulation's:"
-                f" {listed(sorted(threads))}; call it where run() runs, and pass the decision on"
-            )
-        if self.others:
-            if self.plan.one_agent:
-                expected = f"{self.plan.one_agent!r} at {expected}"
-            hints = [f"these have decided: {listed(self.others)}"]
-        hint = "; ".join(hints) or (
-            "does the simulation call its decision functions as attributes of class or module?"
-        )
-        return NoDecisionError(
-            f"{type(self.simulation).__name__}.run() ended without a decision of {expected}; {hint}"
-        )
 
     # -- errors, and the end by a close -----------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""The handlers of the events that a simulation sends: decisions, ends of agents, rules' decisions."""
+"""The handlers of a simulation's events: decisions, ends of agents, decisions of rules."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .state import EpisodeState
 
 MANY_ROUNDS: Final = 100
-"""The number of rounds in a row without an action for the pending agent after which the user is warned."""
+"""After so many rounds in a row without an action for the pending agent, the user is warned."""
 
 
 class Round:
@@ -43,13 +43,17 @@ class Round:
         """The number of actions in the episode, other than ``RULE``."""
         return self.used + self.unused
 
+    def load(self, acted: set[str]) -> None:
+        """Take over the names of the agents that have acted in a clone."""
+        self.acted = acted
+
     def begin(self, actions: dict[str, Action]) -> None:
         """Begin a round with checked actions."""
         self.actions = actions
         self.acted = set()
 
     def take(self, agent: Agent) -> Action:
-        """Return the action for a decision. ``WAIT`` if there is none, or if it is illegal by now."""
+        """Return the action for a decision. ``WAIT`` if there is none, or if it is illegal now."""
         action = self.actions.pop(agent.name, WAIT)
         if action is WAIT:
             return WAIT

@@ -117,8 +117,8 @@ class BaseSession(ABC):
             self._np_random, self.np_random_seed = seeding.np_random(self.np_random_seed)
         return self._np_random
 
-    @np_random.setter
-    def np_random(self, generator: np.random.Generator) -> None:
+    def set_generator(self, generator: np.random.Generator) -> None:
+        """Draw all seeds from a generator."""
         self._np_random = generator
         self.np_random_seed = -1
 
@@ -232,7 +232,8 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_check", "_clock", "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation", "context", "episode",
+        "_check", "_clock", "_close", "_closer", "_driver", "_installed", "_reset", "_rng",
+        "_simulation", "context", "episode",
         "handlers", "unmatched_names",
     )  # fmt: skip
 

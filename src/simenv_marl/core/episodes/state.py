@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from enum import Enum
+from threading import current_thread
 from typing import TYPE_CHECKING, Final
 
 from ...errors import (
     ClosedError,
     EpisodeOverError,
+    NoDecisionError,
     NotResetError,
     ReentrancyError,
     SimEnvError,
@@ -15,7 +17,7 @@ from ...errors import (
     warn_user,
 )
 from ...simulation import Action
-from ..plans.points import declared_agents
+from ..plans.points import declared_agents, overrides
 from ..plans.policies import Where
 from .round import Round
 
@@ -241,3 +243,33 @@ class EpisodeState:
         if not (self.over and self.unreported_end):
             raise self.refusal()
         self.unreported_end = False
+
+
+def missing_decision(episode: EpisodeState, simulation: str) -> NoDecisionError:
+    """Make the error for an episode without a decision for the environment's user.
+
+    ``simulation``: the name of its class.
+    """
+    plan = episode.plan
+    hooks = [point.hook for point in plan.active]
+    expected = ", ".join(hook.name for hook in hooks)
+    overriding = listed([name for hook in hooks for name in overrides(hook)])
+    threads = {name for hook in hooks for name in hook.threads} - {current_thread().name}
+    hints: list[str] = []
+    if overriding:
+        hints.append(
+            f"these override it and are called instead: {overriding}; name them as decision points"
+        )
+    if threads:
+        hints.append(
+            "the rule has decided in threads that are not the simulation's:"
+            f" {listed(sorted(threads))}; call it where run() runs, and pass the decision on"
+        )
+    if episode.others:
+        if plan.one_agent:
+            expected = f"{plan.one_agent!r} at {expected}"
+        hints = [f"these have decided: {listed(episode.others)}"]
+    hint = "; ".join(hints) or (
+        "does the simulation call its decision functions as attributes of class or module?"
+    )
+    return NoDecisionError(f"{simulation}.run() ended without a decision of {expected}; {hint}")

@@ -432,9 +432,8 @@ def _resolve(
         policy = by_point.get(hook, default_policy)
         if options.agent is not None and agent != only:
             policy = policy or RULE
-        if agent is None:
-            policies = [policy, *by_agent.values()]
-        else:
+        policies = [policy, *by_agent.values()]
+        if agent is not None:
             policies = [by_agent.get(agent, policy)]
         if policy is RULE and policies == [RULE]:
             continue

@@ -431,7 +431,7 @@ async def _awaiting(value: Model) -> Model:
 def _applying(
     agent: Applier, inner: Generator[Model, Model, Model]
 ) -> Generator[Model, Model, Model]:
-    """Run a generator of ``apply``. The agent's calls run the rule while it runs, not while it waits."""
+    """Run a generator of ``apply``. While it runs, the agent's calls run the rule."""
     resume: Callable[[Model], Model] = inner.send
     sent: Model = None
     while True:

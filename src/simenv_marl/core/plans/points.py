@@ -73,7 +73,7 @@ def locate(key: Key, own: Definitions = _NONE) -> DecisionPoint:
 
 
 def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
-    """Return the definitions in the attribute ``points``. Names that lead to nothing are left out."""
+    """Return the definitions in the attribute ``points``, without names that lead to nothing."""
     points = getattr(simulation, "points", None)
     own: dict[DecisionPoint, Definition] = {}
     if isinstance(points, Mapping):
@@ -294,7 +294,7 @@ def resolve_policies(
 
 
 def _may_be_agent(key: object) -> bool:
-    """Return whether a callable may name an agent so later. A name in a loaded module is a point."""
+    """Return whether a callable may name an agent so later. Names in loaded modules are points."""
     if not isinstance(key, str):
         return False
     first, dot, _ = key.partition(".")

@@ -39,7 +39,7 @@ class Where(IntEnum):
     """
 
     PLAN = 3
-    """As BRANCH, in a branch in which a planner tries a candidate. A planner itself knows it, too."""
+    """A branch where a planner tries a candidate. A planner itself knows it, too."""
 
 
 class AskedEpisode(Protocol):

@@ -67,10 +67,12 @@ class EventHandler(Protocol[EpisodeType]):
     """
 
     @property
-    def deliver(self) -> Callable[..., Model] | None: ...
+    def deliver(self) -> Callable[..., Model] | None:
+        """Return the function that makes the value of the call."""
 
     @property
-    def report(self) -> AnyHandler | None: ...
+    def report(self) -> AnyHandler | None:
+        """Return the handler of the decisions of the rule."""
 
     def handle(self, episode: EpisodeType, args: Args, kwargs: Kwargs, /) -> Model:
         """Handle an event with the arguments of the call. Return the reply, or ``WAIT``."""

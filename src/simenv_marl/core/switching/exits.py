@@ -1,4 +1,4 @@
-"""The exception that unwinds a suspended simulation, and how to recognise it after a model has caught it."""
+"""The exception that unwinds a suspended simulation, also after a model has caught it."""
 
 from __future__ import annotations
 

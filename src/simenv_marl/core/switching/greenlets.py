@@ -80,7 +80,8 @@ class GreenletDriver(Driver):
             while not self.ended:
                 self._loop = NO_LOOP  # each job begins without a loop
                 # Not by ``Context.run``, because that takes a kilobyte of stack.
-                self._body.gr_context, self._context = self._context, None  # type: ignore[union-attr]
+                self._body.gr_context = self._context  # type: ignore[union-attr]
+                self._context = None
                 self._users_loop = swap_loop(self._loop)
                 try:
                     self._work()

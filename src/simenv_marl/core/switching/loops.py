@@ -10,9 +10,9 @@ from .exits import ASYNCIO
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
-    from sys import _asyncgen_hooks as Hooks
+    from sys import _asyncgen_hooks
 
-LoopState = tuple["AbstractEventLoop | None", "Hooks | tuple[None, None]", int]
+LoopState = tuple["AbstractEventLoop | None", "_asyncgen_hooks | tuple[None, None]", int]
 """The running loop of a thread, its hooks of asynchronous generators, and its tracking depth."""
 
 NO_LOOP: Final[LoopState] = (None, (None, None), 0)

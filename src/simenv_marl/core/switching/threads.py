@@ -18,7 +18,7 @@ from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Args, Driver, Event, K
 from .exits import make_exit
 
 _LONGEST_WAIT: Final = 1.0
-"""The longest single wait of the user's thread, in seconds. Ctrl-C just before it does not end it."""
+"""The longest single wait of the user's thread, in seconds, because Ctrl-C may come before it."""
 
 _EXIT: Final = Sentinel("EXIT")
 _JOB: Final = Sentinel("JOB")

@@ -492,8 +492,8 @@ class Session(BaseSession):
             raise BranchError(
                 f"{type(self._simulation).__name__} does not repeat its decisions with the same"
                 " seed and the same actions: some of its random numbers do not follow from the"
-                ' seed. Use method="fork", or global_rng=True if it draws from random or'
-                " numpy.random"
+                " seed. Use"
+                ' method="fork", or global_rng=True if it draws from random or numpy.random'
             )
         state = self._state
         self.restore(copy.deepcopy(original.snapshot())._replace(state=state))

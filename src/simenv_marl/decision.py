@@ -147,9 +147,9 @@ def make_step(
     Args:
         observation_space: The space of the agent's observations.
         observation_space_mapping: A callable of the decision call's arguments (``self`` first for a
-            method). It gets by position all arguments that can be passed by position, and the
-            others by keyword, however the model writes the call; defaults are filled in. It returns
-            the observation, which is cast to the dtype of the space.
+            method). It takes as many of them as it wants: positional ones from the first on,
+            keyword-only ones by name, however the model writes the call; defaults are filled in.
+            It returns the observation, which is cast to the dtype of the space.
         action_space: The space of the agent's actions.
         action_space_mapping: The decision for an action: a callable of the action, or a dict with
             an entry for each action of a ``Discrete`` space. The decision function returns its

@@ -111,6 +111,20 @@ def test_goal_based_observations_are_dicts_of_the_users_own():
     assert joint_env(Walk, goals()).observation_space["walker_0"] == GOAL["observation_space"]
 
 
+def test_mappings_of_goals_take_as_many_arguments_as_they_want():
+    env = single_env(
+        Walk,
+        goals(
+            observation_space_mapping=lambda walk: [*walk.place, walk.steps],
+            achieved_goal_mapping=lambda *, _simulation: _simulation.place,
+            desired_goal_mapping=lambda walk, *, _simulation: _simulation.goal,
+        ),
+    )
+    first, _ = env.reset(seed=3)
+    assert first["achieved_goal"].tolist() == [0, 0]
+    assert first["desired_goal"].tolist() == env.simulation.goal.tolist()
+
+
 def test_rewards_are_computed_anew_for_other_goals():
     env = single_env(Walk, goals())
     env.reset(seed=3)

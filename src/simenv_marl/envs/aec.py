@@ -97,12 +97,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
         Raises:
             ResetNeededError: There is no episode, or all agents have taken their final step.
         """
-        name = self.agent_selection
         episode = self.session.episode
         observation: Observation = None
         if self._leaving:
             if observe:
-                observation = self.observe(name)
+                observation = self.observe(self.agent_selection)
         elif episode is None or episode.pending is None:
             raise self.session.refusal()
         elif observe:
@@ -111,6 +110,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
                 observation = observation.copy()
             else:
                 observation = duplicate(observation)
+        name = self.agent_selection
         return (
             observation,
             self._cumulative_rewards[name],

@@ -90,6 +90,9 @@ class SimulationEnv(OneAgentView):
                 "desired_goal": definition.desired_goal_mapping,
             }
             asking = {key for key, part in mappings.items() if asks_for(part, "_simulation")}
+            fitted = {
+                key: point.fit(part, f"the mapping of {key}").call for key, part in mappings.items()
+            }
             parts = {
                 "observation": definition.observation_space,
                 "achieved_goal": goal,
@@ -98,7 +101,7 @@ class SimulationEnv(OneAgentView):
             changed = replace(
                 definition,
                 observation_space=spaces.Dict(parts),
-                observation_space_mapping=partial(_observe_with_goals, mappings, asking),
+                observation_space_mapping=partial(_observe_with_goals, fitted, asking),
             )
             plan = plan.redefined(point.hook, changed)
         return super().adapt(plan)

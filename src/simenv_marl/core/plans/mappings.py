@@ -121,7 +121,9 @@ class _Fit:
             self._refuse("it takes fewer arguments than its own")
         self._positional = parameters[leading:]
         self._keyword_only = [
-            p for p in _of_kind(self._own, kind.KEYWORD_ONLY) if p.name not in GIVEN
+            p
+            for p in _of_kind(self._own, kind.KEYWORD_ONLY)
+            if p.name not in GIVEN or p.default is p.empty  # else it is bound already
         ]
 
     def mapped(self) -> Mapped:
@@ -184,7 +186,8 @@ class _Fit:
             if parameter.name in self._names:
                 continue
             required = parameter.default is parameter.empty
-            if parameter.name in self._keys or (required and self._open_keys):
+            is_given = parameter.name in GIVEN
+            if is_given or parameter.name in self._keys or (required and self._open_keys):
                 found.append(parameter.name)
             elif required:
                 self._refuse(f"it requires {parameter.name!r}")

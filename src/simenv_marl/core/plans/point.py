@@ -184,7 +184,10 @@ class Point:
 
     def _mapped(self, name: str, leading: int = 0) -> Mapped:
         """Return a callable of the definition, callable with all arguments of a call."""
-        function = getattr(self.definition, name)
+        return self.fit(getattr(self.definition, name), name, leading)
+
+    def fit(self, function: Callable[..., Model], name: str, leading: int = 0) -> Mapped:
+        """Make a function callable with all arguments of a call, as ``adapt`` does."""
         return adapt(function, name, self.hook, leading + self._items_before(name))
 
     def _callable(self, name: str, leading: int = 0) -> Callable[..., Model] | None:

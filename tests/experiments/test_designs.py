@@ -198,12 +198,17 @@ def test_a_central_composite_design_is_there_for_each_combination_of_levels():
 THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (0, 1)}
 
 
+def test_arrays_can_be_levels():
+    one, other = np.zeros(2), np.ones(2)
+    assert design({"start": [one, other]})["start"].tolist() == [one, other]
+
+
 @pytest.mark.parametrize(
     ("match", "arguments"),
     [
         *(("must be a dict", (factors,)) for factors in ({}, [1])),
         ("has no levels", ({"a": []},)),
-        *(("twice", ({"a": own},)) for own in ([1, 2, 1], [[1], [1]])),
+        *(("twice", ({"a": own},)) for own in ([1, 2, 1], [[1], [1]], [np.ones(2), np.ones(2)])),
         *(
             ("a tuple is a range", ({"a": own},))
             for own in ((1, 2, 3), ("x", "y"), (0.0, float("inf")))

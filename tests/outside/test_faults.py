@@ -214,6 +214,24 @@ def test_descriptors_and_processes_are_given_back():
     alone(fail_many_times)
 
 
+def test_a_process_that_gets_one_pipe_of_two_gives_it_back(monkeypatch):
+    pipes = [os.pipe()]
+
+    def pipe():
+        if not pipes:
+            raise OSError(24, "Too many open files")
+        return pipes.pop()
+
+    monkeypatch.setattr("simenv_marl.remote.child.os.pipe", pipe)
+    (ends,) = pipes
+    with pytest.raises(OSError, match="Too many open files"):
+        ProcessSimulation("true", BOTH).reset()
+    monkeypatch.undo()
+    for end in ends:
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fstat(end)
+
+
 def fail_many_times() -> None:
     """End processes in all ways in which they fail, and look for what is left open."""
     before = descriptors()

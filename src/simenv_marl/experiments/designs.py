@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import checked_seed
+from ..core import checked_seed, same
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
 from .runner import EXACT, dtype_of
@@ -199,7 +199,7 @@ def _parse_factor(name: str, values: Iterable[Any]) -> Factor:
     for level in plain:
         key = level if isinstance(level, (str, int, float)) else None
         others = groups.setdefault((type(level), key), [])
-        if level in others:
+        if any(same(level, other) for other in others):  # arrays, too
             raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
         others.append(level)
     return Factor(name, plain)

@@ -279,7 +279,7 @@ def sobol_indices(
     if (means == means[0]).all():
         raise OptionValueError(f"{metric!r} is {means[0]:g} in all rows, so it has no variance")
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
-    indices = analyze(problem, means, conf_level=confidence, seed=0)
+    indices = analyze(problem, means, conf_level=confidence, seed=1)  # SALib ignores 0
     columns = {
         "first": indices["S1"],
         "first_error": indices["S1_conf"],

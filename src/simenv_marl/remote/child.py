@@ -140,7 +140,12 @@ class Child:
         """Start the process with its pipes."""
         command, _, env, cwd = self.launch
         child_reading, self._writing = os.pipe()
-        self._reading, child_writing = os.pipe()
+        try:
+            self._reading, child_writing = os.pipe()
+        except BaseException:
+            os.close(child_reading)
+            os.close(self._writing)
+            raise
         try:
             self._popen = Popen(
                 command,

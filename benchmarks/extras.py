@@ -29,6 +29,13 @@ class ClockTurns(Turns):
         return 1.0
 
 
+class IdleTurns(Turns):
+    """Two agents, whose simulation has a method that it does not call."""
+
+    def idle(self) -> None:
+        """Do nothing."""
+
+
 def nothing(model: Model) -> None:
     """Handle nothing."""
 
@@ -55,7 +62,10 @@ OURS = partial(aec_env, Turns, POINTS)
 EXTRAS: dict[str, Callable[[], tuple[Any, Any]]] = {
     "without": lambda: (OURS(), None),
     "a clock": lambda: (aec_env(ClockTurns, POINTS), None),
-    "an idle plugin": lambda: (OURS(plugins=[(nothing, f"{__name__}.idle", "before")]), None),
+    "an idle plugin": lambda: (
+        aec_env(IdleTurns, POINTS, plugins=[(nothing, f"{__name__}.IdleTurns.idle", "before")]),
+        None,
+    ),
     "a difference elsewhere": lambda: (
         OURS(),
         other_environment(
@@ -82,10 +92,6 @@ LIMITS = {
     "an idle plugin": (1.08, 1.04),
     "a difference elsewhere": (1.08, 1.04),
 }
-
-
-def idle(model: Model) -> None:
-    """A function of the model that is not called during the measurement."""
 
 
 def groups(number: int) -> Iterator[Group]:

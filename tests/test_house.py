@@ -10,6 +10,7 @@ import re
 import tokenize
 import tomllib
 from collections import Counter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import grimp
@@ -237,6 +238,12 @@ def private_fields(place):
 
 
 # -- directions -----------------------------------------------------------------------------------
+
+
+def test_no_modules_import_each_other_not_even_for_types():
+    graph = grimp.build_graph("simenv_marl", cache_dir=None)
+    imports = {name: graph.find_modules_directly_imported_by(name) for name in graph.modules}
+    TopologicalSorter(imports).prepare()  # raises an error that names a circle
 
 
 def test_folders_of_the_core_import_in_one_direction_also_for_types():

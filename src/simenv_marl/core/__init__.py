@@ -20,9 +20,9 @@ from .episodes.agent import Agent
 from .episodes.clock import Clock
 from .episodes.decision import Decision
 from .episodes.episode import Episode
-from .episodes.round import Round, checked_actions
+from .episodes.round import Round
 from .episodes.session import BaseSession, Session, checked_seed, close_all
-from .episodes.state import EpisodeState, Outcome, State, UnmatchedNames
+from .episodes.state import EpisodeState, Outcome, State, UnmatchedNames, checked_actions
 from .plans.mappings import adapt
 from .plans.options import CheckOptions, EpisodeOptions, Options, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import isfinite
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from greenlet import getcurrent
@@ -14,19 +15,87 @@ from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
 from ...simulation import RULE, Action, Model, Observation
 from ..plans.point import Args, Kwargs, Policy
-from ..plans.policies import AskingPolicy, DeferredPolicy, EpisodePolicy, Info, Where
+from ..plans.policies import AskedEpisode, AskingPolicy, DeferredPolicy, EpisodePolicy, Info, Where
 from ..switching.driver import WAIT, AnyHandler
 from ..values.actions import MASK, Mask, only_choice
 from ..values.spaces import duplicate
 from .arguments import Arguments, Recalled, weaken
 from .clock import Clock
-from .decision import Decision, decision_of
+from .decision import Decision
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from ..plans.plan import Plan
+    from ..plans.point import Point
 
-    from .episode import Episode
-    from .events import PointHandler
+
+class DecisionHandler(Protocol):
+    """The handler of the decisions at a point, as its agents use it."""
+
+    @property
+    def point(self) -> Point:
+        """The decision point."""
+
+    @property
+    def deliver(self) -> Callable[..., Model] | None:
+        """Turns a reply into the value of a call, on the simulation's side."""
+
+    @property
+    def report(self) -> AnyHandler | None:
+        """Handles the decisions of the rule."""
+
+    def handle(self, episode: Any, args: Args, kwargs: Kwargs, /) -> Model:
+        """Handle a decision."""
+
+    def warn_of_several(self, agent: str) -> None:
+        """Warn once that several objects decide under the name of one agent."""
+
+    def warn_of_gone(self, call: Recalled, effect: str) -> None:
+        """Warn once that the model has freed an argument that mappings take."""
+
+
+class RunningEpisode(AskedEpisode, Protocol):
+    """The episode, as its agents and the handlers of its events use it."""
+
+    plan: Plan
+    is_plain: bool
+    agents: dict[str, Agent]
+    others: dict[str, Agent]
+    ended: dict[str, Agent]
+
+    @property
+    def skips(self) -> bool:
+        """Whether forced moves are skipped."""
+
+    @property
+    def is_branch(self) -> bool:
+        """Whether it is a branch or a clone."""
+
+    def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
+        """Handle a decision where more than an update is due."""
+
+    def consult(self, agent: Agent, policy: Policy) -> Action:
+        """Ask the policy of an agent."""
+
+    def agent_for(self, handler: DecisionHandler, name: Model) -> Agent:
+        """Return the agent with a name that decides at a point."""
+
+    def note_entity(self, agent: Agent, entity: Model) -> None:
+        """Note the object as which an agent decides."""
+
+    def named_before(self, handler: DecisionHandler, entity: Model) -> str | None:
+        """Return the name of the agent as which an entity last decided."""
+
+    def end_agent(self, agent: Agent) -> None:
+        """End the episode of one agent."""
+
+    def take_items(self) -> list[Model]:
+        """Return the items of the latest call that was split."""
+
+    def blame(self, agent: Agent) -> None:
+        """Note the agent that notes of errors name."""
+
+    def finish(self, *, truncated: bool) -> None:
+        """End the episode of all live agents."""
 
 
 class Agent:
@@ -72,7 +141,7 @@ class Agent:
     def __init__(
         self,
         name: str,
-        handler: PointHandler,
+        handler: DecisionHandler,
         policy: Policy,
         delegated: bool,
         clock: Clock | None,
@@ -119,7 +188,7 @@ class Agent:
         """Handles the decisions of the rule."""
         return self.handler.report
 
-    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+    def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Handle a decision. Return this agent if it waits for the user, else the reply."""
         if self._applying:
             return RULE
@@ -152,7 +221,7 @@ class Agent:
             raise
         return self
 
-    def ask_policy(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+    def ask_policy(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Let the policy answer a decision. Return the reply, or ``WAIT`` for a deferred policy."""
         if episode.ended:
             if self.ended:
@@ -186,7 +255,7 @@ class Agent:
             return WAIT
         return self.answer(action if action is RULE else self.validate(action))
 
-    def answer_by_policy(self, episode: Episode) -> Action:
+    def answer_by_policy(self, episode: RunningEpisode) -> Action:
         """Ask the policy itself for an action."""
         policy = self.policy
         if isinstance(policy, EpisodePolicy):
@@ -255,11 +324,31 @@ class Agent:
 
     def describe(self, seed: int, where: Where) -> Decision:
         """Describe the decision of the agent."""
-        return decision_of(self, seed, where)
+        point = self.point
+        choices = self.choices
+        call = self.arguments.recall()
+        return Decision(
+            agent=self.name,
+            point=point.hook.name,
+            seed=seed,
+            number=self.answered + 1,
+            time=self.now,
+            observation=duplicate(self.observation),
+            action_space=point.definition.action_space,
+            mask=None if self.mask is None else duplicate(self.mask),
+            choices=None if choices is None else list(choices),
+            action_labels=point.action_labels(choices, call.args, call.kwargs),
+            observation_labels=point.observation_labels(call.args, call.kwargs),
+            reward=self.reward,
+            doc=point.hook.function.__doc__,
+            in_clone=where is not Where.USER,
+            memory=self.memory,
+            _agent=self,
+        )
 
     # -- arguments --------------------------------------------------------------------------------
 
-    def keep(self, episode: Episode, args: Args, kwargs: Kwargs) -> None:
+    def keep(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> None:
         """Hold the arguments of a decision."""
         arguments = self.arguments
         point = self.point

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from ...simulation import Action, Model, Observation
 from ..plans.point import Labels, Space
-from ..plans.policies import Where
 from ..values.actions import Mask
-from ..values.spaces import duplicate
 
-if TYPE_CHECKING:
-    from .agent import Agent
+
+class DecidingAgent(Protocol):
+    """The agent of a decision."""
+
+    def validate(self, action: Action) -> Action:
+        """Validate an action."""
+
+    def count_fallback(self) -> None:
+        """Count an answer of a fallback."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +62,7 @@ class Decision:
     doc: str | None
     in_clone: bool
     memory: dict[Any, Any] = field(repr=False)
-    _agent: Agent = field(repr=False)
+    _agent: DecidingAgent = field(repr=False)
 
     def validate(self, action: Action) -> Action:
         """Validate an action; return it as ``action_space_mapping`` receives it.
@@ -70,28 +75,3 @@ class Decision:
     def count_fallback(self) -> None:
         """Count an answer of a fallback. Evaluations show the number for each agent and seed."""
         self._agent.count_fallback()
-
-
-def decision_of(agent: Agent, seed: int, where: Where) -> Decision:
-    """Describe the decision of an agent that is pending, or for which a policy is asked."""
-    point = agent.point
-    choices = agent.choices
-    call = agent.arguments.recall()
-    return Decision(
-        agent=agent.name,
-        point=point.hook.name,
-        seed=seed,
-        number=agent.answered + 1,
-        time=agent.now,
-        observation=duplicate(agent.observation),
-        action_space=point.definition.action_space,
-        mask=None if agent.mask is None else duplicate(agent.mask),
-        choices=None if choices is None else list(choices),
-        action_labels=point.action_labels(choices, call.args, call.kwargs),
-        observation_labels=point.observation_labels(call.args, call.kwargs),
-        reward=agent.reward,
-        doc=point.hook.function.__doc__,
-        in_clone=where is not Where.USER,
-        memory=agent.memory,
-        _agent=agent,
-    )

@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from math import inf
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn, Protocol
 from weakref import ref
 
 from greenlet import getcurrent
@@ -58,18 +58,18 @@ from ..switching.context import environment_context
 from ..switching.driver import WAIT, AnyHandler, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
-from .agent import Agent
+from .agent import Agent, DecisionHandler
 from .arguments import restore, weaken
 from .clock import Clock
-from .decision import Decision, decision_of
-from .round import Round, checked_actions
-from .state import RUNNING, EpisodeState, Outcome, missing_decision
+from .decision import Decision
+from .events import Handlers
+from .round import Round
+from .split import SplitCall
+from .state import RUNNING, EpisodeState, Outcome, UnmatchedNames, checked_actions, missing_decision
 
 if TYPE_CHECKING:
+    from ..plans.plan import Plan
     from ..plans.point import Args, Kwargs
-    from .events import PointHandler
-    from .session import Session
-    from .split import SplitCall
 
 LONGEST_TAPE: Final = 200_000
 """The number of answers that are kept for a replay. It limits the memory of endless simulations."""
@@ -84,6 +84,16 @@ class Replay:
     def answer(self) -> Action:
         """Return the next answer. ``WAIT`` where the other episode stands."""
         return self.answers.popleft() if self.answers else WAIT
+
+
+class EpisodeOwner(Protocol):
+    """The session, as its episodes use it."""
+
+    plan: Plan
+    where: Where
+    handlers: Handlers
+    context: Callable[..., environment_context]
+    unmatched_names: UnmatchedNames
 
 
 class Episode(EpisodeState):
@@ -108,7 +118,7 @@ class Episode(EpisodeState):
 
     def __init__(
         self,
-        session: Session,
+        session: EpisodeOwner,
         simulation: Model,
         clock: Clock | None,
         driver: Driver,
@@ -120,7 +130,7 @@ class Episode(EpisodeState):
         """Prepare the run of a simulation that has been reset. The next ``resume`` begins it."""
         plan = session.plan
         super().__init__(plan, seed, clock, session.where, in_rounds=in_rounds)
-        self.session: Callable[[], Session | None] = ref(session)
+        self.session: Callable[[], EpisodeOwner | None] = ref(session)
         self.simulation = simulation
         self.driver = driver
         self._context = session.context
@@ -129,7 +139,7 @@ class Episode(EpisodeState):
         self.latest: Agent | None = None
         self.running = True
         self._failed_in_model = False
-        self._entities: dict[tuple[PointHandler, int], Agent] = {}  # by the id of the entity
+        self._entities: dict[tuple[DecisionHandler, int], Agent] = {}  # by the id of the entity
         self._most_steps: float = plan.options.max_steps or inf
         self.is_plain = not (in_rounds or self.skips)
         self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
@@ -391,7 +401,7 @@ class Episode(EpisodeState):
 
     def decision_of(self, agent: Agent) -> Decision:
         """Describe the decision of an agent."""
-        return decision_of(agent, self.seed, self.where)
+        return agent.describe(self.seed, self.where)
 
     def planner_view(self) -> object:
         """Make the environment that a planner gets."""
@@ -422,12 +432,12 @@ class Episode(EpisodeState):
 
     # -- agents -----------------------------------------------------------------------------------
 
-    def _make_agent(self, name: str, handler: PointHandler) -> Agent:
+    def _make_agent(self, name: str, handler: DecisionHandler) -> Agent:
         policy = self.plan.policy_of(name, handler.point)
         delegated = self.plan.is_delegated(policy)
         return Agent(name, handler, policy, delegated, self.clock, self._plugins)
 
-    def agent_for(self, handler: PointHandler, name: Model) -> Agent:
+    def agent_for(self, handler: DecisionHandler, name: Model) -> Agent:
         """Return the agent with a name that decides at a point. Let a new one join.
 
         Raises:
@@ -453,7 +463,7 @@ class Episode(EpisodeState):
         """Note the object as which an agent decides."""
         self._entities[agent.handler, id(entity)] = agent
 
-    def named_before(self, handler: PointHandler, entity: Model) -> str | None:
+    def named_before(self, handler: DecisionHandler, entity: Model) -> str | None:
         """Return the name of the agent as which an entity last decided. None if it was none."""
         agent = self._entities.get((handler, id(entity)))
         if agent is None or not agent.is_entity(entity):  # a freed object may have had the same id

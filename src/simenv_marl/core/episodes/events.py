@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 from weakref import WeakKeyDictionary
 
 from ...decision import inverse
@@ -18,14 +18,11 @@ from ..plans.plan import Plan, Remover
 from ..plans.point import Args, Kwargs, Point, Policy, warn_of_several
 from ..switching.driver import AnyHandler
 from ..values.actions import ILLEGAL
+from .agent import Agent, RunningEpisode
 from .arguments import Recalled, restore
 from .split import SplitHandler, part_of
 
-if TYPE_CHECKING:
-    from .agent import Agent
-    from .episode import Episode
-
-Namer = Callable[["Episode", Args, Kwargs], Model]
+Namer = Callable[[RunningEpisode, Args, Kwargs], Model]
 """Returns the name of the agent that a call ends."""
 
 
@@ -47,7 +44,7 @@ class PointHandler:
         """Turns a reply into the value of a call, on the simulation's side."""
         return self.point.deliver
 
-    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+    def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Find the agent that decides, or let it join; then handle its decision."""
         point = self.point
         name: Model = point.agent
@@ -111,7 +108,7 @@ class RemovalHandler:
             namer = partial(_name_of_call, call)
         self._removals.append((handler, namer))
 
-    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+    def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Give the agents their last rewards and observations; then let the function run."""
         # All names come first, because the end of an agent may change them.
         named = [(handler, name(episode, args, kwargs)) for handler, name in self._removals]
@@ -122,19 +119,19 @@ class RemovalHandler:
         return RULE
 
 
-def _name_of_end_agent(episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+def _name_of_end_agent(episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
     """Return the name that ``SimulationInterface.end_agent`` gets after the simulation."""
     return args[1]
 
 
 def _name_of_call(
-    name_agent: Callable[..., Model], episode: Episode, args: Args, kwargs: Kwargs
+    name_agent: Callable[..., Model], episode: RunningEpisode, args: Args, kwargs: Kwargs
 ) -> Model:
     return name_agent(*args, **kwargs)
 
 
 def _name_of_entity(
-    handler: PointHandler, owner: type | None, episode: Episode, args: Args, kwargs: Kwargs
+    handler: PointHandler, owner: type | None, episode: RunningEpisode, args: Args, kwargs: Kwargs
 ) -> Model:
     """Return the name of the agent that is the first argument of a call. None if it is none."""
     point = handler.point
@@ -156,7 +153,7 @@ class RuleHandler:
         self._point = point
         self._inverse = inverse(point.definition) or {}
 
-    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> None:
+    def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> None:
         """Note the action for a decision. ``args``: the decision, and its call's arguments."""
         decision, call_args, call_kwargs = args
         point = self._point
@@ -167,7 +164,7 @@ class RuleHandler:
             piece = part_of(point.part, decision, item, place, call_args, call_kwargs)
             self._note(episode, piece, (item, *call_args), call_kwargs)
 
-    def _note(self, episode: Episode, decision: Model, args: Args, kwargs: Kwargs) -> None:
+    def _note(self, episode: RunningEpisode, decision: Model, args: Args, kwargs: Kwargs) -> None:
         point = self._point
         name = point.agent or point.name_agent(*args, **kwargs)
         agent = None

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from ...errors import InvalidActionError, UnknownAgentError, listed, short_repr, warn_user
+from ...errors import short_repr, warn_user
 from ...simulation import RULE, Action
 from ..switching.driver import WAIT
-from ..values.actions import ILLEGAL
 
 if TYPE_CHECKING:
     from .agent import Agent
-    from .state import EpisodeState
 
 MANY_ROUNDS: Final = 100
 """After so many rounds in a row without an action for the pending agent, the user is warned."""
@@ -82,36 +79,3 @@ class Round:
                 f" {MANY_ROUNDS} rounds in a row had no action for it; the info of the agent that"
                 ' must decide has "deciding": True'
             )
-
-
-def checked_actions(episode: EpisodeState, actions: Mapping[str, Action]) -> dict[str, Action]:
-    """Check the actions of a round; return them in the form that mappings take.
-
-    Raises:
-        InvalidActionError: An action is not legal, or the actions are no dict.
-        UnknownAgentError: An action is for an agent that is not live.
-    """
-    if type(actions) is not dict and not isinstance(actions, Mapping):
-        raise InvalidActionError(
-            f"a round takes a dict of actions by agent, not {short_repr(actions)}"
-        )
-    pending = episode.pending
-    agents = episode.agents
-    checked: dict[str, Action] = {}
-    for name, action in actions.items():
-        agent = agents.get(name)
-        if agent is None:
-            if episode.unreported_end and name in episode.ended:
-                continue
-            raise UnknownAgentError(
-                f"there is an action for {short_repr(name)}, which is not a live agent; live"
-                f" agents: {listed(agents)}"
-            )
-        if action is not RULE:
-            legal = agent.point.check(action)
-            mask = agent.mask if agent is pending else None
-            if legal is ILLEGAL or mask is not None:
-                legal = agent.point.validate(action, name, mask)
-            action = legal
-        checked[name] = action
-    return checked

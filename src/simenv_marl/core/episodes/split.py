@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from types import coroutine
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from ...errors import SimulationError
 from ...simulation import RULE, Model, Sentinel
 from ..plans.point import Args, Kwargs
 from ..switching.driver import AnyHandler, Event
-
-if TYPE_CHECKING:
-    from .episode import Episode
-    from .events import PointHandler
+from .agent import DecisionHandler
 
 BEGIN: Final = Sentinel("BEGIN")
 """The reply to a call that is split. It does not reach the simulation."""
 
 
+class SplittingEpisode(Protocol):
+    """The episode, as the handlers of calls that are split use it."""
+
+    def begin_split(self, call: SplitCall) -> None:
+        """Decide the items of a call, before the simulation moves."""
+
+
 class SplitHandler:
     """Handles the calls at a decision point whose definition splits them."""
 
-    def __init__(self, items: PointHandler) -> None:
+    def __init__(self, items: DecisionHandler) -> None:
         """Handle calls of a point. ``items`` handles the decision of each item."""
         self._items = items
         self._point = items.point
@@ -32,7 +36,7 @@ class SplitHandler:
         """Handles the decisions of the rule."""
         return self._items.report
 
-    def handle(self, episode: Episode, args: Args, kwargs: Kwargs) -> Model:
+    def handle(self, episode: SplittingEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Split a call. Its items are handled one after the other, as decisions."""
         split = self._point.split
         items = list(() if split is None else split(*args, **kwargs))
@@ -99,7 +103,7 @@ class SplitCall:
     """
 
     def __init__(
-        self, handler: PointHandler, items: list[Model], args: Args, kwargs: Kwargs
+        self, handler: DecisionHandler, items: list[Model], args: Args, kwargs: Kwargs
     ) -> None:
         self.handler = handler
         self.items = items

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import Enum
 from threading import current_thread
 from typing import TYPE_CHECKING, Final
@@ -9,16 +10,20 @@ from typing import TYPE_CHECKING, Final
 from ...errors import (
     ClosedError,
     EpisodeOverError,
+    InvalidActionError,
     NoDecisionError,
     NotResetError,
     ReentrancyError,
     SimEnvError,
+    UnknownAgentError,
     listed,
+    short_repr,
     warn_user,
 )
-from ...simulation import Action
+from ...simulation import RULE, Action
 from ..plans.points import declared_agents, overrides
 from ..plans.policies import Where
+from ..values.actions import ILLEGAL
 from .round import Round
 
 if TYPE_CHECKING:
@@ -273,3 +278,36 @@ def missing_decision(episode: EpisodeState, simulation: str) -> NoDecisionError:
         "does the simulation call its decision functions as attributes of class or module?"
     )
     return NoDecisionError(f"{simulation}.run() ended without a decision of {expected}; {hint}")
+
+
+def checked_actions(episode: EpisodeState, actions: Mapping[str, Action]) -> dict[str, Action]:
+    """Check the actions of a round; return them in the form that mappings take.
+
+    Raises:
+        InvalidActionError: An action is not legal, or the actions are no dict.
+        UnknownAgentError: An action is for an agent that is not live.
+    """
+    if type(actions) is not dict and not isinstance(actions, Mapping):
+        raise InvalidActionError(
+            f"a round takes a dict of actions by agent, not {short_repr(actions)}"
+        )
+    pending = episode.pending
+    agents = episode.agents
+    checked: dict[str, Action] = {}
+    for name, action in actions.items():
+        agent = agents.get(name)
+        if agent is None:
+            if episode.unreported_end and name in episode.ended:
+                continue
+            raise UnknownAgentError(
+                f"there is an action for {short_repr(name)}, which is not a live agent; live"
+                f" agents: {listed(agents)}"
+            )
+        if action is not RULE:
+            legal = agent.point.check(action)
+            mask = agent.mask if agent is pending else None
+            if legal is ILLEGAL or mask is not None:
+                legal = agent.point.validate(action, name, mask)
+            action = legal
+        checked[name] = action
+    return checked

@@ -1,5 +1,6 @@
 """What the views tell beside observations: goals, masks, the time, the state and pictures."""
 
+from functools import partial
 from math import exp
 
 import gymnasium
@@ -680,3 +681,23 @@ def test_lists_of_pictures_have_those_since_the_last_reset_or_render(registered_
     envs.reset()
     envs.step(np.array([4, 5]))
     assert [first_numbers(frames) for frames in envs.render()] == [[0, 4], [0, 5]]
+
+
+def test_a_clock_that_each_reset_sets_anew_is_read():
+    class Shift:
+        def reset(self, seed=None):
+            self.time = partial(float, seed)
+
+        def run(self):
+            self.work()
+
+        def work(self):
+            return 1
+
+    definition = define(
+        agent="worker",
+        observation_space_mapping=lambda: [0, 0],
+        reward_mapping=lambda: 0.0,
+    )
+    env = single_env(Shift, {Shift.work: definition})
+    assert [env.reset(seed=seed)[1]["time"] for seed in (3, 5)] == [3.0, 5.0]

@@ -232,7 +232,7 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_check", "_clock", "_close", "_closer", "_driver", "_installed", "_reset", "_rng",
+        "_check", "_close", "_closer", "_driver", "_installed", "_reset", "_rng",
         "_simulation", "context", "episode",
         "handlers", "unmatched_names",
     )  # fmt: skip
@@ -287,7 +287,6 @@ class Session(BaseSession):
         self._simulation = simulation
         self._reset = resetter(simulation)
         self._closer = closer(simulation)
-        self._clock = self._make_clock()
         self.handlers = handlers_of(self.plan, simulation)
 
     def _run(self, job: Callable[[], Model]) -> Model:
@@ -358,13 +357,14 @@ class Session(BaseSession):
     ) -> Episode:
         """Run the simulation to its first decision."""
         simulation = self._simulation
-        if self._clock is None and self.plan.options.discount_rate is not None:
+        clock = self._make_clock()  # anew, because a reset may set another one
+        if clock is None and self.plan.options.discount_rate is not None:
             raise OptionValueError(
                 f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no"
                 " method time(); add one that returns its clock, or leave out discount_rate"
             )
         driver = self._driver
-        episode = Episode(self, simulation, self._clock, driver, seed, replay, in_rounds=in_rounds)
+        episode = Episode(self, simulation, clock, driver, seed, replay, in_rounds=in_rounds)
         driver.begin(simulation.run, episode.handlers_by_hook(), context)
         check, self._check = self._check, None
         try:

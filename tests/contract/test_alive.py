@@ -4,6 +4,7 @@ import gc
 import random
 import weakref
 from collections import deque, namedtuple
+from functools import partial
 from weakref import WeakSet
 
 import numpy as np
@@ -302,6 +303,45 @@ def test_a_freed_argument_of_the_observation_mapping_keeps_the_last_observation(
     with pytest.warns(UserWarning, match="has freed self .*the last observation stays"):
         observation, reward, terminated, _, _ = env.step(RULE)
     assert (list(observation), reward, terminated) == ([4.0], 4.0, True)
+
+
+@pytest.mark.parametrize("make_env", [aec_env, single_env])
+def test_an_environment_that_its_own_mapping_refers_to_is_freed(make_env):
+    class Walk:
+        def reset(self, seed=None):
+            self.place = 0
+
+        def run(self):
+            while True:
+                self.place += self.step()
+
+        def step(self):
+            return 1
+
+    def observe(holder, walk):
+        return [walk.place, len(holder)]
+
+    def play():
+        holder = []
+        mapping = partial(observe, holder)
+        definition = make_step(
+            observation_space=spaces.Box(-np.inf, np.inf, (2,)),
+            observation_space_mapping=mapping,
+            action_space=spaces.Discrete(2),
+            action_space_mapping=int,
+            reward_mapping=lambda: 0.0,
+            agent="walker",
+        )
+        env = make_env(Walk, {Walk.step: definition})
+        holder.append(env)
+        env.reset(seed=1)
+        env.step(1)
+        env.close()
+        return weakref.ref(env.unwrapped.session)
+
+    session = play()
+    gc.collect()
+    assert session() is None
 
 
 def test_containers_come_back_with_their_living_elements():

@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
-from weakref import WeakKeyDictionary
 
 from ...decision import inverse
 from ...errors import InvalidActionError, short_repr, warn_user
@@ -229,10 +227,6 @@ class Handlers:
     roster: Mapping[str, tuple[PointHandler, Policy, bool]]
 
 
-_HANDLERS: Final[WeakKeyDictionary[Plan, Handlers]] = WeakKeyDictionary()
-"""The handlers that all simulations of a plan share."""
-
-
 def handlers_of(plan: Plan, simulation: Model) -> Handlers:
     """Return the handlers of a simulation's events.
 
@@ -240,13 +234,11 @@ def handlers_of(plan: Plan, simulation: Model) -> Handlers:
     """
     if plan.needs_simulation:
         return _make_handlers(plan, simulation)
-    handlers = _HANDLERS.get(plan)
-    if handlers is None:
-        handlers = _HANDLERS[plan] = _make_handlers(plan, simulation)
+    handlers: Handlers = plan.derive(_make_handlers)
     return handlers
 
 
-def _make_handlers(plan: Plan, simulation: Model) -> Handlers:
+def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:
     by_point = {point: PointHandler(point.bind(simulation)) for point in plan.points}
     by_hook: dict[Hook, AnyHandler] = {}
     for handler in by_point.values():

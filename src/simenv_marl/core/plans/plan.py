@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
 from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias
@@ -191,6 +191,7 @@ class Plan:
         active: The decision points that the environment's user answers.
         policies: The policies of agents, by name.
         has_planner: Whether a policy asks for the environment, and so may branch it.
+        has_split: Whether a call of the model may hold several decisions.
         needs_simulation: Whether a mapping asks for the simulation.
         named_agents: The agents that ``policies`` and ``possible_agents`` name.
         one_agent: The only agent that the environment's user answers for. None if there may be
@@ -213,6 +214,7 @@ class Plan:
     active: tuple[Point, ...]
     policies: Mapping[str, Policy]
     has_planner: bool
+    has_split: bool
     needs_simulation: bool
     named_agents: frozenset[str]
     one_agent: str | None
@@ -221,6 +223,13 @@ class Plan:
     removers: tuple[Remover, ...]
     plugins: Plugins | None
     patches: tuple[tuple[Hook, Handler | None], ...]
+    _derived: dict[Callable[[Plan], Model], Model] = field(init=False, default_factory=dict)
+
+    def derive(self, function: Callable[[Plan], Model]) -> Model:
+        """Return what a function derives from the plan. It is called once for each plan."""
+        if function not in self._derived:
+            self._derived[function] = function(self)
+        return self._derived[function]
 
     @property
     def has_user(self) -> bool:
@@ -482,6 +491,7 @@ def _resolve(
             isinstance(policy, AskingPolicy) and policy.plans
             for policy in (*by_point.values(), *by_agent.values())
         ),
+        has_split=any(point.split is not None for point in points),
         needs_simulation=any(point.needs_simulation for point in points),
         named_agents=frozenset({*by_agent, *declared_agents(options.possible_agents)} - ruled),
         one_agent=one_agent,

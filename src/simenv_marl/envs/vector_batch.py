@@ -201,11 +201,9 @@ class SimulationBatch:
 
     def _move(self, actions: Sequence[Action], ended: set[int]) -> list[Episode]:
         """Step all episodes that have not just begun after an end; return all."""
-        episodes = []
-        for session in self._sessions:
-            if session.episode is None:  # its view was closed
-                raise session.refusal()
-            episodes.append(session.episode)
+        episodes = [session.episode for session in self._sessions if session.episode]
+        if len(episodes) < len(self._sessions):  # a view was closed
+            raise next(s.refusal() for s in self._sessions if s.episode is None)
         places = [place for place, number in enumerate(self._part) if number not in ended]
         step_all(
             [episodes[place] for place in places],

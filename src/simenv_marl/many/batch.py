@@ -489,7 +489,7 @@ def step_all(
     is_inside = {episode.driver.caller for episode in episodes} == {getcurrent()}
     episode = episodes[0]
     has_rounds = episode.in_rounds or len(agents) != len(episodes)
-    is_plain = not EVALUATING and episode.plan.plugins is None
+    is_plain = not EVALUATING and episode.plan.plugins is None and not episode.plan.has_split
     together = is_inside and is_plain and not has_rounds
     replies = []
     events = []
@@ -502,7 +502,7 @@ def step_all(
             replies.append(episode.answer(agent, action))
         replies.reverse()  # popped one by one, so that the lists keep nothing of the models alive
         for episode in episodes:
-            events.append(episode.resume(replies.pop()))
+            events.append(episode.driver.resume(replies.pop()))
         events.reverse()
         for episode in episodes:
             handler, args, kwargs = events.pop()

@@ -300,12 +300,6 @@ class Episode(EpisodeState):
                 return
             del handler, args, kwargs  # they must keep nothing alive that the model frees
 
-    def resume(self, reply: Model) -> Event:
-        """Resume the simulation with a reply; return its next event, or that of the next item."""
-        if self._split is None:
-            return self.driver.resume(reply)
-        return self._next_item(self._split, reply)
-
     def has_to_wait(self, reply: Model) -> bool:
         """Return whether the episode waits for an answer or is over. Note the waiting agent."""
         if type(reply) is Agent:

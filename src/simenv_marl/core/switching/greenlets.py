@@ -97,6 +97,10 @@ class GreenletDriver(Driver):
         finally:
             self._forget_stack()
 
+    def _resume_here(self) -> None:
+        """Let the next reply go to this greenlet of the model."""
+        self.resume = getcurrent().switch
+
     def _resume_body(self) -> None:
         """Let the next reply go to the stack itself, after a greenlet of the model has got one."""
         if self._body is not None:
@@ -119,7 +123,7 @@ class GreenletDriver(Driver):
                     return rule(*args, **kwargs)
                 bound, named = call
             if away:
-                driver.resume = getcurrent().switch
+                driver._resume_here()
             running = driver._running_loop
             if running is None and ASYNCIO in modules:
                 running = driver._running_loop = modules[ASYNCIO]._get_running_loop

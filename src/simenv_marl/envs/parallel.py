@@ -94,9 +94,10 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
             if episode.over:  # an error has ended it
                 self.agents = []
             raise
-        self.agents = [] if episode.over else list(episode.agents)
+        is_over = episode.pending is None and episode.over
+        self.agents = [] if is_over else list(episode.agents)
         results = self.begin(episode)
-        if episode.over and episode.round is not None:
+        if is_over and episode.round is not None:
             self._warn_of_unused_actions(episode.round)
         if self._shows:
             self.show_step()
@@ -122,8 +123,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         acted = () if episode.round is None else episode.round.acted
         if ended:
             agents = {agent.name: agent for agent in ended} | agents
-        terminations = dict.fromkeys(agents, episode.terminated)
-        truncations = dict.fromkeys(agents, episode.truncated)
+        is_pending = pending is not None
+        terminations = dict.fromkeys(agents, not is_pending and episode.terminated)
+        truncations = dict.fromkeys(agents, not is_pending and episode.truncated)
         observations = {}
         rewards = {}
         infos = {}

@@ -252,12 +252,11 @@ class Episode(EpisodeState):
         self.pending = None
         try:
             if len(self.tape) < self._tape_size:
-                self.tape.append(
-                    {
-                        name: action if type(action) is int else duplicate(action)
-                        for name, action in checked.items()
-                    }
-                )
+                recorded = checked.copy()
+                for name, action in checked.items():
+                    if type(action) is not int:
+                        recorded[name] = duplicate(action)
+                self.tape.append(recorded)
             self.turns += bool(checked)
             is_last = bool(checked) and self.turns == self._most_steps
             played.begin(checked)

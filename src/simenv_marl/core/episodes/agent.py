@@ -200,7 +200,10 @@ class Agent:
         if not episode.is_plain:
             return episode.decide(self, args, kwargs)
         try:
-            if not self._is_quick or DIFFERENCES:
+            if DIFFERENCES:
+                self._evaluate(args, kwargs)
+                return self
+            if not self._is_quick:
                 self.update(args, kwargs)
                 return self
             # The same as in ``update``, because its calls take 5 % of a decision.
@@ -384,9 +387,13 @@ class Agent:
             observe: Whether to observe it.
             last: Whether its episode ends here.
         """
-        if DIFFERENCES and EVALUATING.get(getcurrent()) is not self:
-            self._evaluate(args, kwargs, reward=reward, observe=observe, last=last)
-            return
+        if DIFFERENCES:
+            self._evaluate(args, kwargs, reward, observe, last)
+        else:
+            self._update(args, kwargs, reward, observe, last)
+
+    def _update(self, args: Args, kwargs: Kwargs, reward: bool, observe: bool, last: bool) -> None:
+        """Do as ``update`` says. Differences must know the agent."""
         point = self.point
         if reward and self.decided:
             self.reward = checked_reward(self.name, point.reward_mapping(*args, **kwargs))
@@ -414,13 +421,20 @@ class Agent:
         else:
             self.observation = point.cast(point.observation_mapping(*args, **kwargs))
 
-    def _evaluate(self, args: Args, kwargs: Kwargs, **parts: bool) -> None:
+    def _evaluate(
+        self,
+        args: Args,
+        kwargs: Kwargs,
+        reward: bool = True,
+        observe: bool = True,
+        last: bool = False,
+    ) -> None:
         """Update the agent where differences know that it is the one."""
         here = getcurrent()
         before = EVALUATING.get(here)
         EVALUATING[here] = self
         try:
-            self.update(args, kwargs, **parts)
+            self._update(args, kwargs, reward, observe, last)
         finally:
             if before is None:  # without a function call, which fails at the recursion limit
                 del EVALUATING[here]

@@ -28,23 +28,12 @@ if TYPE_CHECKING:
     from ..plans.point import Point
 
 
-class DecisionHandler(Protocol):
+class DecisionHandler(AnyHandler, Protocol):
     """The handler of the decisions at a point, as its agents use it."""
 
     @property
     def point(self) -> Point:
         """The decision point."""
-
-    @property
-    def deliver(self) -> Callable[..., Model] | None:
-        """Turns a reply into the value of a call, on the simulation's side."""
-
-    @property
-    def report(self) -> AnyHandler | None:
-        """Handles the decisions of the rule."""
-
-    def handle(self, episode: Any, args: Args, kwargs: Kwargs, /) -> Model:
-        """Handle a decision."""
 
     def warn_of_several(self, agent: str) -> None:
         """Warn once that several objects decide under the name of one agent."""
@@ -124,7 +113,7 @@ class Agent:
         decided: Whether the reward mapping was called in this episode. Its first value is dropped.
         ended: Whether its episode has ended before the simulation's.
         present: Whether the latest info comes from an observation.
-        asked: Whether anybody was asked for an action. Used where forced moves are skipped.
+        asked: Whether the user or a policy was asked for an action, where forced moves are skipped.
         answered: The number of its decisions that were answered.
         answered_at: The time of the latest answered decision.
         now: The time of the latest decision.
@@ -200,10 +189,7 @@ class Agent:
         if not episode.is_plain:
             return episode.decide(self, args, kwargs)
         try:
-            if DIFFERENCES:
-                self._evaluate(args, kwargs)
-                return self
-            if not self._is_quick:
+            if DIFFERENCES or not self._is_quick:
                 self.update(args, kwargs)
                 return self
             # The same as in ``update``, because its calls take 5 % of a decision.
@@ -297,7 +283,7 @@ class Agent:
         return action if action is RULE else [choices[action]]
 
     def mark_asked(self) -> None:
-        """Note that somebody is asked for an action."""
+        """Note that the user or a policy is asked for an action."""
         self.asked = True
 
     def begin_apply(self) -> None:
@@ -387,10 +373,19 @@ class Agent:
             observe: Whether to observe it.
             last: Whether its episode ends here.
         """
-        if DIFFERENCES:
-            self._evaluate(args, kwargs, reward, observe, last)
-        else:
+        if not DIFFERENCES:
             self._update(args, kwargs, reward, observe, last)
+            return
+        here = getcurrent()
+        before = EVALUATING.get(here)
+        EVALUATING[here] = self
+        try:
+            self._update(args, kwargs, reward, observe, last)
+        finally:
+            if before is None:  # without a function call, which fails at the recursion limit
+                del EVALUATING[here]
+            else:
+                EVALUATING[here] = before
 
     def _update(self, args: Args, kwargs: Kwargs, reward: bool, observe: bool, last: bool) -> None:
         """Do as ``update`` says. Differences must know the agent."""
@@ -420,26 +415,6 @@ class Agent:
             self.observation = point.observe(args, kwargs, mask)
         else:
             self.observation = point.cast(point.observation_mapping(*args, **kwargs))
-
-    def _evaluate(
-        self,
-        args: Args,
-        kwargs: Kwargs,
-        reward: bool = True,
-        observe: bool = True,
-        last: bool = False,
-    ) -> None:
-        """Update the agent where differences know that it is the one."""
-        here = getcurrent()
-        before = EVALUATING.get(here)
-        EVALUATING[here] = self
-        try:
-            self._update(args, kwargs, reward, observe, last)
-        finally:
-            if before is None:  # without a function call, which fails at the recursion limit
-                del EVALUATING[here]
-            else:
-                EVALUATING[here] = before
 
     def _restrict(self, args: Args, kwargs: Kwargs, last: bool) -> None:
         """Set the mask and the choices. An agent that has ended will not be asked again."""

@@ -648,9 +648,7 @@ class Episode(EpisodeState):
                 for problem in self._unwind():
                     self.annotate(problem)
                     raise problem
-        self.pending = None
-        if self.outcome is RUNNING:
-            self.outcome = Outcome.STOPPED
+        self.stop()
 
     def _unwind(self) -> list[BaseException]:
         """Unwind the simulation if it is suspended. Return the errors that it raised."""

@@ -232,9 +232,8 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_check", "_close", "_closer", "_driver", "_installed", "_reset", "_rng",
-        "_simulation", "context", "episode",
-        "handlers", "unmatched_names",
+        "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation", "context",
+        "episode", "handlers", "unmatched_names",
     )  # fmt: skip
 
     episode: Episode | None
@@ -257,9 +256,6 @@ class Session(BaseSession):
         )
         # Closes the simulation, if it was reset since the last time.
         self._close: Callable[[bool], None] | None = None
-        self._check: Callable[[], None] | None = (
-            None  # warns if it has drawn from global generators
-        )
         self._installed: Installation | None = Installation(plan.patches)
         prototype = plan.claim_prototype()
         if prototype is not None:
@@ -334,15 +330,16 @@ class Session(BaseSession):
                 driver.renew()
             context = copy_context()
             with self.context(driver):
+                check = None  # warns of draws from the global generators
+                if self._rng is None:
+                    check = draws_check(self._simulation, in_thread=self.lock is not None)
                 self._reset_simulation(seed, context)
-                return self._begin(seed, context, in_rounds, replay)
+                return self._begin(seed, context, in_rounds, replay, check)
         finally:
             self._state = State.NEW if self.episode is None else State.OVER
 
     def _reset_simulation(self, seed: int, context: Context) -> None:
         """Reset the simulation on its stack."""
-        if self._rng is None:
-            self._check = draws_check(self._simulation, in_thread=self.lock is not None)
         try:
             if self._rng is not None:
                 self._rng.begin(seed)
@@ -353,7 +350,12 @@ class Session(BaseSession):
         self._close = self._closer
 
     def _begin(
-        self, seed: int, context: Context, in_rounds: bool, replay: Replay | None
+        self,
+        seed: int,
+        context: Context,
+        in_rounds: bool,
+        replay: Replay | None,
+        check: Callable[[], None] | None,
     ) -> Episode:
         """Run the simulation to its first decision."""
         simulation = self._simulation
@@ -366,7 +368,6 @@ class Session(BaseSession):
         driver = self._driver
         episode = Episode(self, simulation, clock, driver, seed, replay, in_rounds=in_rounds)
         driver.begin(simulation.run, episode.handlers_by_hook(), context)
-        check, self._check = self._check, None
         try:
             self.episode = episode  # from now on it will be ended, even after an interrupt
             episode.begin(check)

@@ -13,18 +13,15 @@ This module lists the interface of the core. The rooms of the package use nothin
 
 from ..simulation import Action, Model, Observation
 from .copies.clone import branch, clone, pending_view
-from .copies.mirror import Mirror, RemoteSession
 from .copies.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
-from .copies.peer import Peer, PeerLostError, serve
+from .copies.peer import Peer, serve
 from .episodes.agent import Agent
-from .episodes.clock import Clock
 from .episodes.decision import Decision
 from .episodes.episode import Episode
 from .episodes.round import Round
 from .episodes.session import BaseSession, Session, checked_seed, close_all
-from .episodes.state import EpisodeState, Outcome, State, UnmatchedNames, checked_actions
-from .plans.mappings import adapt
-from .plans.options import CheckOptions, EpisodeOptions, Options, ViewOptions, explain_arguments
+from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
+from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name
 from .plans.point import Labels, Point, Policy, Space
 from .plans.points import Points, declared_agents, portable
@@ -49,7 +46,7 @@ from .plans.policies import (
 from .plans.provenance import as_json, describe, provenance
 from .switching.awaiting import Answer, Answers
 from .switching.context import GlobalRandom, environment_context, preserve_generators
-from .switching.driver import WAIT, Driver
+from .switching.driver import Driver
 from .switching.exits import LoopExit
 from .switching.generators import (
     Streams,
@@ -65,10 +62,9 @@ from .values.stacking import Stacker, joined, split_batch, stack_masks, stacker,
 
 __all__ = [  # noqa: RUF022 - by subject
     # What an environment is made of, and what happens in it.
-    "Agent", "BaseSession", "Clock", "Decision", "Driver", "Episode", "EpisodeState", "Mode",
-    "Options", "Outcome", "Plan", "Point", "RemoteSession", "Mirror", "Round", "Session", "State",
-    "UnmatchedNames", "Where", "checked_actions", "checked_seed", "close_all", "describe",
-    "make_plan", "provenance",
+    "Agent", "BaseSession", "Decision", "Driver", "Episode", "EpisodeState", "Mode", "Plan",
+    "Point", "Round", "Session", "UnmatchedNames", "Where", "checked_actions", "checked_seed",
+    "close_all", "describe", "make_plan", "provenance",
     # Types: the first three are the aliases of values of the user.
     "Observation", "Action", "Model", "Info", "Labels", "Mask", "Points", "Policy", "Source",
     "Space", "Stacker", "CheckOptions", "EpisodeOptions", "ViewOptions",
@@ -77,10 +73,10 @@ __all__ = [  # noqa: RUF022 - by subject
     "PolicyWrapper", "count", "has_fallback", "is_asked_alone", "is_planner", "policy_for",
     "two_arguments", "waits", "when_answered",
     # Copies and other processes.
-    "Peer", "PeerLostError", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
+    "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
     "pending_view", "portable", "release", "reuse_resources", "serve", "unpack", "unpack_outcome",
     # Values.
-    "ILLEGAL", "MASK", "WAIT", "action_check", "adapt", "as_json", "blank", "declared_agents",
+    "ILLEGAL", "MASK", "action_check", "as_json", "blank", "declared_agents",
     "duplicate", "explain_arguments", "joined", "observation_cast", "same", "source_name",
     "split_batch", "stack_masks", "stacker", "taken",
     # Chance, and the user's side.

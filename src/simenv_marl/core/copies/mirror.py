@@ -22,7 +22,7 @@ from ..plans.policies import Where
 from .forks import Fork, exhausted, receive_connection
 from .host import FIELDS, AgentReport, HostedView, Report, report_of
 from .packing import pack
-from .peer import Outcome, Peer, PeerLostError
+from .peer import Peer, PeerLostError, Response
 
 
 class Mirror(EpisodeState):
@@ -153,7 +153,7 @@ class RemoteSession(BaseSession):
         if self._gone is not None or not self._fork.usable:
             raise self.refusal()
 
-    def _exchange(self, name: str, args: tuple[Any, ...], limit: float | None) -> Outcome:
+    def _exchange(self, name: str, args: tuple[Any, ...], limit: float | None) -> Response:
         """Send a request and receive its outcome."""
         seconds = self._limit if limit is None else limit
         try:

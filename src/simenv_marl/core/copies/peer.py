@@ -1,4 +1,4 @@
-"""One request to another process: a name and arguments there, and the outcome back.
+"""One request to another process: a name and arguments there, and the response back.
 
 A process ``serve``s an object, whose methods its user calls by a ``Peer``. Each message is pickled.
 A wait for an answer ends when the other process ends.
@@ -14,7 +14,7 @@ from .forks import receive
 from .packing import pack_outcome, pack_plainly, unpack, unpack_outcome
 
 
-class Outcome(NamedTuple):
+class Response(NamedTuple):
     """The result of a request, or its error."""
 
     result: Any
@@ -48,7 +48,7 @@ class Peer:
         except OSError as error:
             raise self.lost() from error
 
-    def receive(self, seconds: float | None = None) -> Outcome | None:
+    def receive(self, seconds: float | None = None) -> Response | None:
         """Wait for the outcome of a request. None if it does not come within some seconds.
 
         Raises:
@@ -63,7 +63,7 @@ class Peer:
         parcel = receive(self.connection)
         if not parcel:
             raise self.lost()
-        return Outcome(*unpack_outcome(parcel))
+        return Response(*unpack_outcome(parcel))
 
     def _has_message(self) -> bool:
         try:

@@ -1,8 +1,8 @@
-"""A sweep of Mesa's wealth model with ``batch_run`` and ``run_experiment``: code lines and seconds.
+"""A sweep of Mesa's wealth model with ``batch_run`` and ``run_experiment``: statements and seconds.
 
 The sweep measures the final inequality, depending on the number of people and on the space: a mean
 with its interval for each combination. The same seeds give the same numbers. A user would write the
-functions ``by_...``, whose lines are counted.
+functions ``by_...``, whose statements are counted.
 """
 
 from __future__ import annotations

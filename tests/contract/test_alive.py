@@ -296,7 +296,7 @@ def test_mappings_that_take_other_arguments_are_asked_at_the_end():
     assert (list(observation), reward, terminated) == ([8.0], 4.0, True)
 
 
-def test_a_freed_argument_of_the_observation_mapping_keeps_the_last_observation():
+def test_a_freed_argument_keeps_the_last_observation():
     env = dish(
         observation_space_mapping=lambda cell, size: [size], reward_mapping=lambda *, size: size
     )

@@ -42,7 +42,7 @@ def test_cancel_waits_for_coroutines_and_drops_answers_that_have_come():
 
 
 @pytest.mark.parametrize("kind", [ValueError, KeyboardInterrupt, SystemExit])
-def test_errors_and_exits_of_coroutines_are_raised_where_the_answer_is_read(kind):
+def test_errors_of_coroutines_are_raised_where_the_answer_is_read(kind):
     async def fail():
         raise kind("no")
 

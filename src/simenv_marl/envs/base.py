@@ -306,7 +306,10 @@ class View:
             BaseException: Any exception of the simulation while it unwinds.
         """
         with self.session.exclusive:
-            self._end(self.session.close)
+            try:
+                self.session.close()
+            finally:
+                self._forget_ended()
 
     def _start(
         self,
@@ -321,10 +324,15 @@ class View:
         session = self.session
         with session.exclusive:
             seed = checked_seed(seed)
-            self._end(session.end)
             if self._finalizer is not None and not self._finalizer.alive:
                 self._finalizer = weakref.finalize(self, session.abandon)
-            results = begin(session.start(seed, options, in_rounds=self.in_rounds))
+            try:
+                episode = session.start(seed, options, in_rounds=self.in_rounds)
+            except BaseException:
+                self._forget_ended()
+                raise
+            self._clear()
+            results = begin(episode)
             if not session.plan.complete:  # the agents of the last episode may never appear again
                 self._spaces = {}
             for agent in self._spaces:
@@ -344,18 +352,15 @@ class View:
         with session.exclusive:
             return step(self, action)
 
-    def _end(self, end: Callable[[], None]) -> None:
-        """End the episode, and forget its records unless that was refused."""
-        try:
-            end()
-        finally:
-            episode = self.session.episode
-            if episode is None or episode.over:
-                self._clear()
-            if self._finalizer is not None and self.session.idle:
-                # It would keep the session alive, and with it an environment that its own options
-                # refer to.
-                self._finalizer.detach()
+    def _forget_ended(self) -> None:
+        """Forget the records of an episode that has ended."""
+        episode = self.session.episode
+        if episode is None or episode.over:
+            self._clear()
+        if self._finalizer is not None and self.session.idle:
+            # It would keep the session alive, and with it an environment that its own options refer
+            # to.
+            self._finalizer.detach()
 
     def _clear(self) -> None:
         """Forget the records of the episode."""

@@ -165,16 +165,16 @@ class Episode(EpisodeState):
 
     # -- steps ------------------------------------------------------------------------------------
 
-    def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
-        """Run the simulation to its first decision, in its context.
+    def begin(self, events: list[Event], at_first_event: Callable[[], None] | None) -> None:
+        """Go on from the simulation's first event to its first decision, in its context.
 
-        Call a function when the simulation has sent an event.
+        Call a function before.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
         """
+        handler, args, kwargs = events.pop()  # so that no caller keeps what the model may free
         try:
-            handler, args, kwargs = self.driver.resume(None)
             if at_first_event is not None:
                 at_first_event()
             reply = handler.handle(self, args, kwargs)
@@ -631,23 +631,25 @@ class Episode(EpisodeState):
         if self.outcome is RUNNING:
             self.outcome = Outcome.STOPPED
 
-    def close(self) -> None:
-        """Unwind the simulation if it is suspended, without answering its decisions.
+    def is_suspended(self) -> bool:
+        """Return whether the simulation must be unwound before the episode ends.
 
         Raises:
-            ReentrancyError, WrongThreadError: The simulation is moving, or suspended in another
-                thread.
+            ReentrancyError: The simulation is moving.
         """
         if self.running and (self.driver.lost or self.driver.given_up is not None):
             self.running = False
             self.stop()
         if self.pending is None and not self.over:
             raise self.refusal()
+        return self.running
+
+    def close(self) -> None:
+        """Unwind the simulation if it is suspended, in its context. Answer no decision."""
         if self.running:
-            with self.context():
-                for problem in self._unwind():
-                    self.annotate(problem)
-                    raise problem
+            for problem in self._unwind():
+                self.annotate(problem)
+                raise problem
         self.stop()
 
     def _unwind(self) -> list[BaseException]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from contextvars import Context, copy_context
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,7 +30,7 @@ from ...simulation import Action, Model, Observation, closer, make_simulation, r
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import ExclusiveLock, GlobalRandom, environment_context
-from ..switching.driver import Driver
+from ..switching.driver import Driver, Job
 from ..switching.generators import ENVIRONMENT, draws_check, is_seed, seed_globals
 from ..switching.resources import reuse_resources
 from ..values.actions import Mask
@@ -315,68 +314,87 @@ class Session(BaseSession):
         replay: Replay | None = None,
     ) -> Episode:
         """Begin another episode: see ``BaseSession``. ``replay`` repeats one of another session."""
-        self.end()
-        self._state = State.MOVING
-        try:
-            if self._close is not None:
-                self._close_simulation(last=False)
-            if self._installed is None or not self._installed.complete:
-                self._installed = Installation(self.plan.patches)
-            self.options = options
-            self.seed = seed = self.seed_for(seed)
-            self._driver = driver = self._driver.ready()
-            if driver.stale:  # code that still uses it must not meet another episode
-                self._make_simulation()
-                driver.renew()
-            context = copy_context()
-            with self.context(driver):
-                check = None  # warns of draws from the global generators
-                if self._rng is None:
-                    check = draws_check(self._simulation, in_thread=self.lock is not None)
-                self._reset_simulation(seed, context)
-                return self._begin(seed, context, in_rounds, replay, check)
-        finally:
-            self._state = State.NEW if self.episode is None else State.OVER
-
-    def _reset_simulation(self, seed: int, context: Context) -> None:
-        """Reset the simulation on its stack."""
-        try:
-            if self._rng is not None:
-                self._rng.begin(seed)
-            self._driver.run(partial(self._reset, seed, self.options), context)
-        except BaseException as error:
-            annotate(error, f"simenv_marl: while the simulation was reset; seed {seed}")
-            raise
-        self._close = self._closer
-
-    def _begin(
-        self,
-        seed: int,
-        context: Context,
-        in_rounds: bool,
-        replay: Replay | None,
-        check: Callable[[], None] | None,
-    ) -> Episode:
-        """Run the simulation to its first decision."""
-        simulation = self._simulation
-        clock = self._make_clock()  # anew, because a reset may set another one
-        if clock is None and self.plan.options.discount_rate is not None:
-            raise OptionValueError(
-                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no"
-                " method time(); add one that returns its clock, or leave out discount_rate"
-            )
+        if not self._is_suspended():
+            self._driver = self._driver.ready()
         driver = self._driver
-        episode = Episode(self, simulation, clock, driver, seed, replay, in_rounds=in_rounds)
-        driver.begin(simulation.run, episode.handlers_by_hook(), context)
+        with self.context(driver):
+            self._end_episode()
+            self._state = State.MOVING
+            try:
+                if self._close is not None:
+                    self._close_simulation(last=False)
+                if self._installed is None or not self._installed.complete:
+                    self._installed = Installation(self.plan.patches)
+                self.options = options
+                self.seed = self.seed_for(seed)
+                self._enter_ready_driver(driver)
+                return self._begin(self.seed, in_rounds, replay)
+            finally:
+                self._state = State.NEW if self.episode is None else State.OVER
+
+    def _enter_ready_driver(self, entered: Driver) -> None:
+        """Replace the driver if it cannot run another job. ``entered``: the context's driver."""
+        self._driver = driver = self._driver.ready()
+        if driver is not entered:
+            driver.enter(direct=self._rng is None)
+        if driver.stale:  # code that still uses it must not meet another episode
+            self._make_simulation()
+            driver.renew()
+
+    def _begin(self, seed: int, in_rounds: bool, replay: Replay | None) -> Episode:
+        """Reset the simulation, and run it to its first decision."""
+        driver = self._driver
+        check = None  # warns of draws from the global generators
+        if self._rng is None:
+            check = draws_check(self._simulation, in_thread=self.lock is not None)
+        else:
+            self._rng.begin(seed)
         try:
-            self.episode = episode  # from now on it will be ended, even after an interrupt
-            episode.begin(check)
+            driver.begin(partial(self._reset_simulation, seed, in_rounds, replay))
+            events = [driver.resume(None)]
+            episode = self.episode
+            if episode is None:
+                driver.take_outcome()  # raises the error of the reset
+                raise AssertionError("a reset without an error begins an episode")
+        except BaseException as error:
+            self._fail(error)
+            raise
+        try:
+            episode.begin(events, check)
         except BaseException:
             episode.stop()  # an interrupt may have come before
             if not episode.running:
                 self.episode = None
             raise
         return episode
+
+    def _fail(self, error: BaseException) -> None:
+        """Note that a reset has failed, or an interrupt has come before the first decision."""
+        if self.episode is not None:
+            self.episode.fail(error)
+            self.episode = None
+            return
+        self._driver.unwind()
+        annotate(error, f"simenv_marl: while the simulation was reset; seed {self.seed}")
+
+    def _reset_simulation(self, seed: int, in_rounds: bool, replay: Replay | None) -> Job:
+        """On the simulation's stack, reset the simulation, and prepare its episode.
+
+        Return the simulation's ``run``, and the handlers of its events.
+        """
+        simulation = self._simulation
+        self._reset(seed, self.options)
+        self._close = self._closer
+        clock = self._make_clock()  # anew, because a reset may set another one
+        if clock is None and self.plan.options.discount_rate is not None:
+            raise OptionValueError(
+                f"discount_rate needs the times of decisions, but {short_repr(simulation)} has no"
+                " method time(); add one that returns its clock, or leave out discount_rate"
+            )
+        self.episode = episode = Episode(
+            self, simulation, clock, self._driver, seed, replay, in_rounds=in_rounds
+        )
+        return simulation.run, episode.handlers_by_hook()
 
     def _make_clock(self) -> Clock | None:
         """Make the clock of the simulation. None if it has no time."""
@@ -389,8 +407,20 @@ class Session(BaseSession):
 
     def end(self) -> None:
         """End the current episode, or raise a ``ReentrancyError`` if that is not possible here."""
+        if self._is_suspended():
+            with self.context(self._driver):
+                self._end_episode()
+        else:
+            self._end_episode()
+
+    def _is_suspended(self) -> bool:
+        """Return whether there is an episode to unwind, or raise a ``ReentrancyError``."""
         if self._state is State.MOVING:
             raise self._state.refusal()
+        return self.episode is not None and self.episode.is_suspended()
+
+    def _end_episode(self) -> None:
+        """End the current episode, in the context of its driver if it is suspended."""
         episode = self.episode
         if episode is None:
             return

@@ -82,6 +82,9 @@ AnyHandler: TypeAlias = EventHandler[Any]
 Event: TypeAlias = tuple[AnyHandler, Args, Kwargs]
 """A handler, and the arguments of the call."""
 
+Job: TypeAlias = tuple[Callable[[], Model], Mapping[Hook, AnyHandler]]
+"""A function to run on the stack, and the handlers of the events that it sends, by hook."""
+
 
 class _Ended:
     """Handles the end of a job."""
@@ -140,9 +143,9 @@ class Driver(ABC):
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_outcome", "_refused",
-        "_spawned", "_stack", "caller", "ended", "events", "forked", "given_up", "idle", "opened",
-        "plugins", "stale",
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_outcome", "_prepare",
+        "_refused", "_spawned", "_stack", "caller", "ended", "events", "forked", "given_up", "idle",
+        "opened", "plugins", "stale",
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
@@ -171,7 +174,7 @@ class Driver(ABC):
         self.idle = True
         self.forked = False
         self._exiting = False
-        self._job: Callable[[], Model] | None = None
+        self._prepare: Callable[[], Job] | None = None  # until the job begins
         self._context: Context | None = None  # of the job, until it begins
         self._outcome: list[Model] = []  # the result of the job, or its error
         self._refused: WrongThreadError | None = None  # until the user gets it
@@ -193,24 +196,18 @@ class Driver(ABC):
     def end(self) -> None:
         """End the stack."""
 
-    def begin(
-        self,
-        job: Callable[[], Model],
-        events: Mapping[Hook, AnyHandler] | None = None,
-        context: Context | None = None,
-    ) -> None:
+    def begin(self, prepare: Callable[[], Job]) -> None:
         """Prepare a job. After ``enter``, the next ``resume`` starts it on the stack.
 
         Args:
-            job: The function to run.
-            events: The handlers of the events that it sends, by hook.
-            context: The context variables of the job. None: a copy of the user's.
+            prepare: Returns the job. It runs on the stack, too, where decisions follow the rule
+                until it has returned.
         """
-        self._job = job
-        self.events = events or {}
+        self._prepare = prepare
+        self.events = {}
         self._refused = None
         self._outcome = []
-        self._context = copy_context() if context is None else context
+        self._context = copy_context()
 
     @property
     def reachable(self) -> bool:
@@ -233,10 +230,10 @@ class Driver(ABC):
         """Note that the simulation was made anew."""
         self.stale = False
 
-    def run(self, job: Callable[[], Model], context: Context | None = None) -> Model:
+    def run(self, job: Callable[[], Model]) -> Model:
         """Run a job to its end, after ``enter``; return its result. Decisions follow the rule."""
         try:
-            self.begin(job, context=context)
+            self.begin(lambda: (job, {}))
             self.resume(None)
         except BaseException:
             self.unwind()  # because an interrupt has ended the wait
@@ -272,7 +269,7 @@ class Driver(ABC):
         Return the errors that the job raised instead.
         """
         if self.idle or self.ended:
-            self._job = None  # an interrupt may have come before it began
+            self._prepare = None  # an interrupt may have come before it began
             return []
         self._exiting = True
         for _ in range(UNWINDING_TRIES):
@@ -329,15 +326,21 @@ class Driver(ABC):
         # collected.
         self.idle = False
         self._exiting = False
-        job, self._job = self._job, None
+        prepare, self._prepare = self._prepare, None
+        job = None
         try:
             self.enter_hooks()
+            if prepare is not None:
+                job, self.events = prepare()
+                prepare = None  # the job must not keep what it refers to
+            if self.events:
+                self.enter_hooks()
             result = None if job is None else job()
         except BaseException as error:
             self._outcome = [None, self._explain(error)]
             return
         finally:
-            job = None
+            prepare = job = None
             self.leave_hooks(self._stack)
             self.events = {}
         self._outcome = [result] if self._refused is None else [None, self.refusal()]

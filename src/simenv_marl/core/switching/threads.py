@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from contextvars import Context
 from queue import Empty, SimpleQueue
@@ -14,7 +14,7 @@ from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import SIMULATION, Interceptor
 from ...plugins import Plugins
 from ...simulation import RULE, Model, Sentinel
-from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Args, Driver, Event, Kwargs
+from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Args, Driver, Event, Job, Kwargs
 from .exits import make_exit
 
 _LONGEST_WAIT: Final = 1.0
@@ -46,18 +46,13 @@ class ThreadDriver(Driver):
 
     # -- in the user's thread ---------------------------------------------------------------------
 
-    def begin(
-        self,
-        job: Callable[[], Model],
-        events: Mapping[Hook, AnyHandler] | None = None,
-        context: Context | None = None,
-    ) -> None:
+    def begin(self, prepare: Callable[[], Job]) -> None:
         """Prepare a job, and start the thread if there is none."""
         with suppress(Empty):
             while True:
                 self._replies.get_nowait()
         self._arrived = SimpleQueue()
-        super().begin(job, events, context)
+        super().begin(prepare)
         if self._thread is not None:
             return
         self._thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
@@ -77,7 +72,7 @@ class ThreadDriver(Driver):
 
     def resume(self, reply: Model) -> Event:
         """Resume the simulation with a reply; return its next event."""
-        self._replies.put(reply if self._job is None else _JOB)
+        self._replies.put(reply if self._prepare is None else _JOB)
         while True:
             with suppress(Empty):
                 return self._arrived.get(True, _LONGEST_WAIT)

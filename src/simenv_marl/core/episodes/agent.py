@@ -194,8 +194,9 @@ class Agent:
                 return self
             # The same as in ``update``, because its calls take 5 % of a decision.
             point = self.point
-            pay = point.reward_mapping
+            pay = point.reward_mapping  # variables, because calling an attribute is slower
             observe = point.observation_mapping
+            cast = point.cast
             reward = pay(*args, **kwargs) if kwargs else pay(*args)
             if type(reward) is not float or reward - reward != 0.0:
                 reward = checked_reward(self.name, reward)
@@ -204,7 +205,7 @@ class Agent:
                 self.info = {}
             else:
                 self.read_clock()
-            self.observation = point.cast(observe(*args, **kwargs) if kwargs else observe(*args))
+            self.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
         except BaseException:
             episode.blame(self)
             raise
@@ -269,7 +270,8 @@ class Agent:
         if self.choices is not None:
             reply = self._take_choice(action, self.choices)
         elif action is not RULE:
-            reply = point.convert(action)
+            convert = point.convert
+            reply = convert(action)
         self.answered += 1
         if not forced or self.answered_at is None:
             self.answered_at = self.now
@@ -450,7 +452,10 @@ class Agent:
             if entity is not None:
                 # The same as in ``handle``, for the one argument that most mappings take.
                 point = self.point
-                value = point.reward_mapping(entity)
+                pay = point.reward_mapping
+                observe = point.observation_mapping
+                cast = point.cast
+                value = pay(entity)
                 if type(value) is not float or value - value != 0.0:
                     value = checked_reward(self.name, value)
                 self.reward = value
@@ -458,7 +463,7 @@ class Agent:
                     self.info = {}
                 else:
                     self.read_clock()
-                self.observation = point.cast(point.observation_mapping(entity))
+                self.observation = cast(observe(entity))
                 return
         if arguments.is_empty:
             self.clear_observation()

@@ -23,7 +23,8 @@ class Clock:
 
     def read(self, before: float | None) -> dict[str, Any]:
         """Return the time, and the time elapsed since an earlier one, as an info."""
-        time = self.time()
+        read = self.time
+        time = read()
         now = time if type(time) is float else float(time)
         info: dict[str, Any] = {"time": now, "elapsed": 0.0 if before is None else now - before}
         if self._rate is not None:

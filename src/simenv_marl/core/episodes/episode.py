@@ -218,7 +218,8 @@ class Episode(EpisodeState):
             return
         try:
             if action is not RULE:
-                legal = agent.point.check(action)
+                check = agent.point.check  # a variable, because calling an attribute is slower
+                legal = check(action)
                 if legal is ILLEGAL or agent.mask is not None:
                     legal = agent.validate(action)
                 action = legal
@@ -290,7 +291,8 @@ class Episode(EpisodeState):
         """
         while True:
             if self._split is None:
-                handler, args, kwargs = self.driver.resume(reply)
+                resume = self.driver.resume
+                handler, args, kwargs = resume(reply)
             else:
                 handler, args, kwargs = self._next_item(self._split, reply)
             reply = handler.handle(self, args, kwargs)

@@ -304,7 +304,8 @@ def checked_actions(episode: EpisodeState, actions: Mapping[str, Action]) -> dic
                 f" agents: {listed(agents)}"
             )
         if action is not RULE:
-            legal = agent.point.check(action)
+            check = agent.point.check
+            legal = check(action)
             mask = agent.mask if agent is pending else None
             if legal is ILLEGAL or mask is not None:
                 legal = agent.point.validate(action, name, mask)

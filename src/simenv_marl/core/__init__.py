@@ -16,10 +16,11 @@ from .copies.clone import branch, clone, pending_view
 from .copies.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
 from .copies.peer import Peer, serve
 from .episodes.agent import Agent
+from .episodes.base import BaseSession, checked_seed, close_all
 from .episodes.decision import Decision
 from .episodes.episode import Episode
 from .episodes.round import Round
-from .episodes.session import BaseSession, Session, checked_seed, close_all
+from .episodes.session import Session
 from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
 from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name

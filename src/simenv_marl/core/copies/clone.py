@@ -32,7 +32,8 @@ from ...errors import (
     did_you_mean,
     short_repr,
 )
-from ..episodes.session import BaseSession, Session
+from ..episodes.base import BaseSession
+from ..episodes.session import Session
 from ..plans.policies import Where
 from ..switching.context import preserve_generators
 from ..switching.generators import PROCESS, is_seed, seed_globals

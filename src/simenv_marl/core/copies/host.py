@@ -13,8 +13,9 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from ...errors import BranchError
 from ...simulation import Action, Model
+from ..episodes.base import Recording, ResetOptions, Snapshot
 from ..episodes.episode import Episode
-from ..episodes.session import Recording, ResetOptions, Session, Snapshot
+from ..episodes.session import Session
 from ..episodes.state import Outcome
 from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals

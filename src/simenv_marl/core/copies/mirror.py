@@ -13,10 +13,9 @@ from typing import Any
 
 from ...errors import BranchError, ClosedError, SimEnvError, annotate, short_repr, warn_user
 from ...simulation import Action, Model
-from ..episodes.agent import Agent
-from ..episodes.clock import Clock
+from ..episodes.agent import Agent, Clock
+from ..episodes.base import BaseSession, Recording, ResetOptions
 from ..episodes.events import PointHandler
-from ..episodes.session import BaseSession, Recording, ResetOptions
 from ..episodes.state import EpisodeState, State
 from ..plans.policies import Where
 from .forks import Fork, exhausted, receive_connection

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite
+from math import exp, isfinite
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -20,12 +20,36 @@ from ..switching.driver import WAIT, AnyHandler
 from ..values.actions import MASK, Mask, only_choice
 from ..values.spaces import duplicate
 from .arguments import Arguments, Recalled, weaken
-from .clock import Clock
 from .decision import Decision
 
 if TYPE_CHECKING:
     from ..plans.plan import Plan
     from ..plans.point import Point
+
+
+class Clock:
+    """Reads the simulation's time.
+
+    Attributes:
+        time: Returns the simulation's time.
+    """
+
+    __slots__ = ("_rate", "time")
+
+    def __init__(self, time: Callable[[], float], rate: float | None) -> None:
+        """Read times by a function, and discount by a rate per unit of time if there is one."""
+        self.time = time
+        self._rate = rate
+
+    def read(self, before: float | None) -> dict[str, Any]:
+        """Return the time, and the time elapsed since an earlier one, as an info."""
+        read = self.time
+        time = read()
+        now = time if type(time) is float else float(time)
+        info: dict[str, Any] = {"time": now, "elapsed": 0.0 if before is None else now - before}
+        if self._rate is not None:
+            info["discount"] = exp(-self._rate * info["elapsed"])
+        return info
 
 
 class DecisionHandler(AnyHandler, Protocol):

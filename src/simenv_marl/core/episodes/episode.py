@@ -58,9 +58,8 @@ from ..switching.context import environment_context
 from ..switching.driver import WAIT, AnyHandler, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
-from .agent import Agent, DecisionHandler
+from .agent import Agent, Clock, DecisionHandler
 from .arguments import restore, weaken
-from .clock import Clock
 from .decision import Decision
 from .events import Handlers
 from .round import Round

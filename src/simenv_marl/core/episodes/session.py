@@ -7,218 +7,32 @@ freed at once, together with its session.
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
-
-import numpy as np
-from gymnasium.utils import seeding
+from typing import Any
 
 from ...errors import (
     BranchError,
     OptionValueError,
     ReentrancyError,
-    SimEnvError,
     annotate,
     short_repr,
     warn_user,
 )
 from ...hooks.handlers import Installation
-from ...simulation import Action, Model, Observation, closer, make_simulation, resetter
+from ...simulation import Model, closer, make_simulation, resetter
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
-from ..switching.context import ExclusiveLock, GlobalRandom, environment_context
+from ..switching.context import GlobalRandom, environment_context
 from ..switching.driver import Driver, Job
-from ..switching.generators import ENVIRONMENT, draws_check, is_seed, seed_globals
-from ..switching.resources import reuse_resources
-from ..values.actions import Mask
+from ..switching.generators import ENVIRONMENT, draws_check, seed_globals
 from ..values.spaces import same
-from .clock import Clock
+from .agent import Clock
+from .base import BaseSession, PendingDecision, Recording, ResetOptions
 from .episode import LONGEST_TAPE, Episode, Replay
 from .events import Handlers, handlers_of
 from .state import EpisodeState, State, UnmatchedNames
-
-ResetOptions = dict[str, Any] | None
-"""The options of a ``reset``."""
-
-
-class Snapshot(NamedTuple):
-    """What a copy of a session takes over.
-
-    Attributes:
-        state: Its state.
-        seed: The seed of the latest episode.
-        np_random_seed: The seed of the generator.
-        np_random: The generator.
-    """
-
-    state: State
-    seed: int | None
-    np_random_seed: int | None
-    np_random: np.random.Generator | None
-
-
-class PendingDecision(NamedTuple):
-    """What a pending decision looks like, to compare a replay with its original."""
-
-    agent: str
-    agents: list[str]
-    observation: Observation
-    mask: Mask | None
-
-
-class Recording(NamedTuple):
-    """What a replay of an episode needs."""
-
-    seed: int
-    options: ResetOptions
-    in_rounds: bool
-    tape: list[Action]
-    decision: PendingDecision | None
-
-
-class BaseSession(ABC):
-    """What views know of a session, whose simulation may be in another process.
-
-    Attributes:
-        plan: The plan.
-        where: Whether it belongs to the user, a clone or a branch.
-        seed: The seed of the latest episode.
-        options: The options of the latest reset.
-        np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
-        exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
-        lock: The same lock, if steps need it, too. None if only the thread that began an episode
-            can step it.
-    """
-
-    __slots__ = (
-        "__weakref__", "_np_random", "_state", "exclusive", "lock", "np_random_seed", "options",
-        "plan", "seed", "where",
-    )  # fmt: skip
-
-    def __init__(self, plan: Plan, where: Where) -> None:
-        self.plan = plan
-        self.where = where
-        self._state = State.NEW
-        self.seed: int | None = None
-        self.options: ResetOptions = None
-        self.np_random_seed: int | None = None
-        self._np_random: np.random.Generator | None = None
-        self.exclusive = ExclusiveLock()
-        self.lock: ExclusiveLock | None = None
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        """The generator that was seeded with the last given seed. It draws all other seeds."""
-        if self._np_random is None:
-            self._np_random, self.np_random_seed = seeding.np_random(self.np_random_seed)
-        return self._np_random
-
-    def set_generator(self, generator: np.random.Generator) -> None:
-        """Draw all seeds from a generator."""
-        self._np_random = generator
-        self.np_random_seed = -1
-
-    def seed_for(self, seed: int | None) -> int:
-        """Return the seed of an episode, and seed the generator with it. None: draw one."""
-        if seed is None:
-            return int(self.np_random.integers(2**31))
-        self._np_random = None  # made when a seed must be drawn
-        self.np_random_seed = seed
-        return seed
-
-    def snapshot(self) -> Snapshot:
-        """Return what a copy takes over."""
-        has_decision = self.episode is not None and self.episode.pending is not None
-        state = State.COPIED if has_decision else State.NEW
-        return Snapshot(state, self.seed, self.np_random_seed, self._np_random)
-
-    def restore(self, snapshot: Snapshot) -> None:
-        """Take over what ``snapshot`` has returned."""
-        self._state, self.seed, self.np_random_seed, self._np_random = snapshot
-
-    def refusal(self) -> SimEnvError:
-        """Make the error that says why no action can be taken now."""
-        episode = self.episode
-        return self._state.refusal() if episode is None else episode.refusal()
-
-    def move_to(self, where: Where) -> None:
-        """Note that its episodes are played in a clone or a branch from now on."""
-        self.where = max(self.where, where)
-        if self.episode is not None:
-            self.episode.move_to(where)
-
-    @property
-    @abstractmethod
-    def episode(self) -> EpisodeState | None:
-        """The current or latest episode."""
-
-    @property
-    @abstractmethod
-    def simulation(self) -> Model:
-        """The simulation."""
-
-    @property
-    @abstractmethod
-    def idle(self) -> bool:
-        """Whether there is nothing to end."""
-
-    @abstractmethod
-    def start(
-        self, seed: int | None, options: ResetOptions, *, in_rounds: bool = False
-    ) -> EpisodeState:
-        """End the current episode, reset the simulation, and run it to its first decision.
-
-        Args:
-            seed: The seed. None: one is drawn.
-            options: The options of the reset.
-            in_rounds: Whether all agents are updated when a step returns.
-
-        Returns:
-            The episode.
-        """
-
-    @abstractmethod
-    def end(self) -> None:
-        """End the current episode, or raise a ``ReentrancyError`` if that is not possible here."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End the current episode, and close the simulation."""
-
-    @abstractmethod
-    def abandon(self) -> None:
-        """Close it from a finalizer. Warn of errors instead of raising them."""
-
-    @abstractmethod
-    def ask(self, name: str, *args: Any) -> Model:
-        """Call a method of the simulation, or raise ``NotImplementedError`` if it has none."""
-
-    def declare(self, plan: Plan) -> None:
-        """Forget the episode that has shown the agents, and take over a plan that declares them."""
-        raise NotImplementedError
-
-    @abstractmethod
-    def call(self, view: Model, function: Callable[..., Model], args: tuple[Any, ...]) -> Model:
-        """Call a function with the view, where the simulation is."""
-
-    @abstractmethod
-    def check_reseed(self) -> None:
-        """Raise a ``BranchError`` unless the simulation's future chance can be drawn anew."""
-
-    @abstractmethod
-    def reseed(self, seed: int) -> None:
-        """Draw the simulation's future chance anew."""
-
-    @abstractmethod
-    def recording(self) -> Recording:
-        """Return what a replay of the episode needs."""
-
-    @abstractmethod
-    def leave_caller(self) -> None:
-        """In a branch that was forked from inside a policy, leave the step that has asked it."""
 
 
 class Session(BaseSession):
@@ -590,41 +404,3 @@ def _pending_decision(episode: EpisodeState) -> PendingDecision | None:
     if agent is None:
         return None
     return PendingDecision(agent.name, list(episode.agents), agent.observation, agent.mask)
-
-
-def checked_seed(seed: Any) -> int | None:
-    """Return the seed of a ``reset`` as a Python integer, or None. Refuse all other values."""
-    if seed is None:
-        return None
-    if not is_seed(seed):
-        raise OptionValueError(
-            f"seed must be a non-negative integer or None, not {short_repr(seed)}"
-        )
-    return int(seed)
-
-
-def close_all(
-    sessions: Iterable[tuple[str, BaseSession]], error: BaseException | None = None
-) -> BaseException | None:
-    """Close sessions, given with their names.
-
-    Args:
-        sessions: The sessions.
-        error: An error that was raised before.
-
-    Returns:
-        The first error, with notes of all others. None without any.
-    """
-    with reuse_resources():  # it waits for all processes of simulations together
-        for name, session in sessions:
-            try:
-                session.close()
-            except BaseException as problem:
-                if error is None:
-                    error = problem
-                    annotate(error, f"simenv_marl: in {name}")
-                else:
-                    annotate(
-                        error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well"
-                    )
-    return error

@@ -28,8 +28,7 @@ from .round import Round
 
 if TYPE_CHECKING:
     from ..plans.plan import Plan
-    from .agent import Agent
-    from .clock import Clock
+    from .agent import Agent, Clock
 
 
 class Outcome(Enum):

@@ -128,7 +128,8 @@ class Agent:
         plugins: The handlers that take part in its mappings.
         memory: Values of this agent in this episode: of differences, and of policies.
         reward: The reward of its previous action, as of its latest decision or its end.
-        observation: The latest observation, cast to its space. None before the first one.
+        observation: The latest observation, cast to its space. None before the first one; views
+            show ``Point.blank()`` then.
         info: The latest info.
         mask: The mask of the pending decision. None if all actions are legal.
         choices: The choices of the pending decision. None without ``choices=``.

@@ -31,7 +31,7 @@ class Decision:
         agent: The name of the agent.
         point: The dotted name of the decision point.
         seed: The seed of the episode.
-        number: The number of the decision among those of the agent in the episode, from 1.
+        number: The number of the agent's decision in the episode, from 1.
         time: The simulation's time. None if it has none.
         observation: The agent's observation.
         action_space: The space of its actions.
@@ -44,7 +44,7 @@ class Decision:
         reward: The reward of the agent's previous action; 0.0 at its first decision.
         doc: The docstring of the model's function. None if it has none.
         in_clone: Whether the environment is a clone or a branch, where policies count nothing.
-        memory: A dict in which policies remember values of this agent in this episode.
+        memory: A dict where policies remember values of this agent in this episode.
     """
 
     agent: str

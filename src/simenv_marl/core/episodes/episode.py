@@ -1,4 +1,4 @@
-"""One episode of one simulation. This module determines what happens when.
+"""One episode of one simulation: the order of events.
 
 An episode::
 
@@ -150,7 +150,7 @@ class Episode(EpisodeState):
             self.agents[name] = Agent(name, *prepared, self.clock, self._plugins)
 
     def context(self) -> environment_context:
-        """Return the context in which the environment's code must run."""
+        """Return the context that the environment's code needs."""
         return self._context(self.driver)
 
     def handlers_by_hook(self) -> dict[Hook, AnyHandler]:
@@ -172,7 +172,8 @@ class Episode(EpisodeState):
         Raises:
             NoDecisionError: There is no decision for the environment's user.
         """
-        handler, args, kwargs = events.pop()  # so that no caller keeps what the model may free
+        # Out of the list, because a caller must not keep arguments that the model may free.
+        handler, args, kwargs = events.pop()
         try:
             if at_first_event is not None:
                 at_first_event()
@@ -237,7 +238,7 @@ class Episode(EpisodeState):
             with self.context():
                 self.step(action, True)
             return
-        # This does what the context does where only plugins need it, in a fifth of the time.
+        # The context would do the same in five times the time: here only plugins need it.
         here = getcurrent()
         EVALUATING[here] = self._plugins
         try:
@@ -312,7 +313,10 @@ class Episode(EpisodeState):
     # -- decisions --------------------------------------------------------------------------------
 
     def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
-        """Handle a decision where more than an update is due. Return the agent or the reply."""
+        """Handle a decision in a round, with skipped forced moves, or after the last step.
+
+        Return the agent if it waits for the user, else the reply.
+        """
         self.latest = agent
         if self.round is not None:
             if agent.point.legal is not None or agent.clock is not None:
@@ -599,7 +603,7 @@ class Episode(EpisodeState):
     # -- errors, and the end by a close -----------------------------------------------------------
 
     def annotate(self, error: BaseException) -> None:
-        """Add a note to an error: at which decision of which agent it arose."""
+        """Add a note to an error: the decision and the agent where it arose."""
         agent = self.latest
         if agent is None:
             where = "before the first decision"

@@ -40,7 +40,7 @@ class Session(BaseSession):
 
     Attributes:
         handlers: The handlers of the simulation's events.
-        context: Makes the context in which the environment's code must run.
+        context: Makes the context that the environment's code needs.
         unmatched_names: The agents that options name, and that no episode has had yet.
     """
 
@@ -56,7 +56,7 @@ class Session(BaseSession):
     def __init__(self, plan: Plan, unmatched_names: UnmatchedNames | None = None) -> None:
         """Make the simulation, and set the plan's decision functions in the model.
 
-        ``unmatched_names``: those of many sessions that run side by side.
+        ``unmatched_names``: shared by sessions that run side by side.
         """
         super().__init__(plan, Where.USER)
         self.episode = None
@@ -269,7 +269,7 @@ class Session(BaseSession):
             if episode is None or not episode.running or self._driver.reachable:
                 self.close()  # else the simulation's thread unwinds it at its next switch
         except ReentrancyError:
-            pass  # the process exits, and the thread in which the simulation moves ends with it
+            pass  # the process exits, and the thread of the moving simulation ends with it
         except Exception as error:
             warn_user(
                 f"a simulation that was abandoned raised {short_repr(error)}", ResourceWarning
@@ -300,7 +300,7 @@ class Session(BaseSession):
     # -- replays ----------------------------------------------------------------------------------
 
     def recording(self) -> Recording:
-        """Return what a replay of the episode needs."""
+        """Return the record for a replay of the episode."""
         episode = self.episode
         if episode is None:
             raise self.refusal()
@@ -346,7 +346,7 @@ class Session(BaseSession):
     # -- branches ---------------------------------------------------------------------------------
 
     def leave_parent(self) -> None:
-        """In a forked process, never unwind or close the simulation in which it was forked."""
+        """In a forked process, never unwind or close the simulation that has forked it."""
         self.move_to(Where.CLONE)
         self._driver.give_up("belongs to the environment that was cloned")
         self._close = None

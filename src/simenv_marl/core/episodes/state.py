@@ -1,4 +1,4 @@
-"""What views and clones read of an episode."""
+"""The state of an episode, as views and clones read it."""
 
 from __future__ import annotations
 
@@ -119,14 +119,14 @@ class UnmatchedNames:
 
 
 class EpisodeState:
-    """What views read of an episode. A clone has no more of it; the rest is in its process.
+    """The state of an episode, as views read it. A clone has the rest in its process.
 
     Attributes:
         plan: The plan.
         seed: The seed.
         clock: The clock. None if the simulation has no time.
-        agents: The live agents of the environment, by name, in the order in which they joined.
-        others: The agents for which policies answer, by name.
+        agents: The live agents of the environment, by name, in the order of joining.
+        others: The agents whose policy or rule answers, by name.
         ended: The agents of the environment whose episodes ended before the simulation's, by name.
         just_ended: The ended agents that no view has reported yet.
         pending: The agent whose decision waits for an answer. None in all states but PENDING.
@@ -227,7 +227,7 @@ class EpisodeState:
         """In a branch, wait for one agent alone: see ``Episode.single_out``."""
         raise NotImplementedError
 
-    # -- what views report ------------------------------------------------------------------------
+    # -- reports to views -------------------------------------------------------------------------
 
     def take_ended(self) -> list[Agent]:
         """Return the ended agents that no view has reported yet, and forget them."""

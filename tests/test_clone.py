@@ -258,7 +258,7 @@ def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
         signal.signal(signal.SIGALRM, handler)
     with pytest.raises(BranchError, match="died"):
         Fork.begin(lambda connection: None, lambda: 1 / 0, wait=True)
-    assert children() == before
+    assert children() - before == set()  # those of earlier tests may end meanwhile
 
 
 @pytest.mark.parametrize("end", [lambda twins: twins[0].close(), list.clear])

@@ -15,15 +15,14 @@ from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
 from ...simulation import RULE, Action, Model, Observation
 from ..plans.point import Args, Kwargs, Policy
-from ..plans.policies import AskedEpisode, AskingPolicy, DeferredPolicy, EpisodePolicy, Info, Where
-from ..switching.driver import WAIT, AnyHandler
+from ..plans.policies import Info, Where
+from ..switching.driver import AnyHandler
 from ..values.actions import MASK, Mask, only_choice
 from ..values.spaces import duplicate
 from .arguments import Arguments, Recalled, weaken
 from .decision import Decision
 
 if TYPE_CHECKING:
-    from ..plans.plan import Plan
     from ..plans.point import Point
 
 
@@ -66,28 +65,18 @@ class DecisionHandler(AnyHandler, Protocol):
         """Warn once that the model has freed an argument that mappings take."""
 
 
-class RunningEpisode(AskedEpisode, Protocol):
+class RunningEpisode(Protocol):
     """The episode, as its agents and the handlers of its events use it."""
 
-    plan: Plan
     is_plain: bool
     agents: dict[str, Agent]
     others: dict[str, Agent]
-    ended: dict[str, Agent]
-
-    @property
-    def skips(self) -> bool:
-        """Whether forced moves are skipped."""
-
-    @property
-    def is_branch(self) -> bool:
-        """Whether it is a branch or a clone."""
 
     def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
         """Handle a decision where more than an update is due."""
 
-    def consult(self, agent: Agent, policy: Policy) -> Action:
-        """Ask the policy of an agent."""
+    def ask(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
+        """Let the policy of an agent answer a decision."""
 
     def agent_for(self, handler: DecisionHandler, name: Model) -> Agent:
         """Return the agent with a name that decides at a point."""
@@ -106,9 +95,6 @@ class RunningEpisode(AskedEpisode, Protocol):
 
     def blame(self, agent: Agent) -> None:
         """Note the agent that notes of errors name."""
-
-    def finish(self, *, truncated: bool) -> None:
-        """End the episode of all live agents."""
 
 
 class Agent:
@@ -207,7 +193,7 @@ class Agent:
         if self._applying:
             return RULE
         if self.delegated:
-            return self.ask_policy(episode, args, kwargs)
+            return episode.ask(self, args, kwargs)
         arguments = self.arguments
         if not (arguments.is_single and args and arguments.first() is args[0]):
             self.keep(episode, args, kwargs)
@@ -236,46 +222,13 @@ class Agent:
             raise
         return self
 
-    def ask_policy(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
-        """Let the policy answer a decision. Return the reply, or ``WAIT`` for a deferred policy."""
-        if episode.ended:
-            if self.ended:
-                raise AgentError(
-                    f"the agent {self.name!r} decides at {self.point.hook.name} after its end;"
-                    " agent= must name each entity differently, and removed_by= or end_agent()"
-                    " must end an agent only when its entity is gone"
-                )
-            if episode.plan.one_agent in episode.ended:  # else it might run for ever without a user
-                episode.finish(truncated=False)
-                return WAIT
-        policy = self.policy
-        if policy is RULE:
-            return RULE
-        episode.blame(self)
-        is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
-        self.update(args, kwargs, reward=is_rewarded)
-        if episode.skips:
-            forced = self.only_action()
-            if is_rewarded:
-                self.carry_reward(forced is not None or not self.asked)
-            if forced is not None:
-                return self.answer(forced, forced=True)
-        self.asked = True
-        if isinstance(policy, AskingPolicy):
-            self.keep(episode, args, kwargs)
-        if isinstance(policy, DeferredPolicy) and not episode.is_branch:
-            return self
-        action = episode.consult(self, policy)
-        if action is WAIT:
-            return WAIT
-        return self.answer(action if action is RULE else self.validate(action))
-
-    def answer_by_policy(self, episode: RunningEpisode) -> Action:
-        """Ask the policy itself for an action."""
-        policy = self.policy
-        if isinstance(policy, EpisodePolicy):
-            return policy.answer(episode, self, self.observation, self.info)
-        return policy(self.observation, self.info)
+    def refusal(self) -> AgentError:
+        """Make the error for a decision after the end of its episode."""
+        return AgentError(
+            f"the agent {self.name!r} decides at {self.point.hook.name} after its end; agent= must"
+            " name each entity differently, and removed_by= or end_agent() must end an agent only"
+            " when its entity is gone"
+        )
 
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision: see ``Point.validate``."""
@@ -285,7 +238,7 @@ class Agent:
         """Return the only legal action of the pending decision. None if there are several."""
         return only_choice(self.point.definition.action_space, self.mask)
 
-    def answer(self, action: Action, forced: bool = False) -> Model:
+    def reply_to(self, action: Action, forced: bool = False) -> Model:
         """Turn a checked action, or ``RULE``, into the reply to the pending decision.
 
         ``forced``: it is the only legal action, so elapsed times add up to the next decision.
@@ -298,7 +251,10 @@ class Agent:
             convert = point.convert
             reply = convert(action)
         self.answered += 1
-        if not forced or self.answered_at is None:
+        if not forced:
+            self.asked = True
+            self.answered_at = self.now
+        elif self.answered_at is None:
             self.answered_at = self.now
         return (self, reply) if point.applies and reply is not RULE else reply
 
@@ -308,10 +264,6 @@ class Agent:
         if self.point.reports_rule:
             self.offered = [weaken(choice) for choice in choices]
         return action if action is RULE else [choices[action]]
-
-    def mark_asked(self) -> None:
-        """Note that the user or a policy is asked for an action."""
-        self.asked = True
 
     def begin_apply(self) -> None:
         """Let the agent's calls run the rule, on the simulation's side."""

@@ -17,7 +17,7 @@ A decision::
                                      simulation
                                    ``Agent.update``: reward of the previous action (the first of an
                                      episode is dropped), legal actions, info, observation
-                                   if a policy answers (``Agent.ask_policy``), back to the
+                                   if a policy answers (``ask``), back to the
                                      simulation with its action
                                    else PENDING, until the user answers
                                    ``answer``: map the checked action to the reply
@@ -34,55 +34,39 @@ functions run their rule.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from math import inf
-from typing import TYPE_CHECKING, Final, NoReturn, Protocol
+from typing import NoReturn, Protocol
 from weakref import ref
 
 from greenlet import getcurrent
 
-from ...errors import (
-    AgentError,
-    annotate,
-    clear_frames,
-    short_repr,
-    warn_user,
-)
+from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
 from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel
-from ..plans.point import Policy
-from ..plans.policies import Where, policy_for, two_arguments
+from ..plans.plan import Plan
+from ..plans.point import Args, Kwargs, Policy
+from ..plans.policies import (
+    AskingPolicy,
+    DeferredPolicy,
+    EpisodePolicy,
+    Where,
+    policy_for,
+    two_arguments,
+)
 from ..switching.context import environment_context
 from ..switching.driver import WAIT, AnyHandler, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, Clock, DecisionHandler
 from .arguments import restore, weaken
+from .base import LONGEST_TAPE, Replay
 from .decision import Decision
 from .events import Handlers
 from .round import Round
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, UnmatchedNames, checked_actions, missing_decision
-
-if TYPE_CHECKING:
-    from ..plans.plan import Plan
-    from ..plans.point import Args, Kwargs
-
-LONGEST_TAPE: Final = 200_000
-"""The number of answers that are kept for a replay. It limits the memory of endless simulations."""
-
-
-class Replay:
-    """A policy that repeats the answers of another episode, in place of all other policies."""
-
-    def __init__(self, answers: Iterable[Action]) -> None:
-        self.answers = deque(answers)
-
-    def answer(self) -> Action:
-        """Return the next answer. ``WAIT`` where the other episode stands."""
-        return self.answers.popleft() if self.answers else WAIT
 
 
 class EpisodeOwner(Protocol):
@@ -190,8 +174,10 @@ class Episode(EpisodeState):
             self.fail(error)
             raise
         self.unreported_end = is_over or (self.round is not None and bool(self.just_ended))
-        if self.pending is None and self.plan.has_user and not self._has_only_forced_moves():
-            raise missing_decision(self, type(self.simulation).__name__)
+        if self.pending is None and self.plan.has_user:
+            agents = (*self.agents.values(), *self.just_ended)
+            if not (self.skips and any(agent.decided for agent in agents)):  # no forced moves
+                raise missing_decision(self, type(self.simulation).__name__)
 
     def step(self, action: Action, entered: bool = False) -> None:
         """Answer the pending decision, and run to the user's next decision, or to the end.
@@ -330,8 +316,7 @@ class Episode(EpisodeState):
             forced = agent.only_action()
             agent.carry_reward(forced is not None or not agent.asked)
             if forced is not None:
-                return agent.answer(forced, forced=True)
-            agent.mark_asked()
+                return agent.reply_to(forced, forced=True)
         return agent
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
@@ -344,7 +329,7 @@ class Episode(EpisodeState):
         if not agent.decided:  # it acts before it was ever updated
             call = agent.arguments.recall()
             agent.update(call.args, call.kwargs, observe=False)
-        return agent.answer(action, forced is not None)
+        return agent.reply_to(action, forced is not None)
 
     def answer(self, agent: Agent, action: Action) -> Model:
         """Turn the user's checked action, or ``RULE``, into the reply to the pending decision.
@@ -356,7 +341,7 @@ class Episode(EpisodeState):
             recorded = action
             if type(action) is not int and action is not RULE:
                 recorded = duplicate(action)  # before a mapping can change it
-            reply = agent.answer(action)
+            reply = agent.reply_to(action)
         except BaseException:
             self.pending = agent
             raise
@@ -367,8 +352,36 @@ class Episode(EpisodeState):
             self.is_plain = False
         return reply
 
-    def consult(self, agent: Agent, policy: Policy) -> Action:
-        """Ask the policy of an agent. ``WAIT`` where a replay ends."""
+    def ask(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
+        """Let a policy answer. Return the reply, or the agent if the policy is asked later."""
+        if agent.ended:
+            raise agent.refusal()
+        if self.plan.one_agent in self.ended:  # else it might run for ever without a user
+            self.finish(truncated=False)
+            return WAIT
+        policy = agent.policy
+        if policy is RULE:
+            return RULE
+        self.latest = agent
+        is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
+        agent.update(args, kwargs, reward=is_rewarded)
+        if self.skips:
+            forced = agent.only_action()
+            if is_rewarded:
+                agent.carry_reward(forced is not None or not agent.asked)
+            if forced is not None:
+                return agent.reply_to(forced, forced=True)
+        if isinstance(policy, AskingPolicy):
+            agent.keep(self, args, kwargs)
+        if isinstance(policy, DeferredPolicy) and not self.is_branch:
+            return agent
+        action = self._consult(agent, policy)
+        if action is WAIT:
+            return WAIT
+        return agent.reply_to(action if action is RULE else agent.validate(action))
+
+    def _consult(self, agent: Agent, policy: Policy) -> Action:
+        """Call the policy of an agent. ``WAIT`` where a replay ends."""
         if self.replay is not None:
             action = self.replay.answer()
             if action is WAIT:
@@ -377,17 +390,20 @@ class Episode(EpisodeState):
         else:
             self.consulted = agent
             try:
-                action = agent.answer_by_policy(self)
+                if isinstance(policy, EpisodePolicy):
+                    action = policy.answer(self, agent, agent.observation, agent.info)
+                else:
+                    action = policy(agent.observation, agent.info)
             finally:
                 self.consulted = None
-        if self.is_recorded:
-            self.record(_copied(action))
+        self.record(action)
         return action
 
     def record(self, action: Action) -> None:
-        """Keep an answer for replays."""
+        """Keep a copy of an answer for replays."""
         if len(self.tape) < self._tape_size:
-            self.tape.append(action)
+            is_constant = type(action) is int or action is RULE
+            self.tape.append(action if is_constant else duplicate(action))
 
     @property
     def is_recorded(self) -> bool:
@@ -596,10 +612,6 @@ class Episode(EpisodeState):
         if session is not None and self.plan.named_agents:
             session.unmatched_names.check(self)
 
-    def _has_only_forced_moves(self) -> bool:
-        agents = (*self.agents.values(), *self.just_ended)
-        return self.skips and any(agent.decided for agent in agents)
-
     # -- errors, and the end by a close -----------------------------------------------------------
 
     def annotate(self, error: BaseException) -> None:
@@ -682,10 +694,6 @@ class Episode(EpisodeState):
         if self.driver.given_up is not None:
             warn_user(f"{type(self.simulation).__name__} {self.driver.given_up}.", ResourceWarning)
         return problems
-
-
-def _copied(action: Action) -> Action:
-    return action if type(action) is int or action is RULE else duplicate(action)
 
 
 def _at(agent: Agent) -> str:

@@ -29,8 +29,8 @@ from ..switching.driver import Driver, Job
 from ..switching.generators import ENVIRONMENT, draws_check, seed_globals
 from ..values.spaces import same
 from .agent import Clock
-from .base import BaseSession, PendingDecision, Recording, ResetOptions
-from .episode import LONGEST_TAPE, Episode, Replay
+from .base import LONGEST_TAPE, BaseSession, PendingDecision, Recording, Replay, ResetOptions
+from .episode import Episode
 from .events import Handlers, handlers_of
 from .state import EpisodeState, State, UnmatchedNames
 

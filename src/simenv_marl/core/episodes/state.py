@@ -21,13 +21,13 @@ from ...errors import (
     warn_user,
 )
 from ...simulation import RULE, Action
+from ..plans.plan import Plan
 from ..plans.points import declared_agents, overrides
 from ..plans.policies import Where
 from ..values.actions import ILLEGAL
 from .round import Round
 
 if TYPE_CHECKING:
-    from ..plans.plan import Plan
     from .agent import Agent, Clock
 
 

@@ -1,0 +1,255 @@
+"""The base class of sessions, and the records that their copies and replays exchange."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from gymnasium.utils import seeding
+
+from ...errors import OptionValueError, SimEnvError, annotate, short_repr
+from ...simulation import Action, Model, Observation
+from ..plans.plan import Plan
+from ..plans.policies import Where
+from ..switching.context import ExclusiveLock
+from ..switching.driver import WAIT
+from ..switching.generators import is_seed
+from ..switching.resources import reuse_resources
+from ..values.actions import Mask
+from .state import EpisodeState, State
+
+ResetOptions = dict[str, Any] | None
+"""The options of a ``reset``."""
+
+
+class Snapshot(NamedTuple):
+    """The record that a copy of a session takes over.
+
+    Attributes:
+        state: Its state.
+        seed: The seed of the latest episode.
+        np_random_seed: The seed of the generator.
+        np_random: The generator.
+    """
+
+    state: State
+    seed: int | None
+    np_random_seed: int | None
+    np_random: np.random.Generator | None
+
+
+class PendingDecision(NamedTuple):
+    """A pending decision, to compare a replay with its original."""
+
+    agent: str
+    agents: list[str]
+    observation: Observation
+    mask: Mask | None
+
+
+class Recording(NamedTuple):
+    """A record from which another session can repeat an episode."""
+
+    seed: int
+    options: ResetOptions
+    in_rounds: bool
+    tape: list[Action]
+    decision: PendingDecision | None
+
+
+LONGEST_TAPE: Final = 200_000
+"""The number of answers that are kept for a replay. It limits the memory of endless simulations."""
+
+
+class Replay:
+    """A policy that repeats the answers of another episode, in place of all other policies."""
+
+    def __init__(self, answers: Iterable[Action]) -> None:
+        self.answers = deque(answers)
+
+    def answer(self) -> Action:
+        """Return the next answer. ``WAIT`` where the other episode stands."""
+        return self.answers.popleft() if self.answers else WAIT
+
+
+class BaseSession(ABC):
+    """The base class of sessions. The simulation may be in another process.
+
+    Attributes:
+        plan: The plan.
+        where: Whether it belongs to the user, a clone or a branch.
+        seed: The seed of the latest episode.
+        options: The options of the latest reset.
+        np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
+        exclusive: The lock that lets one thread at a time begin and end the episodes of a view.
+        lock: The same lock, if steps need it, too. None if only the thread that began an episode
+            can step it.
+    """
+
+    __slots__ = (
+        "__weakref__", "_np_random", "_state", "exclusive", "lock", "np_random_seed", "options",
+        "plan", "seed", "where",
+    )  # fmt: skip
+
+    def __init__(self, plan: Plan, where: Where) -> None:
+        self.plan = plan
+        self.where = where
+        self._state = State.NEW
+        self.seed: int | None = None
+        self.options: ResetOptions = None
+        self.np_random_seed: int | None = None
+        self._np_random: np.random.Generator | None = None
+        self.exclusive = ExclusiveLock()
+        self.lock: ExclusiveLock | None = None
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator that was seeded with the last given seed. It draws all other seeds."""
+        if self._np_random is None:
+            self._np_random, self.np_random_seed = seeding.np_random(self.np_random_seed)
+        return self._np_random
+
+    def set_generator(self, generator: np.random.Generator) -> None:
+        """Draw all seeds from a generator."""
+        self._np_random = generator
+        self.np_random_seed = -1
+
+    def seed_for(self, seed: int | None) -> int:
+        """Return the seed of an episode, and seed the generator with it. None: draw one."""
+        if seed is None:
+            return int(self.np_random.integers(2**31))
+        self._np_random = None  # made when a seed must be drawn
+        self.np_random_seed = seed
+        return seed
+
+    def snapshot(self) -> Snapshot:
+        """Return the record for a copy."""
+        has_decision = self.episode is not None and self.episode.pending is not None
+        state = State.COPIED if has_decision else State.NEW
+        return Snapshot(state, self.seed, self.np_random_seed, self._np_random)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Take over the record of another session."""
+        self._state, self.seed, self.np_random_seed, self._np_random = snapshot
+
+    def refusal(self) -> SimEnvError:
+        """Make the error that says why no action can be taken now."""
+        episode = self.episode
+        return self._state.refusal() if episode is None else episode.refusal()
+
+    def move_to(self, where: Where) -> None:
+        """Note that its episodes are played in a clone or a branch from now on."""
+        self.where = max(self.where, where)
+        if self.episode is not None:
+            self.episode.move_to(where)
+
+    @property
+    @abstractmethod
+    def episode(self) -> EpisodeState | None:
+        """The current or latest episode."""
+
+    @property
+    @abstractmethod
+    def simulation(self) -> Model:
+        """The simulation."""
+
+    @property
+    @abstractmethod
+    def idle(self) -> bool:
+        """Whether there is nothing to end."""
+
+    @abstractmethod
+    def start(
+        self, seed: int | None, options: ResetOptions, *, in_rounds: bool = False
+    ) -> EpisodeState:
+        """End the current episode, reset the simulation, and run it to its first decision.
+
+        Args:
+            seed: The seed. None: one is drawn.
+            options: The options of the reset.
+            in_rounds: Whether all agents are updated when a step returns.
+
+        Returns:
+            The episode.
+        """
+
+    @abstractmethod
+    def end(self) -> None:
+        """End the current episode, or raise a ``ReentrancyError`` if that is not possible here."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the current episode, and close the simulation."""
+
+    @abstractmethod
+    def abandon(self) -> None:
+        """Close it from a finalizer. Warn of errors instead of raising them."""
+
+    @abstractmethod
+    def ask(self, name: str, *args: Any) -> Model:
+        """Call a method of the simulation, or raise ``NotImplementedError`` if it has none."""
+
+    def declare(self, plan: Plan) -> None:
+        """Forget the episode that has shown the agents, and take over a plan that declares them."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def call(self, view: Model, function: Callable[..., Model], args: tuple[Any, ...]) -> Model:
+        """Call a function with the view, where the simulation is."""
+
+    @abstractmethod
+    def check_reseed(self) -> None:
+        """Raise a ``BranchError`` unless the simulation's future chance can be drawn anew."""
+
+    @abstractmethod
+    def reseed(self, seed: int) -> None:
+        """Draw the simulation's future chance anew."""
+
+    @abstractmethod
+    def recording(self) -> Recording:
+        """Return the record for a replay of the episode."""
+
+    @abstractmethod
+    def leave_caller(self) -> None:
+        """In a branch that was forked from inside a policy, leave the step that has asked it."""
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Return the seed of a ``reset`` as a Python integer, or None. Refuse all other values."""
+    if seed is None:
+        return None
+    if not is_seed(seed):
+        raise OptionValueError(
+            f"seed must be a non-negative integer or None, not {short_repr(seed)}"
+        )
+    return int(seed)
+
+
+def close_all(
+    sessions: Iterable[tuple[str, BaseSession]], error: BaseException | None = None
+) -> BaseException | None:
+    """Close sessions, given with their names.
+
+    Args:
+        sessions: The sessions.
+        error: An error that was raised before.
+
+    Returns:
+        The first error, with notes of all others. None without any.
+    """
+    with reuse_resources():  # it waits for all processes of simulations together
+        for name, session in sessions:
+            try:
+                session.close()
+            except BaseException as problem:
+                if error is None:
+                    error = problem
+                    annotate(error, f"simenv_marl: in {name}")
+                else:
+                    annotate(
+                        error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well"
+                    )
+    return error

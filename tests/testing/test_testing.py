@@ -133,6 +133,16 @@ def test_models_whose_agents_come_and_go_are_clean(simulation, points):
         assert [part.agents for part in report.statistics] == ["waterer_0", "ventilator_0"]
 
 
+def test_masks_of_several_components_are_clean():
+    changes = {
+        "action_space": spaces.MultiDiscrete([3, 2]),
+        "action_space_mapping": lambda action: int(action[0]) - 1,
+        "action_mask_mapping": lambda walk: ([1, 1, 0], [1, 0]),
+    }
+    report = clean(checked(Walk, changes))
+    assert report.statistics[0].never_legal == ()
+
+
 def in_one_generator(seed):
     return dict.fromkeys("012", np.random.default_rng(seed))
 

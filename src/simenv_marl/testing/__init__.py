@@ -11,24 +11,17 @@ calls. Both are also on the command line::
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from itertools import chain, count, islice
+from functools import partial
 from typing import Unpack
 
 from ..core import CheckOptions, Point, Points, is_seed
 from ..envs.single import plan_of
-from ..errors import OptionValueError, SimEnvError, short_repr
+from ..errors import OptionValueError, short_repr
 from ..simulation import Model
-from .checks import (
-    CHECKS,
-    Report,
-    fitting_views,
-    make_environment,
-)
+from .checks import Check
 from .report import (
-    SEVERITIES,
     CheckReport,
     Finding,
     Inspection,
@@ -38,7 +31,7 @@ from .report import (
 )
 from .runs import (
     Run,
-    Subject,
+    Runner,
     describe_with_place,
     silence,
 )
@@ -105,46 +98,20 @@ def check_simulation(
         raise OptionValueError(
             f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
         )
-    plain_seeds = list(map(int, unique_seeds))
-    all_seeds = chain(plain_seeds, count(max(plain_seeds) + 1))
-    report = Report()
-    calls = ""
-    with silence() as warnings:
-        try:
-            plan = plan_of(simulation, points, options)
-            make_environment(plan, "aec")
-            subject = Subject(
-                plan=plan,
-                max_steps=max_steps,
-                seconds=time_limit / 4,
-                state_of=fingerprint,
-                seeds=plain_seeds,
-                episode_seeds=islice(all_seeds, episodes),
-                deadline=time.monotonic() + time_limit,
-            )
-            for check in CHECKS:
-                if check is CHECKS[0] or subject.views:
-                    check(subject, report)
-            if subject.is_late:
-                report.add("out_of_time", f"after {time_limit:g} seconds")
-            calls = order_of(subject.plain_runs[subject.seeds[0]].calls)
-        except SimEnvError:
-            raise
-        except (Exception, SystemExit) as error:  # of the model's constructor, for example
-            run = Run()
-            run.fail(error)
-            report.add_error(run, "while the simulation was made or reset")
-    for warning in warnings:
-        report.add("warned", str(warning.message)[:300])
-    findings = dict.fromkeys(report.findings)  # without duplicates
-    return CheckReport(
-        simulation=str(getattr(simulation, "__name__", type(simulation).__name__)),
-        findings=tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity))),
-        checked=tuple(report.checked),
-        statistics=tuple(report.statistics),
-        episodes=report.episodes,
-        calls=calls,
+    check = Check(
+        make_plan=partial(plan_of, simulation, points, options),
+        max_steps=max_steps,
+        seconds=time_limit / 4,
+        state_of=fingerprint,
+        seeds=list(map(int, unique_seeds)),
+        most_episodes=episodes,
+        time_limit=time_limit,
     )
+    with silence() as warnings:
+        check.run()
+    for warning in warnings:
+        check.add("warned", str(warning.message)[:300])
+    return check.report(getattr(simulation, "__name__", type(simulation).__name__))
 
 
 def inspect_simulation(
@@ -171,15 +138,17 @@ def inspect_simulation(
     if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
     with silence():
-        plan = plan_of(simulation, points, options)
-        subject = Subject(
-            plan=plan, max_steps=max_steps, seconds=time_limit, state_of=lambda simulation: None
+        runner = Runner(
+            partial(plan_of, simulation, points, options),
+            max_steps,
+            time_limit,
+            lambda simulation: None,
         )
-        run = subject.run_plainly(seed)
-        views = tuple(fitting_views(plan))
+        run = runner.run_plainly(seed)
+        views = tuple(runner.fitting_views())
     return Inspection(
-        simulation=plan.name,
-        points=tuple(map(_describe, plan.active)),
+        simulation=runner.plan.name,
+        points=tuple(map(_describe, runner.plan.active)),
         views=views,
         calls=order_of(run.calls),
         counts=dict(Counter(run.calls)),

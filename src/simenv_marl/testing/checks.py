@@ -1,18 +1,18 @@
-"""The checks: functions of a ``Subject`` and a ``Report``.
-
-Each adds its findings to the report.
-"""
+"""The check of a simulation: its runs are compared, and each fault is a finding."""
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, product
 from typing import Any, Final
 
 import numpy as np
+from gymnasium.spaces import Discrete
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import (
     api_test,
@@ -21,11 +21,13 @@ from pettingzoo.test import (
     seed_test,
 )
 
-from ..core import MASK, Plan, Point, Streams, generators_of
-from ..envs import VIEWS, SimulationAECEnv, view_class
+from ..core import MASK, Point, Streams, generators_of
+from ..envs import SimulationAECEnv
+from ..envs.base import StepResult
 from ..errors import (
     AgentError,
     InvalidActionError,
+    SimEnvError,
     error_text,
     short_repr,
 )
@@ -38,207 +40,46 @@ from ..simulation import (
 )
 from .fingerprint import (
     ABSENT,
-    STATE,
+    STEP,
+    Difference,
     describe_differences,
+    differences,
     generalize,
+    is_essential,
 )
 from .report import (
     FINDINGS,
+    SEVERITIES,
+    CheckReport,
     Finding,
     PointStatistics,
     Range,
+    order_of,
 )
 from .runs import (
     LimitReached,
     Run,
-    Step,
-    Subject,
+    Runner,
     describe_with_place,
     place_of,
     seed_global_generators,
 )
 
-
-def make_environment(plan: Plan, view: str, **options: Any) -> Any:
-    """Make an environment of a plan with changed options."""
-    if view != "joint" and plan.options.flatten:
-        options["flatten"] = False
-    plan = plan.amended(options)
-    return view_class(plan, view)(plan)
-
-
-def fitting_views(plan: Plan) -> list[str]:
-    """Return the views that a plan allows."""
-    views = []
-    for view in VIEWS:
-        # The view may refuse the plan, or reset the model, which may raise anything.
-        with suppress(Exception):
-            make_environment(plan, view).close()
-            views.append(view)
-    return views
-
-
-class Report:
-    """A report while it is written.
-
-    Attributes:
-        findings, checked, statistics, episodes: As in ``CheckReport``, but mutable.
-        names: The names of the findings.
-    """
-
-    def __init__(self) -> None:
-        self.findings: list[Finding] = []
-        self.names: set[str] = set()
-        self.checked: list[str] = []
-        self.statistics: list[PointStatistics] = []
-        self.episodes = {"terminated": 0, "truncated": 0, "cut": 0}
-        self._errors: set[tuple[str, str]] = set()  # by class and place
-
-    def add(
-        self,
-        name: str,
-        evidence: str = "",
-        **words: str | int,
-    ) -> None:
-        """Add a finding of ``FINDINGS``; ``words`` replace the placeholders of its text."""
-        severity, *texts = FINDINGS[name]
-        title, explanation = (" ".join(text.format(**words).split()) for text in texts)
-        self.findings.append(Finding(severity, title, explanation, evidence))
-        self.names.add(name)
-
-    def add_error(
-        self,
-        run: Run,
-        where: str,
-        view: str = "aec",
-    ) -> bool:
-        """Add the error of a run, once for each place; return whether the run has an error."""
-        error = run.error
-        if isinstance(error, LimitReached):
-            name = "stuck" if run.is_stuck else "out_of_time"
-            self.add(name, f"{where}, after {len(run.calls)} steps")
-        # The joint view may be unable to know all agents.
-        elif error is not None and not (view == "joint" and isinstance(error, AgentError)):
-            kind = type(error).__name__
-            key = kind, place_of(error) or error_text(error)
-            if key not in self._errors:
-                self._errors.add(key)
-                self.add("raises", f"{where}: {describe_with_place(error)}", kind=kind)
-        return error is not None
-
-    @contextmanager
-    def environment(
-        self,
-        subject: Subject,
-        view: str = "aec",
-        **options: Any,
-    ) -> Iterator[Any]:
-        """Make an environment, and close it at the end."""
-        env = make_environment(subject.plan, view, **options)
-        try:
-            yield env
-        finally:
-            self.add_error(
-                subject.record(env.close), "when an environment was closed in mid-episode"
-            )
-
-
-# -- the simulation by itself ---------------------------------------------------------------------
-
-
-def check_plain_runs(subject: Subject, report: Report) -> None:
-    """Check that the simulation runs without an environment, and decides something."""
-    if not takes(make_simulation(subject.plan.subject.source).reset, "seed"):
-        report.add("unseeded_reset")
-    for seed in subject.seeds:
-        run = subject.run_plainly(seed)
-        subject.plain_runs[seed] = run
-        subject.draws.update(run.draws)
-        if report.add_error(run, f"in a plain run without any environment, seed {seed}"):
-            return
-    runs = list(subject.plain_runs.values())
-    if not any(run.calls for run in runs):
-        points = ", ".join(point.hook.name for point in subject.plan.active)
-        report.add("no_decision", points=points)
-        return
-    subject.views.extend(fitting_views(subject.plan))
-    if any(run.is_cut for run in runs):
-        report.add("cut_runs", most=subject.max_steps)
-    first, *others = runs
-    if others and not any(
-        first.difference(run) or subject.differences(first, run) for run in others
-    ):
-        report.add("same_seeds", f"seeds {', '.join(map(str, subject.seeds))}")
-
-
-def check_repetition(subject: Subject, report: Report) -> None:
-    """Repeat a plain run: if it differs, differences of environments mean nothing."""
-    seed = subject.seeds[0]
-    first = subject.plain_runs[seed]
-    again = subject.run_plainly(seed)
-    # Other states of the global generators show whether the model seeds them.
-    other = subject.run_plainly(seed, seed + 1) if subject.draws else again
-    if any(isinstance(run.error, LimitReached) for run in (again, other)):
-        return
-    if subject.draws:
-        differs = first.difference(other) or subject.differences(first, other)
-        name = "unseeded_generators" if differs else "shared_generators"
-        names = " and ".join(sorted(subject.draws))
-        report.add(name, subject.sources_of_chance().lstrip(), names=names)
-    parts = subject.differences(first, again)
-    states = [part for part in parts if STATE in part.path]
-    difference = first.difference(again) or describe_differences(states)
-    if difference:
-        evidence = f"two plain runs of seed {seed}: {difference}{subject.sources_of_chance()}"
-        report.add("unrepeatable", evidence)
-    elif parts:
-        report.add("unstable", describe_differences(parts))
-        subject.unstable.update(generalize(part.path) for part in parts)
-
-
-# -- environments with RULE throughout ------------------------------------------------------------
-
-
-def check_views(subject: Subject, report: Report) -> None:
-    """Compare plain runs with each view and driver under ``RULE``, up to the first difference."""
-    if "unrepeatable" in report.names:
-        return
-    options = subject.plan.options
-    drivers = ["greenlet", "thread"] if options.driver == "greenlet" else [options.driver]
-    # Rules take all decisions, because plain runs have no policies.
-    policies = dict.fromkeys(options.policies or (), RULE) or None
-    rules = {"policies": policies, "max_steps": None, "skip_forced": False}
-    for driver, view, seed in product(drivers, subject.views, subject.plain_runs):
-        plain = subject.plain_runs[seed]
-        if subject.is_late or not plain.calls:
-            continue
-        seed_global_generators(seed)
-        with report.environment(subject, view, driver=driver, **rules) as env:
-            run = subject.run_rules(env, seed)
-        where = f"{view} view, driver {driver}, seed {seed}"
-        if report.add_error(run, f"in the {where}, with RULE throughout", view):
-            continue
-        draws = run.draws - subject.draws
-        if draws:
-            names = " and ".join(sorted(draws))
-            report.add("unseeded_generators", f"in the {where}", names=names)
-            subject.draws.update(draws)
-        difference = plain.difference(run)
-        parts = subject.differences(plain, run)
-        if difference or parts:
-            more = not difference and all(part.first is ABSENT for part in parts)
-            evidence = f"plain run, then {where}: {difference}\n{describe_differences(parts)}"
-            report.add("writing_mappings" if more else "changed_model", evidence.rstrip())
-            return
-    most = max(len(run.calls) for run in subject.plain_runs.values())
-    report.checked.append(
-        f"plain runs against RULE throughout ({', '.join(subject.views)}; drivers"
-        f" {', '.join(drivers)}; seeds {', '.join(map(str, subject.seeds))}; up to {most} decisions"
-        f" each): the decisions, and {len(plain.fingerprint)} parts that the simulation holds then"
-    )
-
-
-# -- episodes of random legal actions -------------------------------------------------------------
+_TESTS: Final = (
+    ("PettingZoo's api_test", "aec", lambda make: api_test(make(), num_cycles=50)),
+    ("seed_test", "aec", lambda make: seed_test(make, num_cycles=20)),
+    ("parallel_api_test", "parallel", lambda make: parallel_api_test(make(), num_cycles=50)),
+    ("parallel_seed_test", "parallel", lambda make: parallel_seed_test(make, num_cycles=20)),
+    *(
+        (
+            f"Gymnasium's check_env ({view} view)",
+            view,
+            lambda make: check_env(make(), skip_render_check=True),
+        )
+        for view in ("single", "joint")
+    ),
+)
+"""The tests and their views; each test is called with a factory of environments."""
 
 
 class Tally:
@@ -262,211 +103,413 @@ class Tally:
 
     def ranges(self, name: str) -> list[Range]:
         """Return the range of each element."""
-        ranges = []
-        for place, mean in np.ndenumerate(self.total / self.number):
-            path = f"{name}{list(place) or ''}"
-            low = self.low[place].item()
-            high = self.high[place].item()
-            ranges.append(Range(path, low, mean.item(), high))
-        return ranges
+        return [
+            Range(
+                f"{name}{list(place) or ''}",
+                self.low[place].item(),
+                mean.item(),
+                self.high[place].item(),
+            )
+            for place, mean in np.ndenumerate(self.total / self.number)
+        ]
 
 
 class PointRecord:
-    """The record of a decision point in episodes of random legal actions."""
+    """The record of a decision point in episodes of random legal actions.
+
+    Attributes:
+        point: The decision point.
+        decisions: The number of its decisions.
+        outside: The first observation outside of its space, in words.
+        tallies: The tallies of "reward", "mask", and the parts of "observation".
+    """
 
     def __init__(self, point: Point) -> None:
         self.point = point
         self.decisions = 0
-        self.rewards = Tally()
-        self.masks = Tally()
-        self.observations: defaultdict[str, Tally] = defaultdict(Tally)
-        self.outside = ""  # the first observation outside of its space
+        self.outside = ""
+        self.tallies: defaultdict[str, Tally] = defaultdict(Tally)
 
-    def add(
-        self,
-        agent: str,
-        step: Step,
-        *,
-        with_reward: bool,
-    ) -> None:
-        """Add a result of ``last()``, with its reward if the agent has acted in the episode."""
-        observation, reward, terminated, truncated, info = step
-        self.observe("observation", observation)
+    def add(self, agent: str, result: StepResult) -> None:
+        """Add a result of ``last()``, without its reward."""
+        observation, _, terminated, truncated, info = result
+        self.tally("observation", observation)
         space = self.point.definition.observation_space
         if not (self.outside or space.contains(observation)):
             text = short_repr(observation)
             self.outside = f"{agent} has observed {text}; the space is {space}"
-        if with_reward:
-            self.rewards.add(reward)
         if not (terminated or truncated):
             self.decisions += 1
-            if isinstance(info.get(MASK), np.ndarray):
-                self.masks.add(info[MASK])
+            self.tally("mask", info.get(MASK))
 
-    def observe(self, name: str, value: Observation) -> None:
-        """Add a number, an array, or a dict or tuple of these."""
+    def tally(self, name: str, value: Observation) -> None:
+        """Add a number, an array, or a dict or tuple of these, to its tallies."""
         if isinstance(value, Mapping):
             for key, part in value.items():
                 if key != MASK:
-                    self.observe(f"{name}.{key}", part)
+                    self.tally(f"{name}.{key}", part)
         elif isinstance(value, tuple):
             for number, part in enumerate(value):
-                self.observe(f"{name}.{number}", part)
+                self.tally(f"{name}.{number}", part)
         elif isinstance(value, (np.ndarray, np.generic, int, float)):
-            self.observations[name].add(value)
+            self.tallies[name].add(value)
 
-    def conclude(self, report: Report, subject: Subject) -> None:
-        """Report the statistics, and their findings."""
-        point = self.point.hook.name
-        rewards = self.rewards.ranges("reward")[0] if self.rewards.number else None
-        start = int(getattr(self.point.definition.action_space, "start", 0))
-        never = (np.flatnonzero(self.masks.high == 0) + start).tolist()
-        if not self.decisions and not any(
-            point in run.calls for run in subject.plain_runs.values()
-        ):
-            report.add("never_called", point=point)
-        if self.outside:
-            report.add("outside", self.outside, point=point)
-        if never:
-            report.add("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=point)
-        if rewards is not None and rewards.minimum == rewards.maximum and self.rewards.number > 1:
-            name = "same_rewards" if rewards.minimum else "zero_rewards"
-            report.add(name, f"{self.rewards.number} rewards of {rewards.mean:.6g}", point=point)
-        ranges = (tally.ranges(name) for name, tally in self.observations.items())
-        observations = tuple(chain(*ranges))
-        agents = self.point.agent or "agents named by each call"
-        report.statistics.append(
-            PointStatistics(point, agents, self.decisions, observations, rewards, tuple(never))
+    def statistics(self) -> PointStatistics:
+        """Return the statistics."""
+        ranges = {name: tally.ranges(name) for name, tally in self.tallies.items()}
+        rewards = ranges.pop("reward", [None])
+        space = self.point.definition.action_space
+        first = int(space.start) if isinstance(space, Discrete) else 0
+        never = [
+            first + action for action, part in enumerate(ranges.get("mask", [])) if not part.maximum
+        ]
+        observations = [ranges[name] for name in ranges if name.startswith("observation")]
+        return PointStatistics(
+            self.point.hook.name,
+            self.point.agent or "agents named by each call",
+            self.decisions,
+            tuple(chain(*observations)),
+            rewards[0],
+            tuple(never),
         )
 
 
-def check_episodes(subject: Subject, report: Report) -> None:
-    """Play episodes with random legal actions, and compare episodes of the same seed."""
-    records = {point.hook: PointRecord(point) for point in subject.plan.active}
-    most = subject.max_steps
-    first: Run | None = None
-    failures = 0
-    with report.environment(subject, max_steps=most) as env:
-        for number, seed in enumerate(subject.episode_seeds, 1):
-            if subject.is_late or failures == 3:
-                break
-            run = subject.run_randomly(env, seed)
-            actors = set()
-            for agent, step in run.results:
-                record = records[agent.point.hook]
-                record.add(agent.name, step, with_reward=agent.name in actors)
-                actors.add(agent.name)
-            if report.add_error(run, f"in episode {number} of random legal actions, seed {seed}"):
-                failures += 1
-                if isinstance(run.error, LimitReached):
-                    break
+@dataclass(kw_only=True)
+class Check(Runner):
+    """A check: a simulation, the limits of its runs, and the results so far.
+
+    Attributes:
+        seeds: The seeds of plain runs, and of the first episodes of random actions.
+        most_episodes: The number of episodes of random actions.
+        time_limit: The time limit for all checks, in seconds.
+        findings: The findings, with their names in ``FINDINGS``.
+        checked, statistics, episodes: As in ``CheckReport``, but mutable.
+        plain_runs: The plain runs by seed.
+        views: The views that the plan allows. Empty if plain runs fail or decide nothing.
+        unstable: Parts of the fingerprint that are not compared.
+        sources: The global generators that the simulation uses, by name.
+    """
+
+    seeds: list[int]
+    most_episodes: int
+    time_limit: float
+
+    def __post_init__(self) -> None:
+        """Begin the check."""
+        self.findings: dict[Finding, str] = {}
+        self.checked: list[str] = []
+        self.statistics: list[PointStatistics] = []
+        self.episodes = {"terminated": 0, "truncated": 0, "cut": 0}
+        self.plain_runs: dict[int, Run] = {}
+        self.views: list[str] = []
+        self.unstable: set[str] = set()
+        self.sources: set[str] = set()
+        self._errors: set[tuple[str, str]] = set()  # by class and place
+        self._deadline = time.monotonic() + self.time_limit
+
+    def run(self) -> None:
+        """Run the checks, the more basic first: if plain runs fail, the others are left out.
+
+        Raises:
+            SimEnvError: The simulation, the points or an option is invalid.
+        """
+        try:
+            self.make_environment("aec")
+            self.check_plain_runs()
+            if self.views:
+                self.check_repetition()
+                self.check_views()
+                self.check_episodes()
+                self.check_conformance()
+        except SimEnvError:
+            raise
+        except (Exception, SystemExit) as error:  # of the model's constructor, for example
+            self.add_error(error, "while the simulation was made or reset")
+        if self.is_late:
+            self.add("out_of_time", f"after {self.time_limit:g} seconds")
+
+    def report(self, simulation: str) -> CheckReport:
+        """Return the report of a simulation with a name."""
+        runs = list(self.plain_runs.values())
+        return CheckReport(
+            simulation=simulation,
+            findings=tuple(sorted(self.findings, key=lambda f: SEVERITIES.index(f.severity))),
+            checked=tuple(self.checked),
+            statistics=tuple(self.statistics),
+            episodes=self.episodes,
+            calls=order_of(runs[0].calls) if runs else "",
+        )
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time is up."""
+        return time.monotonic() >= self._deadline
+
+    def add(
+        self,
+        name: str,
+        evidence: str = "",
+        **words: str | int,
+    ) -> None:
+        """Add a finding of ``FINDINGS``; ``words`` replace the placeholders of its text."""
+        severity, *texts = FINDINGS[name]
+        title, explanation = (" ".join(text.format(**words).split()) for text in texts)
+        self.findings[Finding(severity, title, explanation, evidence)] = name
+
+    def add_error(self, error: BaseException, where: str) -> None:
+        """Add an error, once for each place."""
+        kind = type(error).__name__
+        key = kind, place_of(error) or error_text(error)
+        if key not in self._errors:
+            self._errors.add(key)
+            self.add("raises", f"{where}: {describe_with_place(error)}", kind=kind)
+
+    def fails(
+        self,
+        run: Run,
+        where: str,
+        view: str = "aec",
+    ) -> bool:
+        """Return whether a run has failed, and add its error."""
+        error = run.error
+        if isinstance(error, LimitReached):
+            name = "stuck" if run.is_stuck else "out_of_time"
+            self.add(name, f"{where}, after {len(run.calls)} steps")
+        # The joint view may be unable to know all agents.
+        elif error is not None and not (view == "joint" and isinstance(error, AgentError)):
+            self.add_error(error, where)
+        return error is not None
+
+    @contextmanager
+    def environment(self, view: str = "aec", **options: Any) -> Iterator[Any]:
+        """Make an environment, and close it at the end."""
+        env = self.make_environment(view, **options)
+        try:
+            yield env
+        finally:
+            self.fails(self.call(env.close), "when an environment was closed in mid-episode")
+
+    def differences(self, run: Run, other: Run) -> list[Difference]:
+        """Return the differences between two runs."""
+        return differences(run.parts, other.parts, self.unstable)
+
+    def repeats(
+        self,
+        first: Run,
+        again: Run,
+        name: str,
+        where: str,
+    ) -> bool:
+        """Return whether a run repeats another one; else add the finding with a name."""
+        parts = self.differences(first, again)
+        if parts:
+            sources = self.sources_of_chance(self.seeds[0]) if name == "unrepeatable" else ""
+            self.add(name, f"{where}: {describe_differences(parts)}{sources}")
+        return not parts
+
+    # -- the simulation by itself -----------------------------------------------------------------
+
+    def check_plain_runs(self) -> None:
+        """Check that the simulation runs without an environment, and decides something."""
+        if not takes(make_simulation(self.plan.subject.source).reset, "seed"):
+            self.add("unseeded_reset")
+        for seed in self.seeds:
+            run = self.run_plainly(seed)
+            self.plain_runs[seed] = run
+            self.sources |= run.draws
+            if self.fails(run, f"in a plain run without any environment, seed {seed}"):
+                return
+        first, *others = self.plain_runs.values()
+        if not any(run.calls for run in (first, *others)):
+            points = ", ".join(point.hook.name for point in self.plan.active)
+            self.add("no_decision", points=points)
+            return
+        self.views = self.fitting_views()
+        if any(run.is_cut for run in (first, *others)):
+            self.add("cut_runs", most=self.max_steps)
+        if others and not any(self.differences(first, run) for run in others):
+            self.add("same_seeds", f"seeds {', '.join(map(str, self.seeds))}")
+
+    def check_repetition(self) -> None:
+        """Repeat a plain run: if it differs, differences of environments mean nothing."""
+        seed = self.seeds[0]
+        first = self.plain_runs[seed]
+        again = self.run_plainly(seed)
+        # Other states of the global generators show whether the model seeds them.
+        other = self.run_plainly(seed, seed + 1) if self.sources else again
+        if any(self.fails(run, "in another plain run") for run in (again, other)):
+            return
+        if self.sources:
+            differs = self.differences(first, other)
+            name = "unseeded_generators" if differs else "shared_generators"
+            self.add_draws(name, self.sources_of_chance(seed).lstrip(), self.sources)
+        parts = self.differences(first, again)
+        paths = {part.path for part in parts}
+        self.unstable = {generalize(path) for path in paths if not is_essential(path)}
+        if self.repeats(first, again, "unrepeatable", f"two plain runs of seed {seed}") and parts:
+            self.add("unstable", describe_differences(parts))
+
+    def add_draws(
+        self,
+        name: str,
+        evidence: str,
+        generators: set[str],
+    ) -> None:
+        """Add a finding about global generators."""
+        self.add(name, evidence, names=" and ".join(sorted(generators)))
+
+    # -- environments with RULE throughout --------------------------------------------------------
+
+    def check_views(self) -> None:
+        """Compare plain runs with each view and driver under ``RULE``, to the first difference."""
+        if self.is_unrepeatable:
+            return
+        options = self.plan.options
+        drivers = ["greenlet", "thread"] if options.driver == "greenlet" else [options.driver]
+        # Rules take all decisions, because plain runs have no policies.
+        policies = dict.fromkeys(options.policies or (), RULE) or None
+        rules = {"policies": policies, "max_steps": None, "skip_forced": False}
+        for driver, view, seed in product(drivers, self.views, self.seeds):
+            plain = self.plain_runs[seed]
+            if self.is_late or not plain.calls:
                 continue
-            if number == 1:
-                first = run
-                check_generators(report, run, env.simulation)
-            report.episodes[run.end if len(run.actions) < most else "cut"] += 1
-        for record in records.values():
-            record.conclude(report, subject)
-        episodes = sum(report.episodes.values())
-        if episodes:
-            report.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
-        if report.episodes["cut"] == episodes > 0:
-            report.add("cut_runs", most=most)
-        if first is not None and not failures and "unrepeatable" not in report.names:
-            compare_episodes(subject, report, env, first)
-        subject.record(partial(env.reset, seed=subject.seeds[0]))  # to close it in mid-episode
-
-
-def check_generators(report: Report, run: Run, simulation: Model) -> None:
-    """Report that entities share generators, unless the model has no generator."""
-    names = list({agent.name: None for agent, _ in run.results if agent.point.agent is None})
-    generators = generators_of(simulation)
-    number = sum(len(each) if isinstance(each, Streams) else 1 for each in generators)
-    if 0 < number < len(names):
-        evidence = f"{number} for {len(names)} agents, {names[0]} and {names[1]} among them"
-        report.add("few_generators", evidence)
-
-
-def compare_episodes(
-    subject: Subject,
-    report: Report,
-    used: SimulationAECEnv,
-    first: Run,
-) -> None:
-    """Repeat an episode in a new environment, in a used one, and beside another one."""
-    seed = subject.seeds[0]
-    with report.environment(subject, max_steps=subject.max_steps) as new:
-        subject.run_randomly(used, seed, most=1 + len(first.calls) // 2)
-        for name, env, beside in (
-            ("unrepeatable", new, None),
-            ("left_over", used, None),
-            ("disturbance", new, used),
-        ):
-            again = subject.run_randomly(env, seed, beside=beside)
-            if report.add_error(again, "after an episode that was closed in mid-episode"):
+            seed_global_generators(seed)
+            with self.environment(view, driver=driver, **rules) as env:
+                run = self.run_rules(env, seed)
+            where = f"{view} view, driver {driver}, seed {seed}"
+            if self.fails(run, f"in the {where}, with RULE throughout", view):
+                continue
+            draws = run.draws - self.sources
+            if draws:
+                self.add_draws("unseeded_generators", f"in the {where}", draws)
+                self.sources |= draws
+            parts = self.differences(plain, run)
+            name = "changed_model"
+            if all(part.first is ABSENT and not is_essential(part.path) for part in parts):
+                name = "writing_mappings"
+            if not self.repeats(plain, run, name, f"plain run, then {where}"):
                 return
-            if subject.is_late or (beside and subject.draws):
-                return
-            difference = first.difference(again)
-            if difference:
-                sources = subject.sources_of_chance() if name == "unrepeatable" else ""
-                report.add(name, f"seed {seed}, the same actions: {difference}{sources}")
-                return
-        other = subject.run_randomly(used, seed, salt=1)
-        acts_alike = len(other.calls) <= 1 or repr(first.actions) == repr(other.actions)
-        if not acts_alike and not first.difference(other):
-            report.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
-    report.checked.append(
-        "the same seed and actions in a new environment, in a used one, and beside another one"
-    )
-
-
-# -- the tests of PettingZoo and Gymnasium --------------------------------------------------------
-
-
-_TESTS: Final = (
-    ("PettingZoo's api_test", "aec", lambda make: api_test(make(), num_cycles=50)),
-    ("seed_test", "aec", lambda make: seed_test(make, num_cycles=20)),
-    ("parallel_api_test", "parallel", lambda make: parallel_api_test(make(), num_cycles=50)),
-    ("parallel_seed_test", "parallel", lambda make: parallel_seed_test(make, num_cycles=20)),
-    *(
-        (
-            f"Gymnasium's check_env ({view} view)",
-            view,
-            lambda make: check_env(make(), skip_render_check=True),
+        most = max(len(run.calls) for run in self.plain_runs.values())
+        held = [path for path in plain.parts if not path.startswith(STEP)]
+        self.checked.append(
+            f"plain runs against RULE throughout ({', '.join(self.views)}; drivers"
+            f" {', '.join(drivers)}; seeds {', '.join(map(str, self.seeds))}; up to {most}"
+            f" decisions each): the decisions, and {len(held)} parts that the simulation holds then"
         )
-        for view in ("single", "joint")
-    ),
-)
-"""The tests and their views; each test is called with a factory of environments."""
 
+    @property
+    def is_unrepeatable(self) -> bool:
+        """Whether the same seed does not give the same run."""
+        return "unrepeatable" in self.findings.values()
 
-def check_conformance(subject: Subject, report: Report) -> None:
-    """Run the tests of PettingZoo and Gymnasium, unless they would only repeat errors."""
-    passed_tests = []
-    for name, view, test in _TESTS:
-        if any(finding.severity == "error" for finding in report.findings):
-            break
-        if subject.is_late or view not in subject.views or (subject.draws and "seed" in name):
-            continue
-        make = partial(make_environment, subject.plan, view, max_steps=subject.max_steps)
-        run = subject.record(partial(test, make))
-        if run.error is None:
-            passed_tests.append(name)
-        elif isinstance(run.error, AssertionError):
-            report.add("failed_test", describe_with_place(run.error), test=name)
-        # The tests ignore masks, or changes of masks.
-        elif not isinstance(run.error, (LimitReached, InvalidActionError)):
-            report.add_error(run, f"in {name}", view)
-    if passed_tests:
-        report.checked.append(", ".join(passed_tests))
+    # -- episodes of random legal actions ---------------------------------------------------------
 
+    def check_episodes(self) -> None:
+        """Play episodes with random legal actions, and compare episodes of the same seed."""
+        records = {point.hook: PointRecord(point) for point in self.plan.active}
+        later = range(max(self.seeds) + 1, max(self.seeds) + 1 + self.most_episodes)
+        seeds = [*self.seeds, *later][: self.most_episodes]
+        with self.environment(max_steps=self.max_steps) as env:
+            for number, seed in enumerate(seeds, 1):
+                if self.is_late:
+                    break
+                run = self.run_randomly(env, seed)
+                actors = set()
+                for agent, result in run.results:
+                    record = records[agent.point.hook]
+                    record.add(agent.name, result)
+                    if agent.name in actors:
+                        record.tally("reward", result[1])
+                    actors.add(agent.name)
+                if self.fails(run, f"in episode {number} of random legal actions, seed {seed}"):
+                    if isinstance(run.error, LimitReached):
+                        break
+                    continue
+                if number == 1:
+                    first = run
+                    self.check_generators(run, env.simulation)
+                self.episodes["cut" if len(run.actions) == self.max_steps else run.end] += 1
+            for record in records.values():
+                self.conclude(record)
+            episodes = sum(self.episodes.values())
+            if episodes:
+                self.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
+            if self.episodes["cut"] == episodes > 0:
+                self.add("cut_runs", most=self.max_steps)
+            if episodes == len(seeds) and not self.is_unrepeatable:
+                self.compare_episodes(env, first)
+            self.call(partial(env.reset, seed=seeds[0]))  # to close it in mid-episode
 
-CHECKS: Final = (
-    check_plain_runs,
-    check_repetition,
-    check_views,
-    check_episodes,
-    check_conformance,
-)
-"""All checks, the more basic first: if the plain run fails, the others are left out."""
+    def conclude(self, record: PointRecord) -> None:
+        """Add the statistics of a decision point, and their findings."""
+        statistics = record.statistics()
+        self.statistics.append(statistics)
+        point = statistics.point
+        if not (record.decisions or any(point in run.calls for run in self.plain_runs.values())):
+            self.add("never_called", point=point)
+        if record.outside:
+            self.add("outside", record.outside, point=point)
+        if statistics.never_legal:
+            actions = ", ".join(map(str, statistics.never_legal[:10]))
+            self.add("never_legal", f"actions {actions}", point=point)
+        rewards = statistics.rewards
+        number = record.tallies["reward"].number
+        if rewards is not None and rewards.minimum == rewards.maximum and number > 1:
+            name = "same_rewards" if rewards.minimum else "zero_rewards"
+            self.add(name, f"{number} rewards of {rewards.mean:.6g}", point=point)
+
+    def check_generators(self, run: Run, simulation: Model) -> None:
+        """Add a finding if entities share generators, unless the model has no generator."""
+        names = list({agent.name: None for agent, _ in run.results if agent.point.agent is None})
+        generators = generators_of(simulation)
+        number = sum(len(each) if isinstance(each, Streams) else 1 for each in generators)
+        if 0 < number < len(names):
+            evidence = f"{number} for {len(names)} agents, {names[0]} and {names[1]} among them"
+            self.add("few_generators", evidence)
+
+    def compare_episodes(self, used: SimulationAECEnv, first: Run) -> None:
+        """Repeat an episode in a new environment, in a used one, and beside another one."""
+        seed = self.seeds[0]
+        with self.environment(max_steps=self.max_steps) as new:
+            self.run_randomly(used, seed, most=1 + len(first.calls) // 2)
+            for name, env, beside in (
+                ("unrepeatable", new, None),
+                ("left_over", used, None),
+                ("disturbance", new, used),
+            ):
+                again = self.run_randomly(env, seed, beside=beside)
+                if self.fails(again, "after an episode that was closed in mid-episode"):
+                    return
+                if self.is_late or (beside and self.sources):
+                    return
+                if not self.repeats(first, again, name, f"seed {seed}, the same actions"):
+                    return
+            other = self.run_randomly(used, seed, skipped=1)
+            acts_alike = len(other.calls) <= 1 or repr(first.actions) == repr(other.actions)
+            if not acts_alike and not self.differences(first, other):
+                self.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
+        self.checked.append(
+            "the same seed and actions in a new environment, in a used one, and beside another one"
+        )
+
+    # -- the tests of PettingZoo and Gymnasium ----------------------------------------------------
+
+    def check_conformance(self) -> None:
+        """Run the tests of PettingZoo and Gymnasium, unless they would only repeat errors."""
+        passed_tests = []
+        for name, view, test in _TESTS:
+            if any(finding.severity == "error" for finding in self.findings):
+                break
+            if self.is_late or view not in self.views or (self.sources and "seed" in name):
+                continue
+            make = partial(self.make_environment, view, max_steps=self.max_steps)
+            run = self.call(partial(test, make))
+            if run.error is None:
+                passed_tests.append(name)
+            elif isinstance(run.error, AssertionError):
+                self.add("failed_test", describe_with_place(run.error), test=name)
+            # The tests ignore masks, or changes of masks.
+            elif not isinstance(run.error, (LimitReached, InvalidActionError)):
+                self.fails(run, f"in {name}", view)
+        if passed_tests:
+            self.checked.append(", ".join(passed_tests))

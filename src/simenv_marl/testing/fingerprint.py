@@ -10,9 +10,10 @@ from __future__ import annotations
 import random
 import re
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from enum import Enum
 from functools import cached_property
+from itertools import groupby
 from types import (
     BuiltinFunctionType,
     EllipsisType,
@@ -33,6 +34,10 @@ ABSENT: Final = Sentinel("nothing")
 """In a difference, the value of a part that one of the fingerprints does not have."""
 
 STATE: Final = "state of the generator"
+"""Stands in the path of the state of a random generator."""
+
+STEP: Final = "in step"
+"""Stands at the beginning of the path of a decision."""
 
 _ATOMS: Final = (
     int,
@@ -159,15 +164,25 @@ def _key(value: Model) -> tuple[Model, ...]:
     return type(value), None if is_nan else value
 
 
+def is_essential(path: str) -> bool:
+    """Return whether a path is one of a decision or of a generator, which must not differ."""
+    return path.startswith(STEP) or STATE in path
+
+
 def generalize(path: str) -> str:
     """Return the general form of a path, which is the same for all members of a list or dict."""
     return re.sub(r"\[[^\]]*\]", "[]", path)
 
 
-def describe_differences(parts: list[Difference]) -> str:
-    """Describe the differences of two fingerprints."""
-    texts = [
-        f"{path} is first {short_repr(first, 60)}, then {short_repr(second, 60)}"
-        for path, first, second in parts[:3]
-    ]
-    return "; ".join(texts + [f"{len(parts) - 3} more"] * (len(parts) > 3))
+def describe_differences(parts: Iterable[Difference]) -> str:
+    """Describe the first differences: of the decisions, and of the simulation."""
+    lines = []
+    for _, group in groupby(parts, lambda part: part.path.startswith(STEP)):
+        texts = [
+            f"{path} is first {short_repr(first, 60)}, then {short_repr(second, 60)}"
+            for path, first, second in group
+        ]
+        if len(texts) > 3:
+            texts[3:] = [f"{len(texts) - 3} more"]
+        lines.append("; ".join(texts))
+    return "\n".join(lines)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import io
-import math
 import os
 import random
 import sys
@@ -22,9 +21,10 @@ from collections.abc import (
     Iterable,
     Iterator,
 )
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from dataclasses import dataclass
 from datetime import date, datetime
+from functools import cached_property, partial
 from itertools import islice
 from textwrap import shorten
 from types import FrameType, coroutine
@@ -43,7 +43,8 @@ from ..core import (
     global_states,
     preserve_generators,
 )
-from ..envs import SimulationAECEnv
+from ..envs import VIEWS, SimulationAECEnv
+from ..envs.base import StepResult
 from ..errors import describe_error, error_notes
 from ..hooks.handlers import Installation
 from ..hooks.hook import Hook
@@ -53,20 +54,10 @@ from ..simulation import (
     TRUNCATED,
     Action,
     Model,
-    Observation,
     make_simulation,
     resetter,
 )
-from .fingerprint import (
-    Difference,
-    Fingerprint,
-    describe_differences,
-    differences,
-    fingerprint,
-)
-
-Step = tuple[Observation, float, bool, bool, dict[str, Any]]
-"""The result of ``last()``: observation, reward, terminated, truncated, info."""
+from .fingerprint import STEP, Fingerprint, fingerprint
 
 _WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appear in the episode")
 """Texts of the warnings that are findings."""
@@ -153,35 +144,31 @@ class Run:
     Attributes:
         simulation: The simulation; of a plain run, from its main loop on.
         calls: The name of the decision point, or of the agent, of each step.
-        steps: The decisions of the rules, or the results of ``last()``, as a fingerprint.
+        parts: The fingerprint of the steps (the decisions of the rules, or the results of
+            ``last()``), and of the simulation at the end or at the limit of decisions.
         results: The agents and results of ``last()`` in an episode of random actions.
         actions: Those actions.
-        fingerprint: The fingerprint of the simulation at the end, or at the limit of decisions.
         in_main_loop: Whether a plain run is in the main loop of the simulation.
         is_cut: Whether the run has reached the limit of decisions.
         end: "terminated" or "truncated".
-        error: The exception that ended the run.
+        error: The exception that ended the run, unless the limit of decisions did.
         is_stuck: Whether the last step began long before that exception.
         draws: The global generators that the run has used, by name.
     """
 
-    def __init__(
-        self, simulation: Model = None, state_of: Callable[[Model], Model] | None = None
-    ) -> None:
+    def __init__(self, state_of: Callable[[Model], Model] | None = None) -> None:
         """Begin the record.
 
         Args:
-            simulation: The simulation, if there is one already.
             state_of: A function of the simulation whose results are compared. None: the ``state()``
                 of the simulation, or else all its attributes.
         """
-        self.simulation = simulation
         self._state_of = state_of
+        self.simulation: Model = None
         self.calls: list[str] = []
-        self.steps: Fingerprint = {}
-        self.results: list[tuple[Agent, Step]] = []
+        self.parts: Fingerprint = {}
+        self.results: list[tuple[Agent, StepResult]] = []
         self.actions: list[Action] = []
-        self.fingerprint: Fingerprint = {}
         self.in_main_loop = False
         self.is_cut = False
         self.end = "terminated"
@@ -189,6 +176,29 @@ class Run:
         self.is_stuck = False
         self.draws: set[str] = set()
         self._step_began = time.monotonic()
+
+    def play(
+        self,
+        function: Callable[[], object],
+        seconds: float,
+        seed: int = 0,
+    ) -> Run:
+        """Call a function within a time limit; record its error and draws, and return the record.
+
+        The global generators are seeded first.
+        """
+        seed_global_generators(seed)
+        states = global_states()
+        try:
+            call_within(seconds, function)
+        except (Exception, SystemExit, LimitReached) as error:
+            if not self.is_cut:
+                self.error = error
+                self.is_stuck = time.monotonic() - self._step_began > seconds / 2
+        for name, state in global_states().items():
+            if state != states[name]:
+                self.draws.add(_GENERATORS[name])
+        return self
 
     def run_main_loop(self, simulation: Model) -> None:
         """Run the main loop of a simulation, and record its end and its fingerprint."""
@@ -198,35 +208,64 @@ class Run:
         self.in_main_loop = False
         self.take_fingerprint()
 
+    def play_rules(self, env: Any, seed: int) -> None:
+        """Play an episode of an environment with ``RULE`` throughout."""
+        self.simulation = env.simulation
+        env.reset(seed=seed)
+        while not env.episode.over:
+            env.step(RULE)
+        self.take_fingerprint()
+
+    def play_randomly(
+        self,
+        env: SimulationAECEnv,
+        seed: int,
+        skipped: int = 0,
+    ) -> Iterator[None]:
+        """Play an episode with random legal actions, and yield before each step.
+
+        ``skipped`` random actions before each step are not used.
+        """
+        env.reset(seed=seed)  # which also seeds the spaces of the actions
+        for name in env.agent_iter():
+            result = env.last()
+            _, _, terminated, truncated, info = result
+            agent = env.episode.agents.get(name) or env.episode.ended[name]
+            self.results.append((agent, result))
+            self.parts |= fingerprint(self.begin_step(name), result)
+            self.end = "truncated" if truncated else "terminated"
+            action = None
+            if not (terminated or truncated):
+                for _ in range(1 + skipped):
+                    action = env.action_space(name).sample(info.get(MASK))
+                self.actions.append(action)
+            yield
+            env.step(action)
+
     def begin_step(self, name: str) -> str:
         """Record the call of a decision point or agent; return the name of its step."""
         self.calls.append(name)
         self._step_began = time.monotonic()
-        step = f"in step {len(self.calls)}, {name}"
-        self.steps[step] = "without a result"
+        step = f"{STEP} {len(self.calls)}, {name}"
+        self.parts[step] = "without a result"
         return step
 
     def end_step(self, step: str, value: Model) -> Model:
         """Record the result of a step, and return it."""
-        self.steps |= fingerprint(step, value, follow=False)
+        self.parts |= fingerprint(step, value, follow=False)
         return value
-
-    def add_result(self, agent: Agent, result: Step) -> None:
-        """Record a step of an agent with its result of ``last()``."""
-        self.results.append((agent, result))
-        self.steps |= fingerprint(self.begin_step(agent.name), result)
-        self.end = "truncated" if result[3] else "terminated"
 
     def take_fingerprint(self) -> None:
         """Record the fingerprint of the simulation."""
         with outside_simulation():  # decision functions run their rule here
-            state = getattr(self.simulation, "state", None)
+            simulation = self.simulation
+            state = getattr(simulation, "state", None)
             if self._state_of is not None:
-                self.fingerprint = fingerprint("fingerprint", self._state_of(self.simulation))
+                self.parts |= fingerprint("fingerprint", self._state_of(simulation))
             elif callable(state):
-                self.fingerprint = fingerprint("state()", state())
+                self.parts |= fingerprint("state()", state())
             else:
-                self.fingerprint = fingerprint("simulation", self.simulation)
+                self.parts |= fingerprint("simulation", simulation)
 
     def stop(self) -> NoReturn:
         """Stop the run at the limit of decisions, as often as the model swallows the exit."""
@@ -235,82 +274,48 @@ class Run:
             self.take_fingerprint()
         raise LimitReached
 
-    def fail(self, error: BaseException, seconds: float = math.inf) -> None:
-        """Record an exception of a run with a time limit; ignore it at the limit of decisions."""
-        if not self.is_cut:
-            self.error = error
-            self.is_stuck = time.monotonic() - self._step_began > seconds / 2
 
-    def difference(self, other: Run) -> str:
-        """Describe the first differences from the steps of another run; empty if there are none."""
-        if other.error is not None:
-            return f"the second one raises {describe_with_place(other.error)}"
-        parts = differences(self.steps, other.steps)
-        if not parts and len(self.calls) != len(other.calls):
-            return f"there are first {len(self.calls)} steps, then {len(other.calls)}"
-        return describe_differences(parts)
-
-
-@dataclass(kw_only=True)
-class Subject:
-    """A simulation with its decision points, the limits of its runs, and the results so far.
+@dataclass
+class Runner:
+    """A simulation with its decision points, and the limits of its runs.
 
     Attributes:
-        plan: The simulation with its decision points and options.
+        make_plan: Makes the plan. It may call the simulation's constructor.
         max_steps: The limit of decisions in a run.
         seconds: The time limit of a run.
         state_of: As for ``Run``.
-        seeds: The seeds of plain runs.
-        episode_seeds: The seeds of episodes of random actions.
-        deadline: The end of the time limit for all checks, as ``time.monotonic()``.
-        plain_runs: The plain runs by seed.
-        draws: The global generators that the simulation uses, by name.
-        unstable: Parts of the fingerprint that are not compared.
-        views: The views that the plan allows. Empty if plain runs fail or decide nothing.
     """
 
-    plan: Plan
+    make_plan: Callable[[], Plan]
     max_steps: int
     seconds: float
-    state_of: Callable[[Model], Model] | None = None
-    seeds: list[int] = field(default_factory=list)
-    episode_seeds: Iterable[int] = ()
-    deadline: float = math.inf
-    plain_runs: dict[int, Run] = field(default_factory=dict)
-    draws: set[str] = field(default_factory=set)
-    unstable: set[str] = field(default_factory=set)
-    views: list[str] = field(default_factory=list)
+    state_of: Callable[[Model], Model] | None
 
-    @property
-    def is_late(self) -> bool:
-        """Whether the time is up."""
-        return time.monotonic() >= self.deadline
+    @cached_property
+    def plan(self) -> Plan:
+        """The simulation with its decision points and options."""
+        return self.make_plan()
 
-    def differences(self, run: Run, other: Run) -> list[Difference]:
-        """Return the differences between the simulations after two runs."""
-        return differences(run.fingerprint, other.fingerprint, self.unstable)
+    def make_environment(self, view: str, **options: Any) -> Any:
+        """Make an environment with changed options."""
+        if view != "joint" and self.plan.options.flatten:
+            options["flatten"] = False
+        plan = self.plan.amended(options)
+        return VIEWS[view](plan)
 
-    def record(
-        self,
-        function: Callable[[], object],
-        seed: int = 0,
-        run: Run | None = None,
-    ) -> Run:
-        """Call a function within the time limit, and record its error and draws.
+    def fitting_views(self) -> list[str]:
+        """Return the views that the plan allows."""
+        views = []
+        for view in VIEWS:
+            # The view may refuse the plan, or reset the model, which may raise anything.
+            with suppress(Exception):
+                self.make_environment(view).close()
+                views.append(view)
+        return views
 
-        The global generators are seeded first.
-        """
-        run = run or Run()
-        seed_global_generators(seed)
-        states = global_states()
-        try:
-            call_within(self.seconds, function)
-        except (Exception, SystemExit, LimitReached) as error:
-            run.fail(error, self.seconds)
-        for name, state in global_states().items():
-            if state != states[name]:
-                run.draws.add(_GENERATORS[name])
-        return run
+    def call(self, function: Callable[[], object]) -> Run:
+        """Call a function within the time limit."""
+        return Run().play(function, self.seconds)
 
     def run_plainly(self, seed: int, global_seed: int | None = None) -> Run:
         """Run the simulation's own loop, with the plan's handlers and generators.
@@ -318,7 +323,7 @@ class Subject:
         Records the decisions of the rules. The global generators get the same seed, or
         ``global_seed``.
         """
-        run = Run(None, self.state_of)
+        run = Run(self.state_of)
 
         def start() -> None:
             rng = GlobalRandom() if self.plan.options.global_rng else None
@@ -337,19 +342,8 @@ class Subject:
 
     def run_rules(self, env: Any, seed: int) -> Run:
         """Run an environment of any view with ``RULE`` throughout, and record the rules."""
-        run = Run(env.simulation, self.state_of)
-
-        def start() -> None:
-            env.reset(seed=seed)
-            if hasattr(env, "agents"):
-                while env.agents:
-                    env.step(RULE)
-            else:
-                while not any(env.step(RULE)[2:4]):
-                    pass
-            run.take_fingerprint()
-
-        return self._record_rules(run, start, seed)
+        run = Run(self.state_of)
+        return self._record_rules(run, partial(run.play_rules, env, seed), seed)
 
     def _record_rules(
         self,
@@ -362,7 +356,7 @@ class Subject:
         for hook in hooks:
             hook.replace_rule(self._recording_rule(hook, run))
         try:
-            return self.record(start, seed, run)
+            return run.play(start, self.seconds, seed)
         finally:
             for hook in hooks:
                 hook.replace_rule()
@@ -394,7 +388,7 @@ class Subject:
         env: SimulationAECEnv,
         seed: int,
         *,
-        salt: int = 0,
+        skipped: int = 0,
         most: int | None = None,
         beside: SimulationAECEnv | None = None,
     ) -> Run:
@@ -403,20 +397,20 @@ class Subject:
         Args:
             env: The environment.
             seed: The seed of the episode and its actions.
-            salt: Another salt gives other actions with the same seed.
+            skipped: Another number gives other actions with the same seed.
             most: The number of steps after which the episode is broken off.
             beside: Another environment, which is stepped in turns with this one.
         """
         run = Run()
 
         def start() -> None:
-            other = iter(()) if beside is None else _random_steps(Run(), beside, seed + 1, salt)
-            for _ in islice(_random_steps(run, env, seed, salt), most):
+            other = iter(()) if beside is None else Run().play_randomly(beside, seed + 1)
+            for _ in islice(run.play_randomly(env, seed, skipped), most):
                 next(other, None)
 
-        return self.record(start, seed, run)
+        return run.play(start, self.seconds, seed)
 
-    def sources_of_chance(self) -> str:
+    def sources_of_chance(self, seed: int) -> str:
         """Return where a plain run uses clocks, entropy and the global generators; or nothing."""
         places: list[str] = []
 
@@ -424,42 +418,19 @@ class Subject:
             source = _CHANCE.get(function) if event == "c_call" else None
             if frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
                 source = "a random.Random is made without a seed"
-            caller: FrameType | None = frame if source else None
-            while caller is not None and caller.f_code.co_filename.startswith((_LIBRARY, "<")):
-                caller = caller.f_back
-            if caller is not None and not caller.f_code.co_filename.startswith(_PACKAGE):
-                file, name = caller.f_code.co_filename, caller.f_code.co_name
-                places.append(f"{source} at {file}:{caller.f_lineno}, in {name}")
+            if source:
+                place = _innermost(traceback.extract_stack(frame), _LIBRARY)
+                if not place.startswith(_PACKAGE):
+                    places.append(f"{source} at {place}")
 
         before = sys.getprofile()
         sys.setprofile(profile)
         try:
-            self.run_plainly(self.seeds[0])
+            self.run_plainly(seed)
         finally:
             sys.setprofile(before)
         texts = list(dict.fromkeys(places))
         return f"\nin the model, {'; '.join(texts[:3])}" if texts else ""
-
-
-def _random_steps(
-    run: Run,
-    env: SimulationAECEnv,
-    seed: int,
-    salt: int,
-) -> Iterator[None]:
-    """Play an episode, record it, and yield before each step."""
-    env.reset(seed=seed)
-    for name in env.agent_iter():
-        step = env.last()
-        _, _, terminated, truncated, info = step
-        run.add_result(env.episode.agents.get(name) or env.episode.ended[name], step)
-        action = None
-        if not (terminated or truncated):
-            for _ in range(1 + salt):  # the reset has seeded the space
-                action = env.action_space(name).sample(info.get(MASK))
-            run.actions.append(action)
-        yield
-        env.step(action)
 
 
 # -- where errors and differences come from -------------------------------------------------------
@@ -482,12 +453,20 @@ _CHANCE: Final[dict[object, str]] = {
 """Builtin functions that are sources of chance."""
 
 
+def _innermost(frames: Iterable[traceback.FrameSummary], folder: str) -> str:
+    """Return the place of the last frame outside a folder; empty if there is none."""
+    places = [
+        f"{frame.filename}:{frame.lineno}, in {frame.name}"
+        for frame in frames
+        if not frame.filename.startswith((folder, "<"))
+    ]
+    return places[-1] if places else ""
+
+
 def place_of(error: BaseException) -> str:
     """Return the place in the user's code that raised an error; empty if there is none."""
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename:
-            return f"{frame.filename}:{frame.lineno}, in {frame.name}"
-    return ""
+    frames = traceback.extract_tb(error.__traceback__)
+    return _innermost((each for each in frames if "site-packages" not in each.filename), _PACKAGE)
 
 
 def describe_with_place(error: BaseException) -> str:

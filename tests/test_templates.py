@@ -114,7 +114,7 @@ def test_policies_answer_one_observation_as_they_answer_many(kind):
     ("names", "told"),
     [
         (["water tank", "2nd", "class", "_"], "cannot be the name of a module"),
-        (["\ufb01sh"], "is 'fish' in Python, which would not find the file"),
+        (["\ufb01sh"], "use lower-case letters"),
         (["json", "pytest", "simenv_marl"], "is the name of another module"),
         (["Mesa"], "cannot be the name of a module"),  # of the same file as mesa, on some systems
     ],

@@ -105,7 +105,6 @@ def check_simulation(
         state_of=fingerprint,
         seeds=list(map(int, unique_seeds)),
         most_episodes=episodes,
-        time_limit=time_limit,
     )
     with silence() as warnings:
         check.run()

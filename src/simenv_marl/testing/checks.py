@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, product
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
 from pettingzoo.test import (
     api_test,
     parallel_api_test,
@@ -82,24 +82,13 @@ _TESTS: Final = (
 """The tests and their views; each test is called with a factory of environments."""
 
 
-class Tally:
+class Tally(NamedTuple):
     """The number, the minimum, the maximum and the sum of arrays of one shape."""
 
-    def __init__(self) -> None:
-        self.number = 0
-        self.low = np.array(np.inf)
-        self.high = np.array(-np.inf)
-        self.total = np.array(0.0)
-
-    def add(self, value: Observation) -> None:
-        """Add an array or a number; skip it if the first one had another shape."""
-        array = np.array(value, float)
-        if self.number and array.shape != self.total.shape:
-            return
-        self.number += 1
-        self.low = np.minimum(self.low, array)
-        self.high = np.maximum(self.high, array)
-        self.total = self.total + array
+    number: int
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    total: NDArray[np.float64]
 
     def ranges(self, name: str) -> list[Range]:
         """Return the range of each element."""
@@ -128,7 +117,7 @@ class PointRecord:
         self.point = point
         self.decisions = 0
         self.outside = ""
-        self.tallies: defaultdict[str, Tally] = defaultdict(Tally)
+        self.tallies: dict[str, Tally] = {}
 
     def add(self, agent: str, result: StepResult) -> None:
         """Add a result of ``last()``, without its reward."""
@@ -143,7 +132,10 @@ class PointRecord:
             self.tally("mask", info.get(MASK))
 
     def tally(self, name: str, value: Observation) -> None:
-        """Add a number, an array, or a dict or tuple of these, to its tallies."""
+        """Add a number, an array, or a dict or tuple of these, to its tallies.
+
+        Arrays of another shape than the first one are left out.
+        """
         if isinstance(value, Mapping):
             for key, part in value.items():
                 if key != MASK:
@@ -152,7 +144,20 @@ class PointRecord:
             for number, part in enumerate(value):
                 self.tally(f"{name}.{number}", part)
         elif isinstance(value, (np.ndarray, np.generic, int, float)):
-            self.tallies[name].add(value)
+            array = np.array(value, float)
+            number, low, high, total = self.tallies.get(name) or (
+                0,
+                array,
+                array,
+                np.zeros_like(array),
+            )
+            if array.shape == total.shape:
+                self.tallies[name] = Tally(
+                    number + 1,
+                    np.minimum(low, array),
+                    np.maximum(high, array),
+                    total + array,
+                )
 
     def statistics(self) -> PointStatistics:
         """Return the statistics."""
@@ -178,10 +183,11 @@ class PointRecord:
 class Check(Runner):
     """A check: a simulation, the limits of its runs, and the results so far.
 
+    The time limit for all runs together is four times that for one.
+
     Attributes:
         seeds: The seeds of plain runs, and of the first episodes of random actions.
         most_episodes: The number of episodes of random actions.
-        time_limit: The time limit for all checks, in seconds.
         findings: The findings, with their names in ``FINDINGS``.
         checked, statistics, episodes: As in ``CheckReport``, but mutable.
         plain_runs: The plain runs by seed.
@@ -192,7 +198,6 @@ class Check(Runner):
 
     seeds: list[int]
     most_episodes: int
-    time_limit: float
 
     def __post_init__(self) -> None:
         """Begin the check."""
@@ -205,7 +210,7 @@ class Check(Runner):
         self.unstable: set[str] = set()
         self.sources: set[str] = set()
         self._errors: set[tuple[str, str]] = set()  # by class and place
-        self._deadline = time.monotonic() + self.time_limit
+        self._deadline = time.monotonic() + 4 * self.seconds
 
     def run(self) -> None:
         """Run the checks, the more basic first: if plain runs fail, the others are left out.
@@ -226,7 +231,7 @@ class Check(Runner):
         except (Exception, SystemExit) as error:  # of the model's constructor, for example
             self.add_error(error, "while the simulation was made or reset")
         if self.is_late:
-            self.add("out_of_time", f"after {self.time_limit:g} seconds")
+            self.add("out_of_time", f"after {4 * self.seconds:g} seconds")
 
     def report(self, simulation: str) -> CheckReport:
         """Return the report of a simulation with a name."""
@@ -249,9 +254,11 @@ class Check(Runner):
         self,
         name: str,
         evidence: str = "",
-        **words: str | int,
+        **words: str,
     ) -> None:
         """Add a finding of ``FINDINGS``; ``words`` replace the placeholders of its text."""
+        words["most"] = str(self.max_steps)
+        words["generators"] = " and ".join(sorted(self.sources))
         severity, *texts = FINDINGS[name]
         title, explanation = (" ".join(text.format(**words).split()) for text in texts)
         self.findings[Finding(severity, title, explanation, evidence)] = name
@@ -326,7 +333,7 @@ class Check(Runner):
             return
         self.views = self.fitting_views()
         if any(run.is_cut for run in (first, *others)):
-            self.add("cut_runs", most=self.max_steps)
+            self.add("cut_runs")
         if others and not any(self.differences(first, run) for run in others):
             self.add("same_seeds", f"seeds {', '.join(map(str, self.seeds))}")
 
@@ -342,21 +349,12 @@ class Check(Runner):
         if self.sources:
             differs = self.differences(first, other)
             name = "unseeded_generators" if differs else "shared_generators"
-            self.add_draws(name, self.sources_of_chance(seed).lstrip(), self.sources)
+            self.add(name, self.sources_of_chance(seed).lstrip())
         parts = self.differences(first, again)
         paths = {part.path for part in parts}
         self.unstable = {generalize(path) for path in paths if not is_essential(path)}
         if self.repeats(first, again, "unrepeatable", f"two plain runs of seed {seed}") and parts:
             self.add("unstable", describe_differences(parts))
-
-    def add_draws(
-        self,
-        name: str,
-        evidence: str,
-        generators: set[str],
-    ) -> None:
-        """Add a finding about global generators."""
-        self.add(name, evidence, names=" and ".join(sorted(generators)))
 
     # -- environments with RULE throughout --------------------------------------------------------
 
@@ -379,10 +377,9 @@ class Check(Runner):
             where = f"{view} view, driver {driver}, seed {seed}"
             if self.fails(run, f"in the {where}, with RULE throughout", view):
                 continue
-            draws = run.draws - self.sources
-            if draws:
-                self.add_draws("unseeded_generators", f"in the {where}", draws)
-                self.sources |= draws
+            if run.draws - self.sources:
+                self.sources |= run.draws
+                self.add("unseeded_generators", f"in the {where}")
             parts = self.differences(plain, run)
             name = "changed_model"
             if all(part.first is ABSENT and not is_essential(part.path) for part in parts):
@@ -435,7 +432,7 @@ class Check(Runner):
             if episodes:
                 self.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
             if self.episodes["cut"] == episodes > 0:
-                self.add("cut_runs", most=self.max_steps)
+                self.add("cut_runs")
             if episodes == len(seeds) and not self.is_unrepeatable:
                 self.compare_episodes(env, first)
             self.call(partial(env.reset, seed=seeds[0]))  # to close it in mid-episode
@@ -452,11 +449,14 @@ class Check(Runner):
         if statistics.never_legal:
             actions = ", ".join(map(str, statistics.never_legal[:10]))
             self.add("never_legal", f"actions {actions}", point=point)
-        rewards = statistics.rewards
-        number = record.tallies["reward"].number
-        if rewards is not None and rewards.minimum == rewards.maximum and number > 1:
-            name = "same_rewards" if rewards.minimum else "zero_rewards"
-            self.add(name, f"{number} rewards of {rewards.mean:.6g}", point=point)
+        rewards = record.tallies.get("reward")
+        if rewards is not None and rewards.low == rewards.high and rewards.number > 1:
+            name = "same_rewards" if rewards.low else "zero_rewards"
+            self.add(
+                name,
+                f"{rewards.number} rewards of {rewards.total / rewards.number:.6g}",
+                point=point,
+            )
 
     def check_generators(self, run: Run, simulation: Model) -> None:
         """Add a finding if entities share generators, unless the model has no generator."""

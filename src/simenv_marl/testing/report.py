@@ -62,7 +62,7 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
     ),
     "unseeded_generators": (
         "error",
-        "The model or a mapping draws from generators that the whole process shares ({names})",
+        "The model or a mapping draws from generators that the whole process shares ({generators})",
         """The same seed does not give the same episode: all other code that draws from these
         generators changes them. Give the model a generator of its own, random.Random(seed) or
         numpy.random.default_rng(seed), and seed it in reset(). If you cannot change the model,
@@ -102,7 +102,7 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
     ),
     "shared_generators": (
         "warning",
-        "The model uses generators that the whole process shares ({names})",
+        "The model uses generators that the whole process shares ({generators})",
         """The model seeds them itself, so that one environment repeats its episodes. But
         environments side by side and training code disturb each other. Give the model a
         generator of its own, or its environments the option global_rng=True.""",

@@ -323,9 +323,8 @@ class Runner:
         Records the decisions of the rules. The global generators get the same seed, or
         ``global_seed``.
         """
-        run = Run(self.state_of)
 
-        def start() -> None:
+        def start(run: Run) -> None:
             rng = GlobalRandom() if self.plan.options.global_rng else None
             installation = Installation(self.plan.patches)
             try:
@@ -338,25 +337,20 @@ class Runner:
             finally:
                 installation.uninstall()
 
-        return self._record_rules(run, start, seed if global_seed is None else global_seed)
+        return self._record_rules(start, seed if global_seed is None else global_seed)
 
     def run_rules(self, env: Any, seed: int) -> Run:
         """Run an environment of any view with ``RULE`` throughout, and record the rules."""
-        run = Run(self.state_of)
-        return self._record_rules(run, partial(run.play_rules, env, seed), seed)
+        return self._record_rules(lambda run: run.play_rules(env, seed), seed)
 
-    def _record_rules(
-        self,
-        run: Run,
-        start: Callable[[], None],
-        seed: int,
-    ) -> Run:
+    def _record_rules(self, start: Callable[[Run], None], seed: int) -> Run:
         """Play a run, and record the decisions of the rules."""
+        run = Run(self.state_of)
         hooks = {point.hook for point in self.plan.points}
         for hook in hooks:
             hook.replace_rule(self._recording_rule(hook, run))
         try:
-            return run.play(start, self.seconds, seed)
+            return run.play(partial(start, run), self.seconds, seed)
         finally:
             for hook in hooks:
                 hook.replace_rule()
@@ -437,17 +431,15 @@ class Runner:
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
 _LIBRARY: Final = random.__file__.rpartition("random.py")[0]
-_CLOCKS: Final = (
-    time.time,
-    time.time_ns,
-    time.monotonic,
-    time.perf_counter,
-    datetime.now,
-    date.today,
-)
 _CHANCE: Final[dict[object, str]] = {
-    **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},
-    **dict.fromkeys((random.random, random.getrandbits), "Python's global generator is used"),
+    time.time: "the clock is read (time)",
+    time.time_ns: "the clock is read (time_ns)",
+    time.monotonic: "the clock is read (monotonic)",
+    time.perf_counter: "the clock is read (perf_counter)",
+    datetime.now: "the clock is read (now)",
+    date.today: "the clock is read (today)",
+    random.random: "Python's global generator is used",
+    random.getrandbits: "Python's global generator is used",
     os.urandom: "the operating system is asked for random bits (as by a generator without a seed)",
 }
 """Builtin functions that are sources of chance."""

@@ -6,11 +6,11 @@ into it, and writes tests beside it. The modules also run as they are:
 """
 
 import keyword
+import re
 import shlex
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
-from unicodedata import normalize
 
 from ...errors import OptionValueError, short_repr
 
@@ -80,12 +80,8 @@ def _check_name(name: str) -> None:
     Raises:
         OptionValueError: It is invalid.
     """
-    normal = normalize("NFKC", name)
-    is_lower = name.isidentifier() and name == name.lower() and not name.startswith("_")
-    if not is_lower or keyword.iskeyword(name):
-        problem = "cannot be the name of a module"
-    elif normal != name:  # a ligature, for example
-        problem = f"is {normal!r} in Python, which would not find the file"
+    if not re.fullmatch("[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
+        problem = "cannot be the name of a module: use lower-case letters, digits and underscores"
     elif (spec := find_spec(name)) is not None and spec.origin is not None:
         problem = f"is the name of another module ({spec.origin}), which the new file would hide"
     else:

@@ -2,23 +2,19 @@
 
 import json
 import os
-from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Unpack
 
-from ... import aec_env
-from ...core import EpisodeOptions, Points
+from ...core import Decision, EpisodeOptions, Points
 from ...data import Trajectories, collect_episodes
-from ...envs import SimulationAECEnv
 from ...errors import (
     InvalidActionError,
     OptionValueError,
-    ResetNeededError,
     StoreError,
+    UnknownPointError,
     short_repr,
 )
-from ...simulation import Action, Model
+from ...simulation import Action, Model, Observation
 from ..policies import digest_of
 from .forms import Message, action_of
 
@@ -78,44 +74,31 @@ def replay(
             f"nothing was decided in episode {episode} of the {len(episodes)} of {path}"
         )
     seed, decisions = episodes[episode]
-    actions: list[Action] = []
+    lines = iter(decisions)
     problem = f"{short_repr(simulation)} does not repeat {path}"
+
+    def answer(observation: Observation, *, _decision: Decision) -> Action:
+        line = next(lines)
+        agent = _decision.agent
+        if agent != line["agent"] or digest_of(observation) != line["seen"]:
+            raise OptionValueError(
+                f"{problem}: decision {line['turn']} was one of {line['agent']!r}, and is now one"
+                f" of {agent!r}, or with another observation"
+            )
+        return action_of(_decision.action_space, line["action"])
+
+    options["max_steps"] = len(decisions)
     try:
-        with closing(aec_env(simulation, points, **options)) as env:
-            env.reset(seed=seed)
-            for turn, line in enumerate(decisions):
-                agent = _next_agent(env)
-                if agent != line["agent"] or digest_of(env.observe(agent)) != line["seen"]:
-                    raise OptionValueError(
-                        f"{problem}: decision {turn} was one of {line['agent']!r}, and is now one"
-                        f" of {agent!r}, or with another observation"
-                    )
-                actions.append(action_of(env.action_space(agent), line["action"]))
-                env.step(actions[-1])
-    except (InvalidActionError, ResetNeededError) as error:
+        trajectories = collect_episodes(
+            simulation,
+            {line["agent"]: answer for line in decisions},
+            seeds=[seed],
+            points=points,
+            **options,
+        )
+    except (InvalidActionError, UnknownPointError) as error:
         raise OptionValueError(f"{problem}: {error}") from error
-
-    def policy(
-        observations: object, infos: object, identities: Sequence[tuple[int, int]]
-    ) -> list[Action]:
-        return [actions[turn] for _, turn in identities]
-
-    agents = {line["agent"]: policy for line in decisions}
-    options["max_steps"] = len(actions)
-    return collect_episodes(
-        simulation,
-        agents,
-        seeds=[seed],
-        points=points,
-        **options,
-    )
-
-
-def _next_agent(env: SimulationAECEnv) -> str:
-    """Return the agent that decides next; "" at the end of the episode."""
-    while env.agents:
-        agent = env.agent_selection
-        if not (env.terminations[agent] or env.truncations[agent]):
-            return agent
-        env.step(None)
-    return ""
+    missing = list(lines)
+    if missing:
+        raise OptionValueError(f"{problem}: it ends before decision {missing[0]['turn']}")
+    return trajectories

@@ -1,15 +1,13 @@
 """A policy that asks a language model, over an endpoint that speaks OpenAI's chat completions."""
 
-import asyncio
 import json
 import os
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from inspect import cleandoc
 from itertools import chain
 from time import perf_counter
-from typing import Any, Final
+from typing import Any
 from uuid import uuid4
 from weakref import finalize
 
@@ -24,17 +22,9 @@ from ..errors import (
 )
 from ..many.parallel import import_extra
 from ..simulation import Action, Observation
-from .descriptions import Schema, action_schema, at_decision, describe, parse
+from . import descriptions
+from .descriptions import Schema, action_schema, at_decision, parse
 from .policies import check_count
-
-LONGEST_WAIT: Final = 30.0
-"""The longest time before a request is repeated, in seconds."""
-
-CONNECTION_ERRORS: Final = ("APIConnectionError", "APITimeoutError")
-"""The errors of the client that may pass and have no status."""
-
-TRANSIENT_STATUSES: Final = (408, 409, 429)
-"""The statuses below 500 that may pass: a timeout, a conflict, too many requests."""
 
 Message = dict[str, str]
 """A message of the conversation, with its ``role`` and ``content``."""
@@ -45,9 +35,9 @@ class LanguageModelPolicy:
 
     A request contains the decision as ``describe`` puts it, and the JSON schema of the legal
     actions. Endpoints without structured output are asked without a schema; an answer in plain text
-    is parsed. The policy validates each answer. After an illegal answer or a failure that may pass,
-    it asks again. Then it raises an error, which a ``FallbackPolicy`` catches. In clones, the rule
-    decides.
+    is parsed. The policy validates each answer. After an illegal or a missing answer it asks again;
+    the client repeats failed requests. Then the policy raises an error, which a ``FallbackPolicy``
+    catches. In clones, the rule decides.
 
     Attributes:
         model: The name of the model.
@@ -84,7 +74,8 @@ class LanguageModelPolicy:
                 ``simenv_marl.seats.describe``.
             history: How many of the latest decisions of the same agent, with their answers, each
                 request contains.
-            retries: How often the model is asked again for a decision.
+            retries: How often the model is asked again for a decision, and how often a new client
+                repeats a request.
             timeout: The time limit of a request, in seconds.
             structured: Whether to ask for structured output.
             client: An ``openai.AsyncOpenAI``, or an object like it, to use instead of a new one.
@@ -105,7 +96,7 @@ class LanguageModelPolicy:
         self._base_url = base_url
         self._api_key = api_key
         self._instructions = instructions
-        self._describe = describe
+        self._describe = describe or descriptions.describe
         self._history_length = history
         self._retries = retries
         self._request = {"timeout": timeout, **request}
@@ -136,7 +127,7 @@ class LanguageModelPolicy:
         return text
 
     def _prompt(self, decision: Decision) -> str:
-        return f"{self._system_text(decision)}\n\n{self._question(decision)}"
+        return f"{self._system_text(decision)}\n\n{self._describe(decision)}"
 
     async def __call__(
         self, observation: Observation, info: object = None, *, _decision: Decision
@@ -151,33 +142,28 @@ class LanguageModelPolicy:
         turns: deque[tuple[Message, Message]] = _decision.memory.setdefault(
             self._token, deque(maxlen=self._history_length)
         )
-        question = {"role": "user", "content": self._question(_decision)}
+        question = {"role": "user", "content": self._describe(_decision)}
         messages = [
             {"role": "system", "content": self._system_text(_decision)},
             *chain.from_iterable(turns),
             question,
         ]
-        retry = 0
-        while True:
+        for retry in range(self._retries + 1):
+            text = ""
             try:
                 text = await self._ask(messages, _decision)
                 action = parse(_decision, text)
-            except InvalidActionError as error:
+                break
+            except (InvalidActionError, _NoAnswerError) as error:
                 if retry == self._retries:
                     raise
-                messages += [
-                    {"role": "assistant", "content": text},
-                    {"role": "user", "content": str(error)},
-                ]
-            except _TransientError as error:
-                if retry == self._retries:
-                    raise LanguageModelError(f"{self.model} gave no answer: {error}") from error
-                seconds = max(error.seconds, 0.5 * 2**retry)
-                await asyncio.sleep(min(LONGEST_WAIT, seconds))
-            else:
-                turns.append((question, {"role": "assistant", "content": text}))
-                return action
-            retry += 1
+                if text:
+                    messages += [
+                        {"role": "assistant", "content": text},
+                        {"role": "user", "content": str(error)},
+                    ]
+        turns.append((question, {"role": "assistant", "content": text}))
+        return action
 
     # -- prompts ----------------------------------------------------------------------------------
 
@@ -193,20 +179,14 @@ class LanguageModelPolicy:
             lines.append(self._instructions)
         return "\n".join(lines)
 
-    def _question(self, decision: Decision) -> str:
-        if self._describe is not None:
-            return self._describe(decision)
-        text: str = describe(decision)
-        return text
-
     # -- requests ---------------------------------------------------------------------------------
 
     async def _ask(self, messages: list[Message], decision: Decision) -> str:
         """Send a request; return the text of the answer.
 
         Raises:
-            LanguageModelError: The request cannot succeed.
-            _TransientError: The same request may succeed later.
+            LanguageModelError: The request failed.
+            _NoAnswerError: The model did not answer.
         """
         request: dict[str, object] = {
             "model": self.model,
@@ -226,7 +206,9 @@ class LanguageModelPolicy:
             if self.structured and _refuses_schema(error):
                 self.structured = False
                 return await self._ask(messages, decision)
-            raise _request_error(self.model, error) from error
+            raise LanguageModelError(
+                f"{self.model} cannot be asked: {describe_error(error)}"
+            ) from error
         finally:
             count(self._token, requests=1, seconds=perf_counter() - start)
         usage = getattr(response, "usage", None)
@@ -238,11 +220,12 @@ class LanguageModelPolicy:
         try:
             message = response.choices[0].message
         except (AttributeError, LookupError, TypeError):
-            raise _TransientError(
-                f"the endpoint returned no chat completion but {short_repr(response)}"
+            raise _NoAnswerError(
+                f"{self.model} gave no answer: the endpoint returned {short_repr(response)}"
             ) from None
         if not isinstance(message.content, str) or not message.content.strip():
-            raise _TransientError(f"it refused: {short_repr(getattr(message, 'refusal', None))}")
+            refusal = short_repr(getattr(message, "refusal", None))
+            raise _NoAnswerError(f"{self.model} gave no answer: it refused: {refusal}")
         return message.content
 
     def _default_client(self) -> Any:
@@ -251,7 +234,7 @@ class LanguageModelPolicy:
             client = openai.AsyncOpenAI(
                 base_url=self._base_url,
                 api_key=self._api_key,
-                max_retries=0,
+                max_retries=self._retries,
             )
             finalizer = finalize(self, _close, client, os.getpid())
             finalizer.atexit = False
@@ -259,16 +242,8 @@ class LanguageModelPolicy:
         return self._own_client
 
 
-class _TransientError(Exception):
-    """A request failed in a way that may not happen again.
-
-    Attributes:
-        seconds: The time to wait before the next request, if the endpoint says so; else 0.0.
-    """
-
-    def __init__(self, text: str, seconds: float = 0.0) -> None:
-        super().__init__(text)
-        self.seconds = seconds
+class _NoAnswerError(LanguageModelError):
+    """The endpoint has answered, but not the model."""
 
 
 def _answer_schema(decision: Decision) -> Schema:
@@ -284,21 +259,6 @@ def _refuses_schema(error: Exception) -> bool:
     """Return whether an endpoint has refused a request because of its ``response_format``."""
     status = getattr(error, "status_code", None)
     return status in (400, 404, 422) and "response_format" in str(error)
-
-
-def _request_error(model: str, error: Exception) -> Exception:
-    """Make the error that ``_ask`` raises for an error of the client."""
-    status = getattr(error, "status_code", None)
-    text = describe_error(error)
-    if status is None and type(error).__name__ not in CONNECTION_ERRORS:
-        return LanguageModelError(f"{model} cannot be asked: {text}")
-    if status is not None and status < 500 and status not in TRANSIENT_STATUSES:
-        return LanguageModelError(f"the endpoint refuses to ask {model}: {text}")
-    headers = getattr(getattr(error, "response", None), "headers", None) or {}
-    seconds = 0.0
-    with suppress(ValueError):  # it may be a date
-        seconds = float(headers.get("retry-after", 0.0))
-    return _TransientError(text, seconds)
 
 
 def _close(client: Any, process: int) -> None:

@@ -150,7 +150,8 @@ def differences(
     """Return the parts that differ, unless ``ignored`` has the general form of their path."""
     paths = list(dict.fromkeys([*one, *other]))
     if max(len(one), len(other)) >= MOST_PARTS:
-        paths = [path for path in one if path in other]
+        common = one.keys() & other.keys()
+        paths = [path for path in paths if path in common or path.startswith(STEP)]
     parts = [Difference(path, one.get(path, ABSENT), other.get(path, ABSENT)) for path in paths]
     different = [part for part in parts if _key(part.first) != _key(part.second)]
     return [part for part in different if generalize(part.path) not in ignored]

@@ -93,8 +93,11 @@ class LanguageModelPolicy:
             )
         self.model = model
         self.structured = structured
-        self._base_url = base_url
-        self._api_key = api_key
+        self._client_options: dict[str, object] = {
+            "base_url": base_url,
+            "api_key": api_key,
+            "max_retries": retries,
+        }
         self._instructions = instructions
         self._describe = describe or descriptions.describe
         self._history_length = history
@@ -231,11 +234,7 @@ class LanguageModelPolicy:
     def _default_client(self) -> Any:
         if self._own_client is None:
             openai = import_extra("openai", "LanguageModelPolicy")
-            client = openai.AsyncOpenAI(
-                base_url=self._base_url,
-                api_key=self._api_key,
-                max_retries=self._retries,
-            )
+            client = openai.AsyncOpenAI(**self._client_options)
             finalizer = finalize(self, _close, client, os.getpid())
             finalizer.atexit = False
             self._own_client = client

@@ -176,10 +176,8 @@ def _value_text(value: JSON) -> str:
 
 def legal_actions(space: Discrete, mask: Mask | None) -> list[int]:
     """Return the actions of a ``Discrete`` space that a mask allows; all without a mask."""
-    first = int(space.start)
-    if mask is None:
-        return list(range(first, first + int(space.n)))
-    return [first + offset for offset in np.flatnonzero(mask).tolist()]
+    offsets = range(space.n) if mask is None else np.flatnonzero(mask)
+    return [int(space.start + offset) for offset in offsets]
 
 
 def legal_labels(decision: Decision) -> dict[str, int]:
@@ -259,19 +257,16 @@ def _schema(space: Space[Any], labels: Labels) -> Schema:
         case Dict():
             labels = [str(_label(labels, key)) for key in space]
             parts = [_schema(part, None) for part in space.values()]
-        case Tuple():
-            parts = [_schema(part, None) for part in space]
+        case Tuple() | MultiDiscrete(shape=(_,)):
+            parts = [_schema(space[place], None) for place in range(len(space))]
         case Box(shape=(_,)):
             parts = map(_range, space.low.tolist(), space.high.tolist())
-        case MultiDiscrete(shape=(_,)):
-            last = space.start + space.nvec - 1
-            parts = map(_range, space.start.tolist(), last.tolist())
         case MultiBinary(shape=(size,)):
             parts = [_range(0, 1)] * size
         case _:
             raise ViewError(f"actions of the space {short_repr(space)} cannot be put into words")
     parts = list(parts)
-    names = labels or _indices(len(parts))
+    names = labels or list(map(str, range(len(parts))))
     return {
         "type": "object",
         "properties": dict(zip(names, parts, strict=True)),
@@ -281,16 +276,9 @@ def _schema(space: Space[Any], labels: Labels) -> Schema:
 
 
 def _range(low: float, high: float) -> Schema:
-    schema: Schema = {"type": "number" if isinstance(low, float) else "integer"}
-    if isfinite(low):
-        schema["minimum"] = low
-    if isfinite(high):
-        schema["maximum"] = high
-    return schema
-
-
-def _indices(length: int) -> list[str]:
-    return [str(index) for index in range(length)]
+    bounds = {"minimum": low, "maximum": high}
+    finite = {key: bound for key, bound in bounds.items() if isfinite(bound)}
+    return {"type": "number" if isinstance(low, float) else "integer", **finite}
 
 
 # -- answers --------------------------------------------------------------------------------------
@@ -418,7 +406,7 @@ def _listed(value: Action, labels: Labels) -> Action:
     """Return the components of an object as a list, and another value as it is."""
     if not isinstance(value, Mapping):
         return value
-    names = labels or _indices(len(value))
+    names = labels or list(map(str, range(len(value))))
     if set(value) != set(names):
         raise ValueError("components are missing, or unknown")
     return [value[name] for name in names]

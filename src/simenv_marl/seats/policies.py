@@ -70,14 +70,10 @@ class FallbackPolicy(PolicyWrapper):
         Raises:
             OptionValueError: An argument has an invalid value.
         """
-        self._ask_fallback: Caller | None = None
-        parameters = {"_decision"}
-        if callable(fallback):
-            self._ask_fallback = Caller(fallback)
-            parameters.update(self._ask_fallback.names)
-        elif fallback is not RULE:
+        if fallback is not RULE and not callable(fallback):
             raise OptionValueError(f"fallback must be RULE or a policy, not {short_repr(fallback)}")
-        super().__init__(policy, asks=parameters)
+        self._ask_fallback = Caller(fallback if callable(fallback) else _leave_to_rule)
+        super().__init__(policy, asks=("_decision", *self._ask_fallback.names))
         if timeout is not None and not (isinstance(timeout, (int, float)) and timeout > 0):
             raise OptionValueError(
                 f"timeout must be a number of seconds or None, not {short_repr(timeout)}"
@@ -137,8 +133,6 @@ class FallbackPolicy(PolicyWrapper):
                 self._note(decision, "failed", error)
         self._count(decision, "fallbacks")
         decision.count_fallback()
-        if self._ask_fallback is None:
-            return RULE
         answer = self._ask_fallback(*arguments)
         if isawaitable(answer):
             return await answer
@@ -170,6 +164,10 @@ class FallbackPolicy(PolicyWrapper):
     def _count(self, decision: Decision, kind: str) -> None:
         if not decision.in_clone:
             count(self._token, **{kind: 1})
+
+
+def _leave_to_rule(observation: Observation) -> Action:
+    return RULE
 
 
 def _run_without_waiting(coroutine: Coroutine[None, None, Action]) -> Action:

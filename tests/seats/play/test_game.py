@@ -281,7 +281,8 @@ def test_after_the_limit_the_rule_decides_and_is_counted(make_game, monkeypatch)
     monkeypatch.setattr("simenv_marl.seats.play.game.monotonic", lambda: next(times))
     game.deadline = 0.0
     game.serve(Connection())
-    assert game.late["buyer"] == sum(row.get("by") == "limit" for row in game.timeline) >= 1
+    late = sum(row.get("by") == "limit" for row in game.timeline)
+    assert game.snapshot()["late"]["buyer"] == late >= 1
     assert (game.timeline[0]["action"], game.timeline[0]["by"]) == (None, "limit")
 
 

@@ -88,7 +88,6 @@ class Game:
         can_fork: Whether checkpoints can be made. Else the way back is a replay.
         horizon: The number of an agent's decisions in its futures.
         occupied: The seats that people have.
-        late: The number of decisions of each seat that the rule took because of the time limit.
         checkpoints: The checkpoints, by turn.
         root: The environment that was made for the game.
         env: The environment at the pending decision: ``root`` or a clone.
@@ -115,7 +114,6 @@ class Game:
     can_fork: bool = True
     horizon: int = 8
     occupied: Collection[str] = ()
-    late: Counter[str] = field(default_factory=Counter)
     checkpoints: dict[int, Checkpoint] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -338,7 +336,6 @@ class Game:
             EOFError: The message is the end, or the connection is closed.
         """
         if self.now is not None and self._seconds_left() == 0.0:
-            self.late[self.now["agent"]] += 1
             self.decide(None, "limit")
             return True
         if not connection.poll(timeout):
@@ -491,7 +488,7 @@ class Game:
             "returns": self.returns,
             "history": self.timeline[max(0, self.turn - MOST_ROWS) : self.turn + 1],
             "left": self._seconds_left(),
-            "late": self.late,
+            "late": Counter(row["agent"] for row in self.timeline if row.get("by") == "limit"),
             "picture": self.picture,
             "notice": self.notice,
         }

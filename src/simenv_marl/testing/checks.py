@@ -373,7 +373,7 @@ class Check(Runner):
                 continue
             seed_global_generators(seed)
             with self.environment(view, driver=driver, **rules) as env:
-                run = self.run_rules(env, seed)
+                run = self.record_rules(partial(Run.play_rules, env=env, seed=seed), seed)
             where = f"{view} view, driver {driver}, seed {seed}"
             if self.fails(run, f"in the {where}, with RULE throughout", view):
                 continue

@@ -337,14 +337,13 @@ class Runner:
             finally:
                 installation.uninstall()
 
-        return self._record_rules(start, seed if global_seed is None else global_seed)
+        return self.record_rules(start, seed if global_seed is None else global_seed)
 
-    def run_rules(self, env: Any, seed: int) -> Run:
-        """Run an environment of any view with ``RULE`` throughout, and record the rules."""
-        return self._record_rules(lambda run: run.play_rules(env, seed), seed)
+    def record_rules(self, start: Callable[[Run], None], seed: int) -> Run:
+        """Play a run, and record the decisions of the rules.
 
-    def _record_rules(self, start: Callable[[Run], None], seed: int) -> Run:
-        """Play a run, and record the decisions of the rules."""
+        ``start`` plays it.
+        """
         run = Run(self.state_of)
         hooks = {point.hook for point in self.plan.points}
         for hook in hooks:

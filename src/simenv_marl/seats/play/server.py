@@ -123,8 +123,8 @@ class Table:
         link = Link(websocket)
         number = next(self._numbers)
         if len(self.links) >= MOST_PAGES:
-            spectators = [other for other in self.links if other not in self._seats]
-            closed = self.links[spectators[0]] if spectators else link
+            spectators = (self.links[other] for other in self.links if other not in self._seats)
+            closed = next(spectators, link)
             with suppress(RuntimeError):
                 await closed.websocket.close(1013)  # try again later
         self.links[number] = link

@@ -380,6 +380,58 @@ def test_containers_come_back_with_their_living_elements():
     assert type(restore(held["row"])) is Row
 
 
+class Field(SimulationInterface):
+    """Its entities decide over an array."""
+
+    def reset(self, seed=None):
+        self.cells = [Item(number) for number in range(2)]
+
+    def choose(self, cell, field):
+        return 0
+
+    def run(self):
+        for size in (1.0, 2.0):
+            for cell in self.cells:
+                self.choose(cell, np.full(3, size))
+
+
+def test_arrays_among_several_arguments_are_read_again():
+    given = define(
+        observation_space=spaces.Box(0, 9, (3,)),
+        observation_space_mapping=lambda model, cell, field: field,
+        agent=lambda model, cell: f"cell_{cell.number}",
+    )
+    env = parallel_env(Field, {f"{__name__}.Field.choose": given})
+    env.reset(seed=1)
+    observations, *_ = env.step({"cell_0": 0})
+    assert observations["cell_0"].tolist() == [1.0] * 3
+
+
+def pick(items):
+    return items[0]
+
+
+def test_a_list_as_the_first_argument_is_held_weakly():
+    class Picker(SimulationInterface):
+        def reset(self, seed=None):
+            self.freed = []
+
+        def run(self):
+            for _ in range(2):
+                items = [Item(1)]
+                reference = weakref.ref(items[0])
+                pick(items)
+                del items
+                self.freed.append(reference() is None)
+
+    points = {f"{__name__}.pick": define(observation_space_mapping=lambda: [0.0, 0.0])}
+    simulation = single_env(Picker, points)
+    simulation.reset(seed=1)
+    simulation.step(RULE)
+    simulation.step(RULE)
+    assert simulation.unwrapped.simulation.freed == [True, True]
+
+
 def test_a_set_that_the_model_holds_is_read_as_it_stands():
     from simenv_marl.core.episodes.arguments import restore, weaken
 

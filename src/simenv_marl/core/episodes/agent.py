@@ -19,7 +19,7 @@ from ..plans.policies import Info, Where
 from ..switching.driver import AnyHandler
 from ..values.actions import MASK, Mask, only_choice
 from ..values.spaces import duplicate
-from .arguments import Arguments, Recalled, weaken
+from .arguments import Arguments, freed, weaken
 from .decision import Decision
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ class DecisionHandler(AnyHandler, Protocol):
     def warn_of_several(self, agent: str) -> None:
         """Warn once that several objects decide under the name of one agent."""
 
-    def warn_of_gone(self, call: Recalled, effect: str) -> None:
-        """Warn once that the model has freed an argument that mappings take."""
+    def warn_of_gone(self, gone: set[int | str], effect: str) -> None:
+        """Warn once that the model has freed arguments that mappings take."""
 
 
 class RunningEpisode(Protocol):
@@ -294,7 +294,7 @@ class Agent:
         """Describe the decision of the agent."""
         point = self.point
         choices = self.choices
-        call = self.arguments.recall()
+        args, kwargs = self.arguments.recall()
         return Decision(
             agent=self.name,
             point=point.hook.name,
@@ -305,8 +305,8 @@ class Agent:
             action_space=point.definition.action_space,
             mask=None if self.mask is None else duplicate(self.mask),
             choices=None if choices is None else list(choices),
-            action_labels=point.action_labels(choices, call.args, call.kwargs),
-            observation_labels=point.observation_labels(call.args, call.kwargs),
+            action_labels=point.action_labels(choices, args, kwargs),
+            observation_labels=point.observation_labels(args, kwargs),
             reward=self.reward,
             doc=point.hook.function.__doc__,
             in_clone=where is not Where.USER,
@@ -445,33 +445,29 @@ class Agent:
         if arguments.is_empty:
             self.clear_observation()
             return
-        call = arguments.recall()
-        if call.is_whole:
-            self.update(call.args, call.kwargs, reward=reward, last=last)
-        else:
-            self._refresh_in_part(call, reward, last)
-
-    def _refresh_in_part(self, call: Recalled, reward: bool, last: bool) -> None:
+        args, kwargs = arguments.recall()
+        gone = freed(args, kwargs)
+        if not gone:
+            self.update(args, kwargs, reward=reward, last=last)
+            return
         point = self.point
-        observes = not any(
-            mapping.takes_any(call.places, call.keys) for mapping in point.takes_for_observation
-        )
-        pays = not point.takes_for_reward.takes_any(call.places, call.keys)
+        observes = not any(mapping.takes_any(gone) for mapping in point.takes_for_observation)
+        pays = not point.takes_for_reward.takes_any(gone)
         if not observes:
             self.clear_observation()
         self.reward = 0.0
         if reward and not pays and self.decided:
-            self.handler.warn_of_gone(call, "the reward is 0.0")
+            self.handler.warn_of_gone(gone, "the reward is 0.0")
         elif not observes and self.decided:
-            self.handler.warn_of_gone(call, "the last observation stays")
+            self.handler.warn_of_gone(gone, "the last observation stays")
         if pays or observes:
-            self.update(call.args, call.kwargs, reward=reward and pays, observe=observes, last=last)
+            self.update(args, kwargs, reward=reward and pays, observe=observes, last=last)
 
     def conclude(self) -> None:
         """End the agent's episode: give it its last reward and observation."""
         self.refresh(last=True)
         self.carry_reward(False)
-        self.arguments.clear()
+        self.arguments = Arguments(self.point)
         self.answered_at = None
 
     def end(self) -> None:

@@ -8,65 +8,39 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from copy import copy
 from functools import partial
+from operator import is_
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Final
 from weakref import ReferenceType, ref
 
-import numpy as np
-
 from ...hooks.hook import BOUND
-from ...simulation import Model
+from ...simulation import Model, Sentinel
 from ..plans.point import Args, Kwargs, Point
 
-_ATOMS: Final = frozenset((bool, bytes, complex, float, int, str, type(None)))
+_ATOMS: Final[frozenset[type]] = frozenset((bool, bytes, complex, float, int, str, type(None)))
 """Types of values that refer to nothing."""
 
-_KEPT: Final = (
-    BuiltinFunctionType, FunctionType, MethodType, complex, float, int, str, bytes, type,
-    np.ndarray, np.generic,
-)  # fmt: skip
-"""Types of values that are kept: functions, classes, arrays, numbers and text."""
+_KEPT: Final = (*_ATOMS, BuiltinFunctionType, FunctionType, MethodType, type)
+"""Types of values that are kept: numbers, text, functions and classes."""
 
 _LIBRARY: Final = __name__.partition(".")[0]
 
-
-class _Gone:
-    """The place of an object that the model has freed."""
-
-    def __repr__(self) -> str:
-        return "<an object that the model has freed>"
+GONE: Final = Sentinel("GONE")
+"""The place of an object that the model has freed."""
 
 
-GONE: Final = _Gone()
+_is_gone: Final = partial(is_, GONE)  # because arrays compare element by element
 
 
-class Recalled:
-    """Arguments, as they were held.
-
-    Attributes:
-        args: The positional arguments that mappings take. ``GONE`` in place of those that are gone.
-        kwargs: The keyword arguments that mappings take.
-        is_whole: Whether none of them is gone.
-    """
-
-    __slots__ = ("args", "is_whole", "kwargs")
-
-    def __init__(self, args: Args, kwargs: Kwargs) -> None:
-        self.args = args
-        self.kwargs = kwargs
-        self.is_whole = GONE not in args and GONE not in kwargs.values()
-
-    @property
-    def places(self) -> set[int]:
-        """The numbers of the positional arguments that are gone."""
-        return {place for place, value in enumerate(self.args) if value is GONE}
-
-    @property
-    def keys(self) -> set[str]:
-        """The keyword arguments that are gone."""
-        return {key for key, value in self.kwargs.items() if value is GONE}
+def freed(args: Args, kwargs: Kwargs) -> set[int | str]:
+    """Return the numbers and the keywords of the arguments that the model has freed."""
+    if not any(map(_is_gone, (*args, *kwargs.values()))):
+        return set()
+    pairs: Iterable[tuple[int | str, Model]] = (*enumerate(args), *kwargs.items())
+    return {key for key, value in pairs if value is GONE}
 
 
 class Arguments:
@@ -78,55 +52,43 @@ class Arguments:
         is_empty: Whether no arguments are held.
     """
 
-    __slots__ = ("_args", "_keys", "_kwargs", "_number", "first", "is_empty", "is_single")
+    __slots__ = ("_args", "_kwargs", "_point", "first", "is_empty", "is_single")
 
     def __init__(self, point: Point) -> None:
         """Prepare to hold the arguments of decisions at a point."""
-        self._number = point.taken_places
-        self._keys = point.taken_keys
+        self._point = point
         self.first: Callable[[], Model] = _nothing
         self.is_single = False
         self.is_empty = True
-        self._args: tuple[Model, ...] = ()
+        self._args: Args = ()
         self._kwargs: Kwargs = BOUND
-
-    def clear(self) -> None:
-        """Hold nothing."""
-        self.first = _nothing
-        self.is_single = False
-        self.is_empty = True
-        self._args = ()
-        self._kwargs = BOUND
 
     def store(self, args: Args, kwargs: Kwargs) -> None:
         """Hold the arguments of a call."""
         self.is_empty = False
-        self.first = _nothing
-        if args and type(args[0]) not in _ATOMS:
-            try:
-                self.first = ref(args[0])
-            except TypeError:  # of a class without weak references
-                self.first = partial(_same, args[0])
-        if self._number is not None:
-            args = args[: self._number]
-        self._args = tuple(map(weaken, args))
+        self._args = tuple(map(weaken, args[: self._point.taken_places]))
         self._kwargs = BOUND
-        if kwargs and self._keys != frozenset():
+        if kwargs:
+            taken = self._point.taken
             self._kwargs = {
-                key: weaken(value)
-                for key, value in kwargs.items()
-                if self._keys is None or key in self._keys
+                key: weaken(value) for key, value in kwargs.items() if taken is None or key in taken
             }
-        self.is_single = self._args == (self.first,) and self._kwargs is BOUND
+        first = _nothing
+        if args:
+            held = self._args[0] if self._args else weaken(args[0])
+            if isinstance(held, (ReferenceType, _Held)):
+                first = held
+            elif type(held) not in _ATOMS:  # of a class without weak references
+                first = partial(_same, held)
+        self.first = first
+        self.is_single = (
+            isinstance(first, ReferenceType) and len(self._args) == 1 and not self._kwargs
+        )
 
-    def recall(self) -> Recalled:
-        """Return the arguments that are held, with those that are gone."""
-        if self.is_single:
-            entity = self.first()
-            return Recalled((GONE if entity is None else entity,), BOUND)
+    def recall(self) -> tuple[Args, Kwargs]:
+        """Return the arguments that are held. ``GONE`` in place of those that are freed."""
         args = tuple(map(restore, self._args))
-        kwargs = {key: restore(value) for key, value in self._kwargs.items()}
-        return Recalled(args, kwargs)
+        return args, {key: restore(value) for key, value in self._kwargs.items()}
 
 
 def _nothing() -> None:
@@ -140,99 +102,55 @@ def _same(value: Model) -> Model:
 # -- values that are held weakly ------------------------------------------------------------------
 
 
-class _Held:
-    """The place of a container that has weakly held content."""
-
-    __slots__ = ()
-
-    def restore(self) -> Model:
-        """Return the container with its living elements."""
-        raise NotImplementedError
+class _Held(partial[Model]):
+    """The place of a container that has weakly held content. A call returns what lives of it."""
 
 
-class _Constant(_Held):
-    """A weak reference that the model itself has passed."""
-
-    __slots__ = ("_value",)
-
-    def __init__(self, value: Model) -> None:
-        self._value = value
-
-    def restore(self) -> Model:
-        return self._value
+def _living(elements: Iterable[Model]) -> list[Model]:
+    values = map(restore, elements)
+    return [value for value in values if value is not GONE]
 
 
-class _Sequence(_Held):
-    """A list or a tuple. A named tuple is gone with any of its elements."""
-
-    __slots__ = ("_elements", "_kind")
-
-    def __init__(self, value: list[Model] | tuple[Model, ...], elements: list[Model]) -> None:
-        self._elements = elements
-        self._kind: Model = type(value)
-
-    def restore(self) -> Model:
-        elements = [restore(element) for element in self._elements]
-        living = [element for element in elements if element is not GONE]
-        if hasattr(self._kind, "_make"):
-            return self._kind._make(living) if len(living) == len(elements) else GONE
-        return tuple(living) if issubclass(self._kind, tuple) else living
+def _sequence(kind: Model, elements: list[Model]) -> Model:
+    """Return a list or a tuple. A named tuple is gone with any of its elements."""
+    living = _living(elements)
+    if hasattr(kind, "_make"):
+        return kind._make(living) if len(living) == len(elements) else GONE
+    return tuple(living) if issubclass(kind, tuple) else living
 
 
-class _Dict(_Held):
-    """A dict. Its entries go with their keys and with their values."""
-
-    __slots__ = ("_entries", "_shell")
-
-    def __init__(self, value: dict[Model, Model], entries: list[tuple[Model, Model]]) -> None:
-        self._entries = entries
-        self._shell = copy(value)
-        self._shell.clear()
-
-    def restore(self) -> Model:
-        made = copy(self._shell)
-        for held_key, held_value in self._entries:
-            key = restore(held_key)
-            value = restore(held_value)
-            if key is not GONE and value is not GONE:
-                made[key] = value
-        return made
+def _dict(empty: dict[Model, Model], keys: list[Model], values: list[Model]) -> Model:
+    """Return a dict. Its entries go with their keys and with their values."""
+    made = copy(empty)
+    for entry in zip(keys, values, strict=True):
+        living = _living(entry)
+        if len(living) == 2:
+            made[living[0]] = living[1]
+    return made
 
 
-class _Shared(_Held):
-    """A set or a deque: itself while the model holds it, else one with its living elements."""
-
-    __slots__ = ("_elements", "_make", "_reference")
-
-    def __init__(self, value: Model, elements: list[Model]) -> None:
-        self._elements = elements
-        self._reference = ref(value)
-        self._make: Callable[[list[Model]], Model] = type(value)
-
-    def restore(self) -> Model:
-        value = self._reference()
-        if value is not None:
-            return value
-        elements = [restore(element) for element in self._elements]
-        return self._make([element for element in elements if element is not GONE])
+def _set(reference: Callable[[], Model], kind: type, elements: list[Model]) -> Model:
+    """Return a set or a deque: itself while the model holds it."""
+    value = reference()
+    return kind(_living(elements)) if value is None else value
 
 
 def weaken(value: Model, outer: frozenset[int] = frozenset()) -> Model:
-    """Return a value, or what holds it weakly.
+    """Return a value, or its place, which holds it weakly.
 
     Args:
         value: The value.
         outer: The identities of the containers around it, because a container may contain itself.
     """
     kind = type(value)
-    if kind in _ATOMS or isinstance(value, _KEPT):
+    if kind in _ATOMS or isinstance(value, _KEPT) or hasattr(kind, "__array__"):
         return value
     if isinstance(value, (list, tuple, dict, set, frozenset, deque)):
         return _weaken_container(value, outer)
-    if kind.__module__.partition(".")[0] == _LIBRARY or hasattr(kind, "__array__"):
+    if kind.__module__.partition(".")[0] == _LIBRARY:
         return value
     if isinstance(value, ReferenceType):
-        return _Constant(value)
+        return _Held(_same, value)
     try:
         return ref(value)
     except TypeError:  # of a class without weak references
@@ -242,33 +160,32 @@ def weaken(value: Model, outer: frozenset[int] = frozenset()) -> Model:
 def _weaken_container(value: Model, outer: frozenset[int]) -> Model:
     kind = type(value)
     if kind.__module__ not in ("builtins", "collections"):
-        try:
+        with suppress(TypeError):
             return ref(value)  # because it is an object of the model
-        except TypeError:
-            pass
     if id(value) in outer:
         return value
     inner = outer | {id(value)}
-    if isinstance(value, dict):
-        keys = [weaken(key, inner) for key in value]
-        values = [weaken(part, inner) for part in value.values()]
-        if _is_same(keys, value) and _is_same(values, value.values()):
-            return value
-        return _Dict(value, list(zip(keys, values, strict=True)))
     elements = [weaken(element, inner) for element in value]
-    if not isinstance(value, (list, tuple)):
-        return _Shared(value, elements)
-    return value if _is_same(elements, value) else _Sequence(value, elements)
+    if isinstance(value, (list, tuple)):
+        return value if _is_same(elements, value) else _Held(_sequence, kind, elements)
+    if not isinstance(value, dict):
+        return _Held(_set, ref(value), kind, elements)
+    parts = [weaken(part, inner) for part in value.values()]
+    if _is_same(elements, value) and _is_same(parts, value.values()):
+        return value
+    empty = copy(value)
+    empty.clear()
+    return _Held(_dict, empty, elements, parts)
 
 
 def _is_same(held: list[Model], values: Iterable[Model]) -> bool:
     """Return whether nothing is held in another form."""
-    return all(one is other for one, other in zip(held, values, strict=True))
+    return all(map(is_, held, values))
 
 
 def restore(held: Model) -> Model:
-    """Return a value that ``weaken`` has returned in another form. ``GONE`` if it was freed."""
+    """Return the value of a place that ``weaken`` has returned. ``GONE`` if it was freed."""
     if isinstance(held, ReferenceType):
         value = held()
         return GONE if value is None else value
-    return held.restore() if isinstance(held, _Held) else held
+    return held() if type(held) is _Held else held

@@ -327,8 +327,8 @@ class Episode(EpisodeState):
             return agent
         self.latest = agent
         if not agent.decided:  # it acts before it was ever updated
-            call = agent.arguments.recall()
-            agent.update(call.args, call.kwargs, observe=False)
+            args, kwargs = agent.arguments.recall()
+            agent.update(args, kwargs, observe=False)
         return agent.reply_to(action, forced is not None)
 
     def answer(self, agent: Agent, action: Action) -> Model:
@@ -568,9 +568,9 @@ class Episode(EpisodeState):
         self.round = None  # it is played in turns from now on
         self.is_plain = not self.skips
         if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
-            call = agent.arguments.recall()
+            args, kwargs = agent.arguments.recall()
             with self.context():
-                agent.update(call.args, call.kwargs, observe=False)
+                agent.update(args, kwargs, observe=False)
         self.consulted = None
         self.pending = agent
 

@@ -17,7 +17,7 @@ from ..plans.point import Args, Kwargs, Point, Policy, warn_of_several
 from ..switching.driver import AnyHandler
 from ..values.actions import ILLEGAL
 from .agent import Agent, RunningEpisode
-from .arguments import Recalled, restore
+from .arguments import restore
 from .split import SplitHandler, part_of
 
 Namer = Callable[[RunningEpisode, Args, Kwargs], Model]
@@ -64,19 +64,16 @@ class PointHandler:
             self._warnings.add("several")
             warn_of_several(self.point.hook.name, agent)
 
-    def warn_of_gone(self, call: Recalled, effect: str) -> None:
-        """Warn once that the model has freed an argument that mappings take."""
+    def warn_of_gone(self, gone: set[int | str], effect: str) -> None:
+        """Warn once that the model has freed arguments that mappings take."""
         if "gone" in self._warnings:
             return
         self._warnings.add("gone")
         signature = self.point.hook.signature
-        known = [] if signature is None else list(signature.parameters)
-        skipped = int(self.point.split is not None)  # the item comes before the parameters
-        names = [
-            known[place - skipped] if 0 <= place - skipped < len(known) else f"argument {place}"
-            for place in sorted(call.places)
-        ]
-        names += sorted(call.keys)
+        parameters = ["the item"] * (self.point.split is not None)
+        parameters += [] if signature is None else signature.parameters
+        known: dict[int | str, str] = dict(enumerate(parameters))
+        names = sorted(known.get(argument, f"argument {argument}") for argument in gone)
         warn_user(
             f"the model has freed {', '.join(names)} of the latest call of"
             f" {self.point.hook.name}, which its mappings take, so {effect} where an agent has"

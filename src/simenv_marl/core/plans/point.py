@@ -25,7 +25,7 @@ from ...hooks.hook import BOUND
 from ...simulation import Action, Model, Observation, asks_for
 from ..values import actions, spaces
 from ..values.actions import ILLEGAL, MASK, Mask
-from .mappings import Mapped, adapt, number_of_places, union_of_keys
+from .mappings import Mapped, adapt, taken_by
 
 Space: TypeAlias = gym_spaces.Space[Any]
 Args = tuple[Model, ...]
@@ -64,8 +64,8 @@ class Point:
         observation_mapping, reward_mapping: The mappings, callable with all arguments.
         takes_for_observation: The mappings of which an observation consists: also that of the mask.
         takes_for_reward: The reward mapping, with the arguments that it takes.
-        taken_places: How many positional arguments mappings take after the decision. None: all.
-        taken_keys: The keyword arguments that they take. None: all.
+        taken: The arguments that mappings take after the decision.
+        taken_places: The number of positional arguments up to the last of these. None: all.
         cast: Casts an observation to the observation space.
         check: Checks an action against the action space. Returns it in the form that ``convert``
             takes, or ``ILLEGAL``.
@@ -93,7 +93,7 @@ class Point:
         "definition", "deliver", "expects_one", "gather", "hook", "informs_rule_action",
         "is_plain", "legal", "masked_parts", "name_agent", "needs_simulation",
         "observation_mapping", "part", "policy", "removed_by", "reports_rule", "reward_mapping",
-        "rule_action_mapping", "split", "taken_keys", "taken_places", "takes_for_observation",
+        "rule_action_mapping", "split", "taken", "taken_places", "takes_for_observation",
         "takes_for_reward",
     )  # fmt: skip
 
@@ -147,9 +147,11 @@ class Point:
             for name in ("action_mask_mapping", "choices")
             if getattr(definition, name) is not None
         ]
-        taken = [*self.takes_for_observation, reward, *self._labels.values()]
-        self.taken_places = number_of_places(taken)
-        self.taken_keys = union_of_keys(taken)
+        self.taken = taken_by([*self.takes_for_observation, reward, *self._labels.values()])
+        self.taken_places: int | None = None
+        if self.taken is not None:
+            places = [place for place in self.taken if isinstance(place, int)]
+            self.taken_places = max(places, default=-1) + 1
         self.split = self._callable("split")
         self.gather = self._callable("gather", leading=2)
         self.part = self._callable("part", leading=2)

@@ -374,7 +374,7 @@ class Agent:
         elif reward and not last:  # the agent has not acted yet, so this value rewards nothing
             point.reward_mapping(*args, **kwargs)
             self.decided = True
-            self._is_quick = point.is_plain
+            self._is_quick = point.legal is None and point.definition.rule_action_mapping is None
         if not observe:
             return
         self.present = True

@@ -13,7 +13,7 @@ from ...hooks.hook import Hook
 from ...simulation import RULE, Action, Model
 from ..plans.mappings import adapt
 from ..plans.plan import Plan, Remover
-from ..plans.point import Args, Kwargs, Point, Policy, warn_of_several
+from ..plans.point import Args, Kwargs, Point, Policy
 from ..switching.driver import AnyHandler
 from ..values.actions import ILLEGAL
 from .agent import Agent, RunningEpisode
@@ -62,7 +62,11 @@ class PointHandler:
         """Warn once that several objects decide under the name of one agent."""
         if "several" not in self._warnings:
             self._warnings.add("several")
-            warn_of_several(self.point.hook.name, agent)
+            warn_user(
+                f"several objects decide at {self.point.hook.name} as one agent, {agent!r}: their"
+                " rewards and differences mix. Set agent= of its make_step to a callable that names"
+                " an agent for each object, or to a string if one agent is meant"
+            )
 
     def warn_of_gone(self, gone: set[int | str], effect: str) -> None:
         """Warn once that the model has freed arguments that mappings take."""
@@ -169,7 +173,8 @@ class RuleHandler:
             return
         episode.blame(agent)
         action = self._action(decision, args, kwargs, agent)
-        agent.note_rule_action(action, point.informs_rule_action and action is not None)
+        informs = point.definition.rule_action_mapping is not None and action is not None
+        agent.note_rule_action(action, informs)
 
     def _action(self, decision: Model, args: Args, kwargs: Kwargs, agent: Agent) -> Action:
         """Return the action that corresponds to a decision. None if no action does."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import replace
+from copy import copy
 from functools import partial
 from types import coroutine
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 import numpy as np
 from gymnasium import spaces as gym_spaces
@@ -19,10 +19,9 @@ from ...errors import (
     MaskError,
     OptionValueError,
     short_repr,
-    warn_user,
 )
 from ...hooks.hook import BOUND
-from ...simulation import Action, Model, Observation, asks_for
+from ...simulation import Action, Model, Observation, asks_for, signature_of
 from ..values import actions, spaces
 from ..values.actions import ILLEGAL, MASK, Mask
 from .mappings import Mapped, adapt, taken_by
@@ -36,6 +35,22 @@ Labels = Mapping[Any, str] | Sequence[str] | None
 
 Policy: TypeAlias = "Callable[..., Action] | Model"
 """A policy, as a plan has it: a callable, or ``RULE``."""
+
+_LEADING: Final = {
+    "agent": 0,
+    "observation_space_mapping": 0,
+    "reward_mapping": 0,
+    "action_mask_mapping": 0,
+    "choices": 0,
+    "action_labels": 0,
+    "observation_labels": 0,
+    "apply": 1,
+    "rule_action_mapping": 1,
+    "split": 0,
+    "gather": 2,
+    "part": 2,
+}
+"""The callables of a definition that get a call's arguments, and how many come before these."""
 
 _WITHOUT_ITEM = ("split", "gather", "part")
 """The callables of a definition that do not get an item of a split call first."""
@@ -58,43 +73,40 @@ class Point:
         hook: The decision function.
         definition: Its definition in this environment.
         agent: The name of the agent. None if ``name_agent`` names it.
-        name_agent: A callable of the call's arguments that names the agent.
         policy: The policy that answers all decisions of the point. None: the agents' own policies
             answer them, or the environment's user does.
+        cast: Casts an observation to the observation space.
+        check: Checks an action against the action space. Returns it in the form that ``convert``
+            takes, or ``ILLEGAL``.
+        applies: Whether an ``apply`` gets the action, on the simulation's side.
+        reports_rule: Whether the decisions of the rule are reported.
+        expects_one: Whether one object makes all decisions, because the definition names no agents.
+        needs_simulation: Whether a callable asks for the simulation.
+        name_agent: A callable of the call's arguments that names the agent, if ``agent`` is None.
         observation_mapping, reward_mapping: The mappings, callable with all arguments.
         takes_for_observation: The mappings of which an observation consists: also that of the mask.
         takes_for_reward: The reward mapping, with the arguments that it takes.
         taken: The arguments that mappings take after the decision.
         taken_places: The number of positional arguments up to the last of these. None: all.
-        cast: Casts an observation to the observation space.
-        check: Checks an action against the action space. Returns it in the form that ``convert``
-            takes, or ``ILLEGAL``.
         convert: Turns a checked action into the reply to the simulation.
-        applies: Whether an ``apply`` gets the action, on the simulation's side.
         legal: Returns the mask of a call, and its choices if it has any. None if all actions are
             always legal.
+        masked_parts: The keys of the parts of the observation space that contain the mask; "" for
+            the whole space.
         deliver: Turns the reply, on the simulation's side, into the value of the call. None if the
             reply is that value.
         split, gather, part: The callables for calls that decide for several items; None without.
         removed_by: The callables that name the agents that other functions end, by the functions'
             names. None in place of a callable: the agent of the call's first argument.
         rule_action_mapping: Returns the action for a decision of the rule. None without.
-        masked_parts: The keys of the parts of the observation space that contain the mask; "" for
-            the whole space.
-        informs_rule_action: Whether infos contain the action of the rule.
-        reports_rule: Whether the decisions of the rule are reported.
-        is_plain: Whether an observation and a reward are all that a decision needs.
-        expects_one: Whether one object makes all decisions, because the definition names no agents.
-        needs_simulation: Whether a mapping asks for the simulation.
     """
 
     __slots__ = (
-        "__weakref__", "_labels", "_settings", "agent", "applies", "cast", "check", "convert",
-        "definition", "deliver", "expects_one", "gather", "hook", "informs_rule_action",
-        "is_plain", "legal", "masked_parts", "name_agent", "needs_simulation",
-        "observation_mapping", "part", "policy", "removed_by", "reports_rule", "reward_mapping",
-        "rule_action_mapping", "split", "taken", "taken_places", "takes_for_observation",
-        "takes_for_reward",
+        "__weakref__", "_calls", "agent", "applies", "cast", "check", "convert", "definition",
+        "deliver", "expects_one", "gather", "hook", "legal", "masked_parts", "name_agent",
+        "needs_simulation", "observation_mapping", "part", "policy", "removed_by", "reports_rule",
+        "reward_mapping", "rule_action_mapping", "split", "taken", "taken_places",
+        "takes_for_observation", "takes_for_reward",
     )  # fmt: skip
 
     def __init__(
@@ -124,56 +136,72 @@ class Point:
         self.definition = definition
         self.agent = agent
         self.policy = policy
-        self._settings = records, clips
-        self.name_agent = self._callable("agent") or (lambda *args, **kwargs: agent)
-        observation = self._mapped("observation_space_mapping")
-        reward = self._mapped("reward_mapping")
-        self.observation_mapping = observation.call
-        self.reward_mapping = reward.call
-        self.takes_for_reward = reward
         self.cast = spaces.observation_cast(definition.observation_space)
         self.check = actions.action_check(definition.action_space, clips=clips)
-        self.convert: Callable[[Action], Model] = definition.action_space_mapping or _same
         self.applies = definition.apply is not None
-        self.deliver = self._delivery()
-        self._labels = {
-            name: self._mapped(name)
-            for name in ("action_labels", "observation_labels")
-            if callable(getattr(definition, name))
+        is_invertible = definition.choices is not None or inverse(definition) is not None
+        informs = definition.rule_action_mapping is not None
+        self.reports_rule = informs or (records and is_invertible)
+        self.expects_one = definition.agent is None and hook.bound
+        callables = (*vars(definition).values(), *definition.removed_by.values())
+        self.needs_simulation = any(asks_for(part, "_simulation") for part in callables)
+        self.fit_callables(None)
+
+    def bind(self, simulation: Model) -> Point:
+        """Return this point with the simulation given to the callables that ask for it."""
+        if not self.needs_simulation:
+            return self
+        point = copy(self)
+        point.fit_callables(simulation)
+        return point
+
+    def fit_callables(self, simulation: Model) -> None:
+        """Fit the callables of the definition to calls, with the simulation for those that ask."""
+        definition = self.definition
+        parts = {name: _bound(part, simulation) for name, part in vars(definition).items()}
+        if asks_for(parts["apply"], "_rule"):
+            hook = self.hook
+            parts["apply"] = partial(
+                parts["apply"], _rule=lambda *args, **kwargs: hook.rule(*args, **kwargs)
+            )
+        fitted = {
+            name: self.fit(parts[name], name, leading)
+            for name, leading in _LEADING.items()
+            if callable(parts[name])
         }
-        self.legal = self._legal()
-        self.takes_for_observation = [observation] + [
-            self._mapped(name)
-            for name in ("action_mask_mapping", "choices")
-            if getattr(definition, name) is not None
-        ]
-        self.taken = taken_by([*self.takes_for_observation, reward, *self._labels.values()])
+        self._calls = calls = {name: mapped.call for name, mapped in fitted.items()}
+        self.name_agent = calls.get("agent", _same)
+        self.observation_mapping = calls["observation_space_mapping"]
+        self.reward_mapping = calls["reward_mapping"]
+        self.takes_for_reward = fitted["reward_mapping"]
+        makes_observation = ("observation_space_mapping", "action_mask_mapping", "choices")
+        self.takes_for_observation = [fitted[name] for name in makes_observation if name in fitted]
+        labels = [mapped for name, mapped in fitted.items() if name.endswith("_labels")]
+        self.taken = taken_by([*self.takes_for_observation, self.takes_for_reward, *labels])
         self.taken_places: int | None = None
         if self.taken is not None:
             places = [place for place in self.taken if isinstance(place, int)]
             self.taken_places = max(places, default=-1) + 1
-        self.split = self._callable("split")
-        self.gather = self._callable("gather", leading=2)
-        self.part = self._callable("part", leading=2)
-        self.removed_by = {**hook.removed_by, **definition.removed_by}
-        self.rule_action_mapping = self._rule_action_mapping()
+        self.convert: Callable[[Action], Model] = parts["action_space_mapping"] or _same
+        self.legal = self._legal()
         self.masked_parts: list[str] = []
         if self.legal is not None:
             self.masked_parts = _masked_parts(definition.observation_space)
-        self.informs_rule_action = definition.rule_action_mapping is not None
-        is_invertible = definition.choices is not None or inverse(definition) is not None
-        self.reports_rule = self.informs_rule_action or (records and is_invertible)
-        self.is_plain = self.legal is None and not self.informs_rule_action
-        self.expects_one = definition.agent is None and hook.bound
-        self.needs_simulation = _with_simulation(definition, None) is not definition
+        self.deliver = self._delivery()
+        self.split = calls.get("split")
+        self.gather = calls.get("gather")
+        self.part = calls.get("part")
+        self.rule_action_mapping = calls.get("rule_action_mapping")
+        removers = {**self.hook.removed_by, **definition.removed_by}
+        self.removed_by = {name: _bound(part, simulation) for name, part in removers.items()}
 
-    def bind(self, simulation: Model) -> Point:
-        """Return this point with the simulation given to the mappings that ask for it."""
-        if not self.needs_simulation:
-            return self
-        definition = _with_simulation(self.definition, simulation)
-        records, clips = self._settings
-        return Point(self.hook, definition, self.agent, self.policy, records=records, clips=clips)
+    def fit(self, function: Callable[..., Model], name: str, leading: int = 0) -> Mapped:
+        """Make a function callable with all arguments of a call, as ``adapt`` does."""
+        if self.definition.split is not None and name not in _WITHOUT_ITEM:
+            leading += 1
+        if name == "rule_action_mapping" and signature_of(function) is None:  # such as int
+            return Mapped(lambda decision, *args, **kwargs: function(decision), None)
+        return adapt(function, name, self.hook, leading)
 
     def decisions_of(self, call: Sequence[Model]) -> list[tuple[Args, Kwargs]]:
         """Return the bound arguments of the decisions of a call: one, or one for each item."""
@@ -182,43 +210,14 @@ class Point:
             return [(args, kwargs)]
         return [((item, *args), kwargs) for item in self.split(*args, **kwargs)]
 
-    # -- callables of the definition --------------------------------------------------------------
-
-    def _mapped(self, name: str, leading: int = 0) -> Mapped:
-        """Return a callable of the definition, callable with all arguments of a call."""
-        return self.fit(getattr(self.definition, name), name, leading)
-
-    def fit(self, function: Callable[..., Model], name: str, leading: int = 0) -> Mapped:
-        """Make a function callable with all arguments of a call, as ``adapt`` does."""
-        return adapt(function, name, self.hook, leading + self._items_before(name))
-
-    def _callable(self, name: str, leading: int = 0) -> Callable[..., Model] | None:
-        if not callable(getattr(self.definition, name)):
-            return None
-        return self._mapped(name, leading).call
-
-    def _items_before(self, name: str) -> int:
-        """Return how many items of a split call come before the arguments of the call."""
-        return int(self.definition.split is not None and name not in _WITHOUT_ITEM)
-
-    def _rule_action_mapping(self) -> Callable[..., Model] | None:
-        mapping = self.definition.rule_action_mapping
-        if mapping is None or isinstance(mapping, Mapping):
-            return None
-        try:
-            inspect.signature(mapping)
-        except (TypeError, ValueError):  # a builtin, such as int
-            return lambda decision, *args, **kwargs: mapping(decision)
-        return self._mapped("rule_action_mapping", leading=1).call
-
     def _legal(self) -> Callable[[Args, Kwargs], tuple[Mask, list[Model] | None]] | None:
         """Make the function that returns the mask of a call, and its choices."""
         space = self.definition.action_space
-        mapping = self._callable("action_mask_mapping")
+        mapping = self._calls.get("action_mask_mapping")
         if mapping is not None:
             cast = actions.mask_cast(space)
             return lambda args, kwargs: (cast(mapping(*args, **kwargs)), None)
-        choose = self._callable("choices")
+        choose = self._calls.get("choices")
         if choose is None or not isinstance(space, gym_spaces.Discrete):
             return None
         most = int(space.n)
@@ -263,35 +262,43 @@ class Point:
     def action_labels(self, choices: Sequence[Model] | None, args: Args, kwargs: Kwargs) -> Labels:
         """Return the texts of the actions of a call. Default: choices, decisions or numbers."""
         definition = self.definition
-        space = definition.action_space
-        labels = definition.action_labels
-        if labels is None and choices is not None:
-            labels = dict(enumerate(map(str, choices)))
-        elif labels is None and isinstance(space, gym_spaces.Discrete):
-            decisions = inverse(definition) or {}
-            labels = {action: str(decision) for decision, action in decisions.items()}
-        elif callable(labels):
-            labels = self._labels_of_call("action_labels", space, args, kwargs)
-        return _labels(space, labels)
+        decisions = inverse(definition) or {}
+        default = {action: str(decision) for decision, action in decisions.items()}
+        if choices is not None:
+            default = dict(enumerate(map(str, choices)))
+        labels = definition.action_labels or default or None
+        return self._labels("action_labels", labels, definition.action_space, args, kwargs)
 
     def observation_labels(self, args: Args, kwargs: Kwargs) -> Labels:
         """Return the texts of the parts of an observation of a call."""
-        space = self.definition.observation_space
         labels = self.definition.observation_labels
-        if callable(labels):
-            labels = self._labels_of_call("observation_labels", space, args, kwargs)
-        return _labels(space, labels)
+        space = self.definition.observation_space
+        return self._labels("observation_labels", labels, space, args, kwargs)
 
-    def _labels_of_call(self, name: str, space: Space, args: Args, kwargs: Kwargs) -> Labels:
-        labels: Labels = self._labels[name].call(*args, **kwargs)
-        # Labels of a Discrete may leave out the illegal actions of this call.
-        is_partial = isinstance(labels, Mapping) and isinstance(space, gym_spaces.Discrete)
-        if not is_partial and not fit_labels(space, labels):
-            raise DefinitionError(
-                f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"
-                f" not texts for the parts of {short_repr(space)}"
-            )
-        return labels
+    def _labels(self, name: str, labels: Model, space: Space, args: Args, kwargs: Kwargs) -> Labels:
+        """Return labels as a dict or a tuple, completed by numbers. None if a space has no labels.
+
+        ``labels`` may be a callable, which returns the labels of this call.
+        """
+        if callable(labels):
+            labels = self._calls[name](*args, **kwargs)
+            # Labels of a Discrete may leave out the illegal actions of this call.
+            is_partial = isinstance(labels, Mapping) and isinstance(space, gym_spaces.Discrete)
+            if not is_partial and not fit_labels(space, labels):
+                raise DefinitionError(
+                    f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"
+                    f" not texts for the parts of {short_repr(space)}"
+                )
+        if isinstance(space, gym_spaces.Discrete):
+            start = int(space.start)
+            texts = labels if isinstance(labels, Mapping) else dict(enumerate(labels or (), start))
+            return {key: str(texts.get(key, key)) for key in range(start, start + space.n)}
+        if isinstance(space, gym_spaces.Dict):
+            return dict(labels or zip(space.spaces, space.spaces, strict=True))
+        if space.shape is None or len(space.shape) != 1:
+            return None
+        places = range(space.shape[0])
+        return tuple(str(place) if labels is None else labels[place] for place in places)
 
     # -- actions ----------------------------------------------------------------------------------
 
@@ -340,12 +347,12 @@ class Point:
         ``apply`` comes with its agent. A choice comes in a list, which is emptied, so that the
         user's side keeps no reference to it.
         """
-        has_choices = self.definition.choices is not None
+        has_choices = "choices" in self._calls
         kind = self.hook.kind
         if not self.applies and not has_choices and kind == "function":
             return None
         wrap = {"function": _same, "generator": _returning, "coroutine": _awaiting}[kind]
-        apply = self._apply()
+        apply = self._calls.get("apply")
 
         def deliver(reply: Model, *args: Model, **kwargs: Model) -> Model:
             if apply is None:
@@ -364,48 +371,10 @@ class Point:
 
         return deliver
 
-    def _apply(self) -> Callable[..., Model] | None:
-        apply = self.definition.apply
-        if apply is None:
-            return None
-        hook = self.hook
-        if asks_for(apply, "_rule"):
-            apply = partial(apply, _rule=lambda *args, **kwargs: hook.rule(*args, **kwargs))
-        return adapt(apply, "apply", hook, 1 + self._items_before("apply")).call
 
-
-def _with_simulation(definition: Definition, simulation: Model) -> Definition:
-    """Give the simulation to the mappings that ask for it. Return the same object if none asks."""
-
-    def bound(part: Model) -> Model:
-        return partial(part, _simulation=simulation) if asks_for(part, "_simulation") else part
-
-    parts = {name: bound(part) for name, part in vars(definition).items()}
-    parts["removed_by"] = {name: bound(agent) for name, agent in definition.removed_by.items()}
-    return definition if parts == vars(definition) else replace(definition, **parts)
-
-
-def warn_of_several(name: str, agent: str) -> None:
-    """Warn that several objects decide under the name of one agent."""
-    warn_user(
-        f"several objects decide at {name} as one agent, {agent!r}: their rewards and differences"
-        " mix. Set agent= of its make_step to a callable that names an agent for each object, or to"
-        " a string if one agent is meant"
-    )
-
-
-def _labels(space: Space, labels: Labels) -> Labels:
-    """Return labels as a dict or a tuple, completed by numbers. None if a space has no labels."""
-    if isinstance(space, gym_spaces.Discrete):
-        start = int(space.start)
-        texts = labels if isinstance(labels, Mapping) else dict(enumerate(labels or (), start))
-        return {action: str(texts.get(action, action)) for action in range(start, start + space.n)}
-    if isinstance(space, gym_spaces.Dict):
-        return dict(labels) if isinstance(labels, Mapping) else {key: key for key in space.spaces}
-    if space.shape is None or len(space.shape) != 1:
-        return None
-    places = range(space.shape[0])
-    return tuple(str(place) if labels is None else labels[place] for place in places)
+def _bound(part: Model, simulation: Model) -> Model:
+    """Give the simulation to a callable that asks for it."""
+    return partial(part, _simulation=simulation) if asks_for(part, "_simulation") else part
 
 
 def _masked_parts(space: Space) -> list[str]:

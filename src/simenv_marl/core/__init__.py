@@ -25,7 +25,7 @@ from .episodes.state import EpisodeState, UnmatchedNames, checked_actions
 from .plans.options import CheckOptions, EpisodeOptions, ViewOptions, explain_arguments
 from .plans.plan import Mode, Plan, Source, make_plan, source_name
 from .plans.point import Labels, Point, Policy, Space
-from .plans.points import Points, declared_agents, portable
+from .plans.points import Points, portable
 from .plans.policies import (
     COUNTS,
     AskingPolicy,
@@ -77,8 +77,8 @@ __all__ = [  # noqa: RUF022 - by subject
     "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
     "pending_view", "portable", "release", "reuse_resources", "serve", "unpack", "unpack_outcome",
     # Values.
-    "ILLEGAL", "MASK", "action_check", "as_json", "blank", "declared_agents",
-    "duplicate", "explain_arguments", "joined", "observation_cast", "same", "source_name",
+    "ILLEGAL", "MASK", "action_check", "as_json", "blank", "duplicate",
+    "explain_arguments", "joined", "observation_cast", "same", "source_name",
     "split_batch", "stack_masks", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",

@@ -11,7 +11,7 @@ from itertools import chain
 from types import NoneType
 from typing import TYPE_CHECKING, Any, SupportsFloat, SupportsIndex
 
-from ..core import Episode, Plan, Points, declared_agents, has_fallback, waits
+from ..core import Episode, Plan, Points, has_fallback, waits
 from ..data.collect import learners_plan
 from ..decision import decision_points
 from ..errors import (
@@ -219,8 +219,7 @@ class Runner:
 
     def undeclared_agents(self, plan: Plan, contender: str) -> set[str]:
         """Return the agents that a contender names, but neither points nor ``possible_agents``."""
-        by_option = declared_agents(plan.options.possible_agents)
-        declared_names = {*by_option, *(point.agent for point in plan.points)}
+        declared_names = {*plan.options.declared_agents, *(point.agent for point in plan.points)}
         return (self.contenders[contender].keys() & plan.policies.keys()) - declared_names
 
     def episodes_at_once(self, contender: str) -> int:

@@ -421,7 +421,7 @@ class Episode(EpisodeState):
 
     def planner_view(self) -> object:
         """Make the environment that a planner gets."""
-        return self.plan.planner_view(self.session())
+        return self.plan.subject.planner_view(self.session())
 
     # -- calls that are split ---------------------------------------------------------------------
 

@@ -232,9 +232,9 @@ class Handlers:
 def handlers_of(plan: Plan, simulation: Model) -> Handlers:
     """Return the handlers of a simulation's events.
 
-    All simulations of a plan share them, unless mappings ask for the simulation.
+    All simulations of a plan share them, unless callables ask for the simulation.
     """
-    if plan.needs_simulation:
+    if any(point.needs_simulation for point in plan.points):
         return _make_handlers(plan, simulation)
     handlers: Handlers = plan.derive(_make_handlers)
     return handlers

@@ -22,7 +22,7 @@ from ...errors import (
 )
 from ...simulation import RULE, Action
 from ..plans.plan import Plan
-from ..plans.points import declared_agents, overrides
+from ..plans.points import overrides
 from ..plans.policies import Where
 from ..values.actions import ILLEGAL
 from .round import Round
@@ -208,11 +208,13 @@ class EpisodeState:
     def may_have(self, name: object) -> bool:
         """Return whether there is an agent with that name, or could be one later."""
         plan = self.plan
-        declared = plan.options.possible_agents
-        groups = (self.agents, self.others, plan.roster, plan.policies, declared_agents(declared))
+        declared = plan.options.declared_agents
+        groups = (self.agents, self.others, plan.roster, plan.policies, declared)
         if any(name in names for names in groups):
             return True
-        is_open = declared is None and any(point.agent is None for point in plan.points)
+        is_open = plan.options.possible_agents is None and any(
+            point.agent is None for point in plan.points
+        )
         return is_open and isinstance(name, str)
 
     def move_to(self, where: Where) -> None:

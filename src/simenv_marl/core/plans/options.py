@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from inspect import cleandoc
+from itertools import chain
 from math import inf
 from numbers import Integral, Real
 from textwrap import indent
@@ -206,6 +207,14 @@ class Options:
             agents = list(agents)
         object.__setattr__(self, "possible_agents", agents)
         object.__setattr__(self, "plugins", tuple(self.plugins))
+
+    @property
+    def declared_agents(self) -> list[str]:
+        """The names in ``possible_agents``."""
+        declared = self.possible_agents or ()
+        if isinstance(declared, Mapping):
+            return list(chain.from_iterable(declared.values()))
+        return list(declared)
 
     @property
     def picture_mode(self) -> str | None:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
-from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias
+from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias, cast
 from weakref import finalize
 
 from ...decision import BY_NAME, DecisionPoint, Definition
@@ -40,7 +40,6 @@ from .points import (
     Definitions,
     Points,
     agent_names,
-    declared_agents,
     find_points,
     locate,
     own_points,
@@ -69,7 +68,7 @@ def no_view(session: object) -> NoReturn:
 
 
 class Mode(Enum):
-    """What the episodes of a plan are played for."""
+    """The uses of the episodes of a plan."""
 
     ENVIRONMENT = "environment"
     """A user answers the agents without a policy."""
@@ -106,33 +105,36 @@ class Prototype:
     """A simulation that was made to be inspected, on a stack that ends with this object.
 
     The first session of a plan claims both.
+
+    Attributes:
+        driver: The name of the driver.
     """
 
     def __init__(self, source: Source, driver: str) -> None:
         """Make a simulation on a stack of the driver with that name."""
-        made = DRIVERS[driver]()
-        self._end = finalize(self, made.end)
+        self.driver = driver
+        stack = DRIVERS[driver]()
+        self._end = finalize(self, stack.end)
         try:
             with outside_simulation():
-                made.enter()
-                simulation = made.run(partial(make_simulation, source))
+                stack.enter()
+                simulation = stack.run(partial(make_simulation, source))
         except BaseException:
             self._end()
             raise
-        self._unclaimed: list[tuple[Driver, Model]] = [(made, simulation)]
+        self._unclaimed: list[tuple[Driver, Model]] = [(stack, simulation)]
 
     @property
     def simulation(self) -> Model:
         """The simulation, before it is claimed."""
         return self._unclaimed[0][1]
 
-    def claim(self, driver: str) -> tuple[Driver, Model] | None:
-        """Hand over both. None if the driver is of another kind, or they are claimed already."""
+    def claim(self) -> tuple[Driver, Model] | None:
+        """Hand over the stack and the simulation. None if they are claimed already."""
         with suppress(IndexError):  # because another thread may have claimed them
             claimed = self._unclaimed.pop()
-            if type(claimed[0]) is DRIVERS[driver]:
-                self._end.detach()
-                return claimed
+            self._end.detach()
+            return claimed
         return None
 
 
@@ -154,11 +156,14 @@ class Remover(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What a plan is about: the source of its simulations, and what one of them shows.
+    """The source of a plan's simulations, its use, and the features of the simulation.
 
     Attributes:
         source: The source of its simulations.
         variant: The variant that gave the source, if there is one.
+        mode: The use of its episodes.
+        default_policy: The policy of all agents without one. None: the user or the rule.
+        planner_view: Makes the environment that a planner gets.
         named: The decision points that are named, with their definitions.
         own: The definitions of the simulation itself.
         render_modes: The render modes of the simulation.
@@ -169,6 +174,9 @@ class Subject:
 
     source: Source
     variant: Variant | None
+    mode: Mode
+    default_policy: Policy
+    planner_view: PlannerView
     named: Definitions
     own: Definitions
     render_modes: Collection[str]
@@ -182,17 +190,13 @@ class Plan:
     """The plan of an environment.
 
     Attributes:
-        subject: What it is about.
+        subject: The simulation and its use.
         options: The options.
-        mode: What its episodes are played for.
-        default_policy: The policy of all agents without one. None: the user or the rule.
-        planner_view: Makes the environment that a planner gets.
         points: The decision points that do not run their rule.
         active: The decision points that the environment's user answers.
         policies: The policies of agents, by name.
         has_planner: Whether a policy asks for the environment, and so may branch it.
         has_split: Whether a call of the model may hold several decisions.
-        needs_simulation: Whether a mapping asks for the simulation.
         named_agents: The agents that ``policies`` and ``possible_agents`` name.
         one_agent: The only agent that the environment's user answers for. None if there may be
             several.
@@ -207,15 +211,11 @@ class Plan:
 
     subject: Subject
     options: Options
-    mode: Mode
-    default_policy: Policy
-    planner_view: PlannerView
     points: tuple[Point, ...]
     active: tuple[Point, ...]
     policies: Mapping[str, Policy]
     has_planner: bool
     has_split: bool
-    needs_simulation: bool
     named_agents: frozenset[str]
     one_agent: str | None
     roster: Mapping[str, Point]
@@ -223,10 +223,11 @@ class Plan:
     removers: tuple[Remover, ...]
     plugins: Plugins | None
     patches: tuple[tuple[Hook, Handler | None], ...]
+
     _derived: dict[Callable[[Plan], Model], Model] = field(init=False, default_factory=dict)
 
     def derive(self, function: Callable[[Plan], Model]) -> Model:
-        """Return what a function derives from the plan. It is called once for each plan."""
+        """Call a function of the plan once, and return its result each time."""
         if function not in self._derived:
             self._derived[function] = function(self)
         return self._derived[function]
@@ -234,7 +235,7 @@ class Plan:
     @property
     def has_user(self) -> bool:
         """Whether a user answers the agents without a policy."""
-        return self.mode is Mode.ENVIRONMENT
+        return self.subject.mode is Mode.ENVIRONMENT
 
     @property
     def possible_agents(self) -> list[str] | None:
@@ -272,50 +273,47 @@ class Plan:
         """Return whether agents with a policy are no agents of the environment."""
         if policy is None:
             return False
-        return self.mode is not Mode.COLLECT or not isinstance(policy, DeferredPolicy)
+        return self.subject.mode is not Mode.COLLECT or not isinstance(policy, DeferredPolicy)
 
     def claim_prototype(self) -> tuple[Driver, Model] | None:
         """Hand over the simulation that was made to be inspected, and its driver, or None."""
         prototype = self.subject.prototype
-        if prototype is None or self.plugins or self.options.global_rng:  # it was made without them
+        options = self.options
+        if prototype is None or prototype.driver != options.driver:
             return None
-        return prototype.claim(self.options.driver)
+        if self.plugins or options.global_rng:  # it was made without them
+            return None
+        return prototype.claim()
 
     # -- other plans ------------------------------------------------------------------------------
 
     def amended(self, options: Mapping[str, Any]) -> Plan:
         """Return the same plan with other values of some options."""
-        if not options:
-            return self
-        return self._resolved(self.subject, self.options.amended(options))
+        return _resolve(self.subject, self.options.amended(options)) if options else self
 
     def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
         """Return the same plan with another definition of a point."""
         named = {**self.subject.named, point: definition}
-        return self._resolved(replace(self.subject, named=named), self.options)
+        return _resolve(replace(self.subject, named=named), self.options)
 
     def declared(self, roster: Mapping[str, Point]) -> Plan:
         """Return the same plan with a roster that an episode has shown."""
-        names: dict[str, list[str]] = {
-            point.hook.name: [] for point in self.active if point.agent is None
+        hooks = [point.hook for point in self.active if point.agent is None]
+        names = {
+            hook.name: [agent for agent, point in roster.items() if point.hook is hook]
+            for hook in hooks
         }
-        for agent, point in roster.items():
-            if point.hook.name in names:
-                names[point.hook.name].append(agent)
         made = self.amended({"possible_agents": names})
         return replace(made, named_agents=self.named_agents)  # the user has named no others
 
     def for_one(self, agent: str) -> Plan:
         """Return the plan of a branch that waits for one agent only."""
-        nothing = frozenset[str]()
-        return replace(self, mode=Mode.SIMULATE, one_agent=agent, named_agents=nothing)
+        subject = replace(self.subject, mode=Mode.SIMULATE)
+        return replace(self, subject=subject, one_agent=agent, named_agents=frozenset())
 
     def with_policies(self, policies: Mapping[str, Policy]) -> Plan:
         """Return the plan of a branch in which policies answer for agents that have none."""
         return replace(self, policies={**policies, **self.policies})
-
-    def _resolved(self, subject: Subject, options: Options) -> Plan:
-        return _resolve(subject, options, self.mode, self.default_policy, self.planner_view)
 
     def __deepcopy__(self, memory: object) -> Plan:
         return self  # because nothing changes it
@@ -331,14 +329,13 @@ class Plan:
         for name in ("policies", "possible_agents"):
             if isinstance(options[name], Mapping):
                 options[name] = {portable(key): value for key, value in options[name].items()}
-        return _remake, (
-            subject.source,
-            points,
-            options,
-            self.mode,
-            self.planner_view,
-            subject.variant,
+        make = partial(
+            make_plan,
+            mode=subject.mode,
+            planner_view=subject.planner_view,
+            variant=subject.variant,
         )
+        return make, (subject.source, points, options)
 
 
 def make_plan(
@@ -349,6 +346,7 @@ def make_plan(
     mode: Mode = Mode.ENVIRONMENT,
     default_policy: Policy = None,
     planner_view: PlannerView = no_view,
+    variant: Variant | None = None,
 ) -> Plan:
     """Make a plan from the arguments of ``generate_env``, and check them.
 
@@ -356,33 +354,33 @@ def make_plan(
         source: The simulation, its class, a factory, or a ``Variant``.
         points: The decision points.
         options: The options.
-        mode: What the episodes are played for.
+        mode: The use of the episodes.
         default_policy: The policy of all agents without one. With it, ``points=None`` means all
             decision points.
         planner_view: Makes the environment that a planner gets.
+        variant: The variant that has given the other arguments, if there is one.
 
     Raises:
         SimEnvError: An argument is invalid. The message says which.
     """
-    variant: Variant | None = None
     if hasattr(source, "environment_arguments"):
-        variant = source  # type: ignore[assignment]
-    if variant is not None:
+        variant = cast("Variant", source)
         source, points, options = variant.environment_arguments(points, options)
     checked = Options().amended(options)
-    if mode is not Mode.ENVIRONMENT and checked.agent is not None:
+    has_user = mode is Mode.ENVIRONMENT
+    if not has_user and checked.agent is not None:
         raise UnknownOptionError(
             "agent is an option of single views only, as single_env makes them"
         )
     prototype: Prototype | None = None
     inspected = source
     has_no_points = points is None and getattr(source, "points", None) is None
-    if not isinstance(source, type) or has_no_points:
+    if has_no_points or not isinstance(source, type):
         prototype = Prototype(source, checked.driver)
         inspected = prototype.simulation
     if points is None:
         points = getattr(inspected, "points", None)
-    if mode is not Mode.ENVIRONMENT and points is None and default_policy is None:
+    if points is None and not has_user and default_policy is None:
         policies = checked.policies or {}
         names_agents = any(isinstance(key, str) and "." not in key for key in policies)
         if not names_agents:
@@ -393,52 +391,38 @@ def make_plan(
     subject = Subject(
         source,
         variant,
-        find_points(points, own, empty=mode is not Mode.ENVIRONMENT),
+        mode,
+        default_policy,
+        planner_view,
+        find_points(points, own, empty=not has_user),
         own,
         modes if hasattr(inspected, "render") else [],
         getattr(inspected, "render_fps", 4),
         issubclass(kind, SimulationInterface),
         prototype,
     )
-    return _resolve(subject, checked, mode, default_policy, planner_view)
-
-
-def _remake(
-    source: Source,
-    points: Points,
-    options: Mapping[str, Any],
-    mode: Mode,
-    planner_view: PlannerView,
-    variant: Variant | None,
-) -> Plan:
-    """Make an unpickled plan."""
-    plan = make_plan(source, points, options, mode=mode, planner_view=planner_view)
-    return replace(plan, subject=replace(plan.subject, variant=variant))
+    return _resolve(subject, checked)
 
 
 # -- who decides where ----------------------------------------------------------------------------
 
 
-def _resolve(
-    subject: Subject,
-    options: Options,
-    mode: Mode,
-    default_policy: Policy,
-    planner_view: PlannerView,
-) -> Plan:
+def _resolve(subject: Subject, options: Options) -> Plan:
     """Check the options against the simulation and its points, and find out who decides where."""
     options = _checked_render_mode(subject, options)
     by_point, by_agent, definitions = resolve_policies(
         options.policies or {}, subject.named, subject.own
     )
     agents = agent_names(definitions)
-    known = [agents[point] for point in subject.named]
+    known = [agents[hook] for hook in subject.named]
     only = options.agent if options.agent in known else None
+    has_user = subject.mode is Mode.ENVIRONMENT
+    collects = subject.mode is Mode.COLLECT
     points: list[Point] = []
     active: list[Point] = []
     for hook, definition in definitions.items():
         agent = agents[hook]
-        policy = by_point.get(hook, default_policy)
+        policy = by_point.get(hook, subject.default_policy)
         if options.agent is not None and agent != only:
             policy = policy or RULE
         policies = [policy, *by_agent.values()]
@@ -446,44 +430,34 @@ def _resolve(
             policies = [by_agent.get(agent, policy)]
         if policy is RULE and policies == [RULE]:
             continue
-        point = Point(
-            hook,
-            definition,
-            agent,
-            policy,
-            records=mode is Mode.COLLECT,
-            clips=options.clip_actions,
-        )
+        clips = options.clip_actions
+        point = Point(hook, definition, agent, policy, records=collects, clips=clips)
         points.append(point)
         is_active = policies[0] is None
-        if mode is Mode.COLLECT:
+        if collects:
             is_active = any(isinstance(policy, DeferredPolicy) for policy in policies)
         if is_active:
             active.append(point)
-    declared = options.possible_agents if mode is Mode.ENVIRONMENT else None
+    declared = options.possible_agents if has_user else None
     roster, complete = resolve_roster(active, declared, agents.values())
-    if mode is Mode.ENVIRONMENT:
+    if has_user:
         roster = {name: point for name, point in roster.items() if name not in by_agent}
     if options.agent is not None and (active or None not in known):
         active, roster = _choose_one(options.agent, known, active, roster, complete, by_agent)
         complete = True
-    if not active and mode is Mode.ENVIRONMENT:
+    if has_user and not active:
         raise UnknownPointError(
             "no decision point is left to the environment: policies answer all of them"
         )
-    one_agent = active[0].agent or options.agent if len(active) == 1 else None
     own_hooks = {hook.name: hook for hook in subject.own if hasattr(hook.function, BY_NAME)}
     plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
-    removers = _removers(points, subject)
     handlers = [] if plugins is None else plugins.handlers
-    hooks = dict.fromkeys((*definitions, *(remover.hook for remover in removers)))
-    ruled = {agents[hook] for hook in definitions} - {point.agent for point in points}
+    removers = _removers(points, subject)
+    hooks = (*definitions, *(remover.hook for remover in removers))
+    ruled = set(agents.values()) - {point.agent for point in points}
     return Plan(
-        subject=subject,
-        options=options,
-        mode=mode,
-        default_policy=default_policy,
-        planner_view=planner_view,
+        subject,
+        options,
         points=tuple(points),
         active=tuple(active),
         policies=by_agent,
@@ -492,15 +466,14 @@ def _resolve(
             for policy in (*by_point.values(), *by_agent.values())
         ),
         has_split=any(point.split is not None for point in points),
-        needs_simulation=any(point.needs_simulation for point in points),
-        named_agents=frozenset({*by_agent, *declared_agents(options.possible_agents)} - ruled),
-        one_agent=one_agent,
+        named_agents=frozenset({*by_agent, *options.declared_agents} - ruled),
+        one_agent=active[0].agent or options.agent if len(active) == 1 else None,
         roster=roster,
         complete=complete,
         removers=removers,
         plugins=plugins,
         patches=(
-            *((hook, None) for hook in hooks),
+            *dict.fromkeys(hooks).items(),
             *((handler.target, handler) for handler in handlers),
         ),
     )

@@ -215,13 +215,6 @@ def _free_name(point: DecisionPoint, owners: dict[str, DecisionPoint]) -> str:
     return f"{point.letters}_{number}"
 
 
-def declared_agents(declared: Mapping[Any, Iterable[str]] | Iterable[str] | None) -> list[str]:
-    """Return the names in ``possible_agents``."""
-    if isinstance(declared, Mapping):
-        return [name for names in declared.values() for name in names]
-    return list(declared or ())
-
-
 def resolve_roster(
     active: list[Point],
     declared: Mapping[Any, Iterable[str]] | list[str] | None,

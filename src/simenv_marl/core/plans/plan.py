@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias, cast
 from weakref import finalize
 
-from ...decision import BY_NAME, DecisionPoint, Definition
+from ...decision import DecisionPoint, Definition
 from ...errors import (
     AgentError,
     DefinitionError,
@@ -449,7 +449,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         raise UnknownPointError(
             "no decision point is left to the environment: policies answer all of them"
         )
-    own_hooks = {hook.name: hook for hook in subject.own if hasattr(hook.function, BY_NAME)}
+    own_hooks = {hook.name: hook for hook in subject.own}
     plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
     handlers = [] if plugins is None else plugins.handlers
     removers = _removers(points, subject)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
+from itertools import count
 from sys import modules
 from types import FunctionType, MappingProxyType
 from typing import Any, Final, TypeAlias
@@ -63,13 +64,11 @@ def locate(key: Key, own: Definitions = _NONE) -> DecisionPoint:
 
     ``own`` are the points of the simulation itself, some of which are in no module.
     """
-    if not isinstance(key, str):
-        return point_for(find_hook(key, UnknownPointError))
-    for point in own:
-        if point.name == key and hasattr(point.function, BY_NAME):
-            return point
-    decorated = registered().get(key)
-    return point_for(find_hook(key, UnknownPointError)) if decorated is None else decorated
+    if isinstance(key, str):
+        for points in ({point.name: point for point in own}, registered()):
+            if key in points:
+                return points[key]
+    return point_for(find_hook(key, UnknownPointError))
 
 
 def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
@@ -196,23 +195,20 @@ def agent_names(definitions: Definitions) -> dict[DecisionPoint, str | None]:
     owners: dict[str, DecisionPoint] = {}
     for point, definition in definitions.items():
         agent = definition.agent
-        if isinstance(agent, str) and owners.setdefault(agent, point) is not point:
-            raise AgentError(f"{owners[agent].name} and {point.name} have the same agent {agent!r}")
+        if isinstance(agent, str):
+            if agent in owners:
+                other = owners[agent].name
+                raise AgentError(f"{other} and {point.name} have the same agent {agent!r}")
+            owners[agent] = point
     names: dict[DecisionPoint, str | None] = {}
     for point, definition in definitions.items():
-        if callable(definition.agent):
-            names[point] = None
-        else:
-            names[point] = definition.agent or _free_name(point, owners)
+        agent = definition.agent
+        if agent is None:
+            defaults = (f"{point.letters}_{number}" for number in count())
+            agent = next(name for name in defaults if name not in owners)
+            owners[agent] = point
+        names[point] = agent if isinstance(agent, str) else None
     return names
-
-
-def _free_name(point: DecisionPoint, owners: dict[str, DecisionPoint]) -> str:
-    """Return the first default name of a point's agent that no other point has."""
-    number = 0
-    while owners.setdefault(f"{point.letters}_{number}", point) is not point:
-        number += 1
-    return f"{point.letters}_{number}"
 
 
 def resolve_roster(
@@ -222,23 +218,25 @@ def resolve_roster(
 ) -> tuple[dict[str, Point], bool]:
     """Find out which agents are known beforehand, and whether there can be no others."""
     naming = [point.hook for point in active if point.agent is None]
-    if declared is not None and not isinstance(declared, Mapping):
+    names: dict[DecisionPoint, Iterable[str | None]] = {}
+    if isinstance(declared, Mapping):
+        for key, agents in declared.items():
+            hook = _named(key, naming)
+            if hook is None:
+                raise OptionValueError(
+                    f"possible_agents names {short_repr(key)}, which is not an active decision"
+                    " point with a callable as agent=; these are:"
+                    f" {[point.name for point in naming]}"
+                )
+            names[hook] = agents
+    elif declared is not None:
         others = [name for name in declared if name not in known]
         if len(naming) > 1 or (others and not naming):
             raise OptionValueError(
                 "possible_agents must be a dict from decision points to names, unless exactly one"
                 f" point names its agents by a callable; here {len(naming)} do"
             )
-        declared = {point.name: others for point in naming}
-    names: dict[DecisionPoint, Iterable[str]] = {}
-    for key, agents in (declared or {}).items():
-        hook = _named(key, naming)
-        if hook is None:
-            raise OptionValueError(
-                f"possible_agents names {short_repr(key)}, which is not an active decision point"
-                f" with a callable as agent=; these are: {[point.name for point in naming]}"
-            )
-        names[hook] = agents
+        names = dict.fromkeys(naming, others)
     roster: dict[str, Point] = {}
     for point in active:
         for name in names.get(point.hook, ()) if point.agent is None else [point.agent]:
@@ -273,7 +271,11 @@ def resolve_policies(
             except SimEnvError as error:
                 if policy is RULE and isinstance(error, DefinitionError):
                     continue  # the rule decides there anyway
-                if isinstance(error, UnknownPointError) and None in agents and _may_be_agent(key):
+                # A callable may name an agent so later. Names in loaded modules are points.
+                is_name = isinstance(key, str) and (
+                    "." not in key or key.partition(".")[0] not in modules
+                )
+                if isinstance(error, UnknownPointError) and None in agents and is_name:
                     by_agent[key] = policy
                     continue
                 known = sorted([*filter(None, agents), *(point.name for point in named)])
@@ -284,14 +286,6 @@ def resolve_policies(
             definitions.setdefault(point, definition)
         by_point[point] = policy
     return by_point, by_agent, definitions
-
-
-def _may_be_agent(key: object) -> bool:
-    """Return whether a callable may name an agent so later. Names in loaded modules are points."""
-    if not isinstance(key, str):
-        return False
-    first, dot, _ = key.partition(".")
-    return not dot or first not in modules
 
 
 # -- points in other processes --------------------------------------------------------------------

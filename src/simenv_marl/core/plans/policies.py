@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
 from ...errors import OptionValueError, short_repr
-from ...simulation import RULE, Action, Model, Observation, asks_for, positional
+from ...simulation import RULE, Action, Observation, asks_for, positional
 from ..switching.awaiting import wait_for
 from .point import Policy
 
@@ -102,7 +102,7 @@ def records(policy: Policy) -> bool:
 
 def is_asked_alone(policy: Policy) -> bool:
     """Return whether a policy answers one decision at a time: see this module."""
-    return is_planner(policy) or asks_for(policy, "_decision") or waits(policy)
+    return waits(policy) or any(asks_for(policy, name) for name in ASKED)
 
 
 def two_arguments(policy: Callable[..., Action]) -> Callable[[Observation, Info], Action]:
@@ -279,22 +279,12 @@ class AskingPolicy(EpisodePolicy):
     ) -> Action | Awaitable[Action]:
         """Ask the policy, or its substitute where the episode is played."""
         policy = policy_for(self.policy, agent.name, episode.where)
-        if policy is self.policy:
-            return self.ask(episode, agent, observation, info)
         if policy is RULE:
             return RULE
-        substitute = two_arguments(policy)
-        if isinstance(substitute, AskingPolicy):
-            return substitute.ask(episode, agent, observation, info)
-        return substitute(observation, info)
-
-    def ask(
-        self, episode: AskedEpisode, agent: AskedAgent, observation: Observation, info: Info
-    ) -> Action | Awaitable[Action]:
-        """Ask the policy itself."""
-        asked: dict[str, Model] = {}
-        if self.plans:
-            asked["_environment"] = episode.planner_view()
-        if self.asks:
-            asked["_decision"] = agent.describe(episode.seed, episode.where)
-        return self._call(observation, info, asked)
+        call = self._call if policy is self.policy else Caller(policy)
+        asked: dict[str, object] = {}
+        if ASKED[0] in call.names:
+            asked[ASKED[0]] = episode.planner_view()
+        if ASKED[1] in call.names:
+            asked[ASKED[1]] = agent.describe(episode.seed, episode.where)
+        return call(observation, info, asked)

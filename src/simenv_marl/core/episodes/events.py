@@ -18,7 +18,7 @@ from ..switching.driver import AnyHandler
 from ..values.actions import ILLEGAL
 from .agent import Agent, RunningEpisode
 from .arguments import restore
-from .split import SplitHandler, part_of
+from .split import SplitHandler
 
 Namer = Callable[[RunningEpisode, Args, Kwargs], Model]
 """Returns the name of the agent that a call ends."""
@@ -160,7 +160,7 @@ class RuleHandler:
             self._note(episode, decision, call_args, call_kwargs)
             return
         for place, item in enumerate(episode.take_items()):
-            piece = part_of(point.part, decision, item, place, call_args, call_kwargs)
+            piece = point.part_of(decision, item, place, call_args, call_kwargs)
             self._note(episode, piece, (item, *call_args), call_kwargs)
 
     def _note(self, episode: RunningEpisode, decision: Model, args: Args, kwargs: Kwargs) -> None:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
+from dataclasses import dataclass, field
 from types import coroutine
-from typing import Final, Protocol
+from typing import Protocol
 
 from ...errors import SimulationError
-from ...simulation import RULE, Model, Sentinel
+from ...simulation import RULE, Model
 from ..plans.point import Args, Kwargs
-from ..switching.driver import AnyHandler, Event
-from .agent import DecisionHandler
-
-BEGIN: Final = Sentinel("BEGIN")
-"""The reply to a call that is split. It does not reach the simulation."""
+from ..switching.driver import Event
+from .agent import DecisionHandler, RunningEpisode
 
 
-class SplittingEpisode(Protocol):
+class SplittingEpisode(RunningEpisode, Protocol):
     """The episode, as the handlers of calls that are split use it."""
 
     def begin_split(self, call: SplitCall) -> None:
@@ -30,31 +28,26 @@ class SplitHandler:
         """Handle calls of a point. ``items`` handles the decision of each item."""
         self._items = items
         self._point = items.point
-
-    @property
-    def report(self) -> AnyHandler | None:
-        """Handles the decisions of the rule."""
-        return self._items.report
+        self.report = items.report
 
     def handle(self, episode: SplittingEpisode, args: Args, kwargs: Kwargs) -> Model:
-        """Split a call. Its items are handled one after the other, as decisions."""
+        """Split a call, and handle its first item. The episode handles the others."""
         split = self._point.split
-        items = list(() if split is None else split(*args, **kwargs))
+        items = [] if split is None else list(split(*args, **kwargs))
         if not items:
             return RULE
         episode.begin_split(SplitCall(self._items, items, args, kwargs))
-        return BEGIN
+        return self._items.handle(episode, (items[0], *args), kwargs)
 
     def deliver(self, reply: Model, *args: Model, **kwargs: Model) -> Model:
         """On the simulation's side, turn the replies to the items into the value of the call."""
         replies = reply.pop()  # the user's side keeps no reference to the items
         items = reply.pop()
-        value: Model = self._gather(items, replies, args, kwargs)
         kind = self._point.hook.kind
-        if kind == "generator":
+        gather = coroutine(self._gather) if kind == "coroutine" else self._gather
+        value: Model = gather(items, replies, args, kwargs)
+        if kind != "function":
             return value
-        if kind == "coroutine":
-            return _awaited(value)
         try:
             next(value)
         except StopIteration as end:
@@ -70,78 +63,56 @@ class SplitHandler:
         decisions: list[Model] = []
         result: Model = RULE
         for place, (item, reply) in enumerate(zip(items, replies, strict=True)):
-            if reply is not RULE:
-                decisions.append((yield from self._decide(item, reply, args, kwargs)))
-                continue
-            if result is RULE:
-                result = yield from _value(hook.rule(*args, **kwargs), hook.kind)
-            if result is RULE:
-                raise SimulationError(
-                    f"the rule of {hook.name}, in another process, decides for all items of a call"
-                    " or for none; answer all of them by RULE, or none"
-                )
-            decisions.append(part_of(point.part, result, item, place, args, kwargs))
+            decision = reply
+            if reply is RULE:
+                if result is RULE:
+                    result = yield from _value(hook.rule(*args, **kwargs), hook.kind)
+                if result is RULE:
+                    raise SimulationError(
+                        f"the rule of {hook.name}, in another process, decides for all items of a"
+                        " call or for none; answer all of them by RULE, or none"
+                    )
+                decision = point.part_of(result, item, place, args, kwargs)
+            elif point.deliver is not None:
+                value = point.deliver(reply, item, *args, **kwargs)
+                decision = yield from _value(value, hook.kind)
+            decisions.append(decision)
         if point.gather is None:
             return decisions
         return point.gather(items, decisions, *args, **kwargs)
 
-    def _decide(
-        self, item: Model, reply: Model, args: Args, kwargs: Kwargs
-    ) -> Generator[Model, Model, Model]:
-        deliver = self._point.deliver
-        if deliver is None:
-            return reply
-        return (yield from _value(deliver(reply, item, *args, **kwargs), self._point.hook.kind))
 
-
+@dataclass(eq=False)
 class SplitCall:
     """A call whose items are being decided.
 
     Attributes:
         handler: Handles the decision of each item.
         items: The items.
+        args: The positional arguments of the call.
+        kwargs: Its keyword arguments.
+        replies: The replies to the first items.
     """
 
-    def __init__(
-        self, handler: DecisionHandler, items: list[Model], args: Args, kwargs: Kwargs
-    ) -> None:
-        self.handler = handler
-        self.items = items
-        self._args = args
-        self._kwargs = kwargs
-        self._replies: list[Model] = []
+    handler: DecisionHandler
+    items: list[Model]
+    args: Args
+    kwargs: Kwargs
+    replies: list[Model] = field(default_factory=list)
 
     def next_event(self, reply: Model) -> Event | None:
         """Note the reply to an item. Return the event of the next one, or None at the end."""
-        if reply is not BEGIN:
-            self._replies.append(reply)
-        place = len(self._replies)
+        self.replies.append(reply)
+        place = len(self.replies)
         if place == len(self.items):
             return None
-        return self.handler, (self.items[place], *self._args), self._kwargs
+        return self.handler, (self.items[place], *self.args), self.kwargs
 
     def reply(self) -> Model:
         """Return the reply to the call."""
-        if all(reply is RULE for reply in self._replies):
+        if all(reply is RULE for reply in self.replies):
             return RULE
-        return [self.items, self._replies]
-
-
-def part_of(
-    part: Callable[..., Model] | None,
-    result: Model,
-    item: Model,
-    place: int,
-    args: Args,
-    kwargs: Kwargs,
-) -> Model:
-    """Return the part of the rule's result that is for an item."""
-    return result[place] if part is None else part(result, item, *args, **kwargs)
-
-
-@coroutine
-def _awaited(value: Generator[Model, Model, Model]) -> Generator[Model, Model, Model]:
-    return (yield from value)
+        return [self.items, self.replies]
 
 
 def _value(value: Model, kind: str) -> Generator[Model, Model, Model]:

@@ -210,6 +210,10 @@ class Point:
             return [(args, kwargs)]
         return [((item, *args), kwargs) for item in self.split(*args, **kwargs)]
 
+    def part_of(self, result: Model, item: Model, place: int, args: Args, kwargs: Kwargs) -> Model:
+        """Return the part of the rule's result that is for an item of a split call."""
+        return result[place] if self.part is None else self.part(result, item, *args, **kwargs)
+
     def _legal(self) -> Callable[[Args, Kwargs], tuple[Mask, list[Model] | None]] | None:
         """Make the function that returns the mask of a call, and its choices."""
         space = self.definition.action_space

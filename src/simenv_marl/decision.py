@@ -24,7 +24,7 @@ from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, name_of, short_repr
-from .hooks.hook import Hook, hook_of, hooks, made_with
+from .hooks.hook import Hook, hook_of, hooks
 from .hooks.places import decorate
 from .hooks.stacks import DIFFERENCES, EVALUATING
 from .simulation import Function, Model
@@ -298,22 +298,22 @@ def _actions(space: spaces.Discrete) -> range:
 
 def fit_labels(space: Space, labels: object) -> bool:
     """Return whether labels are texts for the parts of a space."""
-    parts: Collection[int | str] = ()
+    parts: Collection[int | str]
     if isinstance(space, spaces.Discrete):
         parts = _actions(space)
     elif isinstance(space, spaces.Dict):
         parts = space.spaces
     elif space.shape is not None and len(space.shape) == 1:
         parts = range(*space.shape)
-    texts = None
-    if isinstance(labels, Mapping):
-        if set(labels) == set(parts):
-            texts = list(labels.values())
-    elif isinstance(labels, Sequence) and not isinstance(space, spaces.Dict):
-        texts = None if isinstance(labels, str) else list(labels)
-    if texts is None or len(texts) != len(parts):
+    else:
         return False
-    if not all(isinstance(text, str) for text in texts):
+    texts: Collection[object] = ()
+    if isinstance(labels, Mapping):
+        if labels.keys() == set(parts):
+            texts = labels.values()
+    elif isinstance(labels, Sequence) and not isinstance(space, spaces.Dict):
+        texts = () if isinstance(labels, str) else labels
+    if len(texts) != len(parts) or not all(isinstance(text, str) for text in texts):
         return False
     # Labels distinguish the parts of arrays and dicts.
     return isinstance(space, spaces.Discrete) or len(set(texts)) == len(texts)
@@ -361,15 +361,6 @@ def point_for(hook: Hook) -> DecisionPoint:
             f"{hook.name} cannot be a decision point: it is not a function written in Python"
         )
     return hook
-
-
-def point_of(function: object) -> tuple[DecisionPoint, Definition | None] | None:
-    """Return the point of a decision function, also of a bound one, and its definition.
-
-    None for other functions.
-    """
-    hook = hook_of(function)
-    return None if hook is None else (hook, made_with(function))
 
 
 def registered() -> dict[str, DecisionPoint]:

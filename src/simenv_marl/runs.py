@@ -4,8 +4,6 @@ from collections.abc import Callable, Iterable, Mapping
 from itertools import chain
 from typing import Any, Unpack
 
-import numpy as np
-
 from .core import (
     EpisodeOptions,
     Mode,
@@ -21,7 +19,7 @@ from .envs.single import plan_of
 from .errors import OptionValueError, close_after, short_repr
 from .many.batch import BatchRun, policy_keys
 from .many.parallel import ProgressBar, import_extra, progress_bar, spread
-from .simulation import Model
+from .simulation import Model, is_integer
 
 
 def simulate(
@@ -222,7 +220,7 @@ def check_options(
         ("concurrency", concurrency, 1, positive),
         ("workers", workers, -1, "a non-negative integer, or -1 for as many as joblib has"),
     ):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        if not is_integer(value) or value < least:
             raise OptionValueError(f"{name} must be {expected}, not {short_repr(value)}")
     if workers:
         backend, _ = import_extra("joblib.parallel", f"workers={workers}").get_active_backend()

@@ -13,7 +13,7 @@ import pytest
 from greenlet import getcurrent, greenlet
 
 from simenv_marl import aec_env
-from simenv_marl.decision import point_of, registered
+from simenv_marl.decision import registered
 from simenv_marl.errors import PatchError, UnknownTargetError
 from simenv_marl.hooks.handlers import Installation
 from simenv_marl.hooks.hook import Hook, hook_of, made_with, unwrap
@@ -188,7 +188,7 @@ def test_models_of_points_and_of_targets_are_collected_with_these():
                 yield from [1, 2]
 
         references.append(weakref.ref(Model))
-        name = point_of(Model.decorated)[0].name
+        name = hook_of(Model.decorated).name
         assert name in registered()
         env = aec_env(
             calling(lambda model=Model: model().decide()),

@@ -14,7 +14,6 @@ from simenv_marl import RULE, aec_env, generate_env, simulate, single_env
 from simenv_marl.core.copies import packing
 from simenv_marl.core.copies.packing import pack, pack_plainly, unpack
 from simenv_marl.core.plans.points import find_point, portable
-from simenv_marl.decision import point_of
 from simenv_marl.errors import (
     AgentError,
     DefinitionError,
@@ -372,7 +371,7 @@ def test_threads_that_register_name_and_extend_functions_at_once_do_not_disturb_
 
 def test_a_point_is_itself_again_where_it_is_and_comes_along_with_one_hook(monkeypatch):
     local = decision(agent="local_0")
-    point, _ = point_of(Home.heat)
+    point = hook_of(Home.heat)
     assert unpack(pack(point)) is point
     parcel = pack(hook_of(local))
     monkeypatch.setattr(packing, "_known", {})  # as in another process

@@ -202,8 +202,8 @@ def hook_of(value: object) -> Hook | None:
 
 
 def made_with(wrapper: object) -> Any:
-    """Return the object that a wrapper was made with: a definition or None."""
-    return vars(unbind(wrapper))[_MADE_WITH]
+    """Return the object that a wrapper was made with: a definition, or None as for all others."""
+    return None if hook_of(wrapper) is None else vars(unbind(wrapper))[_MADE_WITH]
 
 
 def unwrap(function: object) -> Model:

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from inspect import cleandoc
 from itertools import chain
 from math import inf
-from numbers import Integral, Real
+from numbers import Real
 from textwrap import indent
 from typing import Any, Literal, TypedDict, TypeVar
 
 from gymnasium.spaces import Space
 
 from ...errors import OptionValueError, UnknownOptionError, did_you_mean, short_repr
-from ...simulation import RULE
+from ...simulation import RULE, is_integer
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -73,12 +73,6 @@ def _is_list(value: object) -> bool:
     return isinstance(value, Iterable)
 
 
-def _is_number(value: object, kind: type) -> bool:
-    if isinstance(value, bool):
-        return False
-    return isinstance(value, kind)
-
-
 _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
     "driver": (
         lambda driver: driver in ("greenlet", "thread"),
@@ -97,7 +91,7 @@ _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
         "the name of an agent or None",
     ),
     "discount_rate": (
-        lambda rate: _is_number(rate, Real) and 0 <= rate < inf,
+        lambda rate: isinstance(rate, Real) and not _is_bool(rate) and 0 <= float(rate) < inf,
         "a finite number that is not negative, or None",
     ),
     "clip_actions": (
@@ -121,7 +115,7 @@ _VALID: dict[str, tuple[Callable[[Any], bool], str]] = {
         "a string or None",
     ),
     "max_steps": (
-        lambda steps: _is_number(steps, Integral) and steps >= 1,
+        lambda steps: is_integer(steps) and steps >= 1,
         "a positive integer or None",
     ),
     "policies": (

@@ -19,7 +19,6 @@ from ...decision import (
     Definition,
     decision_points,
     point_for,
-    point_of,
     registered,
 )
 from ...errors import (
@@ -32,7 +31,7 @@ from ...errors import (
     name_of,
     short_repr,
 )
-from ...hooks.hook import unwrap
+from ...hooks.hook import hook_of, made_with, unwrap
 from ...hooks.places import (
     PlacedHook,
     all_classes,
@@ -159,9 +158,8 @@ def find_point(
             f" {short_repr(definition)}"
         )
     point = locate(key, own)
-    decorated = None if isinstance(key, str) else point_of(getattr(key, "__func__", key))
-    if decorated is not None:  # a name means the latest definition, a decision function its own
-        definition = definition or decorated[1]
+    if not isinstance(key, str):  # a name means the latest definition, a decision function its own
+        definition = definition or made_with(getattr(key, "__func__", key))
     definition = definition or own.get(point) or point.definition or _inherited(point)
     if definition is None:
         raise DefinitionError(
@@ -175,8 +173,12 @@ def _inherited(point: DecisionPoint) -> Definition | None:
     """Return the definition that a class inherits together with the decision function."""
     if not isinstance(point, PlacedHook) or not point.inherited:
         return None
-    known = point_of(raw_attribute(point.owner, point.attribute))
-    return known and (known[1] or known[0].definition)
+    inherited = raw_attribute(point.owner, point.attribute)
+    hook = hook_of(inherited)
+    if hook is None:
+        return None
+    definition: Definition | None = made_with(inherited) or hook.definition
+    return definition
 
 
 def _named(key: object, points: Iterable[DecisionPoint]) -> DecisionPoint | None:

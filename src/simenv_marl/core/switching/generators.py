@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from functools import cache
 from gc import get_referents
-from numbers import Integral
 from sys import modules
 from threading import current_thread
 from threading import enumerate as enumerate_threads
@@ -26,7 +25,7 @@ from numpy.random import (
 
 from ...errors import OptionValueError, SimulationError, short_repr, warn_user
 from ...hooks.stacks import SIMULATION
-from ...simulation import Model
+from ...simulation import Model, is_integer
 
 PYTHON: Final[Any] = random.seed.__self__  # type: ignore[attr-defined]
 """The generator behind the functions of ``random``."""
@@ -39,9 +38,7 @@ LEGACY: Final[Any] = np.random  # NumPy's type stubs lack some of its functions
 
 def is_seed(value: object) -> bool:
     """Return whether a value is a non-negative integer."""
-    if isinstance(value, bool) or not isinstance(value, Integral):
-        return False
-    return int(value) >= 0
+    return is_integer(value) and value >= 0
 
 
 # -- simulations that draw from the generators of the process --------------------------------------

@@ -259,7 +259,7 @@ def _problems(definition: Definition) -> Iterator[str]:
     if not isinstance(space, spaces.Discrete):
         yield f"a dict as action_space_mapping needs a Discrete action_space, not {space}"
         return
-    actions = _actions(space)
+    actions = parts_of(space) or ()
     absent = [action for action in actions if action not in decisions]
     surplus = [action for action in decisions if action not in actions]
     if absent or surplus:
@@ -291,28 +291,28 @@ def _required_kind(
     return "callable"
 
 
-def _actions(space: spaces.Discrete) -> range:
-    """Return the actions of a ``Discrete`` space."""
-    return range(int(space.start), int(space.start + space.n))
+def parts_of(space: Space) -> Collection[int | str] | None:
+    """Return the parts of a space that may have labels; None for a space without such parts."""
+    if isinstance(space, spaces.Discrete):
+        return range(int(space.start), int(space.start + space.n))
+    if isinstance(space, spaces.Dict):
+        return space.spaces
+    if space.shape is None or len(space.shape) != 1:
+        return None
+    return range(*space.shape)
 
 
 def fit_labels(space: Space, labels: object) -> bool:
     """Return whether labels are texts for the parts of a space."""
-    parts: Collection[int | str]
-    if isinstance(space, spaces.Discrete):
-        parts = _actions(space)
-    elif isinstance(space, spaces.Dict):
-        parts = space.spaces
-    elif space.shape is not None and len(space.shape) == 1:
-        parts = range(*space.shape)
-    else:
+    parts = parts_of(space)
+    if parts is None or isinstance(labels, str):
         return False
     texts: Collection[object] = ()
     if isinstance(labels, Mapping):
         if labels.keys() == set(parts):
             texts = labels.values()
     elif isinstance(labels, Sequence) and not isinstance(space, spaces.Dict):
-        texts = () if isinstance(labels, str) else labels
+        texts = labels
     if len(texts) != len(parts) or not all(isinstance(text, str) for text in texts):
         return False
     # Labels distinguish the parts of arrays and dicts.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 from ...errors import short_repr, warn_user
 from ...simulation import RULE, Action
 from ..switching.driver import WAIT
+from ..values.actions import mask_allows
 
 if TYPE_CHECKING:
     from .agent import Agent
@@ -55,7 +56,8 @@ class Round:
         if action is WAIT:
             return WAIT
         if action is not RULE:
-            if agent.mask is not None and not agent.point.allows(agent.mask, action):
+            space = agent.point.definition.action_space
+            if agent.mask is not None and not mask_allows(space, agent.mask, action):
                 return WAIT
             self.used += 1
         self.acted.add(agent.name)

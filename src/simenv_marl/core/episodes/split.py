@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
+from inspect import isgenerator
 from types import coroutine
 from typing import Protocol
 
@@ -117,8 +118,6 @@ class SplitCall:
 
 def _value(value: Model, kind: str) -> Generator[Model, Model, Model]:
     """Return the decision of a function of a kind, after it has waited for it."""
-    if kind == "generator":
-        value = yield from value
-    elif kind == "coroutine":
-        value = yield from value.__await__()
-    return value
+    if kind == "function":
+        return value
+    return (yield from value if isgenerator(value) else value.__await__())

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol, TypeAlias
 import numpy as np
 from gymnasium import spaces as gym_spaces
 
-from ...decision import DecisionPoint, Definition, fit_labels, inverse
+from ...decision import DecisionPoint, Definition, fit_labels, inverse, parts_of
 from ...errors import (
     DefinitionError,
     InvalidActionError,
@@ -293,16 +293,15 @@ class Point:
                     f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"
                     f" not texts for the parts of {short_repr(space)}"
                 )
-        if isinstance(space, gym_spaces.Discrete):
-            start = int(space.start)
-            texts = labels if isinstance(labels, Mapping) else dict(enumerate(labels or (), start))
-            return {key: str(texts.get(key, key)) for key in range(start, start + space.n)}
-        if isinstance(space, gym_spaces.Dict):
-            return dict(labels or zip(space.spaces, space.spaces, strict=True))
-        if space.shape is None or len(space.shape) != 1:
+        parts = parts_of(space)
+        if parts is None:
             return None
-        places = range(space.shape[0])
-        return tuple(str(place) if labels is None else labels[place] for place in places)
+        texts = (
+            labels if isinstance(labels, Mapping) else dict(zip(parts, labels or (), strict=False))
+        )
+        named = {part: str(texts.get(part, part)) for part in parts}
+        has_keys = isinstance(space, (gym_spaces.Discrete, gym_spaces.Dict))
+        return named if has_keys else tuple(named.values())
 
     # -- actions ----------------------------------------------------------------------------------
 
@@ -310,10 +309,6 @@ class Point:
         """Make the mask that allows all actions."""
         mask: Mask = actions.open_mask(self.definition.action_space)
         return mask
-
-    def allows(self, mask: Mask, action: Action) -> bool:
-        """Whether a mask allows an action that is in the space."""
-        return actions.mask_allows(self.definition.action_space, mask, action)
 
     def validate(self, action: Action, agent: str, mask: Mask | None) -> Action:
         """Validate an action; return it as ``convert`` receives it.
@@ -335,7 +330,7 @@ class Point:
                 f"the action {short_repr(action)} of {agent!r} is not in its action space"
                 f" {short_repr(space)}"
             )
-        if mask is not None and not self.allows(mask, legal):
+        if mask is not None and not actions.mask_allows(space, mask, legal):
             raise InvalidActionError(
                 f"the action {short_repr(action)} of {agent!r} is masked; its mask is"
                 f" {short_repr(mask)}"
@@ -351,29 +346,38 @@ class Point:
         ``apply`` comes with its agent. A choice comes in a list, which is emptied, so that the
         user's side keeps no reference to it.
         """
+        applies = self.applies
         has_choices = "choices" in self._calls
         kind = self.hook.kind
-        if not self.applies and not has_choices and kind == "function":
+        if not applies and not has_choices and kind == "function":
             return None
-        wrap = {"function": _same, "generator": _returning, "coroutine": _awaiting}[kind]
-        apply = self._calls.get("apply")
+        apply = self._calls.get("apply", _same)
 
         def deliver(reply: Model, *args: Model, **kwargs: Model) -> Model:
-            if apply is None:
-                return wrap(reply.pop() if has_choices else reply)
+            if not applies:
+                return reply.pop() if has_choices else reply
             agent, action = reply
             agent.begin_apply()
             try:
-                value = apply(action.pop() if has_choices else action, *args, **kwargs)
+                return apply(action.pop() if has_choices else action, *args, **kwargs)
             finally:
                 agent.end_apply()
-            if kind != "function" and inspect.isgenerator(value):
-                return _applying(agent, value)
-            if kind != "function" and inspect.isawaitable(value):
-                return coroutine(_applying)(agent, value.__await__())
-            return wrap(value)
 
-        return deliver
+        def deliver_later(
+            reply: Model, *args: Model, **kwargs: Model
+        ) -> Generator[Model, Model, Model]:
+            value = deliver(reply, *args, **kwargs)
+            if not applies:
+                return value
+            if inspect.isgenerator(value):
+                return (yield from _applying(reply[0], value))
+            if inspect.isawaitable(value):
+                return (yield from _applying(reply[0], value.__await__()))
+            return value
+
+        if kind == "function":
+            return deliver
+        return coroutine(deliver_later) if kind == "coroutine" else deliver_later
 
 
 def _bound(part: Model, simulation: Model) -> Model:
@@ -394,15 +398,6 @@ def _masked_parts(space: Space) -> list[str]:
 
 
 def _same(value: Model) -> Model:
-    return value
-
-
-def _returning(value: Model) -> Generator[Model, Model, Model]:
-    return value
-    yield
-
-
-async def _awaiting(value: Model) -> Model:
     return value
 
 

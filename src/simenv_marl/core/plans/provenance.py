@@ -3,7 +3,6 @@
 import platform
 import sys
 from collections.abc import Mapping, Set
-from dataclasses import fields
 from functools import cache, partial
 from importlib.metadata import packages_distributions, version
 from typing import Any, TypeAlias, Unpack
@@ -70,11 +69,9 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     points = {point.hook.name: point.agent for point in plan.active}
     packages = sorted({dotted.partition(".")[0] for dotted in (name, *points)})
     plugins = [] if plan.plugins is None else plan.plugins.entries
-    options = {}
-    for option in fields(Options):
-        value = getattr(plan.options, option.name)
-        if option.name not in ("plugins", "policies") and value != option.default:
-            options[option.name] = as_json(value)
+    options = dict(vars(plan.options))
+    del options["plugins"], options["policies"]  # they have entries of their own
+    defaults = vars(Options())
     return {
         "simulation": name,
         "packages": {package: _version(package) for package in packages},
@@ -86,7 +83,9 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
             for handler, target, position in plugins
         ],
         "policies": as_json(plan.options.policies or {}),
-        "options": options,
+        "options": {
+            name: as_json(value) for name, value in options.items() if value != defaults[name]
+        },
         "seed": seed,
         "python": platform.python_version(),
         "dependencies": {package.replace("_", "-"): _version(package) for package in DEPENDENCIES},
@@ -98,13 +97,11 @@ def as_json(value: object) -> Json:
 
     Functions and classes become their dotted names, other objects their ``repr``.
     """
-    if isinstance(value, np.generic):
-        value = value.item()
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
     match value:
         case str() | int() | float() | None:
             return value
-        case np.ndarray():
-            return as_json(value.tolist())
         case Mapping():
             return {str(as_json(key)): as_json(part) for key, part in value.items()}
         case list() | tuple():

@@ -55,7 +55,7 @@ from ..simulation import (
     Action,
     Model,
     make_simulation,
-    resetter,
+    passing,
 )
 from .fingerprint import STEP, Fingerprint, fingerprint
 
@@ -332,7 +332,7 @@ class Runner:
                     simulation = make_simulation(self.plan.subject.source)
                     if rng is not None:
                         rng.begin(seed)
-                    resetter(simulation)(seed, None)
+                    passing(simulation.reset, "seed", "options")(seed=seed, options=None)
                     run.run_main_loop(simulation)
             finally:
                 installation.uninstall()

@@ -21,7 +21,7 @@ from ...errors import (
     warn_user,
 )
 from ...hooks.handlers import Installation
-from ...simulation import Model, closer, make_simulation, resetter
+from ...simulation import Model, make_simulation, passing
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -67,8 +67,7 @@ class Session(BaseSession):
         self.context: Callable[..., environment_context] = partial(
             environment_context, plan.plugins, self._rng, self.lock
         )
-        # Closes the simulation, if it was reset since the last time.
-        self._close: Callable[[bool], None] | None = None
+        self._close: Callable[..., Model] | None = None  # set by a reset, called once
         self._installed: Installation | None = Installation(plan.patches)
         prototype = plan.claim_prototype()
         if prototype is not None:
@@ -94,8 +93,9 @@ class Session(BaseSession):
 
     def _take_simulation(self, simulation: Model) -> None:
         self._simulation = simulation
-        self._reset = resetter(simulation)
-        self._closer = closer(simulation)
+        self._reset = passing(simulation.reset, "seed", "options")
+        close = getattr(simulation, "close", None)
+        self._closer = None if close is None else passing(close, "last")
         self.handlers = handlers_of(self.plan, simulation)
 
     def _run(self, job: Callable[[], Model]) -> Model:
@@ -108,7 +108,7 @@ class Session(BaseSession):
         """Close the simulation, once for each reset. ``last``: no reset follows."""
         close, self._close = self._close, None
         if close is not None:
-            self._run(partial(close, last))
+            self._run(partial(close, last=last))
 
     def _put_away(self) -> None:
         """End the stack and remove the patches."""
@@ -197,7 +197,7 @@ class Session(BaseSession):
         Return the simulation's ``run``, and the handlers of its events.
         """
         simulation = self._simulation
-        self._reset(seed, self.options)
+        self._reset(seed=seed, options=self.options)
         self._close = self._closer
         clock = self._make_clock()  # anew, because a reset may set another one
         if clock is None and self.plan.options.discount_rate is not None:

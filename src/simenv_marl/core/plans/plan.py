@@ -527,7 +527,7 @@ def _removers(points: Collection[Point], subject: Subject) -> tuple[Remover, ...
     decisions = {point.hook for point in points}
     found: list[Remover] = []
     for point in points:
-        for name in dict.fromkeys((*point.hook.removed_by, *point.definition.removed_by)):
+        for name in point.removed_by:
             hook = locate(name, subject.own)
             if hook in decisions:
                 raise DefinitionError(

@@ -31,7 +31,6 @@ _LIBRARY: Final = __name__.partition(".")[0]
 GONE: Final = Sentinel("GONE")
 """The place of an object that the model has freed."""
 
-
 _is_gone: Final = partial(is_, GONE)  # because arrays compare element by element
 
 
@@ -86,7 +85,7 @@ class Arguments:
         )
 
     def recall(self) -> tuple[Args, Kwargs]:
-        """Return the arguments that are held. ``GONE`` in place of those that are freed."""
+        """Return the held arguments, with ``GONE`` in place of each that the model has freed."""
         args = tuple(map(restore, self._args))
         return args, {key: restore(value) for key, value in self._kwargs.items()}
 
@@ -103,7 +102,7 @@ def _same(value: Model) -> Model:
 
 
 class _Held(partial[Model]):
-    """The place of a container that has weakly held content. A call returns what lives of it."""
+    """The place of a container with weakly held content. A call returns its living content."""
 
 
 def _living(elements: Iterable[Model]) -> list[Model]:

@@ -57,7 +57,7 @@ def adapt(function: Callable[..., Model], name: str, hook: Hook, leading: int = 
         function: The mapping.
         name: The parameter of ``make_step`` that it was given for.
         hook: The decision function.
-        leading: How many arguments of the mapping's own come before those of the call.
+        leading: The number of the mapping's arguments that come before the call's.
 
     Raises:
         DefinitionError: The mapping requires an argument that no call has.

@@ -384,7 +384,7 @@ def make_plan(
         policies = checked.policies or {}
         names_agents = any(isinstance(key, str) and "." not in key for key in policies)
         if not names_agents:
-            points = ()  # those that ``policies`` names are enough
+            points = ()  # the points in ``policies`` are enough
     own = own_points(inspected)
     kind = inspected if isinstance(inspected, type) else type(inspected)
     modes = getattr(inspected, "render_modes", ("ansi", "human", "rgb_array"))

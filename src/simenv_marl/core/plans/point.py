@@ -1,4 +1,4 @@
-"""Decision points under the definition of one environment: what agents there observe and may do."""
+"""Decision points under the definition of one environment: observations, actions and labels."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Point:
         needs_simulation: Whether a callable asks for the simulation.
         name_agent: A callable of the call's arguments that names the agent, if ``agent`` is None.
         observation_mapping, reward_mapping: The mappings, callable with all arguments.
-        takes_for_observation: The mappings of which an observation consists: also that of the mask.
+        takes_for_observation: The mappings that make an observation, with its mask and choices.
         takes_for_reward: The reward mapping, with the arguments that it takes.
         taken: The arguments that mappings take after the decision.
         taken_places: The number of positional arguments up to the last of these. None: all.
@@ -156,7 +156,7 @@ class Point:
         return point
 
     def fit_callables(self, simulation: Model) -> None:
-        """Fit the callables of the definition to calls, with the simulation for those that ask."""
+        """Fit the definition's callables to calls. Give the simulation to each that asks for it."""
         definition = self.definition
         parts = {name: _bound(part, simulation) for name, part in vars(definition).items()}
         if asks_for(parts["apply"], "_rule"):

@@ -82,7 +82,7 @@ def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
 
 
 def owner_class(point: DecisionPoint) -> type | None:
-    """Return the class of which a point is a method. None if it is no method, or is gone."""
+    """Return the class of a method. None for other points, or if the class is gone."""
     try:
         owner, _ = resolve(point.name, UnknownPointError)
     except (UnknownPointError, PatchError):
@@ -91,7 +91,7 @@ def owner_class(point: DecisionPoint) -> type | None:
 
 
 def overrides(point: DecisionPoint) -> list[str]:
-    """Return the dotted names of the functions by which derived classes override a point."""
+    """Return the dotted names of the functions in derived classes that override a point."""
     owner = owner_class(point)
     if owner is None:
         return []
@@ -255,7 +255,7 @@ def resolve_policies(
 ) -> tuple[dict[DecisionPoint, Policy], dict[str, Policy], dict[DecisionPoint, Definition]]:
     """Return the policies by point and by agent, and all points that are named.
 
-    These are the points in ``named``, and those that only ``policies`` names.
+    ``policies`` may name points that ``named`` lacks.
     """
     by_point: dict[DecisionPoint, Policy] = {}
     by_agent: dict[str, Policy] = {}

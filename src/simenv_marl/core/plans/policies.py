@@ -1,4 +1,4 @@
-"""Policies: who answers a decision, and what a policy is called with.
+"""Policies: who answers a decision, and the arguments of a policy.
 
 A *planner* has a keyword-only parameter ``_environment``, and gets the environment in which it
 decides. A policy with ``_decision`` gets the pending ``Decision``. A coroutine function is awaited.
@@ -69,7 +69,7 @@ class AskedAgent(Protocol):
 
 
 ASKED: Final = ("_environment", "_decision")
-"""The keyword-only parameters by which policies ask for more."""
+"""The keyword-only parameters of policies that ask for more."""
 
 
 def takes_info(policy: Callable[..., Action]) -> bool:

@@ -56,9 +56,10 @@ class Round:
         if action is WAIT:
             return WAIT
         if action is not RULE:
-            space = agent.point.definition.action_space
-            if agent.mask is not None and not mask_allows(space, agent.mask, action):
-                return WAIT
+            if agent.mask is not None:
+                space = agent.point.definition.action_space
+                if not mask_allows(space, agent.mask, action):
+                    return WAIT
             self.used += 1
         self.acted.add(agent.name)
         return action

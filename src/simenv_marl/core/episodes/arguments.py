@@ -31,15 +31,17 @@ _LIBRARY: Final = __name__.partition(".")[0]
 GONE: Final = Sentinel("GONE")
 """The place of an object that the model has freed."""
 
-_is_gone: Final = partial(is_, GONE)  # because arrays compare element by element
-
 
 def freed(args: Args, kwargs: Kwargs) -> set[int | str]:
     """Return the numbers and the keywords of the arguments that the model has freed."""
-    if not any(map(_is_gone, (*args, *kwargs.values()))):
-        return set()
-    pairs: Iterable[tuple[int | str, Model]] = (*enumerate(args), *kwargs.items())
-    return {key for key, value in pairs if value is GONE}
+    gone: set[int | str] = set()
+    for place, value in enumerate(args):
+        if value is GONE:
+            gone.add(place)
+    for key, value in kwargs.items():
+        if value is GONE:
+            gone.add(key)
+    return gone
 
 
 class Arguments:
@@ -67,10 +69,10 @@ class Arguments:
         self.is_empty = False
         self._args = tuple(map(weaken, args[: self._point.taken_places]))
         self._kwargs = BOUND
-        if kwargs:
-            taken = self._point.taken
+        keys = self._point.taken_keys
+        if kwargs and (keys is None or keys):
             self._kwargs = {
-                key: weaken(value) for key, value in kwargs.items() if taken is None or key in taken
+                key: weaken(value) for key, value in kwargs.items() if keys is None or key in keys
             }
         first = _nothing
         if args:
@@ -86,6 +88,9 @@ class Arguments:
 
     def recall(self) -> tuple[Args, Kwargs]:
         """Return the held arguments, with ``GONE`` in place of each that the model has freed."""
+        if self.is_single:
+            entity = self.first()
+            return (GONE if entity is None else entity,), BOUND
         args = tuple(map(restore, self._args))
         return args, {key: restore(value) for key, value in self._kwargs.items()}
 

@@ -86,8 +86,9 @@ class Point:
         observation_mapping, reward_mapping: The mappings, callable with all arguments.
         takes_for_observation: The mappings that make an observation, with its mask and choices.
         takes_for_reward: The reward mapping, with the arguments that it takes.
-        taken: The arguments that mappings take after the decision.
-        taken_places: The number of positional arguments up to the last of these. None: all.
+        taken_places: The number of positional arguments up to the last one that mappings take after
+            the decision. None: all.
+        taken_keys: The keyword arguments that they take. None: all.
         convert: Turns a checked action into the reply to the simulation.
         legal: Returns the mask of a call, and its choices if it has any. None if all actions are
             always legal.
@@ -105,7 +106,7 @@ class Point:
         "__weakref__", "_calls", "agent", "applies", "cast", "check", "convert", "definition",
         "deliver", "expects_one", "gather", "hook", "legal", "masked_parts", "name_agent",
         "needs_simulation", "observation_mapping", "part", "policy", "removed_by", "reports_rule",
-        "reward_mapping", "rule_action_mapping", "split", "taken", "taken_places",
+        "reward_mapping", "rule_action_mapping", "split", "taken_keys", "taken_places",
         "takes_for_observation", "takes_for_reward",
     )  # fmt: skip
 
@@ -177,11 +178,13 @@ class Point:
         makes_observation = ("observation_space_mapping", "action_mask_mapping", "choices")
         self.takes_for_observation = [fitted[name] for name in makes_observation if name in fitted]
         labels = [mapped for name, mapped in fitted.items() if name.endswith("_labels")]
-        self.taken = taken_by([*self.takes_for_observation, self.takes_for_reward, *labels])
+        taken = taken_by([*self.takes_for_observation, self.takes_for_reward, *labels])
         self.taken_places: int | None = None
-        if self.taken is not None:
-            places = [place for place in self.taken if isinstance(place, int)]
+        self.taken_keys = taken
+        if taken is not None:
+            places = [place for place in taken if isinstance(place, int)]
             self.taken_places = max(places, default=-1) + 1
+            self.taken_keys = taken.difference(places)
         self.convert: Callable[[Action], Model] = parts["action_space_mapping"] or _same
         self.legal = self._legal()
         self.masked_parts: list[str] = []

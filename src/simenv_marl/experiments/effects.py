@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..data.plots import interval, is_proportion
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
+from .designs import saltelli_blocks
 from .evaluation import check_metric, check_probability, numbers
 from .plots import plot_factors
 from .runner import RUN_COLUMNS, TEAM
@@ -290,22 +291,9 @@ def sobol_indices(
 
 
 def _is_saltelli(rows: NDArray[Any]) -> bool:
-    """Return whether a design has the rows of a Saltelli design.
-
-    Each sample is a block: a row A; A with each factor of B in turn; B with each factor of A in
-    turn; the row B.
-
-    Args:
-        rows: The values of the factors, of shape ``(rows, factors)``.
-    """
+    """Return whether the values of the factors, ``(rows, factors)``, are a Saltelli design."""
     count = rows.shape[1]
     if not count or len(rows) % (2 * count + 2):
         return False
     blocks = rows.reshape(-1, 2 * count + 2, count)
-    first = blocks[:, :1]
-    last = blocks[:, -1:]
-    own = np.eye(count, dtype=bool)
-    mixed_first = np.where(own, last, first)
-    mixed_last = np.where(own, first, last)
-    saltelli_blocks = np.concatenate([first, mixed_first, mixed_last, last], axis=1)
-    return bool((blocks == saltelli_blocks).all())
+    return bool((blocks == saltelli_blocks(blocks[:, :1], blocks[:, -1:])).all())

@@ -87,28 +87,30 @@ STYLE: Final[dict[Any, Any]] = {
 
 
 @contextmanager
-def style(feature: str) -> Iterator[Callable[[float, float], Figure]]:
-    """Set the style of all plots for a feature of this package.
+def style(figure: Figure | SubFigure | None = None) -> Iterator[Callable[[float, float], Any]]:
+    """Set the style of all plots.
 
-    Yield a function that makes a new figure from its width and height in inches.
+    Yield a function that returns the figure, or makes one of a width and a height in inches.
     """
-    make = import_extra("matplotlib.figure", feature).Figure
+    make = import_extra("matplotlib.figure", "a plot").Figure
     from matplotlib import rc_context
 
-    def new_figure(width: float, height: float) -> Any:
-        figure = make(figsize=(width, height), layout="constrained")
+    def make_figure(width: float, height: float) -> Any:
+        if figure is not None:
+            return figure
+        fresh = make(figsize=(width, height), layout="constrained")
 
         def image() -> bytes:
             buffer = BytesIO()
-            figure.savefig(buffer, format="png", dpi=100)
+            fresh.savefig(buffer, format="png", dpi=100)
             return buffer.getvalue()
 
         # IPython calls this method where Matplotlib has not registered its figures.
-        figure._repr_png_ = image
-        return figure
+        fresh._repr_png_ = image
+        return fresh
 
     with rc_context(STYLE):
-        yield new_figure
+        yield make_figure
 
 
 def by_key(trajectories: Collection) -> Mapping[Any, Trajectories]:
@@ -239,9 +241,9 @@ def plot_returns(
     proportion = is_proportion(
         np.concatenate([returns for rows in groups.values() for returns in rows.values()])
     )
-    with style("plot_returns") as new_figure:
+    with style() as make_figure:
         if ax is None:
-            ax = new_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
+            ax = make_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
         height = 0.0
         ticks: list[tuple[float, str, str]] = []
         for title, rows in groups.items():

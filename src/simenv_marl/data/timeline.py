@@ -201,8 +201,7 @@ def plot_timeline(
     begin = min(row.times[0] for row in rows)
     end = max(row.end for row in rows)
     margin = 0.015 * (end - begin or 1.0)
-    with style("plot_timeline") as new_figure:
-        make = new_figure if figure is None else lambda width, height: figure
+    with style(figure) as make:
         if len(rows) <= MOST_CHARTS:
             grid = _draw_charts(rows, make, begin, end)
         else:

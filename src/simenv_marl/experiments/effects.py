@@ -2,18 +2,18 @@
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from math import nan
+from math import ceil, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.plots import interval, is_proportion
+from ..data.plots import COLOURS, interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
 from .designs import saltelli_blocks
 from .evaluation import check_metric, check_probability, numbers
-from .plots import plot_factors
+from .plots import draw_means, label_levels, short_text
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -62,14 +62,49 @@ class Effects:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        return plot_factors(
-            self.main,
-            self.interactions,
-            self._cells,
-            self.levels,
-            self.metric,
-            figure,
-        )
+        pairs = [pair for pair, strength in self.interactions["strength"].items() if strength > 0][
+            :4
+        ]
+        columns = min(max(len(self.levels), len(pairs)), 5)  # more would be too small to read
+        above = ceil(len(self.levels) / columns)
+        with style(figure) as make_figure:
+            figure = make_figure(max(3.2, 2.3 * columns), 2.8 * (above + bool(pairs)))
+            grid = figure.subplots(above + bool(pairs), columns, squeeze=False)
+            upper = grid[:above].ravel()
+            for axes, factor in zip(upper, self.levels, strict=False):
+                means = self.main.loc[factor]
+                draw_means(
+                    axes,
+                    range(len(means)),
+                    means,
+                    fmt="o-",
+                    color=COLOURS[0],
+                )
+                label_levels(axes, self.levels[factor], factor)
+                if axes is not upper[0]:
+                    axes.sharey(upper[0])
+            for axes in grid[:above, 0]:
+                axes.set_ylabel(f"{self.metric}, mean")
+            for axes, (one, other) in zip(grid[-1], pairs, strict=False):
+                for place, level in enumerate(self.levels[other]):
+                    axes.plot(
+                        self._cells[one, other].iloc[:, place].to_numpy(),
+                        "o-",
+                        color=COLOURS[place % len(COLOURS)],
+                        markersize=4,
+                        label=short_text(level),
+                    )
+                label_levels(axes, self.levels[one], one)
+                axes.legend(
+                    title=other,
+                    fontsize=7,
+                    title_fontsize=8,
+                    frameon=True,
+                    edgecolor="none",
+                )
+            for axes in grid.flat:
+                axes.set_visible(axes.has_data())
+        return figure
 
 
 def effects(

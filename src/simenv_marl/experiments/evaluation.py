@@ -1,7 +1,7 @@
 """Compares contenders on the same seeds, with confidence intervals."""
 
 from bisect import bisect_left
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, groupby, product
@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import EpisodeOptions, Plan, Points, pack, reuse_resources
-from ..data.plots import interval, is_proportion
+from ..core import EpisodeOptions, Points, reuse_resources
+from ..data.plots import INK, PALE, interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from ..runs import check_options
 from ..simulation import Model
-from .plots import plot_contenders
+from .plots import draw_dots, label_below
 from .runner import (
     FALLBACKS,
     RUN_COLUMNS,
@@ -45,6 +45,9 @@ FIRST_CHECK = 16
 
 MOST_SEEDS = 10_000_000
 """A difference that needs more seeds than this counts as none."""
+
+LINES = 200
+"""The largest number of seeds that are drawn as lines."""
 
 Rows = dict[tuple[str, int], list[Row]]
 """The rows of a table by contender and seed."""
@@ -105,21 +108,23 @@ class Evaluation:
         """
         values = self.values(metric)
         proportions = values.columns if is_proportion(values.to_numpy()) else ()
-        table, notes = estimate_means(numbers(values, metric), self.confidence, proportions)
+        table = estimate_means(numbers(values, metric), self.confidence, proportions)
+        notes = dict(table.pop("note"))
         if self.baseline is not None:
-            differences, reasons = estimate_means(self._differences(metric), self.confidence)
-            differences.loc[self.baseline] = 0.0
-            columns = ["difference", "difference_low", "difference_high"]
-            table = table.join(differences.set_axis(columns, axis=1))
-            for name, reason in reasons.items():
+            estimates = estimate_means(self._differences(metric), self.confidence)
+            for name, reason in estimates.pop("note").items():
                 notes[name] = notes[name] or (reason and f"differences: {reason}")
-        shares = self._fallback_shares()
-        if shares:
-            table[FALLBACKS] = shares
-        for name, share in shares.items():
-            if share > FALLBACK_LIMIT:
-                separator = "; " if notes[name] else ""
-                notes[name] += f"{separator}{share:.0%} of decisions by a fallback"
+            columns = ["difference", "difference_low", "difference_high"]
+            table = table.join(estimates.astype(float).set_axis(columns, axis=1))
+            table.loc[self.baseline, columns] = 0.0
+        if FALLBACKS in self.frame:
+            team = self.frame[self.frame["agent"] == TEAM]
+            sums = team.groupby("contender")[[FALLBACKS, "length"]].sum()
+            table[FALLBACKS] = sums[FALLBACKS] / sums["length"].clip(lower=1)
+            for name, share in table[FALLBACKS].items():
+                if share > FALLBACK_LIMIT:
+                    separator = "; " if notes[name] else ""
+                    notes[name] += f"{separator}{share:.0%} of decisions by a fallback"
         return table.assign(note=notes) if any(notes.values()) else table
 
     def improvement(self, metric: str = "return") -> "DataFrame":
@@ -135,8 +140,8 @@ class Evaluation:
         """
         signs = np.sign(self._differences(metric))
         proportions = [name for name in signs if not (signs[name] == 0).any()]
-        table, _ = estimate_means((signs + 1) / 2, self.confidence, proportions)
-        return table.clip(0.0, 1.0).rename(columns={"mean": "probability"})
+        table = estimate_means((signs + 1) / 2, self.confidence, proportions)
+        return table.drop(columns="note").clip(0.0, 1.0).rename(columns={"mean": "probability"})
 
     def seeds_needed(
         self,
@@ -185,30 +190,39 @@ class Evaluation:
         ``plot_timeline``.
         """
         values = numbers(self.values(metric), metric)
-        marks = {
-            name: f"\n{share:.0%} fallbacks"
-            for name, share in self._fallback_shares().items()
-            if share > FALLBACK_LIMIT
-        }
-        return plot_contenders(
-            values,
-            self.summary(metric),
-            metric,
-            self.baseline,
-            marks,
-            figure,
-        )
-
-    def _fallback_shares(self) -> dict[str, float]:
-        """Return the share of decisions that a fallback answered, by contender.
-
-        Empty if they are not counted.
-        """
-        if FALLBACKS not in self.frame:
-            return {}
-        team = self.frame[self.frame["agent"] == TEAM]
-        sums = team.groupby("contender")[[FALLBACKS, "length"]].sum()
-        return dict(sums[FALLBACKS] / sums["length"].clip(lower=1))
+        summary = self.summary(metric)
+        names = list(values)
+        number = len(values)
+        others = [] if self.baseline is None else list(self._differences(metric))
+        sizes = [len(names), len(others)] if others else [len(names)]
+        title = f"{number} seeds, lines for {LINES} of them"
+        if number == 1:
+            title = "1 seed"
+        elif len(names) == 1:
+            title = f"{number} seeds, each a dot"
+        elif number <= LINES:
+            title = f"{number} seeds, each a line"
+        with style(figure) as make_figure:
+            figure = make_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, 14.0), 4.2)
+            left, *right = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)[0]
+            lines = values.to_numpy()[:LINES].T
+            left.plot(lines, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
+            draw_dots(left, values, names, summary[["mean", "low", "high"]], 0.0)
+            labels = list(names)
+            for place, share in enumerate(summary.get(FALLBACKS, ())):
+                if share > FALLBACK_LIMIT:
+                    labels[place] += f"\n{share:.0%} fallbacks"
+            label_below(left, labels)
+            left.set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
+            left.set_title(title)
+            for axes in right:
+                axes.axhline(0.0, color=INK, linewidth=0.8, zorder=1)
+                bounds = summary.loc[others, ["difference", "difference_low", "difference_high"]]
+                draw_dots(axes, self._differences(metric), names, bounds, 0.24)
+                label_below(axes, others)
+                axes.set_ylabel(f"difference from {self.baseline}, same seed")
+                axes.set_title("differences")
+        return figure
 
     def _differences(self, metric: str) -> "DataFrame":
         """Return the differences from the baseline: a column for each other contender."""
@@ -313,18 +327,17 @@ def evaluate(
         concurrency,
     )
     all_seeds = distinct_seeds(seeds)
-    # Plans are made and pickled here even if workers do the work, so that errors come first.
+    # Errors of plans come first, even if workers do the work.
     plans = {name: runner.plan(simulation, name) for name in contenders}
-    arguments = (simulation, runner, None if workers else plans)
-    if workers:
-        pack(arguments)
     rows: Rows = {}
     number = len(all_seeds)
-    with progress_bar(len(plans) * number, progress, "episode") as bar, reuse_resources():
+    with progress_bar(len(plans) * number, progress, "episode") as bar:
         for end in [number] if width is None else _checkpoints(number):
             runs = list(product(plans, all_seeds[:end]))
             missing = [run for run in runs if run not in rows]
-            for part in spread(_run, arguments, missing, workers, runner.batch_size, bar):
+            for part in spread(
+                _run, (simulation, runner), missing, workers, runner.batch_size, bar
+            ):
                 rows |= part
             table = make_table(
                 runner.columns,
@@ -355,11 +368,10 @@ def _checkpoints(number: int) -> Iterator[int]:
 def _run(
     simulation: Model,
     runner: Runner,
-    plans: Mapping[str, Plan] | None,
     runs: Sequence[tuple[str, int]],
     bar: Any,
 ) -> Rows:
-    """Run pairs of contender and seed. ``plans`` is None in a worker, which makes its own."""
+    """Run pairs of contender and seed."""
     rows: Rows = {}
 
     def report(name: str, seed: int, outcome: Outcome) -> None:
@@ -368,9 +380,8 @@ def _run(
 
     with reuse_resources():
         for name, group in groupby(runs, lambda run: run[0]):
-            plan = runner.plan(simulation, name) if plans is None else plans[name]
             seeds = [seed for _, seed in group]
-            runner.run(plan, name, seeds, partial(report, name))
+            runner.run(runner.plan(simulation, name), name, seeds, partial(report, name))
     return rows
 
 
@@ -391,7 +402,7 @@ def estimate_means(
     samples: "DataFrame",
     confidence: float,
     proportions: Collection[str] = (),
-) -> "tuple[DataFrame, dict[str, str]]":
+) -> "DataFrame":
     """Estimate the means of samples, one column for each contender.
 
     Args:
@@ -400,25 +411,19 @@ def estimate_means(
         proportions: The columns of zeros and ones.
 
     Returns:
-        A table indexed by contender, with the columns ``mean``, ``low`` and ``high``, and for each
-        contender the reason why the bounds are nan; an empty string if they are known.
+        A table indexed by contender, with the columns ``mean``, ``low``, ``high`` and ``note``: the
+        reason why the bounds are nan, empty if they are known.
     """
     import pandas
 
     rows = {}
-    reasons = {}
     for name, values in samples.items():
         sample = values.to_numpy()
-        low, high, reasons[name] = interval(sample, confidence, proportion=name in proportions)
-        rows[name] = [sample.mean(), low, high]
-    columns = ["mean", "low", "high"]
-    table = pandas.DataFrame.from_dict(
-        rows,
-        "index",
-        columns=columns,
-        dtype=float,
-    )
-    return table.rename_axis("contender"), reasons
+        bounds = interval(sample, confidence, proportion=name in proportions)
+        rows[name] = (sample.mean(), *bounds)
+    columns = ["mean", "low", "high", "note"]
+    table = pandas.DataFrame.from_dict(rows, "index", columns=columns)
+    return table.rename_axis("contender")
 
 
 def numbers(values: "DataFrame", metric: str) -> "DataFrame":

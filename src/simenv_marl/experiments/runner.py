@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from types import NoneType
-from typing import TYPE_CHECKING, Any, SupportsFloat, SupportsIndex
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 from ..core import Episode, Plan, Points, declared_agents, has_fallback, waits
 from ..data.collect import learners_plan
@@ -21,14 +21,13 @@ from ..errors import (
     annotate,
     did_you_mean,
     short_repr,
-    warn_user,
 )
 from ..many.batch import BatchRun, Group, takes_identities
 from ..runs import checked_seeds
 from ..simulation import RULE, Model
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 TEAM = "team"
 """The value of the column ``agent`` in the row of the team."""
@@ -45,9 +44,6 @@ STATUS_COLUMNS = ("status", "error")
 RESERVED = (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS)
 """The columns whose names factors and metrics must not have."""
 
-EXACT = 2**53
-"""The integers up to this are exact as floats."""
-
 Contenders = Mapping[str, Mapping[Any, Any]]
 """The policies of each contender, as ``simulate`` takes them."""
 
@@ -60,8 +56,8 @@ Metrics = Metric | Mapping[str, Metric] | None
 Value = str | float | None
 """A factor or the result of a metric: a string, a number, a bool or None."""
 
-Row = tuple[Value, ...]
-"""A row of a table."""
+Row = dict[str, Value]
+"""A row of a table, by column."""
 
 
 @dataclass(frozen=True)
@@ -81,38 +77,7 @@ class Outcome:
     fallbacks: dict[str, int]
 
 
-class Returns(tuple[float, ...]):
-    """The returns of an episode's agents: a tuple of numbers, and a mapping by agent."""
-
-    _by_agent: dict[str, float]
-
-    def __new__(cls, returns: Mapping[str, float]) -> Returns:
-        """Copy the returns from a dict."""
-        instance = super().__new__(cls, returns.values())
-        instance._by_agent = dict(returns)
-        return instance
-
-    def __getitem__(self, key: SupportsIndex | slice | str) -> Any:
-        if not isinstance(key, str):
-            return super().__getitem__(key)
-        if key not in self._by_agent:
-            raise KeyError(
-                f"{key!r} did not decide in this episode; these agents did:"
-                f" {', '.join(self._by_agent) or 'none'}"
-            )
-        return self._by_agent[key]
-
-    def __contains__(self, key: object) -> bool:
-        if isinstance(key, str):
-            return key in self._by_agent
-        return super().__contains__(key)
-
-    def __getattr__(self, name: str) -> Any:
-        """Return a method of the dict, such as ``get`` or ``items``."""
-        return getattr(self._by_agent, name)
-
-
-Team = Callable[[Returns], SupportsFloat]
+Team = Callable[["Series[float]"], SupportsFloat]
 """A callable that combines the returns of agents into the team's value."""
 
 
@@ -175,7 +140,7 @@ class Runner:
         self.batch_size = batch_size
         self._concurrency = concurrency
         self._counts_fallbacks = any(
-            any(map(has_fallback, policies.values())) for policies in contenders.values()
+            has_fallback(policy) for policies in contenders.values() for policy in policies.values()
         )
         self._team = sum if team is None else team
         # Iterators are copied, because each plan reads them again.
@@ -191,31 +156,22 @@ class Runner:
         All entities that decide are agents with rewards, also without a policy. If the decision
         points are not known, the points that contenders name are used, if there are any.
         """
-        policies = self.contenders[contender]
         make_plan = partial(
             learners_plan,
             simulation,
-            policies,
+            self.contenders[contender],
             options=self._options,
             alone=not self.batch_size,
         )
         with error_note(f"of the contender {contender!r}"):
             try:
                 return make_plan(points=self._points, all_points=True)
-            except (AgentError, UnknownPointError) as error:
-                if self._points is not None:
-                    raise
+            except (AgentError, UnknownPointError):
                 keys = dict.fromkeys(chain.from_iterable(self.contenders.values()))
-                points = [key for key in keys if not isinstance(key, str) or "." in key] or None
-                with suppress(AgentError, UnknownPointError):
-                    plan = make_plan(points=points, all_points=points is not None)
-                    if points is None and decision_points():
-                        warn_user(
-                            "returns are not counted, because the decision points are not known:"
-                            f" {error}"
-                        )
-                    return plan
-                raise
+                points = [key for key in keys if not isinstance(key, str) or "." in key]
+                if self._points is not None or (decision_points() and not points):
+                    raise
+                return make_plan(points=points or None, all_points=bool(points))
 
     def undeclared_agents(self, plan: Plan, contender: str) -> set[str]:
         """Return the agents that a contender names, but neither points nor ``possible_agents``."""
@@ -276,19 +232,34 @@ class Runner:
         outcome: Outcome,
     ) -> list[Row]:
         """Return a row of the table for each agent, and one for the team."""
-        value = self._team(Returns(outcome.returns))
+        from pandas import Series
+
+        returns = Series(outcome.returns, dtype=float)
         try:
-            returns = {**outcome.returns, TEAM: float(value)}
+            value = self._team(returns)
+        except KeyError as error:
+            agents = ", ".join(outcome.returns) or "none"
+            raise KeyError(
+                f"{error} did not decide in this episode; these did: {agents}"
+            ) from error
+        try:
+            returns[TEAM] = float(value)
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
         lengths = {**outcome.lengths, TEAM: sum(outcome.lengths.values())}
         fallbacks = {**outcome.fallbacks, TEAM: sum(outcome.fallbacks.values())}
-        metrics = list(map(outcome.metrics.get, self.metrics))
-        rows = []
-        for agent, length in lengths.items():
-            counts = [fallbacks.get(agent, 0)] if self._counts_fallbacks else []
-            rows.append((contender, seed, agent, returns[agent], length, *counts, *metrics))
-        return rows
+        return [
+            {
+                "contender": contender,
+                "seed": seed,
+                "agent": agent,
+                "return": value,
+                "length": lengths[agent],
+                FALLBACKS: fallbacks.get(agent, 0),
+                **outcome.metrics,
+            }
+            for agent, value in returns.items()
+        ]
 
 
 class Tally:
@@ -395,38 +366,8 @@ def plain_value(name: str, value: Any, advice: str = "") -> Any:
     return value
 
 
-# -- tables ---------------------------------------------------------------------------------------
-
-
-def make_table(names: Sequence[str], rows: Iterable[Row]) -> DataFrame:
-    """Return a table whose columns keep the types of their values.
-
-    A numeric column with missing values is float.
-    """
+def make_table(columns: Sequence[str], rows: Iterable[Row]) -> DataFrame:
+    """Return a table. A numeric column with missing values is float."""
     import pandas
 
-    columns = zip(*rows, strict=True)
-    return pandas.DataFrame(
-        {
-            name: pandas.Series(values, dtype=dtype_of(values, missing=True))
-            for name, values in zip(names, columns, strict=True)
-        }
-    )
-
-
-def dtype_of(values: Collection[Any], *, missing: bool) -> str:
-    """Return the dtype of a column that keeps the types of its values.
-
-    With ``missing``, None is a missing number, and numbers of both types become floats if that is
-    exact.
-    """
-    kinds = set(map(type, values))
-    if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
-        return "int64"
-    if missing and kinds & {int, float} and kinds <= {int, float, NoneType}:
-        is_exact = all(type(value) is not int or abs(value) <= EXACT for value in values)
-        return "float64" if is_exact else "object"
-    for kind, dtype in ((str, "str"), (float, "float64"), (bool, "bool")):
-        if kinds == {kind}:
-            return dtype
-    return "object"
+    return pandas.DataFrame(list(rows), columns=list(columns))

@@ -45,6 +45,11 @@ TRAJECTORY: Final = np.dtype(
 )
 """The dtype of the records of trajectories."""
 
+DECISION: Final = np.dtype(
+    [("turns", "i8"), ("by_rule", "?"), ("times", "f8"), ("rewards", "f8"), ("elapsed", "f8")]
+)
+"""The dtype of the numbers of decisions, by attribute of ``Trajectories``."""
+
 End = tuple[int, bool, bool]
 """The end of an agent: the turn, and whether the agent terminated and was truncated."""
 
@@ -203,27 +208,24 @@ def combine(
     _check_extras([part.decisions["extras"] for part in nonempty])
     decisions = joined([part.decisions for part in nonempty])
     trajectories = np.concatenate([part.trajectories for part in nonempty])
-    lengths = trajectories["length"]
-    starts = np.cumsum(lengths) - lengths
-
-    def per_decision(values: Array) -> Array:
-        return np.repeat(values, lengths)
-
     codes: dict[str, int] = {}
     agents = [codes.setdefault(name, len(codes)) for name in trajectories["agent"]]
-    steps = np.arange(len(decisions["rewards"])) - per_decision(starts)
-    is_last = steps == per_decision(lengths) - 1
+    lengths = trajectories["length"]
+    starts = np.cumsum(lengths) - lengths
+    each = np.repeat(trajectories, lengths)  # a record for each decision
+    steps = np.arange(len(each)) - np.repeat(starts, lengths)
+    is_last = steps == each["length"] - 1
     return Trajectories(
         **decisions,
         **nonempty[0].point,
-        terminations=is_last & per_decision(trajectories["terminated"]),
-        truncations=is_last & per_decision(trajectories["truncated"]),
+        terminations=is_last & each["terminated"],
+        truncations=is_last & each["truncated"],
         last_observations=joined([part.last_observations for part in nonempty]),
         last_turns=trajectories["last_turn"],
         starts=starts,
-        episodes=per_decision(trajectories["episode"]),
+        episodes=each["episode"],
         seeds=seeds,
-        agents=per_decision(np.array(agents, np.int64)),
+        agents=np.repeat(np.array(agents, np.int64), lengths),
         names=tuple(codes),
         steps=steps,
         collected=collected,
@@ -255,17 +257,11 @@ class _DecisionLog:
             self.stack_observations = stacker(definition.observation_space)
             self.stack_actions = stacker(definition.action_space)
             self.unknown_action = blank(definition.action_space)
-        # One entry for each batch.
-        self.observations: list[Observation] = []
-        self.actions: list[Action] = []
-        self.masks: list[Masks] = []
-        self.extras: list[dict[str, Array]] = []
-        # One entry for each decision.
-        self.turns: list[int] = []
-        self.by_rule: list[bool] = []
-        self.times: list[float | None] = []
-        self.rewards: list[float] = []
-        self.elapsed: list[float] = []
+        # A stack of each attribute of ``Trajectories``, for each batch.
+        self.batches: list[dict[str, Any]] = []
+        # The first three fields of ``DECISION``, for each row; then the others, once it is paid.
+        self.answered: list[tuple[int, bool, float | None]] = []
+        self.paid: dict[int, tuple[float, float]] = {}
         # By row; only the known ones.
         self.rule_actions: dict[int, Action] = {}
         # By row of the last decision.
@@ -283,32 +279,29 @@ class _DecisionLog:
     ) -> None:
         """Add a batch of decisions, whose rewards are not known yet."""
         actions, extras = answers
-        number = len(actions)
-        self.observations.append(group.stack(observations))
-        if group.point.legal is not None:
-            self.masks.append(stack_masks([agent.mask for agent in agents]))
-        self.actions.append(
-            self.stack_actions(
-                [self.unknown_action if action is RULE else action for action in actions]
-            )
-        )
+        known = [self.unknown_action if action is RULE else action for action in actions]
         # Copied, because policies may reuse their arrays. Two steps, because np.array cannot copy
         # every tensor.
         arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
         for name, array in arrays.items():
-            if array.shape[:1] != (number,):
+            if array.shape[:1] != (len(actions),):
                 raise OptionValueError(
                     f"{group.policy!r} returned {short_repr(name)} of shape {array.shape} for"
-                    f" {number} decisions; the length of its first axis must be their number"
+                    f" {len(actions)} decisions; the length of its first axis must be their number"
                 )
-        self.extras.append(arrays)
-        self.by_rule += [action is RULE for action in actions]
-        self.turns += [episode.turns for episode in episodes]
-        if episodes[0].clock is not None:
-            # Not from the infos, because the policy may have changed them.
-            self.times += [agent.now for agent in agents]
-        self.rewards += [0.0] * number
-        self.elapsed += [nan] * number
+        batch = {
+            "observations": group.stack(observations),
+            "actions": self.stack_actions(known),
+            "extras": arrays,
+        }
+        if group.point.legal is not None:
+            batch["action_masks"] = stack_masks([agent.mask for agent in agents])
+        self.batches.append(batch)
+        # The time is not from the info, because the policy may have changed that.
+        self.answered += [
+            (episode.turns, action is RULE, agent.now)
+            for episode, agent, action in zip(episodes, agents, actions, strict=True)
+        ]
 
     def pay(
         self,
@@ -317,8 +310,7 @@ class _DecisionLog:
         end: End | None,
     ) -> None:
         """Record the reward of a decision, the rule's action if it decided, and an end."""
-        self.rewards[row] = agent.reward
-        self.elapsed[row] = agent.info.get("elapsed", nan)
+        self.paid[row] = agent.reward, agent.info.get("elapsed", nan)
         rule_action = agent.take_rule_action()  # a rule that is cut short must not report it again
         if rule_action is not None:
             self.rule_actions[row] = rule_action
@@ -328,29 +320,28 @@ class _DecisionLog:
     @cached_property
     def columns(self) -> dict[str, Any]:
         """The values of all decisions, by attribute of ``Trajectories``."""
-        _check_extras(self.extras)
-        by_rule = np.array(self.by_rule, np.bool_)
-        rule_rows = list(self.rule_actions)
-        # The rule's actions come after the policy's.
-        actions = joined([*self.actions, self.stack_actions(list(self.rule_actions.values()))])
-        action_rows = np.arange(len(by_rule))
-        action_rows[rule_rows] = len(by_rule) + np.arange(len(rule_rows))
-        known = ~by_rule
-        known[rule_rows] = True
-        columns = {
-            "observations": joined([*self.observations, self.stack_observations([])]),
-            "actions": taken(actions, action_rows),
-            "rewards": np.array(self.rewards, np.float64),
-            "turns": np.array(self.turns, np.int64),
-            "by_rule": by_rule,
-            "known": known,
-            "extras": joined(self.extras) if self.extras else {},
+        _check_extras([batch["extras"] for batch in self.batches])
+        nothing = {
+            "observations": self.stack_observations([]),
+            "actions": self.stack_actions([]),
+            "extras": {},
         }
-        if self.masks:
-            columns["action_masks"] = joined(self.masks)
-        if self.times:
-            columns["times"] = np.array(self.times, np.float64)
-            columns["elapsed"] = np.array(self.elapsed, np.float64)
+        columns: dict[str, Any] = joined(self.batches or [nothing])
+        number = len(self.answered)
+        table = np.array(
+            [(*answered, *self.paid[row]) for row, answered in enumerate(self.answered)], DECISION
+        )
+        columns |= {name: table[name] for name in DECISION.names or ()}
+        if not number or self.answered[0][2] is None:  # there is no clock
+            del columns["times"], columns["elapsed"]
+        # The rule's actions come after the policy's.
+        rule_rows = list(self.rule_actions)
+        rule_actions = self.stack_actions(list(self.rule_actions.values()))
+        action_rows = np.arange(number)
+        action_rows[rule_rows] = number + np.arange(len(rule_rows))
+        columns["actions"] = taken(joined([columns["actions"], rule_actions]), action_rows)
+        columns["known"] = ~columns["by_rule"]
+        columns["known"][rule_rows] = True
         return columns
 
     def records(self, place: int) -> Records:
@@ -395,7 +386,7 @@ class Recorder:
         if group not in self._logs:
             self._logs[group] = _DecisionLog(group.point)
         log = self._logs[group]
-        first = len(log.rewards)
+        first = len(log.answered)
         agents = [agent for episode in waiting if (agent := episode.pending) is not None]
         log.add(
             group,

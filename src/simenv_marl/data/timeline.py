@@ -67,8 +67,8 @@ MARKS: Final[dict[str, dict[str, Any]]] = {
     },
     "by rule": {"color": INK, "linewidth": 2},
     "by rule, action unknown": {"color": UNKNOWN, "linewidth": 2},
-    "terminated": {"marker": "x", "color": INK, "linewidth": 0, "clip_on": False},
-    "truncated": {"marker": "|", "color": INK, "linewidth": 0, "clip_on": False},
+    "terminated": {"marker": "x", "color": INK, "linewidth": 0, "markersize": 6, "clip_on": False},
+    "truncated": {"marker": "|", "color": INK, "linewidth": 0, "markersize": 6, "clip_on": False},
 }
 """The marks of decisions in charts, of decisions in rows of colours, and of ends."""
 

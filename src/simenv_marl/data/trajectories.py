@@ -33,22 +33,25 @@ Bools = NDArray[np.bool_]
 Masks = Array | tuple[Array, ...]
 """The int8 masks of N decisions: ``(N, n)``, for a ``MultiDiscrete`` a tuple of such arrays."""
 
-TRAJECTORY: Final = np.dtype(
+DECISION: Final = np.dtype(
     [
-        ("length", "i8"),
-        ("episode", "i8"),
-        ("agent", "O"),
-        ("last_turn", "i8"),
-        ("terminated", "?"),
-        ("truncated", "?"),
+        ("place", "i8"),
+        ("episodes", "i8"),
+        ("agents", "O"),
+        ("turns", "i8"),
+        ("by_rule", "?"),
+        ("times", "f8"),
+        ("rewards", "f8"),
+        ("elapsed", "f8"),
+        ("last_turns", "i8"),
+        ("terminations", "?"),
+        ("truncations", "?"),
     ]
 )
-"""The dtype of the records of trajectories."""
+"""The dtype of decisions: the place of the policy, and attributes of ``Trajectories``.
 
-DECISION: Final = np.dtype(
-    [("turns", "i8"), ("by_rule", "?"), ("times", "f8"), ("rewards", "f8"), ("elapsed", "f8")]
-)
-"""The dtype of the numbers of decisions, by attribute of ``Trajectories``."""
+Agents are names here. The turn of the end is 0 before an agent's last decision.
+"""
 
 End = tuple[int, bool, bool]
 """The end of an agent: the turn, and whether the agent terminated and was truncated."""
@@ -183,14 +186,13 @@ class Records:
     """The records of one policy in some episodes, in the order of its ``Trajectories``.
 
     Attributes:
-        decisions: By attribute of ``Trajectories``, a stack with a row for each decision.
-        trajectories: ``(M,)``, in the dtype ``TRAJECTORY``.
+        decisions: By attribute of ``Trajectories``, a stack with a row for each decision; as in
+            ``DECISION``.
         last_observations: The stack of the final observations of the trajectories.
         point: The attributes of ``Trajectories`` that describe the decision point.
     """
 
     decisions: dict[str, Any]
-    trajectories: Array
     last_observations: Observation
     point: dict[str, Any]
 
@@ -207,27 +209,23 @@ def combine(
     nonempty = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
     _check_extras([part.decisions["extras"] for part in nonempty])
     decisions = joined([part.decisions for part in nonempty])
-    trajectories = np.concatenate([part.trajectories for part in nonempty])
     codes: dict[str, int] = {}
-    agents = [codes.setdefault(name, len(codes)) for name in trajectories["agent"]]
-    lengths = trajectories["length"]
-    starts = np.cumsum(lengths) - lengths
-    each = np.repeat(trajectories, lengths)  # a record for each decision
-    steps = np.arange(len(each)) - np.repeat(starts, lengths)
-    is_last = steps == each["length"] - 1
+    agents = [codes.setdefault(name, len(codes)) for name in decisions["agents"]]
+    is_last = decisions["terminations"] | decisions["truncations"]
+    starts = np.flatnonzero(np.append(True, is_last)[:-1])
+    lengths = np.diff(starts, append=len(agents))
+    decisions |= {
+        "agents": np.array(agents, np.int64),
+        "last_turns": decisions["last_turns"][is_last],
+        "steps": np.arange(len(agents)) - np.repeat(starts, lengths),
+    }
     return Trajectories(
         **decisions,
         **nonempty[0].point,
-        terminations=is_last & each["terminated"],
-        truncations=is_last & each["truncated"],
         last_observations=joined([part.last_observations for part in nonempty]),
-        last_turns=trajectories["last_turn"],
         starts=starts,
-        episodes=each["episode"],
         seeds=seeds,
-        agents=np.repeat(np.array(agents, np.int64), lengths),
         names=tuple(codes),
-        steps=steps,
         collected=collected,
     )
 
@@ -259,25 +257,24 @@ class _DecisionLog:
             self.unknown_action = blank(definition.action_space)
         # A stack of each attribute of ``Trajectories``, for each batch.
         self.batches: list[dict[str, Any]] = []
-        # The first three fields of ``DECISION``, for each row; then the others, once it is paid.
-        self.answered: list[tuple[int, bool, float | None]] = []
-        self.paid: dict[int, tuple[float, float]] = {}
+        # For each row, the first fields of ``DECISION``; and the others, once it is paid.
+        self.answered: list[tuple[int, int, str, int, bool, float | None]] = []
+        self.paid: dict[int, tuple[float, float, int, bool, bool]] = {}
         # By row; only the known ones.
         self.rule_actions: dict[int, Action] = {}
         # By row of the last decision.
-        self.ends: dict[int, tuple[Observation, *End]] = {}
-        # The rows of each trajectory, by place of its policy, and by episode and agent.
-        self.trajectories: dict[int, dict[tuple[int, str], list[int]]] = {}
+        self.last_observations: dict[int, Observation] = {}
 
     def add(
         self,
         group: Group,
+        numbers: Sequence[int],
         episodes: Sequence[Episode],
         agents: Sequence[Agent],
         observations: Sequence[Observation],
         answers: Answers,
     ) -> None:
-        """Add a batch of decisions, whose rewards are not known yet."""
+        """Add a batch of decisions in episodes with these numbers. Rewards are not known yet."""
         actions, extras = answers
         known = [self.unknown_action if action is RULE else action for action in actions]
         # Copied, because policies may reuse their arrays. Two steps, because np.array cannot copy
@@ -297,11 +294,12 @@ class _DecisionLog:
         if group.point.legal is not None:
             batch["action_masks"] = stack_masks([agent.mask for agent in agents])
         self.batches.append(batch)
-        # The time is not from the info, because the policy may have changed that.
-        self.answered += [
-            (episode.turns, action is RULE, agent.now)
-            for episode, agent, action in zip(episodes, agents, actions, strict=True)
-        ]
+        for number, episode, agent, action in zip(numbers, episodes, agents, actions, strict=True):
+            policy: Any = agent.policy  # a ``PolicyKey``, because the episode has waited for it
+            # The time is not from the info, because the policy may have changed that.
+            self.answered.append(
+                (policy.place, number, agent.name, episode.turns, action is RULE, agent.now)
+            )
 
     def pay(
         self,
@@ -310,12 +308,12 @@ class _DecisionLog:
         end: End | None,
     ) -> None:
         """Record the reward of a decision, the rule's action if it decided, and an end."""
-        self.paid[row] = agent.reward, agent.info.get("elapsed", nan)
+        self.paid[row] = agent.reward, agent.info.get("elapsed", nan), *(end or (0, False, False))
         rule_action = agent.take_rule_action()  # a rule that is cut short must not report it again
         if rule_action is not None:
             self.rule_actions[row] = rule_action
         if end is not None:
-            self.ends[row] = (agent.observation, *end)
+            self.last_observations[row] = agent.observation
 
     @cached_property
     def columns(self) -> dict[str, Any]:
@@ -332,7 +330,7 @@ class _DecisionLog:
             [(*answered, *self.paid[row]) for row, answered in enumerate(self.answered)], DECISION
         )
         columns |= {name: table[name] for name in DECISION.names or ()}
-        if not number or self.answered[0][2] is None:  # there is no clock
+        if not number or self.answered[0][-1] is None:  # there is no clock
             del columns["times"], columns["elapsed"]
         # The rule's actions come after the policy's.
         rule_rows = list(self.rule_actions)
@@ -346,21 +344,17 @@ class _DecisionLog:
 
     def records(self, place: int) -> Records:
         """Return the records of the policy at a place, sorted by episode, agent and step."""
-        rows: list[int] = []
-        records = []
-        last_observations = []
-        for (episode, agent), agent_rows in sorted(
-            self.trajectories.get(place, {}).items(),
-            key=lambda item: (item[0][0], item[1]),
-        ):
-            last_observation, *end = self.ends[agent_rows[-1]]
-            rows += agent_rows
-            records.append((len(agent_rows), episode, agent, *end))
-            last_observations.append(last_observation)
+        columns = dict(self.columns)
+        rows = np.flatnonzero(columns.pop("place") == place)
+        first: dict[tuple[int, str], int] = {}
+        trajectories = [first.setdefault(self.answered[row][1:3], row) for row in rows.tolist()]
+        rows = rows[np.lexsort((trajectories, columns["episodes"][rows]))]
+        last = [row for row in rows.tolist() if row in self.last_observations]
         return Records(
-            decisions=taken(self.columns, np.array(rows, np.int64)),
-            trajectories=np.array(records, TRAJECTORY),
-            last_observations=self.stack_observations(last_observations),
+            decisions=taken(columns, rows),
+            last_observations=self.stack_observations(
+                [self.last_observations[row] for row in last]
+            ),
             point=self.point,
         )
 
@@ -388,18 +382,9 @@ class Recorder:
         log = self._logs[group]
         first = len(log.answered)
         agents = [agent for episode in waiting if (agent := episode.pending) is not None]
-        log.add(
-            group,
-            waiting,
-            agents,
-            observations,
-            answers,
-        )
-        for row, (place, agent) in enumerate(zip(places, agents, strict=True), first):
-            policy: Any = agent.policy  # a ``PolicyKey``, because the episode has waited for it
-            trajectories = log.trajectories.setdefault(policy.place, {})
-            key = (self._first_episode + place, agent.name)
-            trajectories.setdefault(key, []).append(row)
+        numbers = [self._first_episode + place for place in places]
+        log.add(group, numbers, waiting, agents, observations, answers)
+        for row, agent in enumerate(agents, first):
             self._decisions[agent] = (log, row)
 
     def pay(self, episode: Episode) -> None:
@@ -436,7 +421,7 @@ class Recorder:
             logs = {
                 group.point.hook.name: log
                 for group, log in self._logs.items()
-                if place in log.trajectories
+                if place in log.columns["place"]
             }
             if len(logs) > 1:
                 raise AgentError(

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..data.plots import ABSENT, COLOURS, INK
+from ..data.plots import COLOURS, INK, scatter
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,8 +24,7 @@ def draw_dots(
     The dots are at most ``spread`` from the middle of their column. A contender's place in
     ``names`` determines its colour.
     """
-    # Even distances in an irregular order.
-    offsets = spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)
+    offsets = spread * scatter(len(values))
     for place, name in enumerate(values.columns):
         colour = COLOURS[names.index(name) % len(COLOURS)]
         axes.scatter(
@@ -65,19 +64,12 @@ def draw_means(
     """Draw means with their intervals, from the first three columns: mean, low and high."""
     mean, low, high = means.to_numpy(float)[:, :3].T
     bars = np.maximum([mean - low, high - mean], 0.0)  # unknown bounds are nan, and not drawn
-    axes.errorbar(
-        places,
-        mean,
-        yerr=bars,
-        markersize=4,
-        **format_options,
-    )
+    axes.errorbar(places, mean, yerr=bars, **format_options)
 
 
 def label_below(axes: "Axes", names: Sequence[str]) -> None:
     """Write names below the axes, slanted if they would overlap, and draw a grid."""
-    axes.grid(axis="y", color=ABSENT, linewidth=0.7)
-    axes.set_axisbelow(True)
+    axes.grid(axis="y")
     axes.set_xticks(range(len(names)), names)
     inches = axes.get_window_extent().width / axes.figure.dpi
     if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter

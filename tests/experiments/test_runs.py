@@ -290,7 +290,7 @@ def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
         ("metric 'days' has the name of", {"metric": {"days": level}}),
         ("has no rows", {"design": DESIGN[:0]}),
         ("must be a string", {"design": pd.DataFrame([[1]])}),
-        ("cannot be stored", {"design": {"days": [object()]}}),
+        ("factor 'days' must be a number", {"design": {"days": [object()]}}),
         ("4,200 digits", {"design": {"days": [10**5000]}}),
         ("must be a DataFrame", {"design": 3}),
         ("'rule' is always the model as it is", {"contenders": {"rule": {"keeper": much}}}),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from math import ceil, nan
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,8 +34,7 @@ class Effects:
             standard deviation of the differences between the means of their combinations and the
             sum of both main effects.
         metric: The name of the value.
-        levels: The levels of each factor with their types. An index cannot distinguish 1, True and
-            1.0, so it has texts for the levels of a factor among which there are equal ones.
+        levels: The levels of each factor with their types.
     """
 
     main: "DataFrame"
@@ -143,17 +142,12 @@ def effects(
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
     levels = {}
-    labels = {}
     codes = {}
     for name in factors:
         places, own_levels = _encode(table[name])
-        if len(own_levels) < 2:
-            continue
-        codes[name] = places
-        levels[name] = own_levels
-        labels[name] = own_levels
-        if len(set(own_levels)) < len(own_levels):
-            labels[name] = list(map(repr, own_levels))
+        if len(own_levels) > 1:
+            codes[name] = places
+            levels[name] = own_levels
     if not levels:
         raise OptionValueError("no factor has more than one level")
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
@@ -166,8 +160,8 @@ def effects(
             sample, is_single = _over_seeds(group, seeds[group.index])
             mean = sample.mean()
             low, high, _ = interval(sample, confidence, proportion=is_share and is_single)
-            label = labels[name][code]
-            rows.append((name, label, mean, low, high, mean - overall, len(group)))
+            level = levels[name][code]
+            rows.append((name, level, mean, low, high, mean - overall, len(group)))
     columns = ["factor", "level", "mean", "low", "high", "effect", "count"]
     main = pandas.DataFrame(rows, columns=columns).set_index(["factor", "level"])
     cells = {}
@@ -175,8 +169,8 @@ def effects(
     for one, other in combinations(levels, 2):
         means = values.groupby([codes[one], codes[other]]).mean()
         grid = means.unstack().to_numpy(np.float64)
-        index = pandas.Index(labels[one], name=one)
-        columns = pandas.Index(labels[other], name=other)
+        index = pandas.Index(levels[one], name=one)
+        columns = pandas.Index(levels[other], name=other)
         table = pandas.DataFrame(grid, index, columns)
         cells[one, other] = table
         cells[other, one] = table.T
@@ -234,9 +228,8 @@ def _select(
 def _encode(column: "Series[Any]") -> tuple[NDArray[np.intp], list[Any]]:
     """Return the index of each row's level, and the levels.
 
-    Levels that are numbers are sorted, others have the order of the rows. Missing values are the
-    last level. Numeric factors with more than eight values are grouped into quarters of these
-    values, however often each occurs.
+    Levels of numeric factors are sorted, others have the order of the rows. Numeric factors with
+    more than eight values are grouped into quarters of these values, however often each occurs.
     """
     import pandas
 
@@ -244,16 +237,14 @@ def _encode(column: "Series[Any]") -> tuple[NDArray[np.intp], list[Any]]:
     if is_numeric and column.nunique() > 8:
         _, bounds = pandas.qcut(column.drop_duplicates(), 4, retbins=True)
         column = pandas.cut(column, bounds, include_lowest=True)
-    values = column.tolist()
-    # A key has a type, because 1, True and 1.0 are equal. A missing value differs from itself.
-    levels = list({(type(value), value): value for value in values if value == value}.values())
-    if all(type(level) in (int, float, pandas.Interval) for level in levels):
-        levels.sort()
-    places = {(type(level), level): place for place, level in enumerate(levels)}
-    codes = [places.get((type(value), value), len(places)) for value in values]
-    if len(places) in codes:
-        levels.append(nan)
-    return np.array(codes), levels
+    values = column.dropna().tolist()
+    if len(set(zip(map(type, values), values, strict=True))) > len(set(values)):
+        raise OptionValueError(
+            f"the factor {column.name!r} has levels that are equal, such as 1 and True; replace"
+            " them by texts"
+        )
+    codes, levels = pandas.factorize(column, sort=is_numeric, use_na_sentinel=False)
+    return codes, levels.tolist()
 
 
 # -- shares of the variance -----------------------------------------------------------------------

@@ -31,7 +31,6 @@ from .runner import (
     Runner,
     Team,
     check_agents,
-    check_contenders,
     distinct_seeds,
     make_table,
 )
@@ -302,7 +301,9 @@ def evaluate(
     import_extra("pandas", "evaluate")
     import_extra("scipy.stats", "evaluate")
     check_options(batch_size, workers, None, concurrency)
-    check_contenders(contenders, batched=batched)
+    runner = Runner(
+        contenders, points, options, metric, team, batch_size, concurrency, batched=batched
+    )
     if not contenders:
         raise OptionValueError(
             "contenders must be a dict, such as {'rule': {}}, but there are none"
@@ -317,15 +318,6 @@ def evaluate(
         _check_number("width", width)
         if width <= 0:
             raise OptionValueError(f"width must be positive, not {short_repr(width)}")
-    runner = Runner(
-        contenders,
-        points,
-        options,
-        metric,
-        team,
-        batch_size if batched else 0,
-        concurrency,
-    )
     all_seeds = distinct_seeds(seeds)
     # Errors of plans come first, even if workers do the work.
     plans = {name: runner.plan(simulation, name) for name in contenders}

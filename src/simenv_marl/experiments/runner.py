@@ -94,7 +94,13 @@ def error_note(note: str) -> Iterator[None]:
 class Runner:
     """Runs episodes of contenders for ``evaluate`` and ``run_experiment``.
 
-    Workers get a copy. With a ``batch_size`` of 0, policies answer one decision at a time.
+    Workers get a copy.
+
+    Attributes:
+        contenders: The policies of each contender.
+        metrics: The metrics, by column.
+        batch_size: The largest number of episodes in a batch; 0: policies answer one decision at a
+            time.
     """
 
     def __init__(
@@ -106,6 +112,8 @@ class Runner:
         team: Team | None,
         batch_size: int,
         concurrency: int,
+        *,
+        batched: bool,
         factors: Collection[str] = (),
     ) -> None:
         """Check the arguments.
@@ -121,6 +129,7 @@ class Runner:
                 "there is no option policies here; pass the policies of each contender in"
                 " contenders="
             )
+        check_contenders(contenders, batched=batched)
         self.contenders = contenders
         self.metrics: Mapping[str, Metric] = {}
         if isinstance(metric, Mapping):
@@ -137,7 +146,7 @@ class Runner:
                 raise OptionValueError(
                     f"the metric {name!r} has the name of another column; rename it"
                 )
-        self.batch_size = batch_size
+        self.batch_size = batch_size if batched else 0
         self._concurrency = concurrency
         self._counts_fallbacks = any(
             has_fallback(policy) for policies in contenders.values() for policy in policies.values()
@@ -353,15 +362,15 @@ def distinct_seeds(seeds: Iterable[int]) -> list[int]:
     return all_seeds
 
 
-def plain_value(name: str, value: Any, advice: str = "") -> Any:
-    """Return the named value without NumPy's types, or raise an error with some advice."""
+def plain_value(name: str, value: Any) -> Any:
+    """Return the named value without NumPy's types, or raise an error."""
     if getattr(value, "ndim", None) == 0:
         value = value.item()
     is_short = type(value) is int and value.bit_length() < 14_000  # 4,214 digits
     if not is_short and type(value) not in (bool, float, str, NoneType):
         raise OptionValueError(
             f"{name} must be a number of no more than 4,200 digits, a string or None, not"
-            f" {short_repr(value)}{advice}"
+            f" {short_repr(value)}"
         )
     return value
 

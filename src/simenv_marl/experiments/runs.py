@@ -52,7 +52,6 @@ from .runner import (
     Team,
     Value,
     check_agents,
-    check_contenders,
     distinct_seeds,
     make_table,
     plain_value,
@@ -141,14 +140,12 @@ def run_experiment(
     keys = [to_json(row) for row in rows]
     all_seeds = distinct_seeds(seeds)
     check_options(batch_size, workers, None, concurrency)
-    check_contenders(contenders or {}, batched=batched)
     contenders = {BY_RULE: {}, **(contenders or {})}
     if contenders[BY_RULE]:
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another"
             " name"
         )
-    batch_size = batch_size if batched else 0
     runner = Runner(
         contenders,
         points,
@@ -157,7 +154,8 @@ def run_experiment(
         team,
         batch_size,
         concurrency,
-        rows[0],
+        batched=batched,
+        factors=rows[0],
     )
     if isinstance(make, Variant):
         _source_of_row(make, rows[0])  # a variant checks its parameters
@@ -213,23 +211,19 @@ def _read_design(design: "DataFrame | Iterable[Any]") -> "tuple[DataFrame, list[
         raise OptionValueError(
             f"design must be a DataFrame, or data to make one from, not {short_repr(design)}"
         ) from error
-    names = list(table.columns)
-    for name in names:
+    for name in table.columns:
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
         if name in RESERVED:
             raise OptionValueError(
                 f"the factor {name!r} has the name of another column of the table; rename it"
             )
-        if names.count(name) > 1:
-            raise OptionValueError(f"the factor {name!r} occurs twice")
     if not len(table):
         raise OptionValueError("the design has no rows")
-    advice = "; other values cannot be stored: use a name as the value, and look it up in make"
     rows = table.to_dict("records") or [{}] * len(table)  # no records without columns
     for row in rows:
         for name, value in row.items():
-            row[name] = plain_value(f"the factor {name!r}", value, advice)
+            row[name] = plain_value(f"the factor {name!r}", value)
     return table, rows
 
 

@@ -31,17 +31,8 @@ from .runner import Outcome
 VERSION = 1
 HEADER = "experiment.json"
 
-MADE_OF = (
-    "simulation",
-    "variant",
-    "parameters",
-    "points",
-    "plugins",
-    "policies",
-    "options",
-    "python",
-)
-"""The parts of the provenance that affect the results of a run, besides versions of packages."""
+IRRELEVANT = ("seed", "packages", "dependencies")
+"""The parts of the provenance that are not compared as they are. Each package is a part."""
 
 VARYING = re.compile(r" at 0x[0-9a-fA-F]+|\w+\.<locals>\.")
 """The differences between texts of equal objects.
@@ -231,13 +222,13 @@ class Store:
 
 def _comparable_parts(provenance: Provenance) -> dict[str, str]:
     """Return the parts of a provenance that affect results, and versions, as texts."""
-    options = dict(provenance["options"])
-    options.pop("driver", None)
-    parts = {part: provenance[part] for part in MADE_OF if part in provenance}
-    parts |= {**provenance["packages"], **provenance["dependencies"], "options": options}
+    parts = {**provenance, **provenance["packages"], **provenance["dependencies"]}
+    options = provenance["options"].items()
+    parts["options"] = {name: value for name, value in options if name != "driver"}
     return {
         name: VARYING.sub("", json.dumps(part, sort_keys=True)).strip('"')
         for name, part in parts.items()
+        if name not in IRRELEVANT
     }
 
 

@@ -150,51 +150,40 @@ def effects(
             levels[name] = own_levels
     if not levels:
         raise OptionValueError("no factor has more than one level")
-    values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    seeds = table["seed"].to_numpy()
+    values = pandas.Series(numbers(table[metric], metric).to_numpy(), table["seed"])
     is_share = is_proportion(table[metric].to_numpy())
-    overall = _over_seeds(values, seeds)[0].mean()
+    overall = _over_seeds(values).mean()
     rows = []
     for name in levels:
         for code, group in values.groupby(codes[name]):
-            sample, is_single = _over_seeds(group, seeds[group.index])
+            sample = _over_seeds(group)
             mean = sample.mean()
-            low, high, _ = interval(sample, confidence, proportion=is_share and is_single)
-            level = levels[name][code]
-            rows.append((name, level, mean, low, high, mean - overall, len(group)))
+            is_proper = is_share and len(sample) == len(group)  # each is the value of one run
+            low, high, _ = interval(sample, confidence, proportion=is_proper)
+            rows.append((name, levels[name][code], mean, low, high, mean - overall, len(group)))
     columns = ["factor", "level", "mean", "low", "high", "effect", "count"]
     main = pandas.DataFrame(rows, columns=columns).set_index(["factor", "level"])
     cells = {}
     strengths = []
     for one, other in combinations(levels, 2):
-        means = values.groupby([codes[one], codes[other]]).mean()
-        grid = means.unstack().to_numpy(np.float64)
-        index = pandas.Index(levels[one], name=one)
-        columns = pandas.Index(levels[other], name=other)
-        table = pandas.DataFrame(grid, index, columns)
-        cells[one, other] = table
-        cells[other, one] = table.T
-        row_means = grid.mean(axis=1, keepdims=True)
-        rest = grid - row_means - grid.mean(axis=0) + grid.mean()
-        strength = np.sqrt((rest**2).mean())  # nan if a combination is missing
-        strengths.append((one, other, strength))
+        means = values.groupby([codes[one], codes[other]]).mean().unstack()
+        table = means.set_axis(levels[one], axis=0).set_axis(levels[other], axis=1)
+        cells[one, other] = table.rename_axis(index=one, columns=other)
+        cells[other, one] = cells[one, other].T
+        grid = means.to_numpy()
+        rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0) + grid.mean()
+        strengths.append((one, other, np.sqrt((rest**2).mean())))  # nan if a combination is missing
     interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"])
     interactions = interactions.set_index(["factor", "other"])
     strongest_first = interactions.sort_values("strength", ascending=False)
     return Effects(main, strongest_first, metric, levels, cells)
 
 
-def _over_seeds(
-    values: "Series[float]",
-    seeds: NDArray[Any],
-) -> tuple[NDArray[np.float64], bool]:
-    """Return the mean of each seed, or all values of a single seed.
-
-    The second value says whether each of them is the value of one run.
-    """
-    means = values.groupby(seeds).mean()
-    sample = means if len(means) > 1 else values
-    return sample.to_numpy(), len(sample) == len(values)
+def _over_seeds(values: "Series[float]") -> NDArray[np.float64]:
+    """Return the mean of each seed, the index, or all values of a single seed."""
+    means = values.groupby(level=0).mean()
+    sample: NDArray[np.float64] = (means if len(means) > 1 else values).to_numpy()
+    return sample
 
 
 def _select(
@@ -283,10 +272,6 @@ def sobol_indices(
     analyze = import_extra("SALib.analyze.sobol", "sobol_indices").analyze
     check_probability("confidence", confidence)
     table, names = _select(frame, metric, contender, agent)
-    if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():
-        raise OptionValueError(
-            "some runs have failed, but shares of the variance need all rows of the design"
-        )
     seeds = table["seed"].nunique()
     values = numbers(table[metric], metric).to_numpy()
     rows = table[names].to_numpy(object)
@@ -296,7 +281,8 @@ def sobol_indices(
         )
     if len(values) % seeds or not _is_saltelli(rows[::seeds]):
         raise OptionValueError(
-            "shares of the variance need all rows of design(..., method='saltelli'), in their order"
+            "shares of the variance need all rows of design(..., method='saltelli'), in order, and no"
+            " failed run"
         )
     means = values.reshape(-1, seeds).mean(axis=1)
     if len(means) == 2 * len(names) + 2:

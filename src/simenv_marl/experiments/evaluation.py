@@ -48,9 +48,6 @@ MOST_SEEDS = 10_000_000
 LINES = 200
 """The largest number of seeds that are drawn as lines."""
 
-Rows = dict[tuple[str, int], list[Row]]
-"""The rows of a table by contender and seed."""
-
 FALLBACK_LIMIT = 0.05
 """A contender with a larger share of decisions by fallbacks is marked."""
 
@@ -271,9 +268,9 @@ def evaluate(
         metric: A callable of the simulation after its end, whose column is ``metric``, or a dict
             from column to callable. A metric returns a number, a string or None.
         team: A callable that combines the returns of an episode's agents into the team's value.
-            None: their sum. It gets an object that is both the tuple of returns (``max`` works) and
-            a mapping by agent (``lambda returns: returns["waterer_0"]``). Agents that never decided
-            are missing there (``returns.get("waterer_0", 0.0)``).
+            None: their sum. It gets a pandas ``Series`` by agent (``max``, or ``lambda returns:
+            returns["waterer_0"]``). Agents that never decided are missing there
+            (``returns.get("waterer_0", 0.0)``).
         confidence: The confidence level of the intervals.
         width: Stop as soon as the interval of every difference from the baseline (without a
             baseline: of every mean) is at most this wide; ``seeds`` are then the seeds that may be
@@ -321,37 +318,34 @@ def evaluate(
     all_seeds = distinct_seeds(seeds)
     # Errors of plans come first, even if workers do the work.
     plans = {name: runner.plan(simulation, name) for name in contenders}
-    rows: Rows = {}
-    number = len(all_seeds)
-    with progress_bar(len(plans) * number, progress, "episode") as bar:
-        for end in [number] if width is None else _checkpoints(number):
-            runs = list(product(plans, all_seeds[:end]))
-            missing = [run for run in runs if run not in rows]
-            for part in spread(
-                _run, (simulation, runner), missing, workers, runner.batch_size, bar
-            ):
-                rows |= part
-            table = make_table(
-                runner.columns,
-                chain.from_iterable(rows[run] for run in runs),
+    order: dict[Any, int] = {run: place for place, run in enumerate(product(plans, all_seeds))}
+    rows: list[Row] = []
+    start = 0
+    with progress_bar(len(order), progress, "episode") as bar:
+        for end in _checkpoints(len(all_seeds), width):
+            runs = list(product(plans, all_seeds[start:end]))
+            start = end
+            rows += chain(
+                *spread(_run, (simulation, runner), runs, workers, runner.batch_size, bar)
             )
-            evaluation = Evaluation(table, baseline, float(confidence))
-            if width is not None and end < number and evaluation._widest() <= width:
+            rows.sort(key=lambda row: order[row["contender"], row["seed"]])
+            evaluation = Evaluation(make_table(runner.columns, rows), baseline, float(confidence))
+            if width is not None and evaluation._widest() <= width:
                 break
     for name, plan in plans.items():
-        agents = table.loc[table["contender"] == name, "agent"].unique()
-        present = [agent for agent in agents if agent != TEAM]
-        check_agents(name, runner.undeclared_agents(plan, name), present)
+        frame = evaluation.frame
+        present = set(frame["agent"][frame["contender"] == name]) - {TEAM}
+        check_agents(name, runner.undeclared_agents(plan, name), sorted(present))
     return evaluation
 
 
-def _checkpoints(number: int) -> Iterator[int]:
+def _checkpoints(number: int, width: float | None) -> Iterator[int]:
     """Yield the numbers of seeds after which the width is checked, up to ``number``.
 
     Their distances grow, because each check takes time, too.
     """
     seeds = FIRST_CHECK
-    while seeds < number:
+    while width is not None and seeds < number:
         yield seeds
         seeds += max(4, seeds // 8)
     yield number
@@ -362,12 +356,12 @@ def _run(
     runner: Runner,
     runs: Sequence[tuple[str, int]],
     bar: Any,
-) -> Rows:
+) -> list[Row]:
     """Run pairs of contender and seed."""
-    rows: Rows = {}
+    rows: list[Row] = []
 
     def report(name: str, seed: int, outcome: Outcome) -> None:
-        rows[name, seed] = runner.rows(name, seed, outcome)
+        rows.extend(runner.rows(name, seed, outcome))
         bar.update()
 
     with reuse_resources():

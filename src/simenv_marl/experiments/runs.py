@@ -315,9 +315,8 @@ class Job:
         while parts:
             part = parts.pop()
             try:
-                spread(
-                    self.run_part, (), part, workers, least, bar, share=16
-                )  # small parts are cheap
+                # Small parts cost nothing.
+                spread(self.run_part, (), part, workers, least, bar, share=16)
             except BrokenExecutor:
                 if not any(self.folder.glob(f"runs-{self.session}-*")):
                     raise

@@ -281,8 +281,8 @@ def sobol_indices(
         )
     if len(values) % seeds or not _is_saltelli(rows[::seeds]):
         raise OptionValueError(
-            "shares of the variance need all rows of design(..., method='saltelli'), in order, and no"
-            " failed run"
+            "shares of the variance need all rows of design(..., method='saltelli'), in order, and"
+            " no failed run"
         )
     means = values.reshape(-1, seeds).mean(axis=1)
     if len(means) == 2 * len(names) + 2:

@@ -65,16 +65,13 @@ class Outcome:
     """The results of one episode.
 
     Attributes:
-        returns: The undiscounted return of each agent that has decided.
-        lengths: The number of decisions of each of these agents.
+        agents: For each agent that has decided, its ``return`` (undiscounted), ``length`` (the
+            number of its decisions) and ``fallbacks`` (the number that its fallback answered).
         metrics: The result of each metric.
-        fallbacks: For each agent with a fallback: the number of decisions that it answered.
     """
 
-    returns: dict[str, float]
-    lengths: dict[str, int]
+    agents: dict[str, dict[str, float]]
     metrics: dict[str, Value]
-    fallbacks: dict[str, int]
 
 
 Team = Callable[["Series[float]"], SupportsFloat]
@@ -209,7 +206,7 @@ class Runner:
         def finish(place: int, simulation: Model) -> Callable[[], None]:
             seed = seeds[place]
             outcome = tally.outcomes.pop(seed)
-            if TEAM in outcome.returns:
+            if TEAM in outcome.agents:
                 raise AgentError(
                     f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
                     " agent"
@@ -243,32 +240,21 @@ class Runner:
         """Return a row of the table for each agent, and one for the team."""
         from pandas import Series
 
-        returns = Series(outcome.returns, dtype=float)
+        agents = outcome.agents
+        returns = Series({name: own["return"] for name, own in agents.items()}, dtype=float)
         try:
             value = self._team(returns)
         except KeyError as error:
-            agents = ", ".join(outcome.returns) or "none"
-            raise KeyError(
-                f"{error} did not decide in this episode; these did: {agents}"
-            ) from error
+            names = ", ".join(agents) or "none"
+            raise KeyError(f"{error} did not decide in this episode; these did: {names}") from error
         try:
-            returns[TEAM] = float(value)
+            total = {"return": float(value)}
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
-        lengths = {**outcome.lengths, TEAM: sum(outcome.lengths.values())}
-        fallbacks = {**outcome.fallbacks, TEAM: sum(outcome.fallbacks.values())}
-        return [
-            {
-                "contender": contender,
-                "seed": seed,
-                "agent": agent,
-                "return": value,
-                "length": lengths[agent],
-                FALLBACKS: fallbacks.get(agent, 0),
-                **outcome.metrics,
-            }
-            for agent, value in returns.items()
-        ]
+        for count in ("length", FALLBACKS):
+            total[count] = sum(own[count] for own in agents.values())
+        run = {"contender": contender, "seed": seed, **outcome.metrics}
+        return [{**run, "agent": name, **own} for name, own in {**agents, TEAM: total}.items()]
 
 
 class Tally:
@@ -279,7 +265,7 @@ class Tally:
     """
 
     def __init__(self) -> None:
-        self.outcomes = defaultdict[int, Outcome](lambda: Outcome({}, Counter(), {}, {}))
+        self.outcomes = defaultdict[int, Outcome](lambda: Outcome(defaultdict(_no_decision), {}))
 
     def record(
         self,
@@ -290,23 +276,23 @@ class Tally:
     ) -> None:
         """Count decisions: see ``Watcher``."""
         for episode in waiting:
-            outcome = self.outcomes[episode.seed]
-            name = episode.pending.name
-            outcome.returns.setdefault(name, 0.0)
-            outcome.lengths[name] += 1
+            self.outcomes[episode.seed].agents[episode.pending.name]["length"] += 1
 
     def pay(self, episode: Episode) -> None:
         """Add the rewards: see ``Watcher``.
 
         Agents that end before the simulation get their last reward when it is over.
         """
-        outcome = self.outcomes[episode.seed]
+        results = self.outcomes[episode.seed].agents
         agents = [*episode.ended.values(), *episode.agents.values()]
         for agent in agents if episode.pending is None else [episode.pending]:
-            if agent.name in outcome.returns:
-                outcome.returns[agent.name] += agent.reward
-                if agent.fallbacks:
-                    outcome.fallbacks[agent.name] = agent.fallbacks
+            if agent.name in results:
+                results[agent.name]["return"] += agent.reward
+                results[agent.name][FALLBACKS] = agent.fallbacks
+
+
+def _no_decision() -> dict[str, float]:
+    return {"return": 0.0, "length": 0, FALLBACKS: 0}
 
 
 # -- checks ---------------------------------------------------------------------------------------

@@ -353,10 +353,10 @@ class Job:
         """
         for names, runs in trials:
             entries: list[Entry] = []
-            present: dict[str, float] = {}
+            present: dict[str, object] = {}
             for run in runs:
                 self._run_group([run], entries.append, bar)
-                present |= entries[-1].get("returns", {})
+                present |= entries[-1].get("agents", {})
                 if present.keys() >= names:
                     break
             if any(entry["status"] == "ok" for entry in entries):

@@ -171,13 +171,11 @@ class Store:
         run = Run(row, entry["contender"], entry["seed"])
         result: Result = entry["error"]
         if entry["status"] == "ok":
-            result = Outcome(
-                entry["returns"], entry["lengths"], entry["metrics"], entry["fallbacks"]
-            )
+            result = Outcome(entry["agents"], entry["metrics"])
             if row in self._rows and run.contender not in self.samples:
                 self._parts[run.contender] = _comparable_parts(entry["provenance"])
                 self.samples[run.contender] = row
-            self.agents[run.contender].update(result.returns)
+            self.agents[run.contender].update(result.agents)
         if not isinstance(self.runs.get(run), Outcome):
             self.runs[run] = result
 

@@ -33,25 +33,32 @@ Bools = NDArray[np.bool_]
 Masks = Array | tuple[Array, ...]
 """The int8 masks of N decisions: ``(N, n)``, for a ``MultiDiscrete`` a tuple of such arrays."""
 
-DECISION: Final = np.dtype(
-    [
-        ("place", "i8"),
-        ("episodes", "i8"),
-        ("agents", "O"),
-        ("turns", "i8"),
-        ("by_rule", "?"),
-        ("times", "f8"),
-        ("rewards", "f8"),
-        ("elapsed", "f8"),
-        ("last_turns", "i8"),
-        ("terminations", "?"),
-        ("truncations", "?"),
-    ]
-)
-"""The dtype of decisions: the place of the policy, and attributes of ``Trajectories``.
+DTYPES: Final = {
+    "place": "i8",
+    "episodes": "i8",
+    "agents": "O",
+    "turns": "i8",
+    "by_rule": "?",
+    "times": "f8",
+    "rewards": "f8",
+    "elapsed": "f8",
+    "last_turns": "i8",
+    "terminations": "?",
+    "truncations": "?",
+}
+"""The dtypes of decisions: of the place of the policy, and of attributes of ``Trajectories``.
 
 Agents are names here. The turn of the end is 0 before an agent's last decision.
 """
+
+UNPAID: Final[dict[str, float]] = {
+    "rewards": 0.0,
+    "elapsed": nan,
+    "last_turns": 0,
+    "terminations": False,
+    "truncations": False,
+}
+"""The values of a decision before its reward is known."""
 
 End = tuple[int, bool, bool]
 """The end of an agent: the turn, and whether the agent terminated and was truncated."""
@@ -187,7 +194,7 @@ class Records:
 
     Attributes:
         decisions: By attribute of ``Trajectories``, a stack with a row for each decision; as in
-            ``DECISION``.
+            ``DTYPES``.
         last_observations: The stack of the final observations of the trajectories.
         point: The attributes of ``Trajectories`` that describe the decision point.
     """
@@ -257,9 +264,8 @@ class _DecisionLog:
             self.unknown_action = blank(definition.action_space)
         # A stack of each attribute of ``Trajectories``, for each batch.
         self.batches: list[dict[str, Any]] = []
-        # For each row, the first fields of ``DECISION``; and the others, once it is paid.
-        self.answered: list[tuple[int, int, str, int, bool, float | None]] = []
-        self.paid: dict[int, tuple[float, float, int, bool, bool]] = {}
+        # A value for each row.
+        self.table: dict[str, list[Any]] = {name: [] for name in DTYPES}
         # By row; only the known ones.
         self.rule_actions: dict[int, Action] = {}
         # By row of the last decision.
@@ -294,12 +300,17 @@ class _DecisionLog:
         if group.point.legal is not None:
             batch["action_masks"] = stack_masks([agent.mask for agent in agents])
         self.batches.append(batch)
-        for number, episode, agent, action in zip(numbers, episodes, agents, actions, strict=True):
-            policy: Any = agent.policy  # a ``PolicyKey``, because the episode has waited for it
-            # The time is not from the info, because the policy may have changed that.
-            self.answered.append(
-                (policy.place, number, agent.name, episode.turns, action is RULE, agent.now)
-            )
+        table = self.table
+        policies: list[Any] = [agent.policy for agent in agents]
+        table["place"] += [key.place for key in policies]  # the episodes wait for these keys
+        table["episodes"] += numbers
+        table["agents"] += [agent.name for agent in agents]
+        table["turns"] += [episode.turns for episode in episodes]
+        table["by_rule"] += [action is RULE for action in actions]
+        # Not from the infos, because the policy may have changed them.
+        table["times"] += [agent.now for agent in agents]
+        for name, value in UNPAID.items():
+            table[name] += [value] * len(actions)
 
     def pay(
         self,
@@ -308,11 +319,14 @@ class _DecisionLog:
         end: End | None,
     ) -> None:
         """Record the reward of a decision, the rule's action if it decided, and an end."""
-        self.paid[row] = agent.reward, agent.info.get("elapsed", nan), *(end or (0, False, False))
+        table = self.table
+        table["rewards"][row] = agent.reward
+        table["elapsed"][row] = agent.info.get("elapsed", nan)
         rule_action = agent.take_rule_action()  # a rule that is cut short must not report it again
         if rule_action is not None:
             self.rule_actions[row] = rule_action
         if end is not None:
+            table["last_turns"][row], table["terminations"][row], table["truncations"][row] = end
             self.last_observations[row] = agent.observation
 
     @cached_property
@@ -325,12 +339,9 @@ class _DecisionLog:
             "extras": {},
         }
         columns: dict[str, Any] = joined(self.batches or [nothing])
-        number = len(self.answered)
-        table = np.array(
-            [(*answered, *self.paid[row]) for row, answered in enumerate(self.answered)], DECISION
-        )
-        columns |= {name: table[name] for name in DECISION.names or ()}
-        if not number or self.answered[0][-1] is None:  # there is no clock
+        columns |= {name: np.array(self.table[name], dtype) for name, dtype in DTYPES.items()}
+        number = len(columns["times"])
+        if None in self.table["times"][:1] or not number:  # there is no clock
             del columns["times"], columns["elapsed"]
         # The rule's actions come after the policy's.
         rule_rows = list(self.rule_actions)
@@ -347,7 +358,8 @@ class _DecisionLog:
         columns = dict(self.columns)
         rows = np.flatnonzero(columns.pop("place") == place)
         first: dict[tuple[int, str], int] = {}
-        trajectories = [first.setdefault(self.answered[row][1:3], row) for row in rows.tolist()]
+        identities = zip(columns["episodes"][rows].tolist(), columns["agents"][rows], strict=True)
+        trajectories = [first.setdefault(key, row) for row, key in enumerate(identities)]
         rows = rows[np.lexsort((trajectories, columns["episodes"][rows]))]
         last = [row for row in rows.tolist() if row in self.last_observations]
         return Records(
@@ -380,7 +392,7 @@ class Recorder:
         if group not in self._logs:
             self._logs[group] = _DecisionLog(group.point)
         log = self._logs[group]
-        first = len(log.answered)
+        first = len(log.table["place"])
         agents = [agent for episode in waiting if (agent := episode.pending) is not None]
         numbers = [self._first_episode + place for place in places]
         log.add(group, numbers, waiting, agents, observations, answers)
@@ -421,7 +433,7 @@ class Recorder:
             logs = {
                 group.point.hook.name: log
                 for group, log in self._logs.items()
-                if place in log.columns["place"]
+                if place in log.table["place"]
             }
             if len(logs) > 1:
                 raise AgentError(

@@ -148,7 +148,7 @@ class Runner:
         self._counts_fallbacks = any(
             has_fallback(policy) for policies in contenders.values() for policy in policies.values()
         )
-        self._team = sum if team is None else team
+        self._team = team
         # Iterators are copied, because each plan reads them again.
         self._points = list(points) if isinstance(points, Iterator) else points
         self._options = {
@@ -241,18 +241,25 @@ class Runner:
         from pandas import Series
 
         agents = outcome.agents
-        returns = Series({name: own["return"] for name, own in agents.items()}, dtype=float)
+        total: dict[str, Any] = {
+            name: sum(own[name] for own in agents.values())
+            for name in ("return", "length", FALLBACKS)
+        }
+        if self._team is not None:
+            returns = Series({name: own["return"] for name, own in agents.items()}, dtype=float)
+            try:
+                total["return"] = self._team(returns)
+            except KeyError as error:
+                names = ", ".join(agents) or "none"
+                raise KeyError(
+                    f"{error} did not decide in this episode; these did: {names}"
+                ) from error
         try:
-            value = self._team(returns)
-        except KeyError as error:
-            names = ", ".join(agents) or "none"
-            raise KeyError(f"{error} did not decide in this episode; these did: {names}") from error
-        try:
-            total = {"return": float(value)}
+            total["return"] = float(total["return"])
         except (TypeError, ValueError):
-            raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
-        for count in ("length", FALLBACKS):
-            total[count] = sum(own[count] for own in agents.values())
+            raise OptionValueError(
+                f"team must return a number, not {short_repr(total['return'])}"
+            ) from None
         run = {"contender": contender, "seed": seed, **outcome.metrics}
         return [{**run, "agent": name, **own} for name, own in {**agents, TEAM: total}.items()]
 
@@ -287,8 +294,9 @@ class Tally:
         agents = [*episode.ended.values(), *episode.agents.values()]
         for agent in agents if episode.pending is None else [episode.pending]:
             if agent.name in results:
-                results[agent.name]["return"] += agent.reward
-                results[agent.name][FALLBACKS] = agent.fallbacks
+                own = results[agent.name]
+                own["return"] += agent.reward
+                own[FALLBACKS] = agent.fallbacks
 
 
 def _no_decision() -> dict[str, float]:

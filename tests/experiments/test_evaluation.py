@@ -445,17 +445,8 @@ def test_metrics_are_numbers_strings_or_none():
         for metric in ("text", "huge"):
             with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
                 look(metric=metric)
-    for odd in ([1], 10**5000, 2**13_999):
-        with pytest.raises(
-            OptionValueError, match="metric 'x' must be a number of no more than 4,200 digits"
-        ):
-            evaluate(
-                Shop,
-                {"rule": {}},
-                seeds=[1],
-                points=POINTS,
-                metric={"x": lambda shop, odd=odd: odd},
-            )
+    with pytest.raises(OptionValueError, match="metric 'x' must be a number, a string or None"):
+        evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop: [1]})
 
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch):

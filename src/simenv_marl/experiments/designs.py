@@ -111,10 +111,10 @@ def design(
             - ``"central_composite"``: ranges alone, two or more, for a quadratic response surface:
               corners, star points and the centre, all within the ranges.
             - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space. For
-              ``"sobol"``, ``n`` should be a power of two.
+              ``"sobol"``, ``n`` should be a power of two; SciPy warns if it is not.
             - ``"one_at_a_time"``: the centre of ranges and the first of levels; then each factor
               alone at its other values, for a range ``n`` (default 2) values from bound to bound.
-            - ``"saltelli"``: ``n`` samples (a power of two) for ``sobol_indices``, in
+            - ``"saltelli"``: ``n`` samples, a power of two, for ``sobol_indices``, in
               ``n * (2 * factors + 2)`` rows.
         n: The number of samples, runs or values per range, for methods that use it.
         seed: The seed of random designs. None: always the same design, so that a script that runs
@@ -151,8 +151,6 @@ def design(
 
 
 def _parse_factor(name: str, values: Iterable[Any]) -> Factor:
-    if not isinstance(name, str) or not name:
-        raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
     if isinstance(values, (str, bytes, Mapping, Set)) or not isinstance(values, Iterable):
         raise OptionValueError(
             f"the factor {name!r} must be a range (low, high) or a list of levels, not"
@@ -289,10 +287,6 @@ class Builder:
         """Take the rows that Sobol indices need, of ``n`` samples."""
         samples = check_size(self.n)
         number = len(self.factors)
-        if samples & (samples - 1):
-            raise OptionValueError(
-                f"the number of samples of a Saltelli design must be a power of two, not {samples}"
-            )
         check_size(samples * (2 * number + 2))
         points = _import_qmc().Sobol(2 * number, seed=self.seed).random(samples)
         first, last = np.split(points[:, None], 2, axis=2)

@@ -360,11 +360,9 @@ def plain_value(name: str, value: Any) -> Any:
     """Return the named value without NumPy's types, or raise an error."""
     if getattr(value, "ndim", None) == 0:
         value = value.item()
-    is_short = type(value) is int and value.bit_length() < 14_000  # 4,214 digits
-    if not is_short and type(value) not in (bool, float, str, NoneType):
+    if type(value) not in (bool, int, float, str, NoneType):
         raise OptionValueError(
-            f"{name} must be a number of no more than 4,200 digits, a string or None, not"
-            f" {short_repr(value)}"
+            f"{name} must be a number, a string or None, not {short_repr(value)}"
         )
     return value
 

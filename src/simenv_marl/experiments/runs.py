@@ -164,12 +164,7 @@ def run_experiment(
             f"{name_of(make)} cannot be called with the factors {', '.join(rows[0]) or '(none)'}:"
             f" {problem}; make must be a callable of the factors, such as a class, or a Variant"
         )
-    try:
-        folder = Path(store).absolute()  # other processes may have another working directory
-    except TypeError as error:
-        raise OptionValueError(
-            f"store must be the path of a folder, not {short_repr(store)}"
-        ) from error
+    folder = Path(store).absolute()  # other processes may have another working directory
     storage = Store(folder, keys, rows[0], runner.metrics)
     storage.read()
     storage.check_rows()
@@ -382,8 +377,8 @@ class Job:
             result: Result,
             trace: str | None = None,
         ) -> None:
-            run = remaining.pop(seed)
-            write(make_entry(run, result, {**provenance, "seed": seed}, trace))
+            write(make_entry(remaining[seed], result, {**provenance, "seed": seed}, trace))
+            del remaining[seed]
             bar.update()
 
         while remaining:

@@ -12,8 +12,8 @@ from ..data.plots import COLOURS, interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
 from .designs import saltelli_blocks
-from .evaluation import check_metric, check_probability, numbers
-from .plots import draw_means, label_levels, short_text
+from .evaluation import check_metric, check_number, numbers
+from .plots import LOOKS, draw_means, label_levels, short_text
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -72,13 +72,7 @@ class Effects:
             upper = grid[:above].ravel()
             for axes, factor in zip(upper, self.levels, strict=False):
                 means = self.main.loc[factor]
-                draw_means(
-                    axes,
-                    range(len(means)),
-                    means,
-                    fmt="o-",
-                    color=COLOURS[0],
-                )
+                draw_means(axes, range(len(means)), means, LOOKS["effect"])
                 label_levels(axes, self.levels[factor], factor)
                 if axes is not upper[0]:
                     axes.sharey(upper[0])
@@ -94,13 +88,7 @@ class Effects:
                         label=short_text(level),
                     )
                 label_levels(axes, self.levels[one], one)
-                axes.legend(
-                    title=other,
-                    fontsize=7,
-                    title_fontsize=8,
-                    frameon=True,
-                    edgecolor="none",
-                )
+                axes.legend(title=other, **LOOKS["levels"])
             for axes in grid.flat:
                 axes.set_visible(axes.has_data())
         return figure
@@ -137,7 +125,7 @@ def effects(
     """
     import pandas
 
-    check_probability("confidence", confidence)
+    check_number("confidence", confidence, 1)
     table, factors = _select(frame, metric, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
@@ -270,7 +258,7 @@ def sobol_indices(
     import pandas
 
     analyze = import_extra("SALib.analyze.sobol", "sobol_indices").analyze
-    check_probability("confidence", confidence)
+    check_number("confidence", confidence, 1)
     table, names = _select(frame, metric, contender, agent)
     seeds = table["seed"].nunique()
     values = numbers(table[metric], metric).to_numpy()

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, groupby, product
-from math import inf, isfinite, nan, sqrt
+from math import inf, nan, sqrt
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import EpisodeOptions, Points, reuse_resources
-from ..data.plots import INK, PALE, interval, is_proportion, style
+from ..data.plots import interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from ..runs import check_options
 from ..simulation import Model
-from .plots import draw_dots, label_below
+from .plots import LOOKS, draw_dots, label_below
 from .runner import (
     FALLBACKS,
     RUN_COLUMNS,
@@ -152,7 +152,7 @@ class Evaluation:
         seeds.
 
         Args:
-            difference: The mean difference to detect.
+            difference: The mean difference to detect, of either sign; positive.
             power: The probability of detecting it. 0.8 is four times out of five.
             metric: The name of the value.
 
@@ -163,18 +163,29 @@ class Evaluation:
         Raises:
             OptionValueError: There is no baseline, or an argument has an invalid value.
         """
-        _check_number("difference", difference)
-        check_probability("power", power)
-        if difference == 0:
-            raise OptionValueError(
-                "difference must not be 0: no number of seeds is enough to detect that"
-            )
+        check_number("difference", difference)
+        check_number("power", power, 1)
         import pandas
+        from scipy import stats
 
-        seeds = {
-            name: seeds_needed(sample.to_numpy(), difference, self.confidence, power)
-            for name, sample in self._differences(metric).items()
-        }
+        def seeds_of(sample: NDArray[np.float64]) -> float:
+            *_, note = interval(sample, self.confidence)
+            if note:
+                return nan
+            size = difference / float(np.std(sample, ddof=1))
+
+            def is_enough(number: int) -> bool:
+                critical = stats.t.ppf((1 + self.confidence) / 2, number - 1)
+                shift = min(size * sqrt(number), 1e4)  # SciPy has no values for much larger ones
+                # The probabilities that a positive or a negative difference is significant.
+                probabilities = stats.nct.sf(critical, number - 1, [shift, -shift])
+                return bool(probabilities.sum() >= power)
+
+            number = 2 + bisect_left(range(2, MOST_SEEDS + 1), True, key=is_enough)
+            return number if number <= MOST_SEEDS else inf
+
+        samples = self._differences(metric).items()
+        seeds = {name: seeds_of(sample.to_numpy()) for name, sample in samples}
         return pandas.Series(seeds, name="seeds", dtype=float).rename_axis("contender")
 
     def plot(
@@ -202,7 +213,7 @@ class Evaluation:
             figure = make_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, 14.0), 4.2)
             left, *right = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)[0]
             lines = values.to_numpy()[:LINES].T
-            left.plot(lines, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
+            left.plot(lines, **LOOKS["seed"])
             draw_dots(left, values, names, summary[["mean", "low", "high"]], 0.0)
             labels = list(names)
             for place, share in enumerate(summary.get(FALLBACKS, ())):
@@ -212,7 +223,7 @@ class Evaluation:
             left.set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
             left.set_title(title)
             for axes in right:
-                axes.axhline(0.0, color=INK, linewidth=0.8, zorder=1)
+                axes.axhline(0.0, **LOOKS["zero"])
                 bounds = summary.loc[others, ["difference", "difference_low", "difference_high"]]
                 draw_dots(axes, self._differences(metric), names, bounds, 0.24)
                 label_below(axes, others)
@@ -310,11 +321,9 @@ def evaluate(
             f"the baseline {short_repr(baseline)} is not one of the contenders:"
             f" {', '.join(contenders)}{did_you_mean(baseline, contenders)}"
         )
-    check_probability("confidence", confidence)
+    check_number("confidence", confidence, 1)
     if width is not None:
-        _check_number("width", width)
-        if width <= 0:
-            raise OptionValueError(f"width must be positive, not {short_repr(width)}")
+        check_number("width", width)
     all_seeds = distinct_seeds(seeds)
     # Errors of plans come first, even if workers do the work.
     plans = {name: runner.plan(simulation, name) for name in contenders}
@@ -420,40 +429,10 @@ def numbers(values: "DataFrame", metric: str) -> "DataFrame":
         raise OptionValueError(f"metric={short_repr(metric)} is not a column of numbers") from None
 
 
-def seeds_needed(
-    differences: NDArray[np.float64],
-    difference: float,
-    confidence: float,
-    power: float,
-) -> float:
-    """Return the number of seeds that detects a difference: see ``Evaluation.seeds_needed``."""
-    from scipy import stats
-
-    *_, note = interval(differences, confidence)
-    if note:
-        return nan
-    size = abs(difference) / float(np.std(differences, ddof=1))
-
-    def is_enough(number: int) -> bool:
-        critical = stats.t.ppf((1 + confidence) / 2, number - 1)
-        shift = min(size * sqrt(number), 1e4)  # SciPy has no values for much larger ones
-        # The probabilities that a positive or a negative difference is significant.
-        probabilities = stats.nct.sf(critical, number - 1, [shift, -shift])
-        return bool(probabilities.sum() >= power)
-
-    number = 2 + bisect_left(range(2, MOST_SEEDS + 1), True, key=is_enough)
-    return number if number <= MOST_SEEDS else inf
-
-
-def _check_number(name: str, value: float) -> None:
-    if not isinstance(value, Real) or isinstance(value, bool) or not isfinite(value):
-        raise OptionValueError(f"{name} must be a finite number, not {short_repr(value)}")
-
-
-def check_probability(name: str, value: float) -> None:
-    """Check that an argument is a number between 0 and 1."""
-    _check_number(name, value)
-    if not 0 < value < 1:
+def check_number(name: str, value: float, most: float = inf) -> None:
+    """Check that an argument is a number between 0 and ``most``."""
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not is_number or not 0 < value < most:
         raise OptionValueError(
-            f"{name} must lie between 0 and 1, such as 0.95, not {short_repr(value)}"
+            f"{name} must lie between 0 and {most}, and be neither, not {short_repr(value)}"
         )

@@ -1,15 +1,28 @@
 """Draws dots, means and labels: the parts of the plots of evaluations and effects."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ..data.plots import COLOURS, INK, scatter
+from ..data.plots import COLOURS, INK, PALE, scatter
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pandas import DataFrame
+
+
+LOOKS: Final[dict[str, dict[str, Any]]] = {
+    "seed": {"color": PALE, "linewidth": 0.7, "alpha": 0.7, "zorder": 1},
+    "zero": {"color": INK, "linewidth": 0.8, "zorder": 1},
+    "dots": {"s": 14, "alpha": 0.5, "linewidths": 0},
+    "mean": {"fmt": "o", "color": INK, "elinewidth": 2},
+    "effect": {"fmt": "o-", "color": COLOURS[0]},
+    "number": {"textcoords": "offset points", "va": "center", "fontsize": 8.5},
+    "slanted": {"rotation": 30, "ha": "right", "rotation_mode": "anchor"},
+    "levels": {"fontsize": 7, "title_fontsize": 8, "frameon": True, "edgecolor": "none"},
+}
+"""The options of the parts of the plots of evaluations and effects."""
 
 
 def draw_dots(
@@ -27,31 +40,10 @@ def draw_dots(
     offsets = spread * scatter(len(values))
     for place, name in enumerate(values.columns):
         colour = COLOURS[names.index(name) % len(COLOURS)]
-        axes.scatter(
-            place + offsets,
-            values[name],
-            14,
-            color=colour,
-            alpha=0.5,
-            linewidths=0,
-        )
-        draw_means(
-            axes,
-            [place],
-            means.loc[[name]],
-            fmt="o",
-            color=INK,
-            elinewidth=2,
-        )
+        axes.scatter(place + offsets, values[name], color=colour, **LOOKS["dots"])
+        draw_means(axes, [place], means.loc[[name]], LOOKS["mean"])
         mean = means.loc[name].iloc[0]
-        axes.annotate(
-            f"{mean:.4g}",
-            (place, mean),
-            (8, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8.5,
-        )
+        axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), **LOOKS["number"])
     axes.set_xlim(-0.5, len(values.columns) - 0.5)
 
 
@@ -59,12 +51,12 @@ def draw_means(
     axes: "Axes",
     places: Sequence[int],
     means: "DataFrame",
-    **format_options: Any,
+    look: dict[str, Any],
 ) -> None:
     """Draw means with their intervals, from the first three columns: mean, low and high."""
     mean, low, high = means.to_numpy(float)[:, :3].T
     bars = np.maximum([mean - low, high - mean], 0.0)  # unknown bounds are nan, and not drawn
-    axes.errorbar(places, mean, yerr=bars, **format_options)
+    axes.errorbar(places, mean, yerr=bars, **look)
 
 
 def label_below(axes: "Axes", names: Sequence[str]) -> None:
@@ -74,7 +66,7 @@ def label_below(axes: "Axes", names: Sequence[str]) -> None:
     inches = axes.get_window_extent().width / axes.figure.dpi
     if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter
         for label in axes.get_xticklabels():
-            label.set(rotation=30, ha="right", rotation_mode="anchor")
+            label.set(**LOOKS["slanted"])
 
 
 def label_levels(axes: "Axes", levels: list[Any], factor: str) -> None:

@@ -152,7 +152,7 @@ class Evaluation:
         seeds.
 
         Args:
-            difference: The mean difference to detect, of either sign; positive.
+            difference: The size of the mean difference to detect.
             power: The probability of detecting it. 0.8 is four times out of five.
             metric: The name of the value.
 
@@ -434,5 +434,5 @@ def check_number(name: str, value: float, most: float = inf) -> None:
     is_number = isinstance(value, Real) and not isinstance(value, bool)
     if not is_number or not 0 < value < most:
         raise OptionValueError(
-            f"{name} must lie between 0 and {most}, and be neither, not {short_repr(value)}"
+            f"{name} must lie between 0 and {most}, such as 0.95, not {short_repr(value)}"
         )

@@ -60,7 +60,7 @@ def groups(number: int) -> Iterator[Group]:
 
 def experiment(make: type, rows: int, clock: Callable[[], float], workers: int = 0) -> Contender:
     """Make a contender of a whole experiment: the milliseconds of each run."""
-    table = design({"x": (0.0, 1.0), "n": (1, 1000)}, "sobol", rows)
+    table = design({"x": (0.0, 1.0), "n": (1, 1000)}, "halton", rows)
 
     def run() -> float:
         with TemporaryDirectory() as folder:

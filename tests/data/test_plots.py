@@ -59,15 +59,27 @@ def of(axes, kind):
 
 
 def dots(axes):
-    drawn = [own for own in of(axes, PathCollection) if len(own.get_offsets())]
-    return [
-        (np.asarray(own.get_offsets()).tolist(), to_hex(own.get_facecolor()[0]) != "#ffffff")
-        for own in drawn
-    ]
+    """Where dots are, first the full ones of each line, then the hollow ones."""
+    found = []
+    for own in of(axes, PathCollection):
+        places = np.ma.filled(own.get_offsets(), np.nan)
+        colours = np.broadcast_to(own.get_facecolor(), (len(places), 4))
+        full = np.array([to_hex(colour) != "#ffffff" for colour in colours], bool)
+        seen = ~np.isnan(places).any(axis=1)
+        for kind in (True, False):
+            chosen = places[seen & (full == kind)].tolist()
+            if chosen:
+                found.append((chosen, kind))
+    return found
 
 
-def texts(axes):
-    return [text.get_text() for legend in axes.findobj(Legend) for text in legend.get_texts()]
+def shades(cells):
+    """The colour of each cell."""
+    return [to_hex(colour) for colour in cells.to_rgba(cells.get_array())]
+
+
+def texts(artist):
+    return [text.get_text() for legend in artist.findobj(Legend) for text in legend.get_texts()]
 
 
 def ticks(axes):
@@ -134,7 +146,7 @@ def test_decisions_of_the_rule_look_different(known):
     assert by_policy == ([[0, 1], [2, 3]], True)
     assert ([place for place, _ in by_rule[0]], by_rule[1]) == ([1], False)
     assert by_rule[0] == [[1, 9]] or not known
-    assert texts(plot_timeline(found).axes[0]) == ["policy", "rule", "terminated"]
+    assert texts(plot_timeline(found)) == ["policy", "rule", "terminated"]
     assert plot_timeline(found)._repr_png_().startswith(b"\x89PNG")  # for notebooks
     assert dots(plot_timeline(found[ant]).axes[0]) == [by_policy, by_rule]
 
@@ -193,10 +205,7 @@ def test_many_agents_have_a_row_each_and_some_can_be_chosen():
     # The first decides but once, at 0, and ends when all have decided; the second decides again
     # then.
     assert cells[:2] == [pytest.approx((0, 200, 0)), pytest.approx((1, 200, 1))]
-    assert [(line.get_marker(), len(line.get_xdata())) for line in actions.lines] == [
-        ("x", 100),
-        ("|", 100),
-    ]
+    assert [line.get_marker() for line in actions.lines] == ["x", "|"] * 100
     figure = plot_timeline(found, agents=["being_7", "being_3"])
     assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == [
         "being_7  (Being.act)",
@@ -213,8 +222,8 @@ def test_rows_are_coloured_by_the_action():
         8, 1, key=f"{Being.__module__}.Being.act", policy=lambda seen: [3, *[0] * 7][: len(seen)]
     )
     actions = plot_timeline(found, action_names=["stay", "1", "2", "go"]).axes[0]
-    colours = [tuple(colour) for colour in of(actions, PolyCollection)[-1].get_facecolor()]
-    assert set(colours) <= {to_rgba(COLOURS[0]), to_rgba(COLOURS[3])}
+    colours = set(map(to_rgba, shades(of(actions, PolyCollection)[-1])))
+    assert colours <= {to_rgba(COLOURS[0]), to_rgba(COLOURS[3])}
     assert "go" in texts(actions)
     assert actions.get_title(loc="left") == "Being.act, 8 agents: action"
 
@@ -243,9 +252,9 @@ def test_unknown_actions_of_the_rule_are_grey():
     found = herd(8, 1, policy=lambda seen: next(answers, [2] * len(seen)), seeds=(5, 6))
     assert found[Being.act].by_rule.any()
     of_each = [plot_timeline(found, episode).axes[0] for episode in (0, 1)]
-    cells = [cells.get_facecolor() for axes in of_each for cells in of(axes, PolyCollection)]
-    assert any(to_hex(colours[0]) == UNKNOWN.lower() for colours in cells if len(colours))
-    assert any("by rule, action unknown" in texts(axes.figure.axes[1]) for axes in of_each)
+    cells = [shades(of(axes, PolyCollection)[-1]) for axes in of_each]
+    assert any(UNKNOWN.lower() in colours for colours in cells)
+    assert any("by rule, action unknown" in texts(axes.figure) for axes in of_each)
     plot_timeline(herd(8, 2, policy=lambda seen: RULE)).canvas.draw()  # by nobody but the rule
 
 

@@ -60,8 +60,9 @@ def test_values_are_of_the_factors_and_designs_are_repeatable(factors, method, n
         table = design(factors, method, chosen, seed=seed)
     except OptionValueError:
         few = any(isinstance(given, list) and len(given) != 2 for given in factors.values())
-        ranges = sum(isinstance(given, tuple) for given in factors.values())
-        assert (method in TWO_LEVELS and few) or (method == "central_composite" and ranges < 2)
+        are_ranges = all(isinstance(given, tuple) for given in factors.values())
+        is_surface = len(factors) > 1 and are_ranges
+        assert (method in TWO_LEVELS and few) or (method == "central_composite" and not is_surface)
         return
     assert list(table.columns) == list(factors)
     for name, own in factors.items():
@@ -80,15 +81,13 @@ def test_columns_have_the_types_of_the_factors(method):
         "o": ["a", 1],
         "n": [3, 1],
     }
+    if method == "central_composite":
+        factors = {name: own for name, own in factors.items() if isinstance(own, tuple)}
     table = design(factors, method, 4 if method in (*SIZED, "saltelli") else None)
-    assert [dtype.kind for dtype in table.dtypes[["f", "i", "b", "o", "n"]]] == [
-        "f",
-        "i",
-        "b",
-        "O",
-        "i",
-    ]
-    assert set(map(type, values(table, "s"))) == {str}
+    kinds = {"f": "f", "i": "i", "b": "b", "o": "O", "n": "i"}
+    for name in table:
+        assert name == "s" or table[name].dtype.kind == kinds[name]
+        assert name != "s" or set(map(type, values(table, name))) == {str}
     assert all(
         allowed(value, given_) for name, given_ in factors.items() for value in values(table, name)
     )
@@ -103,7 +102,7 @@ def test_a_full_factorial_has_all_combinations():
 
 
 @pytest.mark.parametrize(
-    "bounds", [(0, 2**53 + 1), (-(2**63), 2**63 - 1), (0, 10**30), (-7, 7)], ids=str
+    "bounds", [(0, 2**53), (-(2**53), 2**53), (1, 2**53 - 1), (-7, 7)], ids=str
 )
 def test_whole_ranges_stay_whole_and_reach_their_bounds(bounds):
     low, high = bounds
@@ -181,18 +180,11 @@ def test_one_at_a_time_changes_one_factor():
     assert list(table.itertuples(index=False, name=None)) == [(5, "x", 0.5), *changed]
 
 
-def test_a_central_composite_design_is_there_for_each_combination_of_levels():
-    alone = design({"a": (0.0, 2.0), "b": (-4.0, 4.0)}, "central_composite")
-    assert len(alone) == 9
-    assert (alone.min().tolist(), alone.max().tolist()) == ([0.0, -4.0], [2.0, 4.0])
-    assert not alone.duplicated().any()
-    factors = {"k": ["x", "y", "z"], "a": (0.0, 2.0), "c": [1, 2], "b": (-4.0, 4.0), "d": ["w"]}
-    table = design(factors, "central_composite")
-    assert len(table) == 9 * 6
-    groups = table.groupby(["k", "c", "d"], sort=False)
-    assert list(groups.groups) == [(k, c, "w") for k in "xyz" for c in (1, 2)]
-    for _, group in groups:
-        assert group[["a", "b"]].reset_index(drop=True).equals(alone)
+def test_a_central_composite_design_lies_within_the_ranges():
+    table = design({"a": (0.0, 2.0), "b": (-4.0, 4.0)}, "central_composite")
+    assert len(table) == 9
+    assert (table.min().tolist(), table.max().tolist()) == ([0.0, -4.0], [2.0, 4.0])
+    assert not table.duplicated().any()
 
 
 THREE, LEVELS = {"a": (0, 1), "b": (0, 1), "c": (0, 1)}, {"a": [1, 2, 3], "b": (0, 1)}
@@ -213,16 +205,16 @@ def test_arrays_can_be_levels():
             ("a tuple is a range", ({"a": own},))
             for own in ((1, 2, 3), ("x", "y"), (0.0, float("inf")))
         ),
-        *(("that a float can hold", ({"a": own},)) for own in ((0, 10**5000), (0.5, 10**400))),
+        *(
+            ("that a float can hold", ({"a": own},))
+            for own in ((0, 2**53 + 1), (0, 10**5000), (0.5, 10**400))
+        ),
         ("is empty", ({"a": (2, 2)},)),
-        *(("must be a range", ({"a": own},)) for own in ("levels", 3)),
-        *(("must have an order", ({"a": own},)) for own in ({"x", "y"}, frozenset([1]))),
-        ("must be a string", ({1: [1]},)),
+        *(("must be a range", ({"a": own},)) for own in ("levels", 3, {"x", "y"}, frozenset([1]))),
         *(("method must be one of", ({"a": [1]}, method)) for method in ("best", ["sobol"])),
         ("needs n", ({"a": (0, 1)}, "sobol")),
         ("positive integer", ({"a": (0, 1)}, "sobol", 0)),
         *(("power of two", (THREE, "fractional_factorial", number)) for number in (6, 2, 16)),
-        ("power of two", ({"a": (0, 1)}, "saltelli", 3)),
         *(
             ("two levels", (LEVELS, method))
             for method in ("fractional_factorial", "plackett_burman")
@@ -230,12 +222,9 @@ def test_arrays_can_be_levels():
         ("has 4 runs", ({"a": (0, 1)}, "plackett_burman", 8)),
         *(
             ("two ranges", (factors, "central_composite"))
-            for factors in ({"a": [1, 2], "b": (0, 1)}, {"a": (0, 1)})
+            for factors in ({"a": [1, 2], "b": (0, 1), "c": (0, 1)}, {"a": (0, 1)})
         ),
-        (
-            "has 18 runs, not 9",
-            ({"a": (0, 1), "b": (0, 1), "c": ["x", "y"]}, "central_composite", 9),
-        ),
+        ("has 9 runs, not 18", ({"a": (0, 1), "b": (0, 1)}, "central_composite", 18)),
         ("more than 10,000,000", ({f"x{i}": (0, 1) for i in range(30)}, "central_composite")),
         ("more than 10,000,000", ({"a": (0, 1), "b": (0, 1)}, "saltelli", 2**22)),
         ("more than 10,000,000", ({"a": (0.0, 1.0)}, "full_factorial", 10**12)),
@@ -248,10 +237,10 @@ def test_invalid_designs_are_refused(match, arguments):
 
 
 def test_pydoe_is_found_under_either_name_or_its_extra_is_named(monkeypatch):
-    expected = design({"x": (0.0, 1.0)}, "halton", 4)
+    expected = design({"x": (0.0, 1.0)}, "plackett_burman")
     monkeypatch.setitem(sys.modules, "pyDOE", pydoe)  # its name in releases for older NumPy
     monkeypatch.setitem(sys.modules, "pydoe", None)
-    assert design({"x": (0.0, 1.0)}, "halton", 4).equals(expected)
+    assert design({"x": (0.0, 1.0)}, "plackett_burman").equals(expected)
     monkeypatch.setitem(sys.modules, "pyDOE", None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[design\]"):
-        design({"x": (0.0, 1.0)}, "halton", 4)
+        design({"x": (0.0, 1.0)}, "plackett_burman")

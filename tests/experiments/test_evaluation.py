@@ -300,13 +300,7 @@ def test_the_team_is_what_its_user_makes_of_the_returns():
     def team(returns):
         assert "keeper" in returns
         assert "stranger" not in returns
-        assert returns["keeper"] in returns
-        assert (
-            dict(returns)["keeper"]
-            == returns["keeper"]
-            == max(returns.values())
-            == max(returns[0], returns[1])
-        )
+        assert dict(returns)["keeper"] == returns["keeper"] == max(returns) == np.max(returns)
         return returns.get("stranger", returns["keeper"])
 
     found = evaluate(Shop, {"much": {"keeper": much}}, seeds=[1], points=POINTS, team=team)
@@ -435,9 +429,11 @@ def test_metrics_are_numbers_strings_or_none():
         "huge": lambda shop: 10**400,  # which no float can hold
     }
     found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=metrics, baseline="rule")
-    expected = {"float": [0.5, 0.5], "array": [3, 3], "text": [None, "a"], "huge": [10**400] * 2}
+    expected = {"float": [0.5, 0.5], "array": [3, 3], "huge": [10**400] * 2}
     team = found.frame[(found.frame["agent"] == "team") & (found.frame["contender"] == "rule")]
     assert {name: team[name].tolist() for name in expected} == expected
+    assert team["text"].isna().tolist() == [True, False]
+    assert team["text"].tolist()[1] == "a"
     assert team["some"].dtype == np.float64
     assert np.isnan(found.summary("some")["mean"]).all()
     for look in (
@@ -449,17 +445,8 @@ def test_metrics_are_numbers_strings_or_none():
         for metric in ("text", "huge"):
             with pytest.raises(OptionValueError, match=f"'{metric}' is not a column of numbers"):
                 look(metric=metric)
-    for odd in ([1], 10**5000, 2**13_999):
-        with pytest.raises(
-            OptionValueError, match="metric 'x' must be a number of no more than 4,200 digits"
-        ):
-            evaluate(
-                Shop,
-                {"rule": {}},
-                seeds=[1],
-                points=POINTS,
-                metric={"x": lambda shop, odd=odd: odd},
-            )
+    with pytest.raises(OptionValueError, match="metric 'x' must be a number, a string or None"):
+        evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda shop: [1]})
 
 
 def test_a_missing_package_is_named_with_its_extra(monkeypatch):
@@ -475,13 +462,12 @@ def test_importing_the_package_imports_neither_its_checks_nor_what_experiments_n
     assert done.stdout.strip() == "set()"
 
 
-def test_returns_are_not_counted_where_two_points_have_the_same_agent_which_is_told(monkeypatch):
+def test_two_points_of_the_same_agent_are_refused(monkeypatch):
     class Doubled(Shop):
         order, sell = map(NEAR[Shop.order], (Shop.order, Shop.sell))
 
     own = [name for name in decision_points() if name.startswith("tests.")]
     # without those of studies
     monkeypatch.setattr("simenv_marl.core.plans.points.decision_points", lambda: own)
-    with pytest.warns(UserWarning, match="not counted, .* have the same agent"):
-        found = evaluate(Doubled, {"rule": {}}, seeds=[1])
-    assert found.frame["length"].tolist() == [0]
+    with pytest.raises(AgentError, match="have the same agent"):
+        evaluate(Doubled, {"rule": {}}, seeds=[1])

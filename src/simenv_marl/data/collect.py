@@ -124,31 +124,10 @@ def collect_episodes(
     policies = checked_policies(policies)
     seed_list = checked_seeds(seeds)
     check_options(batch_size, workers, collect, concurrency)
-    make_plan = partial(
-        learners_plan,
-        simulation,
-        policies,
-        points,
-        options,
-    )
-    plan = make_plan()  # errors show up before any work starts
-    arguments = (
-        make_plan,
-        None if workers else plan,
-        list(policies),
-        collect,
-        batch_size,
-        concurrency,
-    )
+    make_plan = partial(learners_plan, simulation, policies, points, options)
+    arguments = make_plan, list(policies), collect, batch_size, concurrency
     with progress_bar(len(seed_list), progress) as bar:
-        parts = spread(
-            _play,
-            arguments,
-            list(enumerate(seed_list)),
-            workers,
-            batch_size,
-            bar,
-        )
+        parts = spread(_play, arguments, list(enumerate(seed_list)), workers, batch_size, bar)
     collected = None
     if collect is not None:
         collected = tuple(chain.from_iterable(values for _, values in parts))
@@ -190,8 +169,8 @@ def learners_plan(
         others = PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone))
     plan = plan_of(simulation, points, options, mode=Mode.COLLECT, default_policy=others)
     for place, policy in enumerate(policies.values()):
-        for point in points_of(plan, place) if isinstance(policy, LeftToRule) else ():
-            if not point.reports_rule:
+        for point in points_of(plan, place):
+            if isinstance(policy, LeftToRule) and not point.reports_rule:
                 raise DefinitionError(
                     f"the actions of the rule of {point.hook.name} are not known; give its"
                     " make_step a rule_action_mapping, which maps the rule's decision to an action"
@@ -205,7 +184,6 @@ def _follow_rule(observations: Observation) -> Action:
 
 def _play(
     make_plan: Callable[[], Plan],
-    plan: Plan | None,
     keys: list[Any],
     collect: Callable[[Model], Any] | None,
     batch_size: int,
@@ -217,7 +195,7 @@ def _play(
 
     Return the records of each policy, and the result of ``collect`` for each episode.
     """
-    plan = plan or make_plan()
+    plan = make_plan()
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)
 
@@ -226,14 +204,8 @@ def _play(
             collected[place] = collect(simulation)
         bar.update()
 
-    BatchRun(
-        plan,
-        [seed for _, seed in episodes],
-        batch_size,
-        finish,
-        recorder,
-        concurrency,
-    ).run()
+    seeds = [seed for _, seed in episodes]
+    BatchRun(plan, seeds, batch_size, finish, recorder, concurrency).run()
     return recorder.records(plan, keys), collected
 
 
@@ -278,7 +250,7 @@ class Mixture:
         self.weights: Floats = np.array(weights, np.float64) / sum(weights)
         self._bounds = np.cumsum(self.weights)[:-1]
         self._parts = [
-            _BatchedPolicy(_follow_rule if policy is RULE else policy) for policy in policies
+            BatchPolicy(_follow_rule if policy is RULE else policy) for policy in policies
         ]
 
     def __repr__(self) -> str:
@@ -302,7 +274,8 @@ class Mixture:
             rows = index.tolist()
             if not rows:
                 continue
-            actions = part.actions(
+            actions = _actions(
+                part,
                 taken(observations, index),
                 [infos[row] for row in rows],
                 [identities[row] for row in rows],
@@ -330,22 +303,15 @@ def _check_part(policy: Any, weight: Any) -> None:
         )
 
 
-class _BatchedPolicy:
-    """A policy that answers many decisions at once."""
-
-    def __init__(self, policy: Callable[..., Action]) -> None:
-        self._policy = policy
-        self._batch_policy = BatchPolicy(policy)
-
-    def actions(
-        self,
-        observations: Observation,
-        infos: Infos,
-        identities: Identities,
-    ) -> list[Action]:
-        """Ask the policy for one action for each decision, and drop its extras."""
-        answers = self._batch_policy.answers(observations, infos, identities)
-        return read_answers(answers, self._policy, len(identities))[0]
+def _actions(
+    policy: BatchPolicy,
+    observations: Observation,
+    infos: Infos,
+    identities: Identities,
+) -> list[Action]:
+    """Ask a policy for one action for each decision, and drop its extras."""
+    answers = policy.answers(observations, infos, identities)
+    return read_answers(answers, policy.policy, len(identities))[0]
 
 
 def _random_numbers(identities: Identities) -> Array:
@@ -445,19 +411,22 @@ def compare_with_rule(
             f" not {short_repr(others)}"
         )
     # One shadow for each policy, so that keys share batches.
-    shadows: dict[int, LeftToRule] = {}
-    for policy in policies.values():
-        shadow = _Shadow if is_asked_alone(policy) else _BatchedShadow
-        shadows[id(policy)] = LeftToRule(shadow(policy))
-    shadows_by_key = {key: shadows[id(policy)] for key, policy in policies.items()}
+    shadows = {
+        id(policy): (_Shadow if is_asked_alone(policy) else _BatchedShadow)(policy)
+        for policy in policies.values()
+    }
+    to_rule = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
     collected = collect_episodes(
-        simulation, {**shadows_by_key, **(others or {})}, seeds=seeds, points=points, **options
+        simulation, {**to_rule, **(others or {})}, seeds=seeds, points=points, **options
     )
     return {key: _compare(collected[key], tolerance) for key in policies}
 
 
-class _BatchedShadow(_BatchedPolicy):
+class _BatchedShadow:
     """Records the actions of a policy as an extra, and leaves the decisions to the rule."""
+
+    def __init__(self, policy: Callable[..., Action]) -> None:
+        self._policy = BatchPolicy(policy)
 
     def __call__(
         self,
@@ -465,7 +434,7 @@ class _BatchedShadow(_BatchedPolicy):
         infos: Infos,
         identities: Identities,
     ) -> Any:
-        actions = self.actions(observations, infos, identities)
+        actions = _actions(self._policy, observations, infos, identities)
         return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 
 

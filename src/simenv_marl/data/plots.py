@@ -6,6 +6,7 @@ opens, and a figure is freed when its user drops it.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import (
     Callable,
     Hashable,
@@ -62,6 +63,7 @@ PALE = "#C9C9C9"
 ABSENT = "#E9E9E9"
 
 STYLE: Final[dict[Any, Any]] = {
+    "axes.axisbelow": True,
     "axes.edgecolor": PALE,
     "axes.labelcolor": INK,
     "axes.labelsize": 9,
@@ -70,11 +72,14 @@ STYLE: Final[dict[Any, Any]] = {
     "axes.titlelocation": "left",
     "axes.titlesize": 10,
     "figure.titlesize": 11,
+    "grid.color": ABSENT,
+    "grid.linewidth": 0.7,
     "legend.columnspacing": 1.2,
     "legend.fontsize": 8.5,
     "legend.frameon": False,
     "legend.handlelength": 1.5,
     "legend.handletextpad": 0.4,
+    "lines.markersize": 4,
     "text.color": INK,
     "xtick.color": PALE,
     "xtick.labelcolor": INK,
@@ -85,30 +90,47 @@ STYLE: Final[dict[Any, Any]] = {
 }
 """The settings of Matplotlib for all plots."""
 
+LOOKS: Final[dict[str, dict[str, Any]]] = {
+    "quartiles": {"height": 0.62, "alpha": 0.16},
+    "episodes": {"s": 10, "alpha": 0.45, "linewidths": 0},
+    "interval": {"color": INK, "linewidth": 1.6},
+    "mean": {"marker": "o", "color": INK, "markersize": 4},
+    "grid": {"color": ABSENT, "linewidth": 0.7},
+    "beside": {
+        "textcoords": "offset points",
+        "va": "center",
+        "fontsize": 8.5,
+        "annotation_clip": False,
+    },
+}
+"""The options of the parts of the plot of returns."""
+
 
 @contextmanager
-def style(feature: str) -> Iterator[Callable[[float, float], Figure]]:
-    """Set the style of all plots for a feature of this package.
+def style(figure: Figure | SubFigure | None = None) -> Iterator[Callable[[float, float], Any]]:
+    """Set the style of all plots.
 
-    Yield a function that makes a new figure from its width and height in inches.
+    Yield a function that returns the figure, or makes one of a width and a height in inches.
     """
-    make = import_extra("matplotlib.figure", feature).Figure
+    make = import_extra("matplotlib.figure", "a plot").Figure
     from matplotlib import rc_context
 
-    def new_figure(width: float, height: float) -> Any:
-        figure = make(figsize=(width, height), layout="constrained")
+    def make_figure(width: float, height: float) -> Any:
+        if figure is not None:
+            return figure
+        fresh = make(figsize=(width, height), layout="constrained")
 
         def image() -> bytes:
             buffer = BytesIO()
-            figure.savefig(buffer, format="png", dpi=100)
+            fresh.savefig(buffer, format="png", dpi=100)
             return buffer.getvalue()
 
         # IPython calls this method where Matplotlib has not registered its figures.
-        figure._repr_png_ = image
-        return figure
+        fresh._repr_png_ = image
+        return fresh
 
     with rc_context(STYLE):
-        yield new_figure
+        yield make_figure
 
 
 def by_key(trajectories: Collection) -> Mapping[Any, Trajectories]:
@@ -140,16 +162,7 @@ def write_beside(
     transform: Transform,
 ) -> None:
     """Write text to the right of axes, at a height in the coordinates of a transform."""
-    axes.annotate(
-        text,
-        (1.0, height),
-        (6, 0),
-        transform,
-        "offset points",
-        va="center",
-        fontsize=8.5,
-        annotation_clip=False,
-    )
+    axes.annotate(text, (1.0, height), (6, 0), transform, **LOOKS["beside"])
 
 
 # -- intervals ------------------------------------------------------------------------------------
@@ -239,9 +252,9 @@ def plot_returns(
     proportion = is_proportion(
         np.concatenate([returns for rows in groups.values() for returns in rows.values()])
     )
-    with style("plot_returns") as new_figure:
+    with style() as make_figure:
         if ax is None:
-            ax = new_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
+            ax = make_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
         height = 0.0
         ticks: list[tuple[float, str, str]] = []
         for title, rows in groups.items():
@@ -251,13 +264,19 @@ def plot_returns(
                 height += 0.8
             for label, returns in rows.items():
                 colour = COLOURS[labels.index(label) % len(COLOURS)]
-                _draw_returns(
-                    ax,
-                    height,
-                    returns,
-                    colour,
-                    proportion=proportion,
-                )
+                low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
+                ax.barh(height, high - low, left=low, color=colour, **LOOKS["quartiles"])
+                places = height + 0.26 * scatter(len(returns))
+                ax.scatter(returns, places, color=colour, **LOOKS["episodes"])
+                ax.vlines(median, height - 0.31, height + 0.31, color=colour, linewidth=1.4)
+                mean = returns.mean()
+                text = f"{mean:.4g}"
+                below, above, note = interval(returns, 0.95, proportion=proportion)
+                if not note:
+                    text += f"  [{below:.4g}, {above:.4g}]"
+                    ax.hlines(height, below, above, **LOOKS["interval"])
+                ax.plot([mean], [height], **LOOKS["mean"])
+                write_beside(ax, text, height, ax.get_yaxis_transform())
                 ticks.append((height, label or title, "normal"))
                 height += 1.0
         heights, texts, weights = zip(*ticks, strict=True)
@@ -267,7 +286,7 @@ def plot_returns(
         ax.set_ylim(height - 0.3, -0.7)
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
-        ax.grid(axis="x", color=ABSENT, linewidth=0.7)
+        ax.grid(axis="x", **LOOKS["grid"])
         ax.set_axisbelow(True)
         ax.set_xlabel(f"return of an episode{AGGREGATES[per]}")
     return ax.figure
@@ -283,75 +302,22 @@ def _returns(
         isinstance(value, Mapping) for value in collected.values()
     ):
         collections = {str(label): value for label, value in collected.items()}
-    groups: dict[str, dict[str, Floats]] = {}
+    combine = fmean if per == "policy" else sum
+    groups: dict[str, dict[str, Floats]] = defaultdict(dict)
     for label, trajectories in collections.items():
-        by_title: dict[str, dict[int, list[float]]] = {}
+        paid: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for key, group in by_key(trajectories).items():
             title = title_of(key) if per == "policy" else ""
             for start, value in zip(group.starts, group.returns.tolist(), strict=True):
                 if per == "agent":
                     title = group.names[group.agents[start]]
-                by_episode = by_title.setdefault(title, {})
-                by_episode.setdefault(int(group.episodes[start]), []).append(value)
-        combine = fmean if per == "policy" else sum
-        for title, by_episode in by_title.items():
-            returns = [combine(by_episode[episode]) for episode in sorted(by_episode)]
-            groups.setdefault(title, {})[label] = np.array(returns, np.float64)
+                paid[title][group.episodes[start]].append(value)
+        for title, episodes in paid.items():
+            returns = [combine(values) for _, values in sorted(episodes.items())]
+            groups[title][label] = np.array(returns)
     return groups
 
 
-def _draw_returns(
-    axes: Axes,
-    height: float,
-    returns: Floats,
-    colour: str,
-    *,
-    proportion: bool,
-) -> None:
-    """Draw the episodes of a row, their quartiles and median, and their mean with its interval."""
-    mean = returns.mean()
-    low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
-    axes.barh(
-        height,
-        high - low,
-        left=low,
-        height=0.62,
-        color=colour,
-        alpha=0.16,
-    )
-    # Spread evenly, in irregular order.
-    heights = height + 0.26 * (2 * (np.arange(len(returns)) * 0.618034 % 1) - 1)
-    axes.scatter(
-        returns,
-        heights,
-        10,
-        color=colour,
-        alpha=0.45,
-        linewidths=0,
-    )
-    axes.vlines(
-        median,
-        height - 0.31,
-        height + 0.31,
-        color=colour,
-        linewidth=1.4,
-    )
-    below, above, note = interval(returns, 0.95, proportion=proportion)
-    text = f"{mean:.4g}"
-    if not note:
-        text += f"  [{below:.4g}, {above:.4g}]"
-        axes.hlines(
-            height,
-            below,
-            above,
-            color=INK,
-            linewidth=1.6,
-        )
-    axes.plot(
-        [mean],
-        [height],
-        "o",
-        color=INK,
-        markersize=4,
-    )
-    write_beside(axes, text, height, axes.get_yaxis_transform())
+def scatter(number: int) -> Array:
+    """Return numbers from -1 to 1, at even distances in an irregular order."""
+    return 2 * (np.arange(number) * 0.618034 % 1) - 1

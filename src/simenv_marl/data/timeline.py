@@ -7,7 +7,6 @@ from collections import ChainMap
 from collections.abc import (
     Callable,
     Hashable,
-    Iterator,
     Mapping,
     Sequence,
 )
@@ -31,8 +30,6 @@ from .plots import (
 )
 from .trajectories import (
     Array,
-    Bools,
-    Floats,
     Trajectories,
     action_arrays,
 )
@@ -70,26 +67,29 @@ MARKS: Final[dict[str, dict[str, Any]]] = {
     },
     "by rule": {"color": INK, "linewidth": 2},
     "by rule, action unknown": {"color": UNKNOWN, "linewidth": 2},
-    "terminated": {"marker": "x", "color": INK, "linewidth": 0, "markersize": 6},
-    "truncated": {"marker": "|", "color": INK, "linewidth": 0, "markersize": 6},
+    "terminated": {"marker": "x", "color": INK, "linewidth": 0, "markersize": 6, "clip_on": False},
+    "truncated": {"marker": "|", "color": INK, "linewidth": 0, "markersize": 6, "clip_on": False},
 }
 """The marks of decisions in charts, of decisions in rows of colours, and of ends."""
 
-BESIDE: Final[dict[str, Any]] = {
-    "loc": "upper left",
-    "bbox_to_anchor": (1.0, 1.0),
-    "handlelength": 0.9,
-    "handleheight": 0.9,
+LOOKS: Final[dict[str, dict[str, Any]]] = {
+    "charts": {"sharex": True, "squeeze": False},
+    "panels": {"ncols": 2, "sharex": True, "sharey": "row", "squeeze": False},
+    "line": {"where": "post", "linewidth": 0.8},
+    "dots": {"s": 14, "zorder": 3},
+    "unknown": {"s": 14, "color": "white", "edgecolors": UNKNOWN, "zorder": 3},
+    "reward": {"color": INK, "linewidth": 1.0},
+    "absent": {"color": ABSENT, "zorder": 0},
+    "scale": {"fraction": 0.04, "pad": 0.01, "aspect": 30},
+    "marks": {"loc": "outside upper right", "ncols": 6},
+    "names": {  # to the right of the axes
+        "loc": "upper left",
+        "bbox_to_anchor": (1.0, 1.0),
+        "handlelength": 0.9,
+        "handleheight": 0.9,
+    },
 }
-"""The layout of a legend to the right of its axes."""
-
-ABOVE: Final[dict[str, Any]] = {
-    "loc": "lower right",
-    "bbox_to_anchor": (1.0, 1.0),
-    "ncols": 6,
-    "borderaxespad": 0.2,
-}
-"""The layout of a legend above its axes."""
+"""The options of the parts of a picture."""
 
 
 @dataclass(frozen=True)
@@ -107,30 +107,45 @@ class _Component:
     labels: dict[int, str]
 
 
-@dataclass(frozen=True)
 class TimelineRow:
     """The decisions of one agent in the episode.
 
     Attributes:
         key: The key of its policy.
         actions: The components of the policy's actions, by name.
-        rows: The agent's rows of the policy's decisions.
+        values: ``(n,)`` for each component: its numbers, nan where the action is unknown.
         times: ``(n,)``: the float times of the agent's decisions, or without a clock their int
             numbers.
         end: The time of its end.
         ending: "terminated" or "truncated".
     """
 
-    key: Hashable
-    agent: str
-    actions: dict[str, _Component]
-    rows: slice
-    times: Array
-    rewards: Floats
-    known: Bools
-    by_rule: Bools
-    end: float
-    ending: str
+    def __init__(
+        self,
+        key: Hashable,
+        group: Trajectories,
+        place: int,
+        actions: dict[str, _Component],
+    ) -> None:
+        """Take the trajectory of a place from the group of its policy."""
+        start = group.starts[place]
+        rows = slice(start, start + group.lengths[place])
+        known = group.known[rows]
+        self.key = key
+        self.actions = actions
+        self.values = {
+            name: np.where(known, own.values[rows], np.nan) for name, own in actions.items()
+        }
+        self.agent = group.names[group.agents[start]]
+        self.times: Array = group.turns[rows]
+        self.end: float = group.last_turns[place]
+        if group.times is not None and group.elapsed is not None:
+            self.times = group.times[rows]
+            self.end = self.times[-1] + group.elapsed[rows][-1]
+        self.rewards = group.rewards[rows]
+        self.unknown = ~known
+        self.by_rule = group.by_rule[rows]
+        self.ending = "terminated" if group.terminations[rows][-1] else "truncated"
 
 
 def plot_timeline(
@@ -190,7 +205,8 @@ def plot_timeline(
     for key, group in by_policy.items():
         if number in group.episodes:
             actions = _components(group, _action_labels(key, group, action_names))
-            rows += _rows(key, group, actions, number)
+            places = np.flatnonzero(group.episodes[group.starts] == number)
+            rows += [TimelineRow(key, group, place, actions) for place in places.tolist()]
     if not rows:
         raise OptionValueError(
             f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has"
@@ -201,8 +217,7 @@ def plot_timeline(
     begin = min(row.times[0] for row in rows)
     end = max(row.end for row in rows)
     margin = 0.015 * (end - begin or 1.0)
-    with style("plot_timeline") as new_figure:
-        make = new_figure if figure is None else lambda width, height: figure
+    with style(figure) as make:
         if len(rows) <= MOST_CHARTS:
             grid = _draw_charts(rows, make, begin, end)
         else:
@@ -262,35 +277,6 @@ def _components(
     return components
 
 
-def _rows(
-    key: Hashable,
-    trajectories: Trajectories,
-    actions: dict[str, _Component],
-    episode: int,
-) -> Iterator[TimelineRow]:
-    """Yield the row of each agent of a policy that decided in the episode."""
-    for place in np.flatnonzero(trajectories.episodes[trajectories.starts] == episode):
-        start = trajectories.starts[place]
-        rows = slice(start, start + trajectories.lengths[place])
-        times: Array = trajectories.turns[rows]
-        end = trajectories.last_turns[place]
-        if trajectories.times is not None and trajectories.elapsed is not None:
-            times = trajectories.times[rows]
-            end = times[-1] + trajectories.elapsed[rows][-1]
-        yield TimelineRow(
-            key=key,
-            agent=trajectories.names[trajectories.agents[start]],
-            actions=actions,
-            rows=rows,
-            times=times,
-            rewards=trajectories.rewards[rows],
-            known=trajectories.known[rows],
-            by_rule=trajectories.by_rule[rows],
-            end=end,
-            ending="terminated" if trajectories.terminations[rows][-1] else "truncated",
-        )
-
-
 def _choose(rows: Sequence[TimelineRow], agents: Sequence[str], episode: int) -> list[TimelineRow]:
     """Return the rows of some agents, in the order of ``agents``."""
     if isinstance(agents, str) or not agents:
@@ -305,27 +291,26 @@ def _choose(rows: Sequence[TimelineRow], agents: Sequence[str], episode: int) ->
         ) from None
 
 
-def _mark_legend(
-    axes: Axes,
+def _explain_marks(
+    figure: Figure | SubFigure,
     rows: Sequence[TimelineRow],
-    by_rule: list[str],
-    unknown: list[str],
+    by_rule: set[str],
+    unknown: set[str],
 ) -> None:
-    """Explain the marks that occur, above axes that may have another legend.
+    """Explain the marks that occur.
 
     ``by_rule`` and ``unknown`` are the marks to explain where the rule has decided, and where its
     action is unknown.
     """
-    from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
-    labels = sorted({row.ending for row in rows})
-    if not all(row.known.all() for row in rows):
-        labels = unknown + labels
+    labels = {row.ending for row in rows}
     if any(row.by_rule.any() for row in rows):
-        labels = by_rule + labels
-    handles = [Line2D([], [], **MARKS[label]) for label in labels]
-    axes.add_artist(Legend(axes, handles, labels, **ABOVE))
+        labels |= by_rule
+    if any(row.unknown.any() for row in rows):
+        labels |= unknown
+    handles = [Line2D([], [], label=label, **MARKS[label]) for label in MARKS if label in labels]
+    figure.legend(handles=handles, **LOOKS["marks"])
 
 
 # -- few agents: charts ---------------------------------------------------------------------------
@@ -341,105 +326,52 @@ def _draw_charts(
 
     Return the axes, ``(charts, 1)``.
     """
-    charts: list[tuple[TimelineRow, str | None, str]] = []
-    for row in rows:
+    parts = [dict.fromkeys(own.part for own in row.actions.values()) for row in rows]
+    heights = [height for own in parts for height in (*[1.0] * len(own), 0.6)]
+    figure = make(9.5, 0.9 + 0.18 * len(rows) + 0.95 * sum(heights))
+    grid: Array = figure.subplots(len(heights), **LOOKS["charts"], height_ratios=heights)
+    charts = iter(grid[:, 0])
+    for row, own in zip(rows, parts, strict=True):
         title = title_of(row.key)
         title = row.agent if title in ("", row.agent) else f"{row.agent}  ({title})"
-        for part in dict.fromkeys(component.part for component in row.actions.values()):
-            charts.append((row, part, title))
+        for part, axes in zip([*own, None], charts, strict=False):
+            axes.set_title(title)
             title = ""  # the first chart of an agent has the title
-        charts.append((row, None, ""))
-    heights = [0.6 if part is None else 1.0 for _, part, _ in charts]
-    figure = make(9.5, 0.9 + 0.18 * len(rows) + 0.95 * sum(heights))
-    grid: Array = figure.subplots(
-        len(charts),
-        1,
-        sharex=True,
-        squeeze=False,
-        height_ratios=heights,
-    )
-    for axes, (row, name, title) in zip(grid[:, 0], charts, strict=True):
-        axes.set_title(title)
-        if name is None:
-            _chart_rewards(axes, row)
-        else:
-            _chart_actions(axes, row, name)
-        _shade_absence(axes, row, begin, end)
+            if part is None:
+                axes.vlines(row.times, 0.0, row.rewards, **LOOKS["reward"])
+                axes.set_ylabel("reward")
+                write_beside(axes, f"sum {row.rewards.sum():.4g}", 0.5, axes.transAxes)
+            else:
+                _chart_actions(axes, row, part)
+            for left, right in ((begin, row.times[0]), (row.end, end)):
+                if right > left:
+                    axes.axvspan(left, right, **LOOKS["absent"])
+            below = axes.get_xaxis_transform()
+            axes.plot([row.end], [0.0], **MARKS[row.ending], transform=below)
     figure.align_ylabels()
-    _mark_legend(grid[0, 0], rows, ["policy", "rule"], [])
+    _explain_marks(figure, rows, {"policy", "rule"}, set())
     return grid
 
 
 def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
     """Draw a line for each component of a part of the actions, with a dot for each decision."""
-    components = {
-        name: component for name, component in row.actions.items() if component.part == part
-    }
+    names = [name for name, own in row.actions.items() if own.part == part]
     # Not strict: there are at most as many lines as colours.
-    for (name, component), colour in zip(components.items(), COLOURS, strict=False):
-        values = component.values[row.rows]
-        line = np.where(row.known, values, np.nan)
-        axes.step(
-            row.times,
-            line,
-            where="post",
-            color=colour,
-            linewidth=0.8,
-            label=name,
-        )
-        by_rule = row.known & row.by_rule
-        for mask, fill in ((~row.by_rule, colour), (by_rule, "white")):
-            axes.scatter(
-                row.times[mask],
-                values[mask],
-                14,
-                color=fill,
-                edgecolors=colour,
-                zorder=3,
-            )
-    unknown = row.times[~row.known]
-    axes.scatter(
-        unknown,
-        np.full(len(unknown), 0.04),
-        14,
-        color="white",
-        edgecolors=UNKNOWN,
-        zorder=3,
-        transform=axes.get_xaxis_transform(),
-    )
+    for name, colour in zip(names, COLOURS, strict=False):
+        axes.step(row.times, row.values[name], **LOOKS["line"], color=colour, label=name)
+        fill = np.where(row.by_rule, "white", colour)
+        axes.scatter(row.times, row.values[name], **LOOKS["dots"], color=fill, edgecolors=colour)
+    unknown = row.times[row.unknown]
+    heights = np.full(len(unknown), 0.04)
+    below = axes.get_xaxis_transform()
+    axes.scatter(unknown, heights, **LOOKS["unknown"], transform=below)
     axes.set_ylabel(part or "action")
-    labels = next(iter(components.values())).labels  # all of them have the same labels
+    labels = row.actions[names[0]].labels  # all of them have the same labels
     if labels:
         axes.set_yticks(list(labels), list(labels.values()))
         axes.set_ylim(min(labels) - 0.5, max(labels) + 0.5)
-    if len(components) > 1:
-        axes.legend(**BESIDE)
-
-
-def _chart_rewards(axes: Axes, row: TimelineRow) -> None:
-    """Draw a stem for the reward of each decision."""
-    axes.vlines(row.times, 0.0, row.rewards, color=INK, linewidth=1.0)
-    axes.set_ylabel("reward")
-    write_beside(axes, f"sum {row.rewards.sum():.4g}", 0.5, axes.transAxes)
-
-
-def _shade_absence(
-    axes: Axes,
-    row: TimelineRow,
-    begin: float,
-    end: float,
-) -> None:
-    """Shade the times when an agent does not live, and mark its end."""
-    for left, right in ((begin, row.times[0]), (row.end, end)):
-        if right > left:
-            axes.axvspan(left, right, color=ABSENT, zorder=0)
-    axes.plot(
-        [row.end],
-        [0.0],
-        **MARKS[row.ending],
-        transform=axes.get_xaxis_transform(),
-        clip_on=False,
-    )
+    if len(names) > 1:
+        axes.legend(**LOOKS["names"])
 
 
 # -- many agents: rows of colours -----------------------------------------------------------------
@@ -450,11 +382,16 @@ def _draw_panels(
     make: NewFigure,
     component: str | None,
 ) -> Array:
-    """Draw a row for each agent, coloured by its actions and by its rewards.
+    """Draw a row for each agent, on the left coloured by its actions, on the right by its rewards.
 
-    Return the axes, ``(panels, 2)``.
+    Each policy has a panel. Many policies with similar actions share one. Return the axes,
+    ``(panels, 2)``.
     """
-    panels = _panels(rows)
+    panels: dict[Hashable, list[TimelineRow]] = {}
+    for row in rows:
+        panels.setdefault(row.key, []).append(row)
+    if len(panels) > MOST_CHARTS and len({tuple(row.actions) for row in rows}) == 1:
+        panels = {None: sorted(rows, key=lambda row: row.times[0])}
     names = dict.fromkeys(name for row in rows for name in row.actions)
     if component not in (None, *names):
         raise OptionValueError(
@@ -463,64 +400,41 @@ def _draw_panels(
         )
     heights = [min(max(0.16 * len(panel), 1.2), 6.0) for panel in panels.values()]
     figure = make(11.0, 1.0 + 0.3 * len(panels) + sum(heights))
-    grid: Array = figure.subplots(
-        len(panels),
-        2,
-        sharex=True,
-        sharey="row",
-        squeeze=False,
-        height_ratios=heights,
-    )
-    for (left, right), (key, panel) in zip(grid, panels.items(), strict=True):
-        _draw_panel(left, right, key, panel, component)
-    _mark_legend(grid[0, 1], rows, ["by rule"], ["by rule, action unknown"])
+    grid: Array = figure.subplots(len(panels), **LOOKS["panels"], height_ratios=heights)
+    for pair, (key, panel) in zip(grid, panels.items(), strict=True):
+        left, right = pair
+        own = list(panel[0].actions)
+        name = component if component in own else own[0]
+        _colour_actions(left, panel, name)
+        _colour_rewards(right, panel)
+        points = 72 * left.get_window_extent().height / figure.dpi / len(panel)
+        for axes in pair:
+            axes.set_facecolor(ABSENT)
+            for place, row in enumerate(panel):
+                mark = {**MARKS[row.ending], "markersize": min(points, 6.0)}
+                axes.plot([row.end], [place], **mark)
+        step = ceil(9.0 / points)
+        left.set_yticks(range(0, len(panel), step), [row.agent for row in panel[::step]])
+        left.set_ylim(len(panel) - 0.4, -0.6)
+        title = f"{title_of(key)}, {len(panel)} agents: action"
+        if len(own) > 1:
+            title += f" {name}, one of {len(own)}"
+        left.set_title(title.removeprefix(", "))
+        right.set_title("reward")
+    _explain_marks(figure, rows, {"by rule"}, {"by rule, action unknown"})
     return grid
 
 
-def _panels(rows: list[TimelineRow]) -> dict[Hashable, list[TimelineRow]]:
-    """Return the rows of each panel, by the key of its policy.
+def _colour(
+    axes: Axes,
+    rows: Sequence[TimelineRow],
+    by_rule: float,
+    values: Array | None,
+    **colours: Any,
+) -> PolyCollection:
+    """Colour the decisions by values. ``by_rule`` is the height of decisions by the rule."""
+    from matplotlib.collections import PolyCollection
 
-    Many policies with similar actions share one panel, whose key is None.
-    """
-    panels: dict[Hashable, list[TimelineRow]] = {}
-    for row in rows:
-        panels.setdefault(row.key, []).append(row)
-    if len(panels) > MOST_CHARTS and len({tuple(row.actions) for row in rows}) == 1:
-        return {None: sorted(rows, key=lambda row: row.times[0])}
-    return panels
-
-
-def _draw_panel(
-    left: Axes,
-    right: Axes,
-    key: Hashable,
-    rows: list[TimelineRow],
-    component: str | None,
-) -> None:
-    """Draw the rows of a panel, on the left the actions and on the right the rewards."""
-    names = list(rows[0].actions)
-    name = component if component in names else names[0]
-    _colour_actions(left, rows, name)
-    _colour_rewards(right, rows)
-    points = 72 * left.get_window_extent().height / left.figure.dpi / len(rows)
-    for axes in (left, right):
-        axes.set_facecolor(ABSENT)
-        for ending in ("terminated", "truncated"):
-            ends = {place: row.end for place, row in enumerate(rows) if row.ending == ending}
-            mark = {**MARKS[ending], "markersize": min(points, 6.0)}
-            axes.plot(list(ends.values()), list(ends), **mark)
-    step = ceil(9.0 / points)
-    left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
-    left.set_ylim(len(rows) - 0.4, -0.6)
-    title = f"{title_of(key)}, {len(rows)} agents: action"
-    if len(names) > 1:
-        title += f" {name}, one of {len(names)}"
-    left.set_title(title.removeprefix(", "))
-    right.set_title("reward")
-
-
-def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> Floats:
-    """Return ``(decisions, 4, 2)``: the corners of each decision's coloured cell, row by row."""
     cells = []
     for place, row in enumerate(rows):
         number = len(row.times)
@@ -531,34 +445,15 @@ def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> Floats:
             np.append(first, number),
             np.append(times, max(row.end, times[-1])),
         )
-        half = np.full(number, 0.5 if len(rows) > 60 else 0.42)
-        if slim:
-            half[row.by_rule] *= 0.45
-        left, right = edges[:-1], edges[1:]
-        low, high = place - half, place + half
-        corners = [[left, low], [right, low], [right, high], [left, high]]
-        cells.append(np.transpose(corners, (2, 0, 1)))
-    return np.concatenate(cells)
-
-
-def _colour(
-    axes: Axes,
-    cells: Floats,
-    **colours: Any,
-) -> PolyCollection:
-    """Draw cells in their colours."""
-    from matplotlib.collections import PolyCollection
-
+        across = np.stack([edges[:-1], edges[1:], edges[1:], edges[:-1]], axis=1)
+        half = np.where(row.by_rule, by_rule, 1.0) * (0.5 if len(rows) > 60 else 0.42)
+        upwards = place + np.outer(half, [-1, -1, 1, 1])
+        cells += list(np.stack([across, upwards], axis=2))
     # In vector graphics, many cells become one image.
-    collection = PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours)
+    many = len(cells) > 4000
+    collection = PolyCollection(cells, array=values, linewidths=0, rasterized=many, **colours)
     axes.add_collection(collection)
     return collection
-
-
-def _colour_by_scale(axes: Axes, cells: Floats, values: Array, **colours: Any) -> None:
-    """Draw cells in the colours of their values, and the scale beside the axes."""
-    collection = _colour(axes, cells, array=values, **colours)
-    axes.figure.colorbar(collection, ax=axes, fraction=0.04, pad=0.01, aspect=30)
 
 
 def _colour_actions(
@@ -567,24 +462,31 @@ def _colour_actions(
     name: str,
 ) -> None:
     """Colour the decisions by a component of their actions."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    known = np.concatenate([row.known for row in rows])
-    values = np.concatenate([row.actions[name].values[row.rows] for row in rows])[known]
-    _colour(axes, _cells(rows, slim=False), facecolors="white")  # white while the agent lives
-    cells = _cells(rows, slim=True)
-    _colour(axes, cells[~known], facecolors=UNKNOWN)
+    _colour(axes, rows, 1.0, None, facecolors="white")  # white while the agent lives
+    values = np.concatenate([row.values[name] for row in rows])
     labels_of_rows = [row.actions[name].labels for row in rows]
     labels = dict(ChainMap(*labels_of_rows))
     if not all(labels_of_rows) or len(labels) > MOST_COLOURS:
-        _colour_by_scale(axes, cells[known], values, cmap="viridis")
+        scale = colormaps["viridis"].with_extremes(bad=UNKNOWN)
+        cells = _colour(axes, rows, 0.45, values, cmap=scale)
+        axes.figure.colorbar(cells, ax=axes, **LOOKS["scale"])
         return
-    palette = dict(enumerate(COLOURS))
-    if not labels.keys() <= palette.keys():
-        palette = dict(zip(sorted(labels), COLOURS, strict=False))
-    _colour(axes, cells[known], facecolors=[palette[value] for value in values.tolist()])
-    patches = [Patch(color=palette[action], label=labels[action]) for action in sorted(labels)]
-    axes.legend(handles=patches, **BESIDE)
+    actions: Sequence[int] = range(MOST_COLOURS)
+    if not labels.keys() <= set(actions):
+        actions = sorted(labels)
+    codes = np.where(np.isnan(values), values, np.searchsorted(actions, values))
+    palette = ListedColormap(COLOURS).with_extremes(bad=UNKNOWN)
+    _colour(axes, rows, 0.45, codes, cmap=palette, clim=(0, MOST_COLOURS - 1))
+    patches = [
+        Patch(color=colour, label=labels[action])
+        for action, colour in zip(actions, COLOURS, strict=False)
+        if action in labels
+    ]
+    axes.legend(handles=patches, **LOOKS["names"])
 
 
 def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
@@ -593,4 +495,5 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     sizes = np.abs(rewards)
     # A quantile, so that a few large rewards do not make all others pale.
     most = np.quantile(sizes, 0.99) or sizes.max() or 1.0
-    _colour_by_scale(axes, _cells(rows, slim=False), rewards, cmap="PuOr", clim=(-most, most))
+    cells = _colour(axes, rows, 1.0, rewards, cmap="PuOr", clim=(-most, most))
+    axes.figure.colorbar(cells, ax=axes, **LOOKS["scale"])

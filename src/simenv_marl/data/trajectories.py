@@ -33,17 +33,32 @@ Bools = NDArray[np.bool_]
 Masks = Array | tuple[Array, ...]
 """The int8 masks of N decisions: ``(N, n)``, for a ``MultiDiscrete`` a tuple of such arrays."""
 
-TRAJECTORY: Final = np.dtype(
-    [
-        ("length", "i8"),
-        ("episode", "i8"),
-        ("agent", "O"),
-        ("last_turn", "i8"),
-        ("terminated", "?"),
-        ("truncated", "?"),
-    ]
-)
-"""The dtype of the records of trajectories."""
+DTYPES: Final = {
+    "place": "i8",
+    "episodes": "i8",
+    "agents": "O",
+    "turns": "i8",
+    "by_rule": "?",
+    "times": "f8",
+    "rewards": "f8",
+    "elapsed": "f8",
+    "last_turns": "i8",
+    "terminations": "?",
+    "truncations": "?",
+}
+"""The dtypes of decisions: of the place of the policy, and of attributes of ``Trajectories``.
+
+Agents are names here. The turn of the end is 0 before an agent's last decision.
+"""
+
+UNPAID: Final[dict[str, float]] = {
+    "rewards": 0.0,
+    "elapsed": nan,
+    "last_turns": 0,
+    "terminations": False,
+    "truncations": False,
+}
+"""The values of a decision before its reward is known."""
 
 End = tuple[int, bool, bool]
 """The end of an agent: the turn, and whether the agent terminated and was truncated."""
@@ -178,14 +193,13 @@ class Records:
     """The records of one policy in some episodes, in the order of its ``Trajectories``.
 
     Attributes:
-        decisions: By attribute of ``Trajectories``, a stack with a row for each decision.
-        trajectories: ``(M,)``, in the dtype ``TRAJECTORY``.
+        decisions: By attribute of ``Trajectories``, a stack with a row for each decision; as in
+            ``DTYPES``.
         last_observations: The stack of the final observations of the trajectories.
         point: The attributes of ``Trajectories`` that describe the decision point.
     """
 
     decisions: dict[str, Any]
-    trajectories: Array
     last_observations: Observation
     point: dict[str, Any]
 
@@ -202,30 +216,23 @@ def combine(
     nonempty = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
     _check_extras([part.decisions["extras"] for part in nonempty])
     decisions = joined([part.decisions for part in nonempty])
-    trajectories = np.concatenate([part.trajectories for part in nonempty])
-    lengths = trajectories["length"]
-    starts = np.cumsum(lengths) - lengths
-
-    def per_decision(values: Array) -> Array:
-        return np.repeat(values, lengths)
-
     codes: dict[str, int] = {}
-    agents = [codes.setdefault(name, len(codes)) for name in trajectories["agent"]]
-    steps = np.arange(len(decisions["rewards"])) - per_decision(starts)
-    is_last = steps == per_decision(lengths) - 1
+    agents = [codes.setdefault(name, len(codes)) for name in decisions["agents"]]
+    is_last = decisions["terminations"] | decisions["truncations"]
+    starts = np.flatnonzero(np.append(True, is_last)[:-1])
+    lengths = np.diff(starts, append=len(agents))
+    decisions |= {
+        "agents": np.array(agents, np.int64),
+        "last_turns": decisions["last_turns"][is_last],
+        "steps": np.arange(len(agents)) - np.repeat(starts, lengths),
+    }
     return Trajectories(
         **decisions,
         **nonempty[0].point,
-        terminations=is_last & per_decision(trajectories["terminated"]),
-        truncations=is_last & per_decision(trajectories["truncated"]),
         last_observations=joined([part.last_observations for part in nonempty]),
-        last_turns=trajectories["last_turn"],
         starts=starts,
-        episodes=per_decision(trajectories["episode"]),
         seeds=seeds,
-        agents=per_decision(np.array(agents, np.int64)),
         names=tuple(codes),
-        steps=steps,
         collected=collected,
     )
 
@@ -255,60 +262,55 @@ class _DecisionLog:
             self.stack_observations = stacker(definition.observation_space)
             self.stack_actions = stacker(definition.action_space)
             self.unknown_action = blank(definition.action_space)
-        # One entry for each batch.
-        self.observations: list[Observation] = []
-        self.actions: list[Action] = []
-        self.masks: list[Masks] = []
-        self.extras: list[dict[str, Array]] = []
-        # One entry for each decision.
-        self.turns: list[int] = []
-        self.by_rule: list[bool] = []
-        self.times: list[float | None] = []
-        self.rewards: list[float] = []
-        self.elapsed: list[float] = []
+        # A stack of each attribute of ``Trajectories``, for each batch.
+        self.batches: list[dict[str, Any]] = []
+        # A value for each row.
+        self.table: dict[str, list[Any]] = {name: [] for name in DTYPES}
         # By row; only the known ones.
         self.rule_actions: dict[int, Action] = {}
         # By row of the last decision.
-        self.ends: dict[int, tuple[Observation, *End]] = {}
-        # The rows of each trajectory, by place of its policy, and by episode and agent.
-        self.trajectories: dict[int, dict[tuple[int, str], list[int]]] = {}
+        self.last_observations: dict[int, Observation] = {}
 
     def add(
         self,
         group: Group,
+        numbers: Sequence[int],
         episodes: Sequence[Episode],
         agents: Sequence[Agent],
         observations: Sequence[Observation],
         answers: Answers,
     ) -> None:
-        """Add a batch of decisions, whose rewards are not known yet."""
+        """Add a batch of decisions in episodes with these numbers. Rewards are not known yet."""
         actions, extras = answers
-        number = len(actions)
-        self.observations.append(group.stack(observations))
-        if group.point.legal is not None:
-            self.masks.append(stack_masks([agent.mask for agent in agents]))
-        self.actions.append(
-            self.stack_actions(
-                [self.unknown_action if action is RULE else action for action in actions]
-            )
-        )
+        known = [self.unknown_action if action is RULE else action for action in actions]
         # Copied, because policies may reuse their arrays. Two steps, because np.array cannot copy
         # every tensor.
         arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
         for name, array in arrays.items():
-            if array.shape[:1] != (number,):
+            if array.shape[:1] != (len(actions),):
                 raise OptionValueError(
                     f"{group.policy!r} returned {short_repr(name)} of shape {array.shape} for"
-                    f" {number} decisions; the length of its first axis must be their number"
+                    f" {len(actions)} decisions; the length of its first axis must be their number"
                 )
-        self.extras.append(arrays)
-        self.by_rule += [action is RULE for action in actions]
-        self.turns += [episode.turns for episode in episodes]
-        if episodes[0].clock is not None:
-            # Not from the infos, because the policy may have changed them.
-            self.times += [agent.now for agent in agents]
-        self.rewards += [0.0] * number
-        self.elapsed += [nan] * number
+        batch = {
+            "observations": group.stack(observations),
+            "actions": self.stack_actions(known),
+            "extras": arrays,
+        }
+        if group.point.legal is not None:
+            batch["action_masks"] = stack_masks([agent.mask for agent in agents])
+        self.batches.append(batch)
+        table = self.table
+        policies: list[Any] = [agent.policy for agent in agents]
+        table["place"] += [key.place for key in policies]  # the episodes wait for these keys
+        table["episodes"] += numbers
+        table["agents"] += [agent.name for agent in agents]
+        table["turns"] += [episode.turns for episode in episodes]
+        table["by_rule"] += [action is RULE for action in actions]
+        # Not from the infos, because the policy may have changed them.
+        table["times"] += [agent.now for agent in agents]
+        for name, value in UNPAID.items():
+            table[name] += [value] * len(actions)
 
     def pay(
         self,
@@ -317,59 +319,54 @@ class _DecisionLog:
         end: End | None,
     ) -> None:
         """Record the reward of a decision, the rule's action if it decided, and an end."""
-        self.rewards[row] = agent.reward
-        self.elapsed[row] = agent.info.get("elapsed", nan)
+        table = self.table
+        table["rewards"][row] = agent.reward
+        table["elapsed"][row] = agent.info.get("elapsed", nan)
         rule_action = agent.take_rule_action()  # a rule that is cut short must not report it again
         if rule_action is not None:
             self.rule_actions[row] = rule_action
         if end is not None:
-            self.ends[row] = (agent.observation, *end)
+            table["last_turns"][row], table["terminations"][row], table["truncations"][row] = end
+            self.last_observations[row] = agent.observation
 
     @cached_property
     def columns(self) -> dict[str, Any]:
         """The values of all decisions, by attribute of ``Trajectories``."""
-        _check_extras(self.extras)
-        by_rule = np.array(self.by_rule, np.bool_)
-        rule_rows = list(self.rule_actions)
-        # The rule's actions come after the policy's.
-        actions = joined([*self.actions, self.stack_actions(list(self.rule_actions.values()))])
-        action_rows = np.arange(len(by_rule))
-        action_rows[rule_rows] = len(by_rule) + np.arange(len(rule_rows))
-        known = ~by_rule
-        known[rule_rows] = True
-        columns = {
-            "observations": joined([*self.observations, self.stack_observations([])]),
-            "actions": taken(actions, action_rows),
-            "rewards": np.array(self.rewards, np.float64),
-            "turns": np.array(self.turns, np.int64),
-            "by_rule": by_rule,
-            "known": known,
-            "extras": joined(self.extras) if self.extras else {},
+        _check_extras([batch["extras"] for batch in self.batches])
+        nothing = {
+            "observations": self.stack_observations([]),
+            "actions": self.stack_actions([]),
+            "extras": {},
         }
-        if self.masks:
-            columns["action_masks"] = joined(self.masks)
-        if self.times:
-            columns["times"] = np.array(self.times, np.float64)
-            columns["elapsed"] = np.array(self.elapsed, np.float64)
+        columns: dict[str, Any] = joined(self.batches or [nothing])
+        columns |= {name: np.array(self.table[name], dtype) for name, dtype in DTYPES.items()}
+        number = len(columns["times"])
+        if None in self.table["times"][:1] or not number:  # there is no clock
+            del columns["times"], columns["elapsed"]
+        # The rule's actions come after the policy's.
+        rule_rows = list(self.rule_actions)
+        rule_actions = self.stack_actions(list(self.rule_actions.values()))
+        action_rows = np.arange(number)
+        action_rows[rule_rows] = number + np.arange(len(rule_rows))
+        columns["actions"] = taken(joined([columns["actions"], rule_actions]), action_rows)
+        columns["known"] = ~columns["by_rule"]
+        columns["known"][rule_rows] = True
         return columns
 
     def records(self, place: int) -> Records:
         """Return the records of the policy at a place, sorted by episode, agent and step."""
-        rows: list[int] = []
-        records = []
-        last_observations = []
-        for (episode, agent), agent_rows in sorted(
-            self.trajectories.get(place, {}).items(),
-            key=lambda item: (item[0][0], item[1]),
-        ):
-            last_observation, *end = self.ends[agent_rows[-1]]
-            rows += agent_rows
-            records.append((len(agent_rows), episode, agent, *end))
-            last_observations.append(last_observation)
+        columns = dict(self.columns)
+        rows = np.flatnonzero(columns.pop("place") == place)
+        first: dict[tuple[int, str], int] = {}
+        identities = zip(columns["episodes"][rows].tolist(), columns["agents"][rows], strict=True)
+        trajectories = [first.setdefault(key, row) for row, key in enumerate(identities)]
+        rows = rows[np.lexsort((trajectories, columns["episodes"][rows]))]
+        last = [row for row in rows.tolist() if row in self.last_observations]
         return Records(
-            decisions=taken(self.columns, np.array(rows, np.int64)),
-            trajectories=np.array(records, TRAJECTORY),
-            last_observations=self.stack_observations(last_observations),
+            decisions=taken(columns, rows),
+            last_observations=self.stack_observations(
+                [self.last_observations[row] for row in last]
+            ),
             point=self.point,
         )
 
@@ -395,20 +392,11 @@ class Recorder:
         if group not in self._logs:
             self._logs[group] = _DecisionLog(group.point)
         log = self._logs[group]
-        first = len(log.rewards)
+        first = len(log.table["place"])
         agents = [agent for episode in waiting if (agent := episode.pending) is not None]
-        log.add(
-            group,
-            waiting,
-            agents,
-            observations,
-            answers,
-        )
-        for row, (place, agent) in enumerate(zip(places, agents, strict=True), first):
-            policy: Any = agent.policy  # a ``PolicyKey``, because the episode has waited for it
-            trajectories = log.trajectories.setdefault(policy.place, {})
-            key = (self._first_episode + place, agent.name)
-            trajectories.setdefault(key, []).append(row)
+        numbers = [self._first_episode + place for place in places]
+        log.add(group, numbers, waiting, agents, observations, answers)
+        for row, agent in enumerate(agents, first):
             self._decisions[agent] = (log, row)
 
     def pay(self, episode: Episode) -> None:
@@ -445,7 +433,7 @@ class Recorder:
             logs = {
                 group.point.hook.name: log
                 for group, log in self._logs.items()
-                if place in log.trajectories
+                if place in log.table["place"]
             }
             if len(logs) > 1:
                 raise AgentError(

@@ -1,14 +1,12 @@
 """Designs of experiments: which combinations of factors to run."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
-from fractions import Fraction
 from importlib.util import find_spec
-from itertools import product
+from itertools import combinations, product
 from math import ceil, prod
 from numbers import Integral
-from string import ascii_lowercase
 from sys import float_info
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +16,12 @@ from numpy.typing import NDArray
 from ..core import checked_seed, same
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
-from .runner import EXACT, dtype_of
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
+
+EXACT = 2**53
+"""The integers up to this are exact as floats."""
 
 MOST_ROWS = 10_000_000
 """The largest number of rows. A larger design is considered a mistake."""
@@ -40,73 +40,51 @@ METHODS = (
 """The methods of ``design``, each a method of ``Builder``."""
 
 Matrix = NDArray[np.float64]
-"""A design in numbers, of shape ``(rows, factors)``."""
-
-Columns = Iterable[Sequence[Any]]
-"""The values of each factor, in the order of the rows."""
+"""Numbers of a design, of shape ``(rows, factors)``."""
 
 
 @dataclass(frozen=True)
 class Factor:
-    """A factor of an experiment.
+    """A factor. Designs consist of its numbers: values of a range, or indices of levels.
 
     Attributes:
-        values: The levels. Of a range: the lowest and the highest value.
-        kind: The type of the values of a range, int or float. None: the factor has levels.
+        low, high: The lowest and the highest number.
+        kind: The type of the numbers.
+        levels: The levels. None: the factor is a range.
     """
 
     name: str
-    values: tuple[Any, ...]
-    kind: type[float] | None = None
+    low: float
+    high: float
+    kind: type[float]
+    levels: tuple[Any, ...] | None = None
 
-    def sample(self, unit: Matrix) -> list[Any]:
-        """Map numbers in [0, 1) to values of the factor, uniformly."""
-        if self.kind is float:
-            return self.scale(unit)
-        low = 0
-        high = len(self.values) - 1
+    def spread(self, unit: Matrix) -> Matrix:
+        """Map numbers from 0 to 1 to numbers of the factor, uniformly."""
         if self.kind is int:
-            low, high = self.values
-        exact = [int(u * EXACT) for u in unit.tolist()]
-        numbers = [low + u * (high - low + 1) // EXACT for u in exact]
-        if self.kind is int:
-            return numbers
-        return [self.values[number] for number in numbers]
-
-    def scale(self, unit: Matrix) -> list[Any]:
-        """Map numbers in [0, 1], inclusive, to values of a range."""
-        low, high = self.values
-        if self.kind is int and max(-low, high) >= EXACT:
-            return [low + round(Fraction(u) * (high - low)) for u in unit.tolist()]
+            steps = self.high - self.low
+            return self.low + np.floor(unit * (steps + 1)).clip(max=steps)
         # Not low + unit * (high - low), because the difference may overflow.
-        values = np.clip(low * (1 - unit) + high * unit, low, high).tolist()
-        if self.kind is int:
-            return list(map(round, values))
-        return list(values)
+        return np.clip(self.low * (1 - unit) + self.high * unit, self.low, self.high)
 
-    def steps(self, number: int | None) -> Collection[Any]:
+    def steps(self, number: int | None) -> Matrix:
         """Return all levels, or ``number`` values (default 2) of a range from bound to bound."""
         if number == 1:
             raise OptionValueError("this method takes n values of each range; n must be at least 2")
-        if self.kind is None:
-            return self.values
-        unit = np.linspace(0.0, 1.0, check_size(number or 2))
-        return dict.fromkeys(self.scale(unit))
+        if self.levels is not None:
+            number = len(self.levels)
+        return np.unique(self.spread(np.linspace(0.0, 1.0, check_size(number or 2))))
 
-    def centre(self) -> Any:
-        """Return the first of levels, or the middle of a range."""
-        if self.kind is None:
-            return self.values[0]
-        return self.scale(np.array([0.5]))[0]
+    def column(self, numbers: Matrix) -> "Series[Any]":
+        """Return the values of the factor that numbers stand for, in their own type."""
+        from pandas import Series
 
-    def ends(self) -> tuple[Any, ...]:
-        """Return the two values for a two-level design."""
-        if len(self.values) != 2:
-            raise OptionValueError(
-                f"this method needs two levels of each factor, but {self.name!r} has"
-                f" {len(self.values)}; give it two, or a range (low, high)"
-            )
-        return self.values
+        values = Series(numbers.astype(self.kind))
+        if self.levels is None:
+            return values
+        is_mixed = len(set(map(type, self.levels))) > 1
+        levels = [self.levels[place] for place in values]
+        return Series(levels, dtype=object if is_mixed else None)
 
 
 def design(
@@ -130,13 +108,13 @@ def design(
               ``n`` runs. ``n`` is a power of two (default: as many as main effects need). Effects
               are confounded as little as possible.
             - ``"plackett_burman"``: two levels per factor, main effects in a multiple of four runs.
-            - ``"central_composite"``: two or more ranges, for a quadratic response surface:
-              corners, star points and the centre, all within the ranges; once for each combination
-              of levels.
-            - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space.
+            - ``"central_composite"``: ranges alone, two or more, for a quadratic response surface:
+              corners, star points and the centre, all within the ranges.
+            - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space. For
+              ``"sobol"``, ``n`` should be a power of two; SciPy warns if it is not.
             - ``"one_at_a_time"``: the centre of ranges and the first of levels; then each factor
               alone at its other values, for a range ``n`` (default 2) values from bound to bound.
-            - ``"saltelli"``: ``n`` samples (a power of two) for ``sobol_indices``, in
+            - ``"saltelli"``: ``n`` samples, a power of two, for ``sobol_indices``, in
               ``n * (2 * factors + 2)`` rows.
         n: The number of samples, runs or values per range, for methods that use it.
         seed: The seed of random designs. None: always the same design, so that a script that runs
@@ -149,7 +127,7 @@ def design(
     Raises:
         OptionValueError: A factor has no levels, the method does not exist, or it does not fit
             these factors and ``n``.
-        MissingExtraError: pandas, pyDOE or SALib is missing.
+        MissingExtraError: pandas, SciPy or pyDOE is missing.
     """
     pandas = import_extra("pandas", "design")
     if not isinstance(factors, Mapping) or not factors:
@@ -167,58 +145,46 @@ def design(
     if n is not None and not (is_integer and n > 0):
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     builder = Builder(parsed_factors, None if n is None else int(n), checked_seed(seed) or 0)
-    columns = getattr(builder, method)()
-    return pandas.DataFrame(
-        {
-            factor.name: pandas.Series(column, dtype=dtype_of(factor.values, missing=False))
-            for factor, column in zip(parsed_factors, columns, strict=True)
-        }
-    )
+    matrix = getattr(builder, method)()
+    columns = zip(parsed_factors, matrix.T, strict=True)
+    return pandas.DataFrame({factor.name: factor.column(numbers) for factor, numbers in columns})
 
 
 def _parse_factor(name: str, values: Iterable[Any]) -> Factor:
-    if not isinstance(name, str) or not name:
-        raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
-    if isinstance(values, (set, frozenset)):
-        raise OptionValueError(
-            f"the levels of {name!r} must have an order, as in a list: {short_repr(values)} has"
-            " none"
-        )
-    if isinstance(values, (str, bytes, Mapping)) or not isinstance(values, Iterable):
+    if isinstance(values, (str, bytes, Mapping, Set)) or not isinstance(values, Iterable):
         raise OptionValueError(
             f"the factor {name!r} must be a range (low, high) or a list of levels, not"
             f" {short_repr(values)}"
         )
     plain = tuple(value.item() if isinstance(value, np.generic) else value for value in values)
     if isinstance(values, tuple):
-        bounds = _parse_bounds(name, plain)
-        return Factor(name, bounds, type(bounds[0]))
+        return _parse_range(name, plain)
     if not plain:
         raise OptionValueError(f"the factor {name!r} has no levels")
-    groups: dict[tuple[type, Any], list[Any]] = {}  # so that few pairs of levels are compared
-    for level in plain:
-        key = level if isinstance(level, (str, int, float)) else None
-        others = groups.setdefault((type(level), key), [])
-        if any(same(level, other) for other in others):  # arrays, too
-            raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
-        others.append(level)
-    return Factor(name, plain)
+    for one, other in combinations(plain, 2):
+        if type(one) is type(other) and same(one, other):  # arrays, too
+            raise OptionValueError(f"the factor {name!r} has the level {short_repr(one)} twice")
+    return Factor(name, 0, len(plain) - 1, int, plain)
 
 
-def _parse_bounds(name: str, bounds: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the bounds of a range as two integers or two floats."""
+def _parse_range(name: str, bounds: tuple[Any, ...]) -> Factor:
+    """Return the factor of a range, of integers if both bounds are."""
     kinds = set(map(type, bounds))
+    kind: type[float] = int if kinds == {int} else float
+    most = EXACT if kind is int else float_info.max
     are_numbers = len(bounds) == 2 and kinds <= {int, float}
-    if not are_numbers or not all(abs(bound) <= float_info.max for bound in bounds):
+    if not are_numbers or not all(abs(bound) <= most for bound in bounds):
         raise OptionValueError(
             f"the factor {name!r} is {short_repr(bounds)}: a tuple is a range (low, high) of"
-            " two finite numbers that a float can hold; levels come as a list"
+            " two finite floats, or of two integers that a float can hold exactly (up to 2**53);"
+            " levels come as a list"
         )
-    if not bounds[0] < bounds[1]:
+    low, high = map(kind, bounds)
+    if low >= high:
         raise OptionValueError(
             f"the range of {name!r} is empty: in {short_repr(bounds)}, low must be less than high"
         )
-    return bounds if kinds == {int} else tuple(map(float, bounds))
+    return Factor(name, low, high, kind)
 
 
 def check_size(number: int | None) -> int:
@@ -236,6 +202,11 @@ def check_size(number: int | None) -> int:
 # -- methods --------------------------------------------------------------------------------------
 
 
+def _import_qmc() -> Any:
+    """Return the quasi-random sequences of SciPy."""
+    return import_extra("scipy.stats.qmc", "design")
+
+
 def _import_pydoe() -> Any:
     """Return pyDOE. Its releases for NumPy before 2.2 have another name."""
     return import_extra("pydoe" if find_spec("pydoe") else "pyDOE", "design")
@@ -243,19 +214,19 @@ def _import_pydoe() -> Any:
 
 @dataclass(frozen=True)
 class Builder:
-    """Builds the columns of a design, with one method for each method of ``design``."""
+    """Builds the numbers of a design, with one method for each method of ``design``."""
 
     factors: Sequence[Factor]
     n: int | None
     seed: int
 
-    def full_factorial(self) -> Columns:
+    def full_factorial(self) -> Matrix:
         """Combine all levels, and ``n`` values of each range."""
         steps = [factor.steps(self.n) for factor in self.factors]
         check_size(prod(map(len, steps)))
-        return zip(*product(*steps), strict=True)
+        return np.array(list(product(*steps)))
 
-    def fractional_factorial(self) -> Columns:
+    def fractional_factorial(self) -> Matrix:
         """Take a regular fraction of all combinations, of ``n`` rows."""
         number = len(self.factors)
         least = 2 ** ceil(np.log2(number + 1))
@@ -265,10 +236,11 @@ class Builder:
                 f"a fractional design of {number} factors cannot have {n} runs: n must be a power"
                 f" of two, from {least} to {2**number}"
             )
-        generators = make_generators(n.bit_length() - 1, number)
-        return self._choose_ends(_import_pydoe().fracfact(generators))
+        columns = choose_columns(n.bit_length() - 1, number)
+        bits = [[(row & column).bit_count() % 2 for column in columns] for row in range(n)]
+        return self._choose_ends(np.array(bits))
 
-    def plackett_burman(self) -> Columns:
+    def plackett_burman(self) -> Matrix:
         """Take a Plackett-Burman design of as few rows as possible."""
         number = len(self.factors)
         pydoe = _import_pydoe()
@@ -278,27 +250,17 @@ class Builder:
                 break
         else:
             raise OptionValueError(f"no Plackett-Burman design of {number} factors is known")
-        if self.n not in (None, len(matrix)):
-            raise OptionValueError(
-                f"a Plackett-Burman design of {number} factors has {len(matrix)} runs, not {self.n}"
-            )
         return self._choose_ends(matrix)
 
-    def central_composite(self) -> Columns:
-        """Repeat a central composite design of the ranges for each combination of levels."""
-        ranges = [factor for factor in self.factors if factor.kind]
-        levels = [factor.values for factor in self.factors if not factor.kind]
-        number = len(ranges)
-        if number < 2:
+    def central_composite(self) -> Matrix:
+        """Take a central composite design."""
+        number = len(self.factors)
+        if number < 2 or any(factor.levels for factor in self.factors):
             raise OptionValueError(
-                f"a central composite design needs at least two ranges (low, high), not {number}"
+                "a central composite design needs at least two ranges (low, high), and no levels;"
+                " combine it with a design of the levels by merge(..., how='cross')"
             )
-        size = check_size((2**number + 2 * number + 1) * prod(map(len, levels)))
-        if self.n not in (None, size):
-            raise OptionValueError(
-                f"a central composite design of these {len(self.factors)} factors has {size} runs,"
-                f" not {self.n}"
-            )
+        check_size(2**number)
         # The centre occurs once: a simulation with the same seed would have the same result.
         matrix = _import_pydoe().ccdesign(
             number,
@@ -306,78 +268,87 @@ class Builder:
             alpha="rotatable",
             face="inscribed",
         )
-        points = zip(*map(Factor.scale, ranges, (matrix.T + 1) / 2), strict=True)
-        rows = product(*levels, points)
-        *of_lists, surface = zip(*rows, strict=True)
-        list_columns = iter(of_lists)
-        range_columns = zip(*surface, strict=True)
-        return [next(range_columns if f.kind else list_columns) for f in self.factors]
+        self._check_runs(matrix)
+        return self._spread((matrix + 1) / 2)
 
-    def latin_hypercube(self) -> Columns:
+    def latin_hypercube(self) -> Matrix:
         """Draw one sample from each slice of each factor."""
-        size = check_size(self.n)
-        points = _import_pydoe().lhs(len(self.factors), samples=size, seed=self.seed)
-        return self._sample(points)
+        return self._fill(_import_qmc().LatinHypercube)
 
-    def sobol(self) -> Columns:
+    def sobol(self) -> Matrix:
         """Take the first points of a scrambled Sobol sequence."""
-        size = check_size(self.n)
-        points = _import_pydoe().sobol_sequence(
-            size,
-            len(self.factors),
-            scramble=True,
-            seed=self.seed,
-            use_pow_of_2=False,
-        )
-        return self._sample(points)
+        return self._fill(_import_qmc().Sobol)
 
-    def halton(self) -> Columns:
-        """Take the first points of a shifted Halton sequence."""
-        size = check_size(self.n)
-        pydoe = _import_pydoe()
-        points = pydoe.halton_sequence(size, len(self.factors))
-        return self._sample(pydoe.cranley_patterson_shift(points, seed=self.seed))
+    def halton(self) -> Matrix:
+        """Take the first points of a scrambled Halton sequence."""
+        return self._fill(_import_qmc().Halton)
 
-    def saltelli(self) -> Columns:
+    def saltelli(self) -> Matrix:
         """Take the rows that Sobol indices need, of ``n`` samples."""
         samples = check_size(self.n)
         number = len(self.factors)
-        if samples & (samples - 1):
-            raise OptionValueError(
-                f"the number of samples of a Saltelli design must be a power of two, not {samples}"
-            )
         check_size(samples * (2 * number + 2))
-        names = [factor.name for factor in self.factors]
-        problem = {"num_vars": number, "names": names, "bounds": [[0.0, 1.0]] * number}
-        sampler = import_extra("SALib.sample.sobol", "design")
-        return self._sample(sampler.sample(problem, samples, seed=self.seed))
+        points = _import_qmc().Sobol(2 * number, seed=self.seed).random(samples)
+        first, last = np.split(points[:, None], 2, axis=2)
+        return self._spread(saltelli_blocks(first, last).reshape(-1, number))
 
-    def one_at_a_time(self) -> Columns:
+    def one_at_a_time(self) -> Matrix:
         """Change one factor at a time from the centre of ranges and the first of levels."""
-        centre = [factor.centre() for factor in self.factors]
-        rows = [centre]
+        centre = [0.5 if factor.levels is None else 0.0 for factor in self.factors]
+        rows = [*self._spread(np.array([centre]))]
         for place, factor in enumerate(self.factors):
-            for value in factor.steps(self.n):
-                # Two levels may be equal, such as 1 and True.
-                is_centre = value is centre[place] or (factor.kind and value == centre[place])
-                if not is_centre:
-                    rows.append([*centre[:place], value, *centre[place + 1 :]])
-        return zip(*rows, strict=True)
+            for number in factor.steps(self.n):
+                if number != rows[0][place]:
+                    row = rows[0].copy()
+                    row[place] = number
+                    rows.append(row)
+        return np.array(rows)
 
-    def _choose_ends(self, matrix: Matrix) -> Columns:
-        """Return the columns of a two-level design from its matrix of -1 and 1."""
-        return [
-            [factor.ends()[int(sign > 0)] for sign in column]
-            for factor, column in zip(self.factors, matrix.T, strict=True)
-        ]
+    def _check_runs(self, matrix: NDArray[Any]) -> None:
+        """Check ``n`` for a design whose size is fixed."""
+        if self.n not in (None, len(matrix)):
+            raise OptionValueError(
+                f"this design of {len(self.factors)} factors has {len(matrix)} runs, not {self.n}"
+            )
 
-    def _sample(self, points: Matrix) -> Columns:
-        """Return the columns of a design from points in [0, 1)."""
-        return list(map(Factor.sample, self.factors, points.T))
+    def _choose_ends(self, matrix: NDArray[Any]) -> Matrix:
+        """Return a two-level design, with the second level where the matrix is positive."""
+        self._check_runs(matrix)
+        for factor in self.factors:
+            if factor.levels is not None and len(factor.levels) != 2:
+                raise OptionValueError(
+                    f"this method needs two levels of each factor, but {factor.name!r} has"
+                    f" {len(factor.levels)}; give it two, or a range (low, high)"
+                )
+        return self._spread((matrix > 0).astype(float))
+
+    def _fill(self, make_engine: Callable[..., Any]) -> Matrix:
+        """Return ``n`` points of a sequence of SciPy."""
+        engine = make_engine(len(self.factors), seed=self.seed)
+        return self._spread(engine.random(check_size(self.n)))
+
+    def _spread(self, units: Matrix) -> Matrix:
+        """Map numbers from 0 to 1 to the numbers of the factors."""
+        return np.stack(list(map(Factor.spread, self.factors, units.T)), axis=1)
 
 
-def make_generators(basic: int, number: int) -> str:
-    """Return pyDOE's generators of a fractional design that confounds low-order effects least.
+def saltelli_blocks(first: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:
+    """Return the rows of a Saltelli design, of shape ``(samples, 2 * factors + 2, factors)``.
+
+    Each sample is a block: the first row; this with each factor of the last row in turn; the last
+    row with each factor of the first in turn; the last row.
+
+    Args:
+        first: The first row of each block, ``(samples, 1, factors)``.
+        last: The last row of each block, in the same shape.
+    """
+    own = np.eye(first.shape[-1], dtype=bool)
+    mixed = [np.where(own, last, first), np.where(own, first, last)]
+    return np.concatenate([first, *mixed, last], axis=1)
+
+
+def choose_columns(basic: int, number: int) -> list[int]:
+    """Return the columns of a fractional design that confounds low-order effects least.
 
     Columns are sets of bits: the product of two columns is their exclusive or.
 
@@ -398,9 +369,4 @@ def make_generators(basic: int, number: int) -> str:
                     products[order] |= {other ^ word for other in products[order - 1]}
         if len(columns) == number:
             break
-    return " ".join(
-        "".join(
-            letter for place, letter in enumerate(ascii_lowercase[:basic]) if column >> place & 1
-        )
-        for column in columns
-    )
+    return columns

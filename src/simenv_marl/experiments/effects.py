@@ -2,17 +2,18 @@
 
 from dataclasses import dataclass, field
 from itertools import combinations
-from math import nan
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.plots import interval, is_proportion
+from ..data.plots import COLOURS, interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
-from .evaluation import check_metric, check_probability, numbers
-from .plots import plot_factors
+from .designs import saltelli_blocks
+from .evaluation import check_metric, check_number, numbers
+from .plots import LOOKS, draw_means, label_levels, short_text
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -33,8 +34,7 @@ class Effects:
             standard deviation of the differences between the means of their combinations and the
             sum of both main effects.
         metric: The name of the value.
-        levels: The levels of each factor with their types. An index cannot distinguish 1, True and
-            1.0, so it has texts for the levels of a factor among which there are equal ones.
+        levels: The levels of each factor with their types.
     """
 
     main: "DataFrame"
@@ -61,14 +61,37 @@ class Effects:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        return plot_factors(
-            self.main,
-            self.interactions,
-            self._cells,
-            self.levels,
-            self.metric,
-            figure,
-        )
+        pairs = [pair for pair, strength in self.interactions["strength"].items() if strength > 0][
+            :4
+        ]
+        columns = min(max(len(self.levels), len(pairs)), 5)  # more would be too small to read
+        above = ceil(len(self.levels) / columns)
+        with style(figure) as make_figure:
+            figure = make_figure(max(3.2, 2.3 * columns), 2.8 * (above + bool(pairs)))
+            grid = figure.subplots(above + bool(pairs), columns, squeeze=False)
+            upper = grid[:above].ravel()
+            for axes, factor in zip(upper, self.levels, strict=False):
+                means = self.main.loc[factor]
+                draw_means(axes, range(len(means)), means, LOOKS["effect"])
+                label_levels(axes, self.levels[factor], factor)
+                if axes is not upper[0]:
+                    axes.sharey(upper[0])
+            for axes in grid[:above, 0]:
+                axes.set_ylabel(f"{self.metric}, mean")
+            for axes, (one, other) in zip(grid[-1], pairs, strict=False):
+                for place, level in enumerate(self.levels[other]):
+                    axes.plot(
+                        self._cells[one, other].iloc[:, place].to_numpy(),
+                        "o-",
+                        color=COLOURS[place % len(COLOURS)],
+                        markersize=4,
+                        label=short_text(level),
+                    )
+                label_levels(axes, self.levels[one], one)
+                axes.legend(title=other, **LOOKS["levels"])
+            for axes in grid.flat:
+                axes.set_visible(axes.has_data())
+        return figure
 
 
 def effects(
@@ -102,69 +125,53 @@ def effects(
     """
     import pandas
 
-    check_probability("confidence", confidence)
+    check_number("confidence", confidence, 1)
     table, factors = _select(frame, metric, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
     levels = {}
-    labels = {}
     codes = {}
     for name in factors:
         places, own_levels = _encode(table[name])
-        if len(own_levels) < 2:
-            continue
-        codes[name] = places
-        levels[name] = own_levels
-        labels[name] = own_levels
-        if len(set(own_levels)) < len(own_levels):
-            labels[name] = list(map(repr, own_levels))
+        if len(own_levels) > 1:
+            codes[name] = places
+            levels[name] = own_levels
     if not levels:
         raise OptionValueError("no factor has more than one level")
-    values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    seeds = table["seed"].to_numpy()
+    values = pandas.Series(numbers(table[metric], metric).to_numpy(), table["seed"])
     is_share = is_proportion(table[metric].to_numpy())
-    overall = _over_seeds(values, seeds)[0].mean()
+    overall = _over_seeds(values).mean()
     rows = []
     for name in levels:
         for code, group in values.groupby(codes[name]):
-            sample, is_single = _over_seeds(group, seeds[group.index])
+            sample = _over_seeds(group)
             mean = sample.mean()
-            low, high, _ = interval(sample, confidence, proportion=is_share and is_single)
-            label = labels[name][code]
-            rows.append((name, label, mean, low, high, mean - overall, len(group)))
+            is_proper = is_share and len(sample) == len(group)  # each is the value of one run
+            low, high, _ = interval(sample, confidence, proportion=is_proper)
+            rows.append((name, levels[name][code], mean, low, high, mean - overall, len(group)))
     columns = ["factor", "level", "mean", "low", "high", "effect", "count"]
     main = pandas.DataFrame(rows, columns=columns).set_index(["factor", "level"])
     cells = {}
     strengths = []
     for one, other in combinations(levels, 2):
-        means = values.groupby([codes[one], codes[other]]).mean()
-        grid = means.unstack().to_numpy(np.float64)
-        index = pandas.Index(labels[one], name=one)
-        columns = pandas.Index(labels[other], name=other)
-        table = pandas.DataFrame(grid, index, columns)
-        cells[one, other] = table
-        cells[other, one] = table.T
-        row_means = grid.mean(axis=1, keepdims=True)
-        rest = grid - row_means - grid.mean(axis=0) + grid.mean()
-        strength = np.sqrt((rest**2).mean())  # nan if a combination is missing
-        strengths.append((one, other, strength))
+        means = values.groupby([codes[one], codes[other]]).mean().unstack()
+        table = means.set_axis(levels[one], axis=0).set_axis(levels[other], axis=1)
+        cells[one, other] = table.rename_axis(index=one, columns=other)
+        cells[other, one] = cells[one, other].T
+        grid = means.to_numpy()
+        rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0) + grid.mean()
+        strengths.append((one, other, np.sqrt((rest**2).mean())))  # nan if a combination is missing
     interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"])
     interactions = interactions.set_index(["factor", "other"])
     strongest_first = interactions.sort_values("strength", ascending=False)
     return Effects(main, strongest_first, metric, levels, cells)
 
 
-def _over_seeds(
-    values: "Series[float]",
-    seeds: NDArray[Any],
-) -> tuple[NDArray[np.float64], bool]:
-    """Return the mean of each seed, or all values of a single seed.
-
-    The second value says whether each of them is the value of one run.
-    """
-    means = values.groupby(seeds).mean()
-    sample = means if len(means) > 1 else values
-    return sample.to_numpy(), len(sample) == len(values)
+def _over_seeds(values: "Series[float]") -> NDArray[np.float64]:
+    """Return the mean of each seed, the index, or all values of a single seed."""
+    means = values.groupby(level=0).mean()
+    sample: NDArray[np.float64] = (means if len(means) > 1 else values).to_numpy()
+    return sample
 
 
 def _select(
@@ -198,9 +205,8 @@ def _select(
 def _encode(column: "Series[Any]") -> tuple[NDArray[np.intp], list[Any]]:
     """Return the index of each row's level, and the levels.
 
-    Levels that are numbers are sorted, others have the order of the rows. Missing values are the
-    last level. Numeric factors with more than eight values are grouped into quarters of these
-    values, however often each occurs.
+    Levels of numeric factors are sorted, others have the order of the rows. Numeric factors with
+    more than eight values are grouped into quarters of these values, however often each occurs.
     """
     import pandas
 
@@ -208,16 +214,14 @@ def _encode(column: "Series[Any]") -> tuple[NDArray[np.intp], list[Any]]:
     if is_numeric and column.nunique() > 8:
         _, bounds = pandas.qcut(column.drop_duplicates(), 4, retbins=True)
         column = pandas.cut(column, bounds, include_lowest=True)
-    values = column.tolist()
-    # A key has a type, because 1, True and 1.0 are equal. A missing value differs from itself.
-    levels = list({(type(value), value): value for value in values if value == value}.values())
-    if all(type(level) in (int, float, pandas.Interval) for level in levels):
-        levels.sort()
-    places = {(type(level), level): place for place, level in enumerate(levels)}
-    codes = [places.get((type(value), value), len(places)) for value in values]
-    if len(places) in codes:
-        levels.append(nan)
-    return np.array(codes), levels
+    values = column.dropna().tolist()
+    if len(set(zip(map(type, values), values, strict=True))) > len(set(values)):
+        raise OptionValueError(
+            f"the factor {column.name!r} has levels that are equal, such as 1 and True; replace"
+            " them by texts"
+        )
+    codes, levels = pandas.factorize(column, sort=is_numeric, use_na_sentinel=False)
+    return codes, levels.tolist()
 
 
 # -- shares of the variance -----------------------------------------------------------------------
@@ -254,12 +258,8 @@ def sobol_indices(
     import pandas
 
     analyze = import_extra("SALib.analyze.sobol", "sobol_indices").analyze
-    check_probability("confidence", confidence)
+    check_number("confidence", confidence, 1)
     table, names = _select(frame, metric, contender, agent)
-    if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():
-        raise OptionValueError(
-            "some runs have failed, but shares of the variance need all rows of the design"
-        )
     seeds = table["seed"].nunique()
     values = numbers(table[metric], metric).to_numpy()
     rows = table[names].to_numpy(object)
@@ -269,7 +269,8 @@ def sobol_indices(
         )
     if len(values) % seeds or not _is_saltelli(rows[::seeds]):
         raise OptionValueError(
-            "shares of the variance need all rows of design(..., method='saltelli'), in their order"
+            "shares of the variance need all rows of design(..., method='saltelli'), in order, and"
+            " no failed run"
         )
     means = values.reshape(-1, seeds).mean(axis=1)
     if len(means) == 2 * len(names) + 2:
@@ -290,22 +291,9 @@ def sobol_indices(
 
 
 def _is_saltelli(rows: NDArray[Any]) -> bool:
-    """Return whether a design has the rows of a Saltelli design.
-
-    Each sample is a block: a row A; A with each factor of B in turn; B with each factor of A in
-    turn; the row B.
-
-    Args:
-        rows: The values of the factors, of shape ``(rows, factors)``.
-    """
+    """Return whether the values of the factors, ``(rows, factors)``, are a Saltelli design."""
     count = rows.shape[1]
     if not count or len(rows) % (2 * count + 2):
         return False
     blocks = rows.reshape(-1, 2 * count + 2, count)
-    first = blocks[:, :1]
-    last = blocks[:, -1:]
-    own = np.eye(count, dtype=bool)
-    mixed_first = np.where(own, last, first)
-    mixed_last = np.where(own, first, last)
-    saltelli_blocks = np.concatenate([first, mixed_first, mixed_last, last], axis=1)
-    return bool((blocks == saltelli_blocks).all())
+    return bool((blocks == saltelli_blocks(blocks[:, :1], blocks[:, -1:])).all())

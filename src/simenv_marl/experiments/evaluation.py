@@ -1,24 +1,24 @@
 """Compares contenders on the same seeds, with confidence intervals."""
 
 from bisect import bisect_left
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, groupby, product
-from math import inf, isfinite, nan, sqrt
+from math import inf, nan, sqrt
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import EpisodeOptions, Plan, Points, pack, reuse_resources
-from ..data.plots import interval, is_proportion
+from ..core import EpisodeOptions, Points, reuse_resources
+from ..data.plots import interval, is_proportion, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from ..runs import check_options
 from ..simulation import Model
-from .plots import plot_contenders
+from .plots import LOOKS, draw_dots, label_below
 from .runner import (
     FALLBACKS,
     RUN_COLUMNS,
@@ -31,7 +31,6 @@ from .runner import (
     Runner,
     Team,
     check_agents,
-    check_contenders,
     distinct_seeds,
     make_table,
 )
@@ -46,8 +45,8 @@ FIRST_CHECK = 16
 MOST_SEEDS = 10_000_000
 """A difference that needs more seeds than this counts as none."""
 
-Rows = dict[tuple[str, int], list[Row]]
-"""The rows of a table by contender and seed."""
+LINES = 200
+"""The largest number of seeds that are drawn as lines."""
 
 FALLBACK_LIMIT = 0.05
 """A contender with a larger share of decisions by fallbacks is marked."""
@@ -105,21 +104,23 @@ class Evaluation:
         """
         values = self.values(metric)
         proportions = values.columns if is_proportion(values.to_numpy()) else ()
-        table, notes = estimate_means(numbers(values, metric), self.confidence, proportions)
+        table = estimate_means(numbers(values, metric), self.confidence, proportions)
+        notes = dict(table.pop("note"))
         if self.baseline is not None:
-            differences, reasons = estimate_means(self._differences(metric), self.confidence)
-            differences.loc[self.baseline] = 0.0
-            columns = ["difference", "difference_low", "difference_high"]
-            table = table.join(differences.set_axis(columns, axis=1))
-            for name, reason in reasons.items():
+            estimates = estimate_means(self._differences(metric), self.confidence)
+            for name, reason in estimates.pop("note").items():
                 notes[name] = notes[name] or (reason and f"differences: {reason}")
-        shares = self._fallback_shares()
-        if shares:
-            table[FALLBACKS] = shares
-        for name, share in shares.items():
-            if share > FALLBACK_LIMIT:
-                separator = "; " if notes[name] else ""
-                notes[name] += f"{separator}{share:.0%} of decisions by a fallback"
+            columns = ["difference", "difference_low", "difference_high"]
+            table = table.join(estimates.astype(float).set_axis(columns, axis=1))
+            table.loc[self.baseline, columns] = 0.0
+        if FALLBACKS in self.frame:
+            team = self.frame[self.frame["agent"] == TEAM]
+            sums = team.groupby("contender")[[FALLBACKS, "length"]].sum()
+            table[FALLBACKS] = sums[FALLBACKS] / sums["length"].clip(lower=1)
+            for name, share in table[FALLBACKS].items():
+                if share > FALLBACK_LIMIT:
+                    separator = "; " if notes[name] else ""
+                    notes[name] += f"{separator}{share:.0%} of decisions by a fallback"
         return table.assign(note=notes) if any(notes.values()) else table
 
     def improvement(self, metric: str = "return") -> "DataFrame":
@@ -135,8 +136,8 @@ class Evaluation:
         """
         signs = np.sign(self._differences(metric))
         proportions = [name for name in signs if not (signs[name] == 0).any()]
-        table, _ = estimate_means((signs + 1) / 2, self.confidence, proportions)
-        return table.clip(0.0, 1.0).rename(columns={"mean": "probability"})
+        table = estimate_means((signs + 1) / 2, self.confidence, proportions)
+        return table.drop(columns="note").clip(0.0, 1.0).rename(columns={"mean": "probability"})
 
     def seeds_needed(
         self,
@@ -151,7 +152,7 @@ class Evaluation:
         seeds.
 
         Args:
-            difference: The mean difference to detect.
+            difference: The size of the mean difference to detect.
             power: The probability of detecting it. 0.8 is four times out of five.
             metric: The name of the value.
 
@@ -162,18 +163,29 @@ class Evaluation:
         Raises:
             OptionValueError: There is no baseline, or an argument has an invalid value.
         """
-        _check_number("difference", difference)
-        check_probability("power", power)
-        if difference == 0:
-            raise OptionValueError(
-                "difference must not be 0: no number of seeds is enough to detect that"
-            )
+        check_number("difference", difference)
+        check_number("power", power, 1)
         import pandas
+        from scipy import stats
 
-        seeds = {
-            name: seeds_needed(sample.to_numpy(), difference, self.confidence, power)
-            for name, sample in self._differences(metric).items()
-        }
+        def seeds_of(sample: NDArray[np.float64]) -> float:
+            *_, note = interval(sample, self.confidence)
+            if note:
+                return nan
+            size = difference / float(np.std(sample, ddof=1))
+
+            def is_enough(number: int) -> bool:
+                critical = stats.t.ppf((1 + self.confidence) / 2, number - 1)
+                shift = min(size * sqrt(number), 1e4)  # SciPy has no values for much larger ones
+                # The probabilities that a positive or a negative difference is significant.
+                probabilities = stats.nct.sf(critical, number - 1, [shift, -shift])
+                return bool(probabilities.sum() >= power)
+
+            number = 2 + bisect_left(range(2, MOST_SEEDS + 1), True, key=is_enough)
+            return number if number <= MOST_SEEDS else inf
+
+        samples = self._differences(metric).items()
+        seeds = {name: seeds_of(sample.to_numpy()) for name, sample in samples}
         return pandas.Series(seeds, name="seeds", dtype=float).rename_axis("contender")
 
     def plot(
@@ -185,30 +197,39 @@ class Evaluation:
         ``plot_timeline``.
         """
         values = numbers(self.values(metric), metric)
-        marks = {
-            name: f"\n{share:.0%} fallbacks"
-            for name, share in self._fallback_shares().items()
-            if share > FALLBACK_LIMIT
-        }
-        return plot_contenders(
-            values,
-            self.summary(metric),
-            metric,
-            self.baseline,
-            marks,
-            figure,
-        )
-
-    def _fallback_shares(self) -> dict[str, float]:
-        """Return the share of decisions that a fallback answered, by contender.
-
-        Empty if they are not counted.
-        """
-        if FALLBACKS not in self.frame:
-            return {}
-        team = self.frame[self.frame["agent"] == TEAM]
-        sums = team.groupby("contender")[[FALLBACKS, "length"]].sum()
-        return dict(sums[FALLBACKS] / sums["length"].clip(lower=1))
+        summary = self.summary(metric)
+        names = list(values)
+        number = len(values)
+        others = [] if self.baseline is None else list(self._differences(metric))
+        sizes = [len(names), len(others)] if others else [len(names)]
+        title = f"{number} seeds, lines for {LINES} of them"
+        if number == 1:
+            title = "1 seed"
+        elif len(names) == 1:
+            title = f"{number} seeds, each a dot"
+        elif number <= LINES:
+            title = f"{number} seeds, each a line"
+        with style(figure) as make_figure:
+            figure = make_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, 14.0), 4.2)
+            left, *right = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)[0]
+            lines = values.to_numpy()[:LINES].T
+            left.plot(lines, **LOOKS["seed"])
+            draw_dots(left, values, names, summary[["mean", "low", "high"]], 0.0)
+            labels = list(names)
+            for place, share in enumerate(summary.get(FALLBACKS, ())):
+                if share > FALLBACK_LIMIT:
+                    labels[place] += f"\n{share:.0%} fallbacks"
+            label_below(left, labels)
+            left.set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
+            left.set_title(title)
+            for axes in right:
+                axes.axhline(0.0, **LOOKS["zero"])
+                bounds = summary.loc[others, ["difference", "difference_low", "difference_high"]]
+                draw_dots(axes, self._differences(metric), names, bounds, 0.24)
+                label_below(axes, others)
+                axes.set_ylabel(f"difference from {self.baseline}, same seed")
+                axes.set_title("differences")
+        return figure
 
     def _differences(self, metric: str) -> "DataFrame":
         """Return the differences from the baseline: a column for each other contender."""
@@ -258,9 +279,9 @@ def evaluate(
         metric: A callable of the simulation after its end, whose column is ``metric``, or a dict
             from column to callable. A metric returns a number, a string or None.
         team: A callable that combines the returns of an episode's agents into the team's value.
-            None: their sum. It gets an object that is both the tuple of returns (``max`` works) and
-            a mapping by agent (``lambda returns: returns["waterer_0"]``). Agents that never decided
-            are missing there (``returns.get("waterer_0", 0.0)``).
+            None: their sum. It gets a pandas ``Series`` by agent (``max``, or ``lambda returns:
+            returns["waterer_0"]``). Agents that never decided are missing there
+            (``returns.get("waterer_0", 0.0)``).
         confidence: The confidence level of the intervals.
         width: Stop as soon as the interval of every difference from the baseline (without a
             baseline: of every mean) is at most this wide; ``seeds`` are then the seeds that may be
@@ -288,7 +309,9 @@ def evaluate(
     import_extra("pandas", "evaluate")
     import_extra("scipy.stats", "evaluate")
     check_options(batch_size, workers, None, concurrency)
-    check_contenders(contenders, batched=batched)
+    runner = Runner(
+        contenders, points, options, metric, team, batch_size, concurrency, batched=batched
+    )
     if not contenders:
         raise OptionValueError(
             "contenders must be a dict, such as {'rule': {}}, but there are none"
@@ -298,55 +321,40 @@ def evaluate(
             f"the baseline {short_repr(baseline)} is not one of the contenders:"
             f" {', '.join(contenders)}{did_you_mean(baseline, contenders)}"
         )
-    check_probability("confidence", confidence)
+    check_number("confidence", confidence, 1)
     if width is not None:
-        _check_number("width", width)
-        if width <= 0:
-            raise OptionValueError(f"width must be positive, not {short_repr(width)}")
-    runner = Runner(
-        contenders,
-        points,
-        options,
-        metric,
-        team,
-        batch_size if batched else 0,
-        concurrency,
-    )
+        check_number("width", width)
     all_seeds = distinct_seeds(seeds)
-    # Plans are made and pickled here even if workers do the work, so that errors come first.
+    # Errors of plans come first, even if workers do the work.
     plans = {name: runner.plan(simulation, name) for name in contenders}
-    arguments = (simulation, runner, None if workers else plans)
-    if workers:
-        pack(arguments)
-    rows: Rows = {}
-    number = len(all_seeds)
-    with progress_bar(len(plans) * number, progress, "episode") as bar, reuse_resources():
-        for end in [number] if width is None else _checkpoints(number):
-            runs = list(product(plans, all_seeds[:end]))
-            missing = [run for run in runs if run not in rows]
-            for part in spread(_run, arguments, missing, workers, runner.batch_size, bar):
-                rows |= part
-            table = make_table(
-                runner.columns,
-                chain.from_iterable(rows[run] for run in runs),
+    order: dict[Any, int] = {run: place for place, run in enumerate(product(plans, all_seeds))}
+    rows: list[Row] = []
+    start = 0
+    with progress_bar(len(order), progress, "episode") as bar:
+        for end in _checkpoints(len(all_seeds), width):
+            runs = list(product(plans, all_seeds[start:end]))
+            start = end
+            rows += chain(
+                *spread(_run, (simulation, runner), runs, workers, runner.batch_size, bar)
             )
-            evaluation = Evaluation(table, baseline, float(confidence))
-            if width is not None and end < number and evaluation._widest() <= width:
+            rows.sort(key=lambda row: order[row["contender"], row["seed"]])
+            evaluation = Evaluation(make_table(runner.columns, rows), baseline, float(confidence))
+            if width is not None and evaluation._widest() <= width:
                 break
     for name, plan in plans.items():
-        agents = table.loc[table["contender"] == name, "agent"].unique()
-        present = [agent for agent in agents if agent != TEAM]
-        check_agents(name, runner.undeclared_agents(plan, name), present)
+        frame = evaluation.frame
+        present = set(frame["agent"][frame["contender"] == name]) - {TEAM}
+        check_agents(name, runner.undeclared_agents(plan, name), sorted(present))
     return evaluation
 
 
-def _checkpoints(number: int) -> Iterator[int]:
+def _checkpoints(number: int, width: float | None) -> Iterator[int]:
     """Yield the numbers of seeds after which the width is checked, up to ``number``.
 
     Their distances grow, because each check takes time, too.
     """
     seeds = FIRST_CHECK
-    while seeds < number:
+    while width is not None and seeds < number:
         yield seeds
         seeds += max(4, seeds // 8)
     yield number
@@ -355,22 +363,20 @@ def _checkpoints(number: int) -> Iterator[int]:
 def _run(
     simulation: Model,
     runner: Runner,
-    plans: Mapping[str, Plan] | None,
     runs: Sequence[tuple[str, int]],
     bar: Any,
-) -> Rows:
-    """Run pairs of contender and seed. ``plans`` is None in a worker, which makes its own."""
-    rows: Rows = {}
+) -> list[Row]:
+    """Run pairs of contender and seed."""
+    rows: list[Row] = []
 
     def report(name: str, seed: int, outcome: Outcome) -> None:
-        rows[name, seed] = runner.rows(name, seed, outcome)
+        rows.extend(runner.rows(name, seed, outcome))
         bar.update()
 
     with reuse_resources():
         for name, group in groupby(runs, lambda run: run[0]):
-            plan = runner.plan(simulation, name) if plans is None else plans[name]
             seeds = [seed for _, seed in group]
-            runner.run(plan, name, seeds, partial(report, name))
+            runner.run(runner.plan(simulation, name), name, seeds, partial(report, name))
     return rows
 
 
@@ -391,7 +397,7 @@ def estimate_means(
     samples: "DataFrame",
     confidence: float,
     proportions: Collection[str] = (),
-) -> "tuple[DataFrame, dict[str, str]]":
+) -> "DataFrame":
     """Estimate the means of samples, one column for each contender.
 
     Args:
@@ -400,25 +406,19 @@ def estimate_means(
         proportions: The columns of zeros and ones.
 
     Returns:
-        A table indexed by contender, with the columns ``mean``, ``low`` and ``high``, and for each
-        contender the reason why the bounds are nan; an empty string if they are known.
+        A table indexed by contender, with the columns ``mean``, ``low``, ``high`` and ``note``: the
+        reason why the bounds are nan, empty if they are known.
     """
     import pandas
 
     rows = {}
-    reasons = {}
     for name, values in samples.items():
         sample = values.to_numpy()
-        low, high, reasons[name] = interval(sample, confidence, proportion=name in proportions)
-        rows[name] = [sample.mean(), low, high]
-    columns = ["mean", "low", "high"]
-    table = pandas.DataFrame.from_dict(
-        rows,
-        "index",
-        columns=columns,
-        dtype=float,
-    )
-    return table.rename_axis("contender"), reasons
+        bounds = interval(sample, confidence, proportion=name in proportions)
+        rows[name] = (sample.mean(), *bounds)
+    columns = ["mean", "low", "high", "note"]
+    table = pandas.DataFrame.from_dict(rows, "index", columns=columns)
+    return table.rename_axis("contender")
 
 
 def numbers(values: "DataFrame", metric: str) -> "DataFrame":
@@ -429,40 +429,10 @@ def numbers(values: "DataFrame", metric: str) -> "DataFrame":
         raise OptionValueError(f"metric={short_repr(metric)} is not a column of numbers") from None
 
 
-def seeds_needed(
-    differences: NDArray[np.float64],
-    difference: float,
-    confidence: float,
-    power: float,
-) -> float:
-    """Return the number of seeds that detects a difference: see ``Evaluation.seeds_needed``."""
-    from scipy import stats
-
-    *_, note = interval(differences, confidence)
-    if note:
-        return nan
-    size = abs(difference) / float(np.std(differences, ddof=1))
-
-    def is_enough(number: int) -> bool:
-        critical = stats.t.ppf((1 + confidence) / 2, number - 1)
-        shift = min(size * sqrt(number), 1e4)  # SciPy has no values for much larger ones
-        # The probabilities that a positive or a negative difference is significant.
-        probabilities = stats.nct.sf(critical, number - 1, [shift, -shift])
-        return bool(probabilities.sum() >= power)
-
-    number = 2 + bisect_left(range(2, MOST_SEEDS + 1), True, key=is_enough)
-    return number if number <= MOST_SEEDS else inf
-
-
-def _check_number(name: str, value: float) -> None:
-    if not isinstance(value, Real) or isinstance(value, bool) or not isfinite(value):
-        raise OptionValueError(f"{name} must be a finite number, not {short_repr(value)}")
-
-
-def check_probability(name: str, value: float) -> None:
-    """Check that an argument is a number between 0 and 1."""
-    _check_number(name, value)
-    if not 0 < value < 1:
+def check_number(name: str, value: float, most: float = inf) -> None:
+    """Check that an argument is a number between 0 and ``most``."""
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not is_number or not 0 < value < most:
         raise OptionValueError(
-            f"{name} must lie between 0 and 1, such as 0.95, not {short_repr(value)}"
+            f"{name} must lie between 0 and {most}, such as 0.95, not {short_repr(value)}"
         )

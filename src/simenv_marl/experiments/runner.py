@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from types import NoneType
-from typing import TYPE_CHECKING, Any, SupportsFloat, SupportsIndex
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 from ..core import Episode, Plan, Points, has_fallback, waits
 from ..data.collect import learners_plan
@@ -21,14 +21,13 @@ from ..errors import (
     annotate,
     did_you_mean,
     short_repr,
-    warn_user,
 )
 from ..many.batch import BatchRun, Group, takes_identities
 from ..runs import checked_seeds
 from ..simulation import RULE, Model
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
 TEAM = "team"
 """The value of the column ``agent`` in the row of the team."""
@@ -45,9 +44,6 @@ STATUS_COLUMNS = ("status", "error")
 RESERVED = (*RUN_COLUMNS, FALLBACKS, *STATUS_COLUMNS)
 """The columns whose names factors and metrics must not have."""
 
-EXACT = 2**53
-"""The integers up to this are exact as floats."""
-
 Contenders = Mapping[str, Mapping[Any, Any]]
 """The policies of each contender, as ``simulate`` takes them."""
 
@@ -60,8 +56,8 @@ Metrics = Metric | Mapping[str, Metric] | None
 Value = str | float | None
 """A factor or the result of a metric: a string, a number, a bool or None."""
 
-Row = tuple[Value, ...]
-"""A row of a table."""
+Row = dict[str, Value]
+"""A row of a table, by column."""
 
 
 @dataclass(frozen=True)
@@ -69,50 +65,16 @@ class Outcome:
     """The results of one episode.
 
     Attributes:
-        returns: The undiscounted return of each agent that has decided.
-        lengths: The number of decisions of each of these agents.
+        agents: For each agent that has decided, its ``return`` (undiscounted), ``length`` (the
+            number of its decisions) and ``fallbacks`` (the number that its fallback answered).
         metrics: The result of each metric.
-        fallbacks: For each agent with a fallback: the number of decisions that it answered.
     """
 
-    returns: dict[str, float]
-    lengths: dict[str, int]
+    agents: dict[str, dict[str, float]]
     metrics: dict[str, Value]
-    fallbacks: dict[str, int]
 
 
-class Returns(tuple[float, ...]):
-    """The returns of an episode's agents: a tuple of numbers, and a mapping by agent."""
-
-    _by_agent: dict[str, float]
-
-    def __new__(cls, returns: Mapping[str, float]) -> Returns:
-        """Copy the returns from a dict."""
-        instance = super().__new__(cls, returns.values())
-        instance._by_agent = dict(returns)
-        return instance
-
-    def __getitem__(self, key: SupportsIndex | slice | str) -> Any:
-        if not isinstance(key, str):
-            return super().__getitem__(key)
-        if key not in self._by_agent:
-            raise KeyError(
-                f"{key!r} did not decide in this episode; these agents did:"
-                f" {', '.join(self._by_agent) or 'none'}"
-            )
-        return self._by_agent[key]
-
-    def __contains__(self, key: object) -> bool:
-        if isinstance(key, str):
-            return key in self._by_agent
-        return super().__contains__(key)
-
-    def __getattr__(self, name: str) -> Any:
-        """Return a method of the dict, such as ``get`` or ``items``."""
-        return getattr(self._by_agent, name)
-
-
-Team = Callable[[Returns], SupportsFloat]
+Team = Callable[["Series[float]"], SupportsFloat]
 """A callable that combines the returns of agents into the team's value."""
 
 
@@ -129,7 +91,13 @@ def error_note(note: str) -> Iterator[None]:
 class Runner:
     """Runs episodes of contenders for ``evaluate`` and ``run_experiment``.
 
-    Workers get a copy. With a ``batch_size`` of 0, policies answer one decision at a time.
+    Workers get a copy.
+
+    Attributes:
+        contenders: The policies of each contender.
+        metrics: The metrics, by column.
+        batch_size: The largest number of episodes in a batch; 0: policies answer one decision at a
+            time.
     """
 
     def __init__(
@@ -141,6 +109,8 @@ class Runner:
         team: Team | None,
         batch_size: int,
         concurrency: int,
+        *,
+        batched: bool,
         factors: Collection[str] = (),
     ) -> None:
         """Check the arguments.
@@ -156,6 +126,7 @@ class Runner:
                 "there is no option policies here; pass the policies of each contender in"
                 " contenders="
             )
+        check_contenders(contenders, batched=batched)
         self.contenders = contenders
         self.metrics: Mapping[str, Metric] = {}
         if isinstance(metric, Mapping):
@@ -172,12 +143,12 @@ class Runner:
                 raise OptionValueError(
                     f"the metric {name!r} has the name of another column; rename it"
                 )
-        self.batch_size = batch_size
+        self.batch_size = batch_size if batched else 0
         self._concurrency = concurrency
         self._counts_fallbacks = any(
-            any(map(has_fallback, policies.values())) for policies in contenders.values()
+            has_fallback(policy) for policies in contenders.values() for policy in policies.values()
         )
-        self._team = sum if team is None else team
+        self._team = team
         # Iterators are copied, because each plan reads them again.
         self._points = list(points) if isinstance(points, Iterator) else points
         self._options = {
@@ -191,31 +162,22 @@ class Runner:
         All entities that decide are agents with rewards, also without a policy. If the decision
         points are not known, the points that contenders name are used, if there are any.
         """
-        policies = self.contenders[contender]
         make_plan = partial(
             learners_plan,
             simulation,
-            policies,
+            self.contenders[contender],
             options=self._options,
             alone=not self.batch_size,
         )
         with error_note(f"of the contender {contender!r}"):
             try:
                 return make_plan(points=self._points, all_points=True)
-            except (AgentError, UnknownPointError) as error:
-                if self._points is not None:
-                    raise
+            except (AgentError, UnknownPointError):
                 keys = dict.fromkeys(chain.from_iterable(self.contenders.values()))
-                points = [key for key in keys if not isinstance(key, str) or "." in key] or None
-                with suppress(AgentError, UnknownPointError):
-                    plan = make_plan(points=points, all_points=points is not None)
-                    if points is None and decision_points():
-                        warn_user(
-                            "returns are not counted, because the decision points are not known:"
-                            f" {error}"
-                        )
-                    return plan
-                raise
+                points = [key for key in keys if not isinstance(key, str) or "." in key]
+                if self._points is not None or (decision_points() and not points):
+                    raise
+                return make_plan(points=points or None, all_points=bool(points))
 
     def undeclared_agents(self, plan: Plan, contender: str) -> set[str]:
         """Return the agents that a contender names, but neither points nor ``possible_agents``."""
@@ -243,7 +205,7 @@ class Runner:
         def finish(place: int, simulation: Model) -> Callable[[], None]:
             seed = seeds[place]
             outcome = tally.outcomes.pop(seed)
-            if TEAM in outcome.returns:
+            if TEAM in outcome.agents:
                 raise AgentError(
                     f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
                     " agent"
@@ -275,19 +237,30 @@ class Runner:
         outcome: Outcome,
     ) -> list[Row]:
         """Return a row of the table for each agent, and one for the team."""
-        value = self._team(Returns(outcome.returns))
+        from pandas import Series
+
+        agents = outcome.agents
+        total: dict[str, Any] = {
+            name: sum(own[name] for own in agents.values())
+            for name in ("return", "length", FALLBACKS)
+        }
+        if self._team is not None:
+            returns = Series({name: own["return"] for name, own in agents.items()}, dtype=float)
+            try:
+                total["return"] = self._team(returns)
+            except KeyError as error:
+                names = ", ".join(agents) or "none"
+                raise KeyError(
+                    f"{error} did not decide in this episode; these did: {names}"
+                ) from error
         try:
-            returns = {**outcome.returns, TEAM: float(value)}
+            total["return"] = float(total["return"])
         except (TypeError, ValueError):
-            raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
-        lengths = {**outcome.lengths, TEAM: sum(outcome.lengths.values())}
-        fallbacks = {**outcome.fallbacks, TEAM: sum(outcome.fallbacks.values())}
-        metrics = list(map(outcome.metrics.get, self.metrics))
-        rows = []
-        for agent, length in lengths.items():
-            counts = [fallbacks.get(agent, 0)] if self._counts_fallbacks else []
-            rows.append((contender, seed, agent, returns[agent], length, *counts, *metrics))
-        return rows
+            raise OptionValueError(
+                f"team must return a number, not {short_repr(total['return'])}"
+            ) from None
+        run = {"contender": contender, "seed": seed, **outcome.metrics}
+        return [{**run, "agent": name, **own} for name, own in {**agents, TEAM: total}.items()]
 
 
 class Tally:
@@ -298,7 +271,7 @@ class Tally:
     """
 
     def __init__(self) -> None:
-        self.outcomes = defaultdict[int, Outcome](lambda: Outcome({}, Counter(), {}, {}))
+        self.outcomes = defaultdict[int, Outcome](lambda: Outcome(defaultdict(_no_decision), {}))
 
     def record(
         self,
@@ -309,23 +282,24 @@ class Tally:
     ) -> None:
         """Count decisions: see ``Watcher``."""
         for episode in waiting:
-            outcome = self.outcomes[episode.seed]
-            name = episode.pending.name
-            outcome.returns.setdefault(name, 0.0)
-            outcome.lengths[name] += 1
+            self.outcomes[episode.seed].agents[episode.pending.name]["length"] += 1
 
     def pay(self, episode: Episode) -> None:
         """Add the rewards: see ``Watcher``.
 
         Agents that end before the simulation get their last reward when it is over.
         """
-        outcome = self.outcomes[episode.seed]
+        results = self.outcomes[episode.seed].agents
         agents = [*episode.ended.values(), *episode.agents.values()]
         for agent in agents if episode.pending is None else [episode.pending]:
-            if agent.name in outcome.returns:
-                outcome.returns[agent.name] += agent.reward
-                if agent.fallbacks:
-                    outcome.fallbacks[agent.name] = agent.fallbacks
+            if agent.name in results:
+                own = results[agent.name]
+                own["return"] += agent.reward
+                own[FALLBACKS] = agent.fallbacks
+
+
+def _no_decision() -> dict[str, float]:
+    return {"return": 0.0, "length": 0, FALLBACKS: 0}
 
 
 # -- checks ---------------------------------------------------------------------------------------
@@ -381,51 +355,19 @@ def distinct_seeds(seeds: Iterable[int]) -> list[int]:
     return all_seeds
 
 
-def plain_value(name: str, value: Any, advice: str = "") -> Any:
-    """Return the named value without NumPy's types, or raise an error with some advice."""
+def plain_value(name: str, value: Any) -> Any:
+    """Return the named value without NumPy's types, or raise an error."""
     if getattr(value, "ndim", None) == 0:
         value = value.item()
-    is_short = type(value) is int and value.bit_length() < 14_000  # 4,214 digits
-    if not is_short and type(value) not in (bool, float, str, NoneType):
+    if type(value) not in (bool, int, float, str, NoneType):
         raise OptionValueError(
-            f"{name} must be a number of no more than 4,200 digits, a string or None, not"
-            f" {short_repr(value)}{advice}"
+            f"{name} must be a number, a string or None, not {short_repr(value)}"
         )
     return value
 
 
-# -- tables ---------------------------------------------------------------------------------------
-
-
-def make_table(names: Sequence[str], rows: Iterable[Row]) -> DataFrame:
-    """Return a table whose columns keep the types of their values.
-
-    A numeric column with missing values is float.
-    """
+def make_table(columns: Sequence[str], rows: Iterable[Row]) -> DataFrame:
+    """Return a table. A numeric column with missing values is float."""
     import pandas
 
-    columns = zip(*rows, strict=True)
-    return pandas.DataFrame(
-        {
-            name: pandas.Series(values, dtype=dtype_of(values, missing=True))
-            for name, values in zip(names, columns, strict=True)
-        }
-    )
-
-
-def dtype_of(values: Collection[Any], *, missing: bool) -> str:
-    """Return the dtype of a column that keeps the types of its values.
-
-    With ``missing``, None is a missing number, and numbers of both types become floats if that is
-    exact.
-    """
-    kinds = set(map(type, values))
-    if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
-        return "int64"
-    if missing and kinds & {int, float} and kinds <= {int, float, NoneType}:
-        is_exact = all(type(value) is not int or abs(value) <= EXACT for value in values)
-        return "float64" if is_exact else "object"
-    for kind, dtype in ((str, "str"), (float, "float64"), (bool, "bool")):
-        if kinds == {kind}:
-            return dtype
-    return "object"
+    return pandas.DataFrame(list(rows), columns=list(columns))

@@ -9,14 +9,13 @@ import os
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import partial, wraps
+from functools import partial
 from itertools import groupby, product, starmap
 from math import nan
 from pathlib import Path
 from time import time_ns
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Unpack
 from uuid import uuid4
 
@@ -26,10 +25,8 @@ from ..core import (
     Points,
     as_json,
     describe,
-    pack,
     portable,
     reuse_resources,
-    source_name,
 )
 from ..errors import (
     OptionValueError,
@@ -42,10 +39,9 @@ from ..errors import (
 )
 from ..many.parallel import NO_BAR, import_extra, progress_bar, spread
 from ..runs import check_options
-from ..simulation import Model, make_simulation
+from ..simulation import Model
 from .runner import (
     RESERVED,
-    RUN_COLUMNS,
     STATUS_COLUMNS,
     TEAM,
     Contenders,
@@ -56,7 +52,6 @@ from .runner import (
     Team,
     Value,
     check_agents,
-    check_contenders,
     distinct_seeds,
     make_table,
     plain_value,
@@ -67,7 +62,7 @@ from .store import (
     Result,
     Run,
     Store,
-    Writer,
+    append,
     make_entry,
     to_json,
 )
@@ -109,7 +104,8 @@ def run_experiment(
     Args:
         make: A callable that gets the factors of a row as keyword arguments and returns a
             simulation or a ``Variant``; or a ``Variant``, whose parameters the factors become. It
-            is called anew for each run.
+            is called for each row and contender; a simulation that it returns is copied for each
+            run, and a class or factory called.
         design: One row for each combination of factors, as ``design`` makes it: a ``DataFrame``, or
             data for one.
         contenders: As ``evaluate`` takes them. ``"rule"``, the model as it is, is always added.
@@ -144,14 +140,12 @@ def run_experiment(
     keys = [to_json(row) for row in rows]
     all_seeds = distinct_seeds(seeds)
     check_options(batch_size, workers, None, concurrency)
-    check_contenders(contenders or {}, batched=batched)
     contenders = {BY_RULE: {}, **(contenders or {})}
     if contenders[BY_RULE]:
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another"
             " name"
         )
-    batch_size = batch_size if batched else 0
     runner = Runner(
         contenders,
         points,
@@ -160,7 +154,8 @@ def run_experiment(
         team,
         batch_size,
         concurrency,
-        rows[0],
+        batched=batched,
+        factors=rows[0],
     )
     if isinstance(make, Variant):
         _source_of_row(make, rows[0])  # a variant checks its parameters
@@ -169,22 +164,14 @@ def run_experiment(
             f"{name_of(make)} cannot be called with the factors {', '.join(rows[0]) or '(none)'}:"
             f" {problem}; make must be a callable of the factors, such as a class, or a Variant"
         )
-    try:
-        folder = Path(store).absolute()  # other processes may have another working directory
-    except TypeError as error:
-        raise OptionValueError(
-            f"store must be the path of a folder, not {short_repr(store)}"
-        ) from error
+    folder = Path(store).absolute()  # other processes may have another working directory
     storage = Store(folder, keys, rows[0], runner.metrics)
     storage.read()
     storage.check_rows()
     session = f"{time_ns():016x}{uuid4().hex[:8]}"  # later sessions sort after it
     job = Job(make, runner, folder, session)
-    if workers:
-        pack(job)  # errors of pickling come before any run
-    row, provenances, agents = job.try_contenders([storage.sample or keys[0], *keys])
+    agents = job.try_contenders(storage, keys)
     storage.create()
-    storage.warn_of_changes(row, provenances)
     # A row that occurs twice has the same results.
     runs = list(starmap(Run, product(dict.fromkeys(keys), contenders, all_seeds)))
     final_results = Outcome if retry_errors else (Outcome, str)
@@ -219,23 +206,19 @@ def _read_design(design: "DataFrame | Iterable[Any]") -> "tuple[DataFrame, list[
         raise OptionValueError(
             f"design must be a DataFrame, or data to make one from, not {short_repr(design)}"
         ) from error
-    names = list(table.columns)
-    for name in names:
+    for name in table.columns:
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
         if name in RESERVED:
             raise OptionValueError(
                 f"the factor {name!r} has the name of another column of the table; rename it"
             )
-        if names.count(name) > 1:
-            raise OptionValueError(f"the factor {name!r} occurs twice")
     if not len(table):
         raise OptionValueError("the design has no rows")
-    advice = "; other values cannot be stored: use a name as the value, and look it up in make"
     rows = table.to_dict("records") or [{}] * len(table)  # no records without columns
     for row in rows:
         for name, value in row.items():
-            row[name] = plain_value(f"the factor {name!r}", value, advice)
+            row[name] = plain_value(f"the factor {name!r}", value)
     return table, rows
 
 
@@ -259,22 +242,7 @@ def _source_of_row(make: "Callable[..., Model] | Variant", row: Mapping[str, Val
     """Return the variant, class or factory of a row's simulations."""
     if isinstance(make, Variant):
         return replace(make, parameters={**make.parameters, **row})
-    if isinstance(make, type):
-        return partial(make, **row)
-    first = make(**row)
-    if isinstance(first, (Variant, type)) or not hasattr(first, "run"):
-        return first
-    unused = [first]
-
-    @wraps(type(first), updated=())  # because provenance names a source after its class
-    def factory() -> Model:
-        if unused:
-            return unused.pop()
-        simulation = make(**row)
-        # Each run has another simulation, even if make always returns the same object.
-        return make_simulation(first) if simulation is first else simulation
-
-    return factory
+    return partial(make, **row) if isinstance(make, type) else make(**row)
 
 
 @dataclass(frozen=True)
@@ -297,35 +265,30 @@ class Job:
         """Return the plan of runs of a row with a contender, and their provenance."""
         source = _source_of_row(self.make, json.loads(row))
         plan = self.runner.plan(source, contender)
-        name = self.make.name if isinstance(self.make, Variant) else source_name(self.make)
-        variant = plan.subject.variant
-        own_policies = (variant.policies if variant is not None else None) or {}
-        policies = {**own_policies, **self.runner.contenders[contender]}
-        return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
+        provenance = describe(plan, None)
+        provenance["policies"] |= as_json(self.runner.contenders[contender])
+        return plan, provenance
 
-    def try_contenders(
-        self, rows: Sequence[str]
-    ) -> tuple[str, dict[str, Provenance], dict[str, set[str]]]:
-        """Check that all contenders can be set up.
+    def try_contenders(self, storage: Store, rows: Sequence[str]) -> dict[str, set[str]]:
+        """Set up all contenders, and warn if they have changed since their runs were stored.
 
         Returns:
-            The first row whose simulations can be made and, by contender, provenances and
-            undeclared agents. All three are empty if the simulations of the first ten rows cannot
-            be made, because the runs of all rows tell why.
+            The undeclared agents of each contender. It lacks a contender whose simulations cannot
+            be made in the first ten rows, because its runs tell why.
         """
-        for row in rows[:10]:
-            provenances = {}
-            agents = {}
-            try:
-                for contender in self.runner.contenders:
-                    plan, provenances[contender] = self.prepare(row, contender)
-                    agents[contender] = self.runner.undeclared_agents(plan, contender)
-            except SimEnvError:
-                raise
-            except Exception:  # this row fails; another may not
-                continue
-            return row, provenances, agents
-        return "", {}, {}
+        agents = {}
+        for contender in self.runner.contenders:
+            for row in [storage.samples.get(contender, rows[0]), *rows[:10]]:
+                try:
+                    plan, provenance = self.prepare(row, contender)
+                except SimEnvError:
+                    raise
+                except Exception:  # this row fails; another may not
+                    continue
+                storage.warn_of_changes(contender, row, provenance)
+                agents[contender] = self.runner.undeclared_agents(plan, contender)
+                break
+        return agents
 
     def run_all(
         self,
@@ -334,7 +297,6 @@ class Job:
         workers: int,
         least: int,
         bar: Any,
-        is_retry: bool = False,
     ) -> None:
         """Do runs in workers, in parts of at least ``least`` runs.
 
@@ -342,46 +304,31 @@ class Job:
         separately. A single run that kills its worker twice becomes an error.
 
         Raises:
-            BrokenExecutor: The workers have died before one of them opened its file.
+            BrokenExecutor: The workers have died before one of them began.
         """
-        if not runs:
-            return
-        try:
-            # Small parts cost nothing.
-            spread(
-                self.run_part,
-                (),
-                runs,
-                workers,
-                least,
-                bar,
-                share=16,
-            )
-        except BrokenExecutor:
-            if not any(self.folder.glob(f"runs-{self.session}-*")):
-                raise
-            if is_retry and len(runs) == 1:
-                with closing(Writer(self.folder, self.session)) as writer:
-                    writer.write(make_entry(runs[0], DEATH, {}))
-                return
-            storage.read(self.session)
-            missing = [run for run in runs if run not in storage.runs]
-            middle = len(missing) // 2
-            for half in (missing[:middle], missing[middle:]):
-                self.run_all(
-                    half,
-                    storage,
-                    workers,
-                    least,
-                    bar,
-                    is_retry=True,
-                )
+        parts = [runs]
+        while parts:
+            part = parts.pop()
+            try:
+                # Small parts cost nothing.
+                spread(self.run_part, (), part, workers, least, bar, share=16)
+            except BrokenExecutor:
+                if not any(self.folder.glob(f"runs-{self.session}-*")):
+                    raise
+                if len(part) == 1 and part is not runs:
+                    append(self.folder, self.session, make_entry(part[0], DEATH, {}))
+                    continue
+                storage.read(self.session)
+                missing = [run for run in part if run not in storage.runs]
+                middle = len(missing) // 2
+                parts += [missing[middle:], missing[:middle]]
 
     def run_part(self, runs: Sequence[Run], bar: Any) -> None:
         """Do runs and store their results."""
-        with closing(Writer(self.folder, self.session)) as writer, reuse_resources():
+        append(self.folder, self.session)  # because this worker has begun
+        with reuse_resources():
             for _, group in groupby(runs, lambda run: run[:2]):
-                self._run_group(list(group), writer.write, bar)
+                self._run_group(list(group), partial(append, self.folder, self.session), bar)
 
     def try_agents(
         self,
@@ -401,17 +348,15 @@ class Job:
         """
         for names, runs in trials:
             entries: list[Entry] = []
-            present: dict[str, float] = {}
+            present: dict[str, object] = {}
             for run in runs:
                 self._run_group([run], entries.append, bar)
-                present |= entries[-1].get("returns", {})
+                present |= entries[-1].get("agents", {})
                 if present.keys() >= names:
                     break
             if any(entry["status"] == "ok" for entry in entries):
                 check_agents(runs[0].contender, names, present)
-            with closing(Writer(self.folder, self.session)) as writer:
-                for entry in entries:
-                    writer.write(entry)
+            append(self.folder, self.session, *entries)
 
     def _run_group(
         self,
@@ -432,8 +377,8 @@ class Job:
             result: Result,
             trace: str | None = None,
         ) -> None:
-            run = remaining.pop(seed)
-            write(make_entry(run, result, {**provenance, "seed": seed}, trace))
+            write(make_entry(remaining[seed], result, {**provenance, "seed": seed}, trace))
+            del remaining[seed]
             bar.update()
 
         while remaining:
@@ -467,25 +412,17 @@ def _make_frame(
     rows: list[Row] = []
     for (place, key), contender, seed in product(enumerate(keys), runner.contenders, seeds):
         result = results.get(Run(key, contender, seed), "its result is no longer stored")
-        rows += _rows_of_run(contender, seed, result, runner)
+        if isinstance(result, Outcome):
+            try:
+                rows += [{**row, "status": "ok"} for row in runner.rows(contender, seed, result)]
+            except Exception as error:  # raised by team=, which is called for stored runs, too
+                result = describe_error(error)
+        if isinstance(result, str):
+            run: Row = {"contender": contender, "seed": seed, "agent": TEAM, "return": nan}
+            rows.append({**run, "length": 0, "status": "error", "error": result})
         places += [place] * (len(rows) - len(places))
     factors = table.iloc[places].reset_index(drop=True)
     return factors.join(make_table((*runner.columns, *STATUS_COLUMNS), rows))
-
-
-def _rows_of_run(
-    contender: str,
-    seed: int,
-    result: Result,
-    runner: Runner,
-) -> list[Row]:
-    if isinstance(result, Outcome):
-        try:
-            return [(*row, "ok", None) for row in runner.rows(contender, seed, result)]
-        except Exception as error:  # raised by team=, which is called for stored runs, too
-            result = describe_error(error)
-    missing = [None] * (len(runner.columns) - len(RUN_COLUMNS))
-    return [(contender, seed, TEAM, nan, 0, *missing, "error", result)]
 
 
 # -- variants -------------------------------------------------------------------------------------
@@ -493,7 +430,7 @@ def _rows_of_run(
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A simulation with all changes of an experiment, under one name. Immutable.
+    """A simulation with all changes of an experiment, under one name. Its attributes cannot be set.
 
     Use ``dataclasses.replace`` to derive another variant.
 
@@ -532,9 +469,6 @@ class Variant:
                 raise OptionValueError(
                     f"{name} of the variant {self.name!r} must be a dict, not {short_repr(value)}"
                 )
-            # Copied, so that later changes of the arguments do not change the variant.
-            object.__setattr__(self, name, MappingProxyType(dict(value)))
-        object.__setattr__(self, "plugins", tuple(self.plugins))
         misplaced_options = {"plugins", "policies"} & self.options.keys()
         if misplaced_options:
             raise OptionValueError(
@@ -548,26 +482,19 @@ class Variant:
                 " them"
             )
 
-    def __reduce__(self) -> tuple[Callable[..., "Variant"], tuple[()]]:
-        # Functions are pickled by name, because hooks replace them while environments are in use.
-        points = self.points
-        if isinstance(points, Mapping):
-            points = {portable(key): definition for key, definition in points.items()}
-        elif isinstance(points, Iterable) and not isinstance(points, str):
-            points = list(map(portable, points))
-        else:
-            points = portable(points)
-        arguments = {
-            **vars(self),
+        # Copied, so that later changes of the arguments do not change the variant. Functions become
+        # names, because hooks replace them while environments are in use.
+        parts = {
             "parameters": dict(self.parameters),
-            "points": points,
-            "plugins": [
-                (handler, portable(target), *rest) for handler, target, *rest in self.plugins
-            ],
-            "policies": {portable(key): policy for key, policy in self.policies.items()},
+            "points": _named_points(self.points),
+            "plugins": tuple(
+                (handler, _name(target), *rest) for handler, target, *rest in self.plugins
+            ),
+            "policies": {_name(key): policy for key, policy in self.policies.items()},
             "options": dict(self.options),
         }
-        return partial(Variant, **arguments), ()
+        for name, part in parts.items():
+            object.__setattr__(self, name, part)
 
     def environment_arguments(
         self, points: Points, options: Mapping[str, Any]
@@ -586,3 +513,19 @@ class Variant:
             "plugins": (*self.plugins, *options.get("plugins", ())),
         }
         return source, self.points if points is None else points, all_options
+
+
+def _named_points(points: Points) -> Points:
+    """Return points by their names, where they can be imported."""
+    if isinstance(points, Mapping):
+        return {_name(key): definition for key, definition in points.items()}
+    if isinstance(points, Iterable) and not isinstance(points, str):
+        return list(map(_name, points))
+    name: Points = _name(points)
+    return name
+
+
+def _name(key: Model) -> Model:
+    """Return the name of a function that can be imported, and any other key itself."""
+    name = portable(key)
+    return name if isinstance(name, str) else key

@@ -16,32 +16,23 @@ from __future__ import annotations
 import json
 import os
 import re
-import threading
+import sys
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import get_ident
 from typing import Any, NamedTuple
-from uuid import uuid4
+from uuid import getnode, uuid4
 
 from ..errors import LONGEST, OptionValueError, StoreError, short_repr, warn_user
-from .runner import Outcome, plain_value
+from .runner import Outcome
 
 VERSION = 1
 HEADER = "experiment.json"
 
-MADE_OF = (
-    "make",
-    "simulation",
-    "variant",
-    "parameters",
-    "points",
-    "plugins",
-    "policies",
-    "options",
-    "python",
-)
-"""The parts of the provenance that affect the results of a run, besides versions of packages."""
+IRRELEVANT = ("seed", "packages", "dependencies")
+"""The parts of the provenance that are not compared as they are. Each package is a part."""
 
 VARYING = re.compile(r" at 0x[0-9a-fA-F]+|\w+\.<locals>\.")
 """The differences between texts of equal objects.
@@ -91,8 +82,8 @@ class Store:
     Attributes:
         runs: The result of each run. If a run is stored more than once, a success counts, else the
             latest error.
-        sample: The row of the design, as JSON, whose provenance is compared. It has a successful
-            run; the text is empty if no row has one.
+        samples: For each contender, a row of the design that has a successful run, as JSON. Its
+            provenance is compared.
         agents: The agents that have decided, by contender.
     """
 
@@ -105,8 +96,9 @@ class Store:
     ) -> None:
         """Describe an experiment. ``rows`` are the rows of the design, as JSON."""
         self.folder = folder
-        self._rows = {row: row for row in rows}
+        self._rows = dict.fromkeys(rows)
         self._factors = factors
+        self._path = folder / HEADER
         self._header = {
             "simenv_marl": VERSION,
             "factors": sorted(factors),
@@ -114,55 +106,28 @@ class Store:
         }
         self._unusable = f"{folder} cannot be made or read as the folder of an experiment"
 
-    def exists(self) -> bool:
-        """Return whether the folder is the store of this experiment.
-
-        False if it is empty or missing.
-        """
-        header = self.folder / HEADER
-        with _explain_errors(self._unusable):
-            names = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
-            # This comes after the list, because another process may be writing both.
-            if not header.exists():
-                if any(not name.startswith((HEADER, ".")) for name in names):
-                    raise OptionValueError(
-                        f"the folder {self.folder} is not empty, and not the store of an experiment"
-                    )
-                return False
-            text = header.read_bytes()
-        try:
-            content = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise StoreError(
-                f"{header} cannot be read: {error}; restore the file, or pass another folder"
-            ) from error
-        if not isinstance(content, dict) or content.get("simenv_marl") != VERSION:
-            raise OptionValueError(f"{header} was not written by this version of simenv_marl")
-        for part in ("factors", "metrics"):
-            if content.get(part) != self._header[part]:
-                raise OptionValueError(
-                    f"the store {self.folder} belongs to another experiment: its {part} are"
-                    f" {content.get(part)}, not {self._header[part]}; pass another folder"
-                )
-        return True
-
     def create(self) -> None:
-        """Make the store, unless it exists. Errors are as for ``exists``."""
-        if not self.exists():
-            # Renamed as a whole, so that readers never see half of it.
-            fresh = self.folder / f"{HEADER}.{uuid4().hex}"
-            with _explain_errors(self._unusable):
+        """Make the store, unless it exists."""
+        with _explain_errors(self._unusable):
+            if not self._path.exists():
+                # Renamed as a whole, so that readers never see half of it.
+                fresh = self.folder / f"{HEADER}.{uuid4().hex}"
                 self.folder.mkdir(parents=True, exist_ok=True)
                 fresh.write_text(json.dumps(self._header) + "\n", encoding="ascii")
-                os.replace(fresh, self.folder / HEADER)
+                os.replace(fresh, self._path)
 
     def read(self, session: str = "") -> None:
-        """Read all runs, or the runs of a session. Errors are as for ``exists``."""
-        self.exists()
+        """Read all runs, or the runs of a session. The folder may be empty or missing.
+
+        Raises:
+            OptionValueError: The folder is not the store of this experiment.
+            StoreError: The folder cannot be read.
+        """
         self.runs: dict[Run, Result] = {}
-        self.sample = ""
+        self.samples: dict[str, str] = {}
         self.agents = defaultdict[str, set[str]](set)
-        self._parts: dict[str, dict[str, str]] = {}  # of the sample, by contender
+        self._parts: dict[str, dict[str, str]] = {}  # of the samples, by contender
+        self._check_header()
         for path in sorted(self.folder.glob(f"runs-{session}*.jsonl")):
             with _explain_errors(f"{path} cannot be read"), path.open("rb") as file:
                 for number, line in enumerate(file, 1):
@@ -175,33 +140,44 @@ class Store:
                             f"line {number} of {path} cannot be read, so its run counts as missing"
                         )
 
+    def _check_header(self) -> None:
+        """Check that the folder is the store of this experiment, or can become it."""
+        with _explain_errors(self._unusable):
+            names = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
+            # This comes after the list, because another process may be writing both.
+            if not self._path.exists():
+                if any(not name.startswith((HEADER, ".")) for name in names):
+                    raise OptionValueError(
+                        f"the folder {self.folder} is not empty, and not the store of an experiment"
+                    )
+                return
+            text = self._path.read_bytes()
+        try:
+            content = dict(json.loads(text))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise StoreError(
+                f"{self._path} cannot be read: {error}; restore the file, or pass another folder"
+            ) from error
+        for part, expected in self._header.items():
+            if content.get(part) != expected:
+                raise OptionValueError(
+                    f"the store {self.folder} belongs to another experiment: its {part} are"
+                    f" {content.get(part)}, not {expected}; pass another folder"
+                )
+
     def _add(self, entry: Entry) -> None:
         """Add a run. If the line is damaged, it raises an error and adds nothing."""
-        row = to_json({name: entry["factors"][name] for name in self._factors})
-        row = self._rows.get(row, row)  # so that a text is in memory once
-        run = Run(row, entry["contender"], int(entry["seed"]))
-        provenance = entry["provenance"]
-        result: Result = str(entry["error"])
-        parts: dict[str, str] = {}
+        row = sys.intern(to_json({name: entry["factors"][name] for name in self._factors}))
+        run = Run(row, entry["contender"], entry["seed"])
+        result: Result = entry["error"]
         if entry["status"] == "ok":
-            returns = {name: float(value) for name, value in entry["returns"].items()}
-            result = Outcome(
-                returns,
-                {name: int(entry["lengths"][name]) for name in returns},
-                {name: plain_value(name, value) for name, value in entry["metrics"].items()},
-                entry.get("fallbacks", {}),
-            )
-            is_sample = row in self._rows and self.sample in ("", row)
-            if is_sample and run.contender not in self._parts:
-                parts = _comparable_parts(provenance)
-        # No line below raises an error.
+            result = Outcome(entry["agents"], entry["metrics"])
+            if row in self._rows and run.contender not in self.samples:
+                self._parts[run.contender] = _comparable_parts(entry["provenance"])
+                self.samples[run.contender] = row
+            self.agents[run.contender].update(result.agents)
         if not isinstance(self.runs.get(run), Outcome):
             self.runs[run] = result
-        if isinstance(result, Outcome):
-            self.agents[run.contender].update(result.returns)
-        if parts:
-            self.sample = row
-            self._parts[run.contender] = parts
 
     # -- changes since the runs were stored -------------------------------------------------------
 
@@ -225,44 +201,36 @@ class Store:
                 " the table"
             )
 
-    def warn_of_changes(self, row: str, provenances: Mapping[str, Provenance]) -> None:
-        """Warn if the provenance has changed since the runs were stored.
-
-        ``provenances`` are the present ones of a row, by contender.
-        """
-        for contender, provenance in provenances.items() if row == self.sample else ():
-            now = _comparable_parts(provenance)
-            changes = "; ".join(
-                f"{part} {then[:LONGEST]} then, {now[part][:LONGEST]} now"
-                for part, then in self._parts.get(contender, {}).items()
-                if now.get(part, then) != then
+    def warn_of_changes(self, contender: str, row: str, provenance: Provenance) -> None:
+        """Warn if the provenance of a contender in a row has changed since its runs were stored."""
+        if row != self.samples.get(contender):
+            return
+        now = _comparable_parts(provenance)
+        changes = "; ".join(
+            f"{part} {then[:LONGEST]} then, {now[part][:LONGEST]} now"
+            for part, then in self._parts[contender].items()
+            if now.get(part, then) != then
+        )
+        if changes:
+            warn_user(
+                f"the store {self.folder} holds runs of {contender!r} that were made differently:"
+                f" {changes}; they are kept, so pass another folder if all must be made alike"
             )
-            if changes:
-                warn_user(
-                    f"the store {self.folder} holds runs of {contender!r} that were made"
-                    f" differently: {changes}; they are kept, so pass another folder if all must"
-                    " be made alike"
-                )
-                return
 
 
 def _comparable_parts(provenance: Provenance) -> dict[str, str]:
     """Return the parts of a provenance that affect results, and versions, as texts."""
-    options = dict(provenance["options"])
-    options.pop("driver", None)
-    parts = {part: provenance[part] for part in MADE_OF if part in provenance}
-    parts |= {**provenance["packages"], **provenance["dependencies"], "options": options}
+    parts = {**provenance, **provenance["packages"], **provenance["dependencies"]}
+    options = provenance["options"].items()
+    parts["options"] = {name: value for name, value in options if name != "driver"}
     return {
         name: VARYING.sub("", json.dumps(part, sort_keys=True)).strip('"')
         for name, part in parts.items()
+        if name not in IRRELEVANT
     }
 
 
 # -- writing --------------------------------------------------------------------------------------
-
-
-_processes: dict[tuple[int, int], str] = {}
-"""A unique id for each thread of this process, because threads may be workers."""
 
 
 def make_entry(
@@ -284,23 +252,11 @@ def make_entry(
     return entry | {"provenance": provenance}
 
 
-class Writer:
-    """Appends lines to the file of one process."""
-
-    def __init__(self, folder: Path, session: str) -> None:
-        """Open the file of this process in a session, whose id all its processes share."""
-        process = _processes.setdefault((os.getpid(), threading.get_ident()), uuid4().hex[:12])
-        path = folder / f"runs-{session}-{process}.jsonl"
-        self._unwritable = (
-            f"cannot write to {path}, whose folder all machines must share; stored runs stay"
-        )
-        with _explain_errors(self._unwritable):
-            self._file = path.open("ab", buffering=0)
-        self.close = self._file.close
-
-    def write(self, entry: Entry) -> None:
-        """Append the line of a run."""
-        rest = to_json(entry).encode("ascii") + b"\n"
-        with _explain_errors(self._unwritable):
-            while rest:
-                rest = rest[os.write(self._file.fileno(), rest) :]
+def append(folder: Path, session: str, *entries: Entry) -> None:
+    """Append the lines of runs to the file of this thread in a session, which is made at least."""
+    # Threads may be workers, and machines may share the folder.
+    path = folder / f"runs-{session}-{getnode():x}{os.getpid():x}{get_ident():x}.jsonl"
+    lines = "".join(f"{to_json(entry)}\n" for entry in entries)
+    problem = f"cannot write to {path}, whose folder all machines must share; stored runs stay"
+    with _explain_errors(problem), path.open("a", encoding="ascii") as file:
+        file.write(lines)

@@ -301,7 +301,7 @@ class JointPlayer(Player):
         base: Policy,
     ) -> None:
         super().__init__(env, base, "all agents")
-        observation = self.view.joint.observe(self.episode)
+        observation = self.view.joint.read(self.episode, None)[0]
         self.latest = {self.name: (observation, {})}
         if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
             raise OptionValueError(

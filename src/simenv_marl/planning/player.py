@@ -173,6 +173,7 @@ class Player:
 
     def start(self) -> None:
         """Prepare a branch."""
+        self.view.session.move_to(Where.PLAN)
         self.view.stop_showing()
         if isinstance(self.view, SimulationEnv) and isinstance(self.base, Mapping):
             self.episode.delegate(self.base)  # the simulation answers for all other agents

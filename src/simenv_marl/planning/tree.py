@@ -6,28 +6,28 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from math import log, sqrt
 from threading import Lock
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from ..core import branch, clone, pending_view
 from ..envs import SimulationJointEnv
 from ..errors import BranchError, OptionValueError
-from .player import Environment
 from .rollouts import (
     BEGIN,
+    CHECKS,
+    Checks,
     Indices,
     Rollout,
     RolloutPolicy,
     Rollouts,
     Try,
     is_count,
-    is_number,
-    try_out,
+    is_weight,
 )
 
 _AT_ONCE: Final = 8
@@ -65,15 +65,11 @@ class TreeSearchPolicy(RolloutPolicy):
     depth: int = 2
     exploration: float = 1.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        explores = is_number(self.exploration) and self.exploration >= 0
-        self._check_options(
-            {
-                "depth": (is_count(self.depth), "a number of decisions"),
-                "exploration": (explores, "a number that is not negative"),
-            }
-        )
+    _checks: ClassVar[Checks] = {
+        **CHECKS,
+        "depth": (is_count, "a number of decisions"),
+        "exploration": (is_weight, "a number that is not negative"),
+    }
 
     def _search(
         self,
@@ -208,33 +204,23 @@ class _Tree:
 # -- checkpoints, where there is one exact future: no state is reached twice -----------------------
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """A clone that has taken candidates. It is never stepped again.
-
-    Attributes:
-        env: The clone.
-        begun: The rollout up to there.
-        lock: Held while the clone is cloned, or a clone of it ends.
-    """
-
-    env: Any
-    begun: Rollout
-    lock: Lock = field(default_factory=Lock)
-
-
 class Checkpoints:
-    """The checkpoints of one search, by the candidates that they have taken."""
+    """The checkpoints of one search: clones that have taken candidates, and are not stepped again.
+
+    A lock is held while a clone is cloned, or ends, because the process of the first one waits.
+    """
 
     def __init__(
         self,
-        root: Environment,
+        root: Any,
         rollouts: Rollouts,
     ) -> None:
         """Begin with a clone of the environment, which is the root."""
         self._search = rollouts
-        self._root = Checkpoint(root, BEGIN)
-        self._checkpoints: dict[Indices, Checkpoint] = {(): self._root}
+        self._lock = Lock()
+        self._clones = [root]
+        # The clones and the rollouts up to there, by the candidates that they have taken.
+        self._checkpoints: dict[Indices, tuple[Any, Rollout]] = {(): (root, BEGIN)}
         self._rollouts: dict[Indices, Rollout] = {}
 
     def make(self, tries: Sequence[Try]) -> list[Rollout]:
@@ -249,48 +235,27 @@ class Checkpoints:
     def _make(self, node: Indices) -> Rollout:
         """Make a rollout, and a checkpoint after its candidates."""
         lengths = [length for length in range(len(node)) if node[:length] in self._checkpoints]
-        nearest = self._checkpoints[node[: lengths[-1]]]
-        search = self._search
-        limit = search.policy.time_limit
-        function = partial(
-            try_out,
-            tries=[(node, 0)],
-            actions=search.actions,
-            policy=search.policy,
-        )
-        try:
-            with nearest.lock:
-                env = clone(
-                    nearest.env,
-                    method="fork",
-                    time_limit=limit,
-                )
-        except BranchError:  # the model has opened something since
-            with self._root.lock:
-                [rollout] = branch(
-                    self._root.env,
-                    function,
-                    time_limit=limit,
-                )
-            return rollout
-        is_kept = False
-        try:
-            start = partial(function, begun=nearest.begun, stop=len(node))
-            begun = env.call(start, 0)
-            rollout = begun
-            if not begun.over:
-                finish = partial(function, begun=begun)
-                [rollout] = branch(env, finish, time_limit=limit)
-            is_kept = len(self._checkpoints) < _MOST
-        finally:
-            if not is_kept:
-                with nearest.lock:  # because its process waits for the clone's end
-                    env.close()
-        if is_kept:
-            self._checkpoints[node] = Checkpoint(env, begun)
+        nearest, begun = self._checkpoints[node[: lengths[-1]]]
+        function = self._search.trying([(node, 0)])
+        limit = self._search.policy.time_limit
+        with self._lock:
+            try:
+                env = clone(nearest, method="fork", time_limit=limit)
+            except BranchError:  # the model has opened something since
+                [rollout] = branch(self._clones[0], function, time_limit=limit)
+                return rollout
+        self._clones.append(env)
+        rollout = env.call(partial(function, begun=begun, stop=len(node)), 0)
+        if len(self._checkpoints) < _MOST:
+            self._checkpoints[node] = env, rollout
+        if not rollout.over:
+            [rollout] = branch(env, partial(function, begun=rollout), time_limit=limit)
+        if node not in self._checkpoints:
+            with self._lock:
+                env.close()
         return rollout
 
     def close(self) -> None:
         """Close all clones."""
-        for checkpoint in self._checkpoints.values():
-            checkpoint.env.close()
+        for env in self._clones:
+            env.close()

@@ -1,6 +1,7 @@
 """The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
 from collections.abc import Collection, Mapping
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,9 @@ class Joint:
         observations = {}
         actions = {}
         for name, point in self.roster.items():
-            observations[name] = point.definition.observation_space
-            actions[name] = point.definition.action_space
+            # Copies, because agents may share a space, and each draws from its own generator.
+            observations[name] = deepcopy(point.definition.observation_space)
+            actions[name] = deepcopy(point.definition.action_space)
         self.observation_space: Space = spaces.Dict(observations)
         self.action_space: Space = spaces.Dict(actions)
         self._flatten = plan.options.flatten
@@ -73,9 +75,10 @@ class Joint:
                 )
             return {name: action[self._places[name]] for name in live}
         if not isinstance(action, Mapping) or set(action) != set(self.roster):
+            keys = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
                 f"a joint action is a dict with an action for each of {', '.join(self.roster)};"
-                f" given: {short_repr(action)}"
+                f" given: {short_repr(keys)}"
             )
         return {name: action[name] for name in live}
 

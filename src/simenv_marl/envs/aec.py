@@ -63,9 +63,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Observation, Action]):
             BaseException: Any exception of the model, a mapping or a policy.
         """
         episode = self.session.episode
-        if episode is None or (self._lock and not self._lock.held):
-            self._step_in_lock(SimulationAECEnv.step, action)
-            return
+        if episode is None:
+            raise self.session.refusal()
         if self._leaving:
             self._dead_step(episode, action)
             return

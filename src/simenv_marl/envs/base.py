@@ -21,7 +21,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..core import (
-    Action,
     Agent,
     BaseSession,
     EpisodeState,
@@ -56,7 +55,7 @@ ResetOptions: TypeAlias = dict[str, Any] | None
 StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
 """Observation, reward, terminated, truncated, info."""
 
-_NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session"))
+_NOT_COPIED = frozenset(("_finalizer", "_roster", "joint", "own_agent", "session"))
 """The attributes that each view makes for itself."""
 
 
@@ -116,7 +115,6 @@ class View:
         """
         plan = session.plan
         self.session = session
-        self._lock = session.lock
         self._finalizer = weakref.finalize(self, session.abandon) if owned else None
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
@@ -323,17 +321,6 @@ class View:
             if self._shows:
                 self.show_reset()
             return results
-
-    def _step_in_lock(self, step: Callable[..., Result], action: Action) -> Result:
-        """Take a step with the lock of the thread driver, or refuse it without an episode.
-
-        The lock also covers the reading of the results. No other method takes it for a step.
-        """
-        session = self.session
-        if session.episode is None:
-            raise session.refusal()
-        with session.exclusive:
-            return step(self, action)
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode, and forget its records unless that was refused."""

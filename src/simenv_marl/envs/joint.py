@@ -188,8 +188,8 @@ class SimulationJointEnv(OneAgentView):
             BaseException: Any other error of ``SimulationAECEnv.step``.
         """
         episode = self.session.episode
-        if episode is None or (self._lock and not self._lock.held):
-            return self._step_in_lock(SimulationJointEnv.step, action)
+        if episode is None:
+            raise self.session.refusal()
         episode.step(self.joint.actions(episode, action))
         if self._shows:
             self.show_step()

@@ -80,8 +80,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
         episode = self.session.episode
-        if episode is None or (self._lock and not self._lock.held):
-            return self._step_in_lock(SimulationParallelEnv.step, actions)
+        if episode is None:
+            raise self.session.refusal()
         if not self.agents and not actions and (episode.terminated or episode.truncated):
             return {}, {}, {}, {}, {}  # as PettingZoo's own environments do
         if isinstance(actions, Sentinel):

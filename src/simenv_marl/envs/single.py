@@ -134,8 +134,8 @@ class SimulationEnv(OneAgentView):
             BaseException: Any error of ``SimulationAECEnv.step``.
         """
         episode = self.session.episode
-        if episode is None or (self._lock and not self._lock.held):
-            return self._step_in_lock(SimulationEnv.step, action)
+        if episode is None:
+            raise self.session.refusal()
         episode.step(action)
         if self._shows:
             self.show_step()

@@ -162,7 +162,12 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
                 simulation. Then all of them need a reset; the ones after it have not been reset.
         """
         with self._exclusive():
-            seeds = self._seeds(seed)
+            if seed is None:
+                seed = [None] * self.num_envs
+            elif isinstance(seed, (int, np.integer)):
+                seed = [seed, *range(seed + 1, seed + self.num_envs)]
+            self._check_number(seed, "seeds")
+            seeds = [checked_seed(part) for part in seed]
             chosen, options = self._chosen(options)
             results = self._simulations.ask("reset", seeds, options, chosen)
             self._begun = True
@@ -283,14 +288,6 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             chain.from_iterable(self._simulations.ask("check", parts, self._ended.tolist()))
         )
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            seed = [seed, *range(seed + 1, seed + self.num_envs)]
-        self._check_number(seed, "seeds")
-        return [checked_seed(part) for part in seed]
-
     def _check_number(self, items: Sized, noun: str) -> None:
         if len(items) != self.num_envs:
             raise OptionValueError(f"there are {len(items)} {noun} for {self.num_envs} simulations")
@@ -301,14 +298,12 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             return np.ones(self.num_envs, np.bool_), options
         others = dict(options)
         mask = others.pop("reset_mask")
-        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_
+        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.any()
         if not is_mask or mask.shape != (self.num_envs,):
             raise OptionValueError(
-                f"reset_mask must be a bool array of shape ({self.num_envs},), not"
-                f" {short_repr(mask)}"
+                f"reset_mask must be a bool array of shape ({self.num_envs},) that selects a"
+                f" simulation to reset, not {short_repr(mask)}"
             )
-        if not mask.any():
-            raise OptionValueError("reset_mask selects no simulation to reset")
         if not mask.all():
             self._check_begun()
         return mask, others

@@ -153,7 +153,7 @@ class Player:
                 f"the action {short_repr(action)} of {self.name!r} is not in {short_repr(space)}"
             )
 
-    def check_base(self) -> None:
+    def check(self) -> None:
         """Refuse a base that cannot decide in branches, or names an agent that does not exist."""
         _check_policy(self.base)
         if not isinstance(self.base, Mapping):
@@ -170,6 +170,11 @@ class Player:
                 )
 
     # -- in a branch ------------------------------------------------------------------------------
+
+    @property
+    def is_planned(self) -> bool:
+        """Whether a planner already tries a candidate in the environment."""
+        return self.episode.where is Where.PLAN
 
     def start(self) -> None:
         """Prepare a branch."""
@@ -345,12 +350,9 @@ class AECPlayer(Player):
 
     view: SimulationAECEnv
 
-    def __init__(
-        self,
-        env: Environment,
-        base: Policy,
-    ) -> None:
-        super().__init__(env, base)
+    def check(self) -> None:
+        """Refuse a base as in other views, and a decision whose agent is not selected."""
+        super().check()
         selected = self.view.agent_selection
         if selected != self.name:
             raise EpisodeOverError(

@@ -23,7 +23,6 @@ from ..core import (
     AskingPolicy,
     Info,
     Policy,
-    Where,
     branch,
     checked_seed,
     is_seed,
@@ -31,7 +30,7 @@ from ..core import (
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
-from .player import Environment, player_of
+from .player import Environment, Player, player_of
 from .values import ActionValues, estimate, warn_of_futures, warn_of_times
 
 _KEY: Final = 0x706C616E
@@ -286,10 +285,10 @@ def action_values(
         method=method,
         time_limit=time_limit,
     )
-    planned = _base_value(env, base)
-    if planned is not None:
-        return planned
-    rollouts = Rollouts(env, policy)
+    player = player_of(env, base)
+    if player.is_planned:
+        return _base_value(player)
+    rollouts = Rollouts(player, policy)
     candidates = range(len(rollouts.actions))
     with progress_bar(len(candidates) * futures, progress, "branch") as bar:
         for number in [1] * futures if progress else [futures]:
@@ -299,12 +298,9 @@ def action_values(
     return rollouts.values(best)
 
 
-def _base_value(env: Environment, base: Policy) -> ActionValues | None:
-    """Where a planner tries a candidate, return the base's answer as the best. Elsewhere None."""
-    player = player_of(env, base)
-    if player.episode.where is Where.PLAN:
-        return estimate([player.decide()], [[]], 0)
-    return None
+def _base_value(player: Player) -> ActionValues:
+    """Return the base's answer as the best action, as planners act in branches."""
+    return estimate([player.decide()], [[]], 0)
 
 
 class Rollouts:
@@ -324,7 +320,7 @@ class Rollouts:
 
     def __init__(
         self,
-        env: Environment,
+        player: Player,
         policy: RolloutPolicy,
         *,
         planner: bool = False,
@@ -333,10 +329,9 @@ class Rollouts:
 
         For a ``planner``, leave out masked candidates, and add ``RULE``.
         """
-        self.env = env
+        self.env = player.env
         self.policy = policy
-        player = player_of(env, policy.base)
-        player.check_base()
+        player.check()
         episode = player.episode
         is_timed = "time" in (policy.discount_by, policy.horizon_by)
         if is_timed and episode.clock is None:
@@ -537,10 +532,10 @@ class RolloutPolicy:
             OptionValueError: The budget is too small to try each candidate.
             BaseException: As ``action_values``.
         """
-        planned = _base_value(env, self.base)
-        if planned is not None:
-            return planned
-        rollouts = Rollouts(env, self, planner=True)
+        player = player_of(env, self.base)
+        if player.is_planned:
+            return _base_value(player)
+        rollouts = Rollouts(player, self, planner=True)
         number = len(rollouts.actions)
         budget = self.budget
         if budget is None:

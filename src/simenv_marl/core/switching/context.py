@@ -35,13 +35,6 @@ class ExclusiveLock:
         self._lock = RLock()
         self._process = getpid()
 
-    @property
-    def held(self) -> bool:
-        """Whether the current thread uses the environment."""
-        # The method is private, but ``threading.Condition`` relies on it, too.
-        is_owned: bool = self._lock._is_owned()  # type: ignore[attr-defined]
-        return is_owned and self._process == getpid()
-
     def __enter__(self) -> None:
         if self._process != getpid():  # after a fork, the thread that held the lock may not exist
             self._lock = RLock()

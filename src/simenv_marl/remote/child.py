@@ -5,7 +5,6 @@ that the simulator never blocks; errors show the last part of it. The simulator 
 group, which ends with it.
 """
 
-import atexit
 import os
 import select
 import signal
@@ -14,7 +13,6 @@ from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
 from typing import Final, Literal, NoReturn, TypeAlias
-from weakref import WeakSet, finalize
 
 from ..errors import (
     ProcessDiedError,
@@ -121,7 +119,6 @@ class Child:
                 f"{command[0]!r} cannot be started: {describe_error(error)}"
             ) from error
         self.pid = self._popen.pid
-        _children.add(self)
         try:
             guardian.guard(self.pid)
             self.hello = self.receive()
@@ -506,24 +503,3 @@ class Child:
             return f"was killed by {signal.Signals(-code).name}"
         except ValueError:
             return f"was killed by signal {-code}"
-
-
-# -- at the end of this process -------------------------------------------------------------------
-
-_children: Final[WeakSet[Child]] = WeakSet()
-
-
-def _close_all() -> None:
-    """Close all simulators. Their inputs end first, so that this process waits for all together."""
-    children = [child for child in _children if child.usable]
-    for child in children:
-        child.break_off()
-        child.close_input()
-    for child in children:
-        child.close()
-
-
-# ``atexit`` calls the latest function first: this one before the finalizers of environments, whose
-# function the first finalizer registers.
-finalize(Child, int).detach()
-atexit.register(_close_all)

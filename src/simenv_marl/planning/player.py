@@ -119,9 +119,7 @@ class Player:
         mask = self.agent.mask
         for action in actions:
             self._check(action, None if legal else mask)
-        candidates = actions
-        if legal:
-            candidates = [action for action in actions if self.allows(action)]
+        candidates = [action for action in actions if not legal or self.allows(action)]
         if not candidates:
             raise InvalidActionError(
                 f"all candidates of {self.name!r} are masked; its mask is {short_repr(mask)}"

@@ -340,20 +340,18 @@ class Rollouts:
             )
         self.actions = player.candidates(policy.actions, legal=planner)
         rules = [index for index, action in enumerate(self.actions) if action is RULE]
-        self.rule = (rules or [len(self.actions)])[0]
-        self.added = planner and not rules and self.rule > 1
+        number = len(self.actions)
+        self.rule = rules[0] if rules else number
+        self.added = planner and not rules and number > 1
         if self.added:
             self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         self.rollouts: dict[Indices, list[Rollout]] = {}
-        number = episode.turns
-        if isinstance(player.agent.policy, AskingPolicy):
-            number = player.agent.answered
-        name = crc32(player.name.encode(errors="surrogatepass"))
+        agent = player.agent
         self._entropy = [
             episode.seed,
-            number,
-            name,
+            agent.answered if isinstance(agent.policy, AskingPolicy) else episode.turns,
+            crc32(player.name.encode(errors="surrogatepass")),
             _KEY,
         ]
         if policy.seed is not None:
@@ -509,10 +507,10 @@ class RolloutPolicy:
     def __post_init__(self) -> None:
         horizon = is_count if self.horizon_by == "decision" else is_positive
         checks = self._checks | {"horizon": (horizon, _HORIZON)}
-        for name, value in vars(self).items():
-            is_valid, kind = checks.get(name, (None, ""))
+        for name, (is_valid, kind) in checks.items():
+            value = vars(self)[name]
             is_left_out = value is None and name in _OPTIONAL
-            if is_valid is not None and not is_left_out and not is_valid(value):
+            if not is_left_out and not is_valid(value):
                 raise OptionValueError(f"{name} must be {kind}, not {short_repr(value)}")
         self.seed = checked_seed(self.seed)
         if isinstance(self.actions, Iterable) and not isinstance(self.actions, (str, Mapping)):

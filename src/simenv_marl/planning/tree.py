@@ -245,12 +245,13 @@ class Checkpoints:
                 [rollout] = branch(self._clones[0], function, time_limit=limit)
                 return rollout
         self._clones.append(env)
-        rollout = env.call(partial(function, begun=begun, stop=len(node)), 0)
+        reached: Rollout = env.call(partial(function, begun=begun, stop=len(node)), 0)
+        rollout = reached
+        if not reached.over:
+            [rollout] = branch(env, partial(function, begun=reached), time_limit=limit)
         if len(self._checkpoints) < _MOST:
-            self._checkpoints[node] = env, rollout
-        if not rollout.over:
-            [rollout] = branch(env, partial(function, begun=rollout), time_limit=limit)
-        if node not in self._checkpoints:
+            self._checkpoints[node] = env, reached
+        else:
             with self._lock:
                 env.close()
         return rollout

@@ -46,6 +46,7 @@ from ..errors import (
     short_repr,
     warn_user,
 )
+from ..plugins import Entry
 
 Result = TypeVar("Result")
 
@@ -70,6 +71,7 @@ class View:
         set_up            when a view is made or cloned, and when   single, joint, planner
                           another process may have reset it
         _original_spaces  when an agent's spaces are first read     View, joint
+        spaces_of         when a vector environment is made         single, joint
         reset             by the user                               all
         begin             at the first decision of a reset          AEC, parallel, single, joint
         step              by the user                               all
@@ -157,6 +159,15 @@ class View:
     def driver(self) -> str:
         """The name of the driver: "greenlet" or "thread"."""
         return self.session.plan.options.driver
+
+    @property
+    def plugins(self) -> list[Entry]:
+        """The handlers of the option ``plugins``.
+
+        They are tuples of the handler, the dotted name of the target, and the position.
+        """
+        plugins = self.session.plan.plugins
+        return [] if plugins is None else plugins.entries
 
     def provenance(self) -> dict[str, Any]:
         """Return the provenance of this environment, with the seed of its latest episode.

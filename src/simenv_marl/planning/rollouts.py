@@ -417,6 +417,20 @@ class Rollouts:
             self.returns[indices[0]].append(sum(rollout.rewards))
             self.rollouts.setdefault(indices, []).append(rollout)
 
+    def search(self, budget: int) -> Indices:
+        """Try candidates; return the best ones for the next decisions."""
+        left = list(range(len(self.actions)))
+        for rounds in range(ceil(log2(len(left))), 0, -1):
+            most = budget // len(left)
+            number = min(max(1, most // rounds), most)
+            budget -= number * len(left)
+            self.add(left, number)
+            if rounds > 1:
+                left.sort(key=self.mean, reverse=True)
+                left = sorted(left[: (len(left) + 1) // 2])
+        best = max(left, key=self.mean)
+        return (best,)
+
     def is_better_than_rule(self, indices: Indices) -> bool:
         """Return whether candidates have a larger return than the rule.
 
@@ -503,6 +517,7 @@ class RolloutPolicy:
     budget: int | None = None
     margin: float = 1.0
     _checks: ClassVar[Checks] = CHECKS
+    _rollouts: ClassVar[type[Rollouts]] = Rollouts
 
     def __post_init__(self) -> None:
         horizon = is_count if self.horizon_by == "decision" else is_positive
@@ -533,7 +548,7 @@ class RolloutPolicy:
         player = player_of(env, self.base)
         if player.is_planned:
             return _base_value(player)
-        rollouts = Rollouts(player, self, planner=True)
+        rollouts = self._rollouts(player, self, planner=True)
         number = len(rollouts.actions)
         budget = self.budget
         if budget is None:
@@ -544,28 +559,10 @@ class RolloutPolicy:
             )
         if number == 1:
             return rollouts.values(0)
-        best = self._search(rollouts, budget)
+        best = rollouts.search(budget)
         if rollouts.is_better_than_rule(best):
             return rollouts.values(best[0])
         return rollouts.values(rollouts.rule)
-
-    def _search(
-        self,
-        rollouts: Rollouts,
-        budget: int,
-    ) -> Indices:
-        """Try candidates; return the best ones for the next decisions."""
-        left = list(range(len(rollouts.actions)))
-        for rounds in range(ceil(log2(len(left))), 0, -1):
-            most = budget // len(left)
-            number = min(max(1, most // rounds), most)
-            budget -= number * len(left)
-            rollouts.add(left, number)
-            if rounds > 1:
-                left.sort(key=rollouts.mean, reverse=True)
-                left = sorted(left[: (len(left) + 1) // 2])
-        best = max(left, key=rollouts.mean)
-        return (best,)
 
     def __call__(
         self, observation: Observation, info: Info, *, _environment: Environment

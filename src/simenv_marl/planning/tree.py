@@ -40,114 +40,66 @@ _MOST: Final = 200
 """The largest number of checkpoints that are kept. Each takes some megabytes."""
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
-class TreeSearchPolicy(RolloutPolicy):
-    """A policy that looks several decisions ahead, by open-loop UCT over branches.
+class Tree(Rollouts):
+    """The rollouts of sequences of candidates, which are the nodes of a tree.
 
-    At each of the next ``depth`` decisions it tries the candidates that seem best, or that were
-    tried little (UCB1); then the base decides. A node of the tree is a sequence of candidates,
-    for any chance events between them. All candidates for the pending decision meet the same
-    futures in the same order.
-
-    It needs more branches than ``RolloutPolicy``. They pay off if an action is only good with the
-    right actions after it.
-
-    Attributes:
-        actions: The candidates for this decision and the next ones. If a candidate is masked at a
-            next decision, the base decides there.
-        depth: The number of decisions that are tried, including this one.
-        exploration: The weight of exploration, in units of the spread of the returns.
-
-    Raises:
-        OptionValueError: An argument has an invalid value.
+    If ``RULE`` was added to the candidates, as the last one, it is a leaf.
     """
 
-    depth: int = 2
-    exploration: float = 1.0
+    policy: TreeSearchPolicy
 
-    _checks: ClassVar[Checks] = {
-        **CHECKS,
-        "depth": (is_count, "a number of decisions"),
-        "exploration": (is_weight, "a number that is not negative"),
-    }
-
-    def _search(
-        self,
-        rollouts: Rollouts,
-        budget: int,
-    ) -> Indices:
-        tree = _Tree(rollouts, self)
+    def search(self, budget: int) -> Indices:
+        """Try nodes; return the best one."""
+        self._candidates = range(len(self.actions))
+        self._inner = self._candidates[: len(self.actions) - self.added]
+        self._visits: Counter[Indices] = Counter()  # also by tries that are running
+        self._returns: dict[Indices, list[float]] = {}  # from the node's own decision on
+        self._totals: list[float] = []
         checkpoints: Checkpoints | None = None
         try:
             for begin in range(0, budget, _AT_ONCE):
-                tries = [tree.next_try() for _ in range(min(_AT_ONCE, budget - begin))]
-                results = (checkpoints or rollouts).make(tries)
-                rollouts.record(tries, results)
+                tries = [self.next_try() for _ in range(min(_AT_ONCE, budget - begin))]
+                results = (checkpoints or self).make(tries)
+                self.record(tries, results)
                 for (node, _), rollout in zip(tries, results, strict=True):
-                    tree.learn(node, rollout.rewards)
+                    self.learn(node, rollout.rewards)
                 if begin == 0:
-                    checkpoints = self._states_of(rollouts)
+                    checkpoints = self.begin_checkpoints()
         finally:
             if checkpoints is not None:
                 checkpoints.close()
-        if rollouts.reseeds:
-            return tree.best()
-        return max(rollouts.rollouts, key=rollouts.exact_return)
+        if self.reseeds:
+            return self.best()
+        return max(self.rollouts, key=self.exact_return)
 
-    def _states_of(self, rollouts: Rollouts) -> Checkpoints | None:
+    def begin_checkpoints(self) -> Checkpoints | None:
         """Begin to keep checkpoints, if there is one exact future and they save time.
 
         A checkpoint spares a try half of the depth in the mean, and costs a fork. Processes of
         clones have neither the wrappers of an environment nor the infos of joint views.
         """
-        if rollouts.reseeds or self.method == "replay" or self.depth == 1:
+        policy = self.policy
+        if self.reseeds or policy.method == "replay" or policy.depth == 1:
             return None
-        view = pending_view(rollouts.env, "planning")
-        if view is not rollouts.env or isinstance(view, SimulationJointEnv):
+        view = pending_view(self.env, "planning")
+        if view is not self.env or isinstance(view, SimulationJointEnv):
             return None
         began = perf_counter()
         try:
-            root = clone(
-                rollouts.env,
-                method="fork",
-                time_limit=self.time_limit,
-            )
+            root = clone(view, method="fork", time_limit=policy.time_limit)
         except (BranchError, OptionValueError):  # only a replay is possible
             return None
         cost = perf_counter() - began
-        made = chain(*rollouts.rollouts.values())
-        step = max(rollout.seconds for rollout in made)
-        if step * self.depth / 2 > cost:
-            return Checkpoints(root, rollouts)
+        step = max(rollout.seconds for rollout in chain(*self.rollouts.values()))
+        if step * policy.depth / 2 > cost:
+            return Checkpoints(root, self)
         root.close()
         return None
-
-
-class _Tree:
-    """The returns of sequences of candidates, which are the nodes.
-
-    If ``RULE`` was added to the candidates, as the last one, it is a leaf.
-    """
-
-    def __init__(
-        self,
-        rollouts: Rollouts,
-        policy: TreeSearchPolicy,
-    ) -> None:
-        number = len(rollouts.actions)
-        self._candidates = range(number)
-        self._inner = range(number - rollouts.added)
-        self._reseeds = rollouts.reseeds
-        self._depth = policy.depth
-        self._exploration = policy.exploration
-        self._visits: Counter[Indices] = Counter()  # also by tries that are running
-        self._returns: dict[Indices, list[float]] = {}  # from the node's own decision on
-        self._totals: list[float] = []
 
     def next_try(self) -> Try:
         """Choose the next try: descend to an untried node, or to the depth."""
         node: Indices = ()
-        while len(node) < self._depth and (not node or node[0] in self._inner):
+        while len(node) < self.policy.depth and (not node or node[0] in self._inner):
             indices = self._candidates
             if node:
                 indices = self._inner
@@ -162,7 +114,7 @@ class _Tree:
         for length in range(1, len(node) + 1):
             self._visits[node[:length]] += 1
         future = 0
-        if self._reseeds:
+        if self.reseeds:
             future = self._visits[node[:1]] - 1
         return node, future
 
@@ -174,7 +126,7 @@ class _Tree:
         """Return the bound of a node's value: upper for a positive doubt, else lower."""
         returns = self._returns[node]
         spread = max(self._totals) - min(self._totals)
-        error = self._exploration * spread / sqrt(self._visits[node])
+        error = self.policy.exploration * spread / sqrt(self._visits[node])
         return sum(returns) / len(returns) + doubt * error
 
     def learn(
@@ -192,7 +144,7 @@ class _Tree:
         lower = partial(self._bound, doubt=-1.0)
         first = [(index,) for index in self._inner]
         node: Indices = max(first, key=lower)
-        while len(node) < self._depth:
+        while len(node) < self.policy.depth:
             children = [(*node, index) for index in self._inner]
             tried = [child for child in children if child in self._returns]
             if not tried:
@@ -260,3 +212,39 @@ class Checkpoints:
         """Close all clones."""
         for env in self._clones:
             env.close()
+
+
+# -- the policy -----------------------------------------------------------------------------------
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class TreeSearchPolicy(RolloutPolicy):
+    """A policy that looks several decisions ahead, by open-loop UCT over branches.
+
+    At each of the next ``depth`` decisions it tries the candidates that seem best, or that were
+    tried little (UCB1); then the base decides. A node of the tree is a sequence of candidates,
+    for any chance events between them. All candidates for the pending decision meet the same
+    futures in the same order.
+
+    It needs more branches than ``RolloutPolicy``. They pay off if an action is only good with the
+    right actions after it.
+
+    Attributes:
+        actions: The candidates for this decision and the next ones. If a candidate is masked at a
+            next decision, the base decides there.
+        depth: The number of decisions that are tried, including this one.
+        exploration: The weight of exploration, in units of the spread of the returns.
+
+    Raises:
+        OptionValueError: An argument has an invalid value.
+    """
+
+    depth: int = 2
+    exploration: float = 1.0
+
+    _rollouts: ClassVar[type[Rollouts]] = Tree
+    _checks: ClassVar[Checks] = {
+        **CHECKS,
+        "depth": (is_count, "a number of decisions"),
+        "exploration": (is_weight, "a number that is not negative"),
+    }

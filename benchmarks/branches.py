@@ -23,6 +23,7 @@ from benchmarks.measure import Contender, Group, Row, timer, two_cores
 from benchmarks.noop import Alone, Busy, Model, steps
 from simenv_marl import branch, clone, reseed_generators, single_env
 from simenv_marl.planning import TreeSearchPolicy
+from simenv_marl.planning.tree import Tree
 
 BRANCHES, STEPS = 20, 10
 MANY = 64
@@ -114,6 +115,13 @@ def groups(number: int) -> Iterator[Group]:
     yield Group([Row(what, kept, replayed, 0.6, 0.4, unit="ms")], most=3)
 
 
+class ReplayingTree(Tree):
+    """A tree in which each rollout begins at the pending decision."""
+
+    def begin_checkpoints(self) -> None:
+        """Keep no states."""
+
+
 def search(budget: int, *, keeps: bool) -> Contender:
     """Make a contender of a search for one decision, in one exact future, which may keep states."""
     simulation = Busy()
@@ -122,7 +130,7 @@ def search(budget: int, *, keeps: bool) -> Contender:
     env.reset(seed=0)
     policy = TreeSearchPolicy([0, 1], depth=8, horizon=8, budget=budget)
     if not keeps:
-        vars(policy)["_states_of"] = lambda rollouts: None
+        vars(policy)["_rollouts"] = ReplayingTree
     warnings.filterwarnings("ignore", ".*foresees")  # with one future, it does
     return milliseconds(lambda: policy.choose(env), 1)
 

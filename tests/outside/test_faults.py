@@ -49,7 +49,7 @@ IN_MID_EPISODE = {
     "grandchild": (ProcessTimeoutError, "has exited with code 5; it has sent nothing"),
     "updates": (
         WireError,
-        "has sent 100,001 frames of .* bytes since its latest call, and neither a call nor an end",
+        "has sent 100,001 frames since its latest call, and neither a call nor an end",
     ),
     "slow updates": (
         ProcessTimeoutError,

@@ -42,6 +42,7 @@ from simenv_marl.errors import (
     ViewError,
 )
 from simenv_marl.planning import RolloutPolicy, action_values
+from simenv_marl.planning.player import player_of
 from simenv_marl.planning.rollouts import Rollouts
 from tests.conftest import DRIVERS
 from tests.test_branch import METHODS
@@ -64,7 +65,7 @@ def made(view, model=Duel, **options):
 
 
 def futures_of(env, number):
-    return Rollouts(env, RolloutPolicy([RULE])).seeds(number)
+    return Rollouts(player_of(env, RULE), RolloutPolicy([RULE])).seeds(number)
 
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):

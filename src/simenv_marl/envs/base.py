@@ -43,6 +43,7 @@ from ..errors import (
     UnknownOptionError,
     ViewError,
     did_you_mean,
+    listed,
     short_repr,
     warn_user,
 )
@@ -71,6 +72,7 @@ class View:
         set_up            when a view is made or cloned, and when   single, joint, planner
                           another process may have reset it
         _original_spaces  when an agent's spaces are first read     View, joint
+        spaces_of         when a vector environment is made         single, joint
         reset             by the user                               all
         begin             at the first decision of a reset          AEC, parallel, single, joint
         step              by the user                               all
@@ -106,7 +108,7 @@ class View:
     def _attach(
         self,
         session: BaseSession,
-        attributes: dict[str, Any],
+        attributes: dict[str, Model],
         *,
         owned: bool = True,
     ) -> None:
@@ -270,13 +272,13 @@ class View:
         ``reset``.
         """
         plan = self.session.plan
-        if self.render_mode is None:
+        mode = plan.options.picture_mode
+        if mode is None:
             warn_user(
                 "render() shows nothing without a render_mode; the simulation's render modes are"
                 f" {plan.subject.render_modes}"
             )
             return None
-        mode = plan.options.picture_mode
         if mode == self.render_mode:
             return self.session.ask("render", mode)
         frames, self._frames = self._frames, []
@@ -397,9 +399,9 @@ class View:
         live = None if episode is None else episode.agent(agent)
         point = self._roster.get(agent) if live is None else live.point
         if point is None:
-            names = [] if episode is None else list(episode.agents)
+            names = [] if episode is None else episode.agents
             raise UnknownAgentError(
-                f"there is no agent {short_repr(agent)}; the agents now are {names[:10]}"
+                f"there is no agent {short_repr(agent)}; the agents now are {listed(names)}"
                 f"{did_you_mean(agent, names)}"
             )
         return point
@@ -422,7 +424,7 @@ class View:
         """Make an environment like this one, with another simulation. It needs a reset."""
         made = object.__new__(type(self))
         memory[id(self)] = made
-        made.__setstate__(copy.deepcopy(self.__getstate__(), memory))
+        made._imitate(*copy.deepcopy(self._recipe(), memory))
         return made
 
     def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
@@ -436,18 +438,17 @@ class View:
             pickle.dumps(view)
         except Exception:  # generate_env made the class, and its name does not lead to it
             view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-        return _unpickled, (pack((view, self.__getstate__())),)
+        return _unpickled, (pack((view, *self._recipe())),)
 
-    def __getstate__(self) -> tuple[Any, ...]:
+    def _recipe(self) -> tuple[Any, ...]:
         """Return the plan, the session's snapshot and the attributes of a copy.
 
         The attributes include all that users have set.
         """
         return self.session.plan, self.session.snapshot(), self.export_state()
 
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        """Make this environment a copy of the one that has returned a state."""
-        plan, snapshot, attributes = state
+    def _imitate(self, plan: Plan, snapshot: Any, attributes: dict[str, Model]) -> None:
+        """Make this environment a copy of the one that has returned a recipe."""
         session = Session(plan)
         session.restore(snapshot)
         self._attach(session, attributes)
@@ -494,9 +495,9 @@ class View:
 
 def _unpickled(parcel: bytes) -> View:
     """Make the environment that ``View.__reduce_ex__`` has pickled."""
-    view, state = unpack(parcel)
+    view, *recipe = unpack(parcel)
     made: View = view.__new__(view)
-    made.__setstate__(state)
+    made._imitate(*recipe)
     return made
 
 

@@ -12,7 +12,7 @@ from ..core import (
     EpisodeState,
     Info,
     Observation,
-    Point,
+    Plan,
     Space,
     checked_actions,
     duplicate,
@@ -23,25 +23,26 @@ from .base import OneAgentView, StepResult
 
 
 class Joint:
-    """The agents of a roster, combined into one agent.
+    """The agents of a plan, combined into one agent.
 
     Attributes:
         roster: The decision points of the agents, by agent.
         observation_space, action_space: The combined spaces.
     """
 
-    def __init__(self, roster: Mapping[str, Point], *, flatten: bool) -> None:
+    def __init__(self, plan: Plan) -> None:
         """Combine the spaces, or raise ``ViewError`` if they cannot be flattened."""
-        self.roster = roster
+        self.roster = plan.roster
         observations = {}
         actions = {}
-        for name, point in roster.items():
+        for name, point in self.roster.items():
+            # Copies, because agents may share a space, and each draws from its own generator.
             observations[name] = deepcopy(point.definition.observation_space)
             actions[name] = deepcopy(point.definition.action_space)
         self.observation_space: Space = spaces.Dict(observations)
         self.action_space: Space = spaces.Dict(actions)
-        self._flatten = flatten
-        if not flatten:
+        self._flatten = plan.options.flatten
+        if not self._flatten:
             return
         self.observation_space = _concatenate(observations.values())
         self.action_space = _concatenate(actions.values(), discrete=True)
@@ -81,12 +82,15 @@ class Joint:
             )
         return {name: action[name] for name in live}
 
-    def observe(self, episode: EpisodeState) -> Observation:
-        """Return the observations of all agents.
+    def read(self, episode: EpisodeState, before: float | None) -> StepResult:
+        """Return the results of a reset or a step. ``before``: the time of the previous one.
 
-        An agent that has ended keeps its last observation.
+        An agent that has ended keeps its last observation. The reward is the sum of all rewards.
         """
         observations = {}
+        acted = {}
+        masks = {}
+        used = () if episode.round is None else episode.round.acted
         for name in self.roster:
             agent = episode.agents.get(name) or episode.ended[name]
             observation = agent.observation
@@ -94,24 +98,6 @@ class Joint:
                 observations[name] = agent.point.blank()
             else:
                 observations[name] = duplicate(observation)
-        if self._flatten:
-            return np.concatenate(list(observations.values())).astype(self.observation_space.dtype)
-        return observations
-
-    def reward(self, episode: EpisodeState) -> float:
-        """Return the sum of the rewards of a step."""
-        reward = 0.0
-        for agent in (*episode.just_ended, *episode.agents.values()):
-            reward += agent.reward
-        return reward
-
-    def inform(self, episode: EpisodeState, before: float | None) -> Info:
-        """Return the info of a step or a reset. ``before``: the time of the previous one."""
-        acted = {}
-        used = () if episode.round is None else episode.round.acted
-        masks = {}
-        for name in self.roster:
-            agent = episode.agents.get(name) or episode.ended[name]
             acted[name] = name in used
             if agent.mask is not None:
                 masks[name] = duplicate(agent.mask)
@@ -121,7 +107,14 @@ class Joint:
             info["action_mask"] = masks
         if episode.clock is not None:
             info |= episode.clock.read(before)
-        return info
+        reward = 0.0
+        for agent in (*episode.just_ended, *episode.agents.values()):
+            reward += agent.reward
+        joined: Observation = observations
+        if self._flatten:
+            parts = list(observations.values())
+            joined = np.concatenate(parts).astype(self.observation_space.dtype)
+        return joined, reward, episode.terminated, episode.truncated, info
 
 
 class SimulationJointEnv(OneAgentView):
@@ -162,12 +155,17 @@ class SimulationJointEnv(OneAgentView):
             agents = session.start(0, None, in_rounds=True).agents
             roster = {name: agent.point for name, agent in agents.items()}
             session.declare(session.plan.declared(roster))
-        plan = session.plan
-        self._roster = plan.roster
-        self.joint = Joint(plan.roster, flatten=plan.options.flatten)
+        self._roster = session.plan.roster
+        self.joint: Joint = session.plan.derive(Joint)
+
+    @classmethod
+    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
+        """Return the combined spaces of a plan's agents."""
+        joint: Joint = plan.derive(Joint)
+        return joint.observation_space, joint.action_space
 
     def _original_spaces(self, agent: str) -> tuple[Space, Space]:
-        return self.joint.observation_space, self.joint.action_space
+        return self.spaces_of(self.session.plan)
 
     def step(self, action: Action) -> StepResult:
         """Play a round with an action for each agent.
@@ -195,27 +193,19 @@ class SimulationJointEnv(OneAgentView):
         episode.step(self.joint.actions(episode, action))
         if self._shows:
             self.show_step()
-        observation, reward, info = self.read(episode)
-        return (
-            observation,
-            reward,
-            episode.terminated,
-            episode.truncated,
-            info,
-        )
+        return self.read(episode)
 
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Return the observation and the info of a reset."""
         self._last_time = None
-        observation, _, info = self.read(episode)
+        observation, *_, info = self.read(episode)
         return observation, info
 
-    def read(self, episode: EpisodeState) -> tuple[Observation, float, Info]:
-        """Return the observation, the reward and the info of a step."""
-        joint = self.joint
-        info = joint.inform(episode, self._last_time)
-        self._last_time = info.get("time")
-        return joint.observe(episode), joint.reward(episode), info
+    def read(self, episode: EpisodeState) -> StepResult:
+        """Return the results of a step."""
+        results = self.joint.read(episode, self._last_time)
+        self._last_time = results[-1].get("time")
+        return results
 
     def validate(self, action: Action) -> Action:
         """Validate a joint action, as far as possible before the simulation moves."""

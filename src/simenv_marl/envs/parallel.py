@@ -7,12 +7,10 @@ from pettingzoo import ParallelEnv
 
 from ..core import (
     Action,
-    Agent,
     EpisodeState,
     Info,
     Observation,
     Round,
-    duplicate,
 )
 from ..errors import warn_user
 from ..simulation import Sentinel
@@ -123,14 +121,14 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         acted = () if episode.round is None else episode.round.acted
         if ended:
             agents = {agent.name: agent for agent in ended} | agents
-        is_pending = pending is not None
-        terminations = dict.fromkeys(agents, not is_pending and episode.terminated)
-        truncations = dict.fromkeys(agents, not is_pending and episode.truncated)
+        terminations = dict.fromkeys(agents, pending is None and episode.terminated)
+        truncations = dict.fromkeys(agents, pending is None and episode.truncated)
         observations = {}
         rewards = {}
         infos = {}
         for name, agent in agents.items():
-            observations[name] = self._hand_out(agent)
+            observation = agent.observation
+            observations[name] = agent.point.blank() if observation is None else observation
             rewards[name] = agent.reward
             info = agent.info
             infos[name] = info
@@ -147,16 +145,5 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
             infos,
         )
 
-    def _hand_out(self, agent: Agent) -> Observation:
-        """Return an observation that the caller may change."""
-        observation = agent.observation
-        if observation is None:
-            return agent.point.blank()
-        if observation is self._handed_out.get(agent.name):  # it could not be observed anew
-            return duplicate(observation)
-        self._handed_out[agent.name] = observation
-        return observation
-
     def _clear(self) -> None:
         self.agents = []
-        self._handed_out: dict[str, Observation] = {}

@@ -23,6 +23,7 @@ from ..core import (
     Observation,
     Plan,
     Points,
+    Space,
     make_plan,
 )
 from ..errors import CopyError, ReentrancyError, ViewError
@@ -106,6 +107,12 @@ class SimulationEnv(OneAgentView):
             plan = plan.redefined(point.hook, changed)
         return super().adapt(plan)
 
+    @classmethod
+    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
+        """Return the spaces of the agent of an adapted plan."""
+        definition = plan.active[0].definition
+        return definition.observation_space, definition.action_space
+
     def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
         """Note the agent of a new episode; return its observation and info."""
         name = self._agent_name
@@ -146,10 +153,17 @@ class SimulationEnv(OneAgentView):
             agent.info,
         )
 
-    def read(self, episode: EpisodeState) -> tuple[Observation, float, Info]:
-        """Return the observation, the reward and the info of a step."""
+    def read(self, episode: EpisodeState) -> StepResult:
+        """Return the results of a step."""
         agent = self.own_agent
-        return agent.observation, agent.reward, agent.info
+        is_over = episode.pending is None and not agent.ended
+        return (
+            agent.observation,
+            agent.reward,
+            agent.ended or (is_over and episode.terminated),
+            is_over and episode.truncated,
+            agent.info,
+        )
 
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision, before the simulation moves."""

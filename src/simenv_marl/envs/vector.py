@@ -3,9 +3,11 @@
 import weakref
 from collections.abc import Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
+from copy import deepcopy
 from itertools import chain
+from multiprocessing.context import BaseContext
 from threading import Lock
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -24,6 +26,7 @@ from ..core import (
     is_seed,
     stacker,
 )
+from ..decision import decision_points
 from ..errors import (
     ClosedError,
     CopyError,
@@ -37,7 +40,15 @@ from ..errors import (
 from ..many.parallel import WorkerPool
 from ..simulation import RULE
 from .base import OneAgentView, ResetOptions
-from .vector_batch import Infos, SimulationBatch
+from .joint import SimulationJointEnv
+from .single import SimulationEnv, plan_of
+from .vector_batch import Infos, SimulationBatch, make_batch
+
+VIEWS: Final[Mapping[str, type[SimulationEnv | SimulationJointEnv]]] = {
+    "single": SimulationEnv,
+    "joint": SimulationJointEnv,
+}
+"""The views that can be stepped together."""
 
 
 class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
@@ -60,13 +71,13 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         simulation: Model,
         points: Points,
         options: Mapping[str, Any],
-        view: str | None = None,
+        view: str | None,
         *,
         num_envs: int,
-        workers: int = 0,
-        copy: bool = True,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        context: Any = None,
+        workers: int,
+        copy: bool,
+        autoreset_mode: AutoresetMode | str,
+        context: BaseContext | str | None,
     ) -> None:
         """Make the environment. ``vector_env`` explains the arguments.
 
@@ -84,31 +95,42 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
                 f"autoreset_mode must be one of {modes}, not {short_repr(autoreset_mode)}"
             ) from None
         self._copy = copy
-        batch = SimulationBatch(
-            simulation,
-            points,
-            options,
-            view,
-            self._mode,
-            range(0 if workers else self.num_envs),
-        )
-        self.render_mode = batch.plan.options.render_mode
-        self.metadata = {**batch.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space = batch.observation_space
-        self.single_action_space = batch.action_space
+        plan = plan_of(simulation, points, options)
+        if view is None:
+            view = "joint" if plan.one_agent is None else "single"
+        kind = VIEWS.get(view)
+        if kind is None:
+            raise OptionValueError(
+                f'view must be None, "single" or "joint", not {short_repr(view)}'
+            )
+        if kind.in_rounds and not plan.complete:
+            first = kind(plan)  # finds all agents
+            first.close()
+            plan = first.session.plan
+            options = {**options, "possible_agents": plan.options.possible_agents}
+        self.render_mode = plan.options.render_mode
+        self.metadata = {**kind.metadata_of(plan), "autoreset_mode": self._mode}
+        single_spaces = deepcopy(kind.spaces_of(kind.adapt(plan)))
+        self.single_observation_space, self.single_action_space = single_spaces
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._checks_spaces_only = batch.checks_spaces_only
+        # Whether each action of the action space is legal, at any time.
+        self._checks_spaces_only = not kind.in_rounds and plan.active[0].legal is None
         self._begun = False
-        # The simulations whose next episode begins with the next step or reset.
-        self._ended: set[int] = set()
-        self._simulations: SimulationBatch | WorkerPool = batch
+        # Whether the next episode of each simulation begins with the next step or reset.
+        self._ended = np.zeros(self.num_envs, np.bool_)
+        settings = kind, self.single_observation_space, self._mode
+        self._simulations: SimulationBatch | WorkerPool
         if workers:
-            self._simulations = WorkerPool(
-                SimulationBatch, batch.arguments, self.num_envs, workers, context
-            )
+            names = [point.name for point in plan.subject.named]
+            if points is None and names == decision_points():  # others may be there
+                points = names
+            arguments = simulation, points, options, *settings
+            self._simulations = WorkerPool(make_batch, arguments, self.num_envs, workers, context)
             self._stack = stacker(self.single_observation_space, cast=True)
             self._stacked = create_empty_array(self.single_observation_space, self.num_envs)
+        else:
+            self._simulations = SimulationBatch(plan, *settings, range(self.num_envs))
         weakref.finalize(self, self._simulations.abandon)
         self._lock = Lock()
         self.closed = False
@@ -144,7 +166,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             chosen, options = self._chosen(options)
             results = self._simulations.ask("reset", seeds, options, chosen)
             self._begun = True
-            self._ended.difference_update(chosen.nonzero()[0].tolist())
+            self._ended[chosen] = False
             observations, infos = self._join(results)
         return observations, self._merge(infos)
 
@@ -170,15 +192,18 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         """
         with self._exclusive():
             self._check_begun()
-            if self._ended and self._mode == AutoresetMode.DISABLED:
+            if self._mode == AutoresetMode.DISABLED and self._ended.any():
+                numbers = self._ended.nonzero()[0][:10].tolist()
                 raise EpisodeOverError(
-                    f"the episodes of the sub-environments {sorted(self._ended)[:10]} are over;"
+                    f"the episodes of the sub-environments {numbers} are over;"
                     " begin the next ones"
                     ' with reset(options={"reset_mask": ...})'
                 )
-            results = self._simulations.ask("step", self._split(actions), self._ended)
-            observations, rewards, terminations, truncations, ended, infos = self._join(results)
-            self._ended = set(ended)
+            ended = self._ended.tolist()
+            results = self._simulations.ask("step", self._split(actions), ended)
+            observations, rewards, terminations, truncations, infos = self._join(results)
+            if self._mode != AutoresetMode.SAME_STEP:
+                self._ended = terminations | truncations
         return (
             observations,
             rewards,
@@ -254,7 +279,9 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
                 f"there are {len(parts)} actions for {self.num_envs} simulations:"
                 f" {short_repr(actions)}"
             )
-        return list(chain.from_iterable(self._simulations.ask("check", parts, self._ended)))
+        return list(
+            chain.from_iterable(self._simulations.ask("check", parts, self._ended.tolist()))
+        )
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:

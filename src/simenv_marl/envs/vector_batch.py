@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -17,14 +16,15 @@ from ..core import (
     Info,
     Model,
     Observation,
+    Plan,
     Points,
     Session,
+    Space,
     UnmatchedNames,
     close_all,
     stacker,
 )
-from ..decision import decision_points
-from ..errors import InvalidActionError, OptionValueError, annotate, short_repr
+from ..errors import InvalidActionError, annotate
 from ..many.batch import step_all
 from .base import ResetOptions
 from .joint import SimulationJointEnv
@@ -41,64 +41,28 @@ class SimulationBatch:
     *number* is the one in the vector environment, its *place* the one in this batch.
 
     Attributes:
-        arguments: The arguments that make the same in another process, completed by everything that
-            only this process can find out.
-        plan: The plan of the sessions.
         views: The Gymnasium environments of the sub-environments.
-        checks_spaces_only: Whether each action of the action space is legal, at any time.
         failed: Whether an error has left them at different steps, so that all of them need a reset.
     """
 
     def __init__(
         self,
-        simulation: Model,
-        points: Points,
-        options: Mapping[str, Any],
-        view: str | None,
+        plan: Plan,
+        view: type[SimulationEnv | SimulationJointEnv],
+        space: Space,
         mode: AutoresetMode,
         part: range,
     ) -> None:
-        """Make the simulations, by arguments of ``vector_env``.
+        """Make the simulations. ``part``: the numbers of the sub-environments.
 
-        A joint view may need the reset of another simulation. ``part``: the numbers of the
-        sub-environments.
+        ``space``: the space of their observations.
         """
-        plan = plan_of(simulation, points, options)
-        names = [point.name for point in plan.subject.named]
-        if points is None and names == decision_points():
-            points = names
-        if view is None:
-            view = "joint" if plan.one_agent is None else "single"
-        kind: type[SimulationEnv | SimulationJointEnv] = SimulationEnv
-        if view == "single":
-            plan = SimulationEnv.adapt(plan)
-            definition = plan.active[0].definition
-            self.observation_space = deepcopy(definition.observation_space)
-            self.action_space = deepcopy(definition.action_space)
-        elif view == "joint":
-            kind = SimulationJointEnv
-            first = SimulationJointEnv(plan)
-            first.close()
-            plan = first.session.plan
-            options = {**options, "possible_agents": plan.options.possible_agents}
-            self.observation_space = first.observation_space
-            self.action_space = first.action_space
-        else:
-            raise OptionValueError(
-                f'view must be None, "single" or "joint", not {short_repr(view)}'
-            )
-        self.plan = plan
-        self.metadata = kind.metadata_of(plan)
-        self.checks_spaces_only = view == "single" and plan.active[0].legal is None
-        self.arguments = simulation, points, options, view, mode
+        plan = view.adapt(plan)
         self._mode = mode
         self._part = part
         self._shows = plan.options.shows
-        self._stack = stacker(self.observation_space, cast=True)
-        self._stacked = create_empty_array(self.observation_space, len(part))
-        self._observations: list[Observation] = [None] * len(part)
-        self._first: int | None = None  # the place that moves first in a reset or a step
         self.failed = False
+        self._first: int | None = None  # the place that moves first in a reset or a step
         self._sessions: list[Session] = []
         unmatched = UnmatchedNames(plan.named_agents)
         for number in part:
@@ -108,7 +72,10 @@ class SimulationBatch:
                 annotate(error, f"simenv_marl: in sub-environment {number}")
                 self.abandon()
                 raise
-        self.views = [kind.of_session(session) for session in self._sessions]
+        self.views = [view.of_session(session) for session in self._sessions]
+        self._stack = stacker(space, cast=True)
+        self._stacked = create_empty_array(space, len(part))
+        self._observations: list[Observation] = [None] * len(part)
 
     def ask(self, method: str, *arguments: Any) -> list[Any]:
         """Call a method; return a list of its result, as ``WorkerPool.ask`` does."""
@@ -138,11 +105,11 @@ class SimulationBatch:
     def check(
         self,
         actions: list[Action],
-        ended: set[int],
+        ended: list[bool],
     ) -> list[Action]:
         """Check the actions that will be used; return them in the form that mappings take."""
         for place, number in enumerate(self._part):
-            if number in ended:
+            if ended[place]:
                 continue
             try:
                 actions[place] = self.views[place].validate(actions[place])
@@ -153,38 +120,33 @@ class SimulationBatch:
     def step(
         self,
         actions: Sequence[Action],
-        ended: set[int],
+        ended: list[bool],
     ) -> tuple[Any, ...]:
         """Answer all pending decisions by checked actions, or begin the next episode after an end.
 
         Returns:
-            Observations, rewards, terminations, truncations, the numbers of the sub-environments
-            that have ended now, and infos.
+            Observations, rewards, terminations, truncations, and infos.
         """
-        begun = [place for place, number in enumerate(self._part) if number in ended]
-        self._first = None if begun else 0
-        for place in begun:
-            self._begin(place)
+        self._first = None if any(ended) else 0
+        for place, is_over in enumerate(ended):
+            if is_over:
+                self._begin(place)
         episodes = self._move(actions, ended)
         rewards = []
         terminations, truncations = np.zeros((2, len(episodes)), np.bool_)
-        ends = []
         infos = []
         for place, number in enumerate(self._part):
-            episode = episodes[place]
-            self._observations[place], reward, info = self.views[place].read(episode)
-            rewards.append(0.0 if number in ended else reward)
-            if episode.pending is None and not episode.unreported_end:  # else a later step ends it
-                removed = not episode.in_rounds and self.plan.one_agent in episode.ended
-                terminations[place] = removed or episode.terminated
-                truncations[place] = episode.truncated and not removed
+            results = self.views[place].read(episodes[place])
+            observation, reward, terminated, truncated, info = results
+            self._observations[place] = observation
+            rewards.append(0.0 if ended[place] else reward)
+            # Where the agent has ended during the reset, a later step reports it.
+            if (terminated or truncated) and not episodes[place].unreported_end:
+                terminations[place] = terminated
+                truncations[place] = truncated
                 if self._mode == AutoresetMode.SAME_STEP:
-                    infos.append(
-                        (number, {"final_obs": self._observations[place], "final_info": info})
-                    )
+                    infos.append((number, {"final_obs": observation, "final_info": info}))
                     info = self._begin(place)
-                else:
-                    ends.append(number)
             if info:
                 infos.append((number, info))
         if self._shows:
@@ -195,16 +157,15 @@ class SimulationBatch:
             np.array(rewards, np.float64),
             terminations,
             truncations,
-            ends,
             infos,
         )
 
-    def _move(self, actions: Sequence[Action], ended: set[int]) -> list[Episode]:
+    def _move(self, actions: Sequence[Action], ended: list[bool]) -> list[Episode]:
         """Step all episodes that have not just begun after an end; return all."""
         episodes = [session.episode for session in self._sessions if session.episode]
         if len(episodes) < len(self._sessions):  # a view was closed
             raise next(s.refusal() for s in self._sessions if s.episode is None)
-        places = [place for place, number in enumerate(self._part) if number not in ended]
+        places = [place for place, is_over in enumerate(ended) if not is_over]
         step_all(
             [episodes[place] for place in places],
             [actions[place] for place in places],
@@ -280,3 +241,13 @@ class SimulationBatch:
         """Unwind all simulations, from a finalizer. Warn of errors instead of raising them."""
         for session in self._sessions:
             session.abandon()
+
+
+def make_batch(
+    simulation: Model,
+    points: Points,
+    options: Mapping[str, Any],
+    *arguments: Any,
+) -> SimulationBatch:
+    """Make a batch in a worker. ``arguments``: the ones of ``SimulationBatch`` after the plan."""
+    return SimulationBatch(plan_of(simulation, points, options), *arguments)

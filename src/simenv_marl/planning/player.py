@@ -119,9 +119,7 @@ class Player:
         mask = self.agent.mask
         for action in actions:
             self._check(action, None if legal else mask)
-        candidates = actions
-        if legal:
-            candidates = [action for action in actions if self.allows(action)]
+        candidates = [action for action in actions if not legal or self.allows(action)]
         if not candidates:
             raise InvalidActionError(
                 f"all candidates of {self.name!r} are masked; its mask is {short_repr(mask)}"
@@ -153,7 +151,7 @@ class Player:
                 f"the action {short_repr(action)} of {self.name!r} is not in {short_repr(space)}"
             )
 
-    def check_base(self) -> None:
+    def check(self) -> None:
         """Refuse a base that cannot decide in branches, or names an agent that does not exist."""
         _check_policy(self.base)
         if not isinstance(self.base, Mapping):
@@ -171,8 +169,14 @@ class Player:
 
     # -- in a branch ------------------------------------------------------------------------------
 
+    @property
+    def is_planned(self) -> bool:
+        """Whether a planner already tries a candidate in the environment."""
+        return self.episode.where is Where.PLAN
+
     def start(self) -> None:
         """Prepare a branch."""
+        self.view.session.move_to(Where.PLAN)
         self.view.stop_showing()
         if isinstance(self.view, SimulationEnv) and isinstance(self.base, Mapping):
             self.episode.delegate(self.base)  # the simulation answers for all other agents
@@ -301,7 +305,7 @@ class JointPlayer(Player):
         base: Policy,
     ) -> None:
         super().__init__(env, base, "all agents")
-        observation = self.view.joint.observe(self.episode)
+        observation = self.view.joint.read(self.episode, None)[0]
         self.latest = {self.name: (observation, {})}
         if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
             raise OptionValueError(
@@ -344,12 +348,9 @@ class AECPlayer(Player):
 
     view: SimulationAECEnv
 
-    def __init__(
-        self,
-        env: Environment,
-        base: Policy,
-    ) -> None:
-        super().__init__(env, base)
+    def check(self) -> None:
+        """Refuse a base as in other views, and a decision whose agent is not selected."""
+        super().check()
         selected = self.view.agent_selection
         if selected != self.name:
             raise EpisodeOverError(

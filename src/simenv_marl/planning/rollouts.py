@@ -9,11 +9,11 @@ import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from math import ceil, inf, isfinite, log2
 from numbers import Real
 from time import perf_counter
-from typing import Any, Final, TypeGuard
+from typing import Any, ClassVar, Final, TypeAlias, TypeGuard
 from zlib import crc32
 
 import numpy as np
@@ -23,16 +23,14 @@ from ..core import (
     AskingPolicy,
     Info,
     Policy,
-    Where,
     branch,
     checked_seed,
     is_seed,
-    pending_view,
 )
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..many.parallel import progress_bar
 from ..simulation import RULE, Action, Observation
-from .player import Environment, player_of
+from .player import Environment, Player, player_of
 from .values import ActionValues, estimate, warn_of_futures, warn_of_times
 
 _KEY: Final = 0x706C616E
@@ -103,19 +101,14 @@ def try_out(
     indices, future = tries[number]
     path = [actions[index] for index in indices]
     began = perf_counter()
-    pending_view(env, "planning").session.move_to(Where.PLAN)
     try:
         player = player_of(env, policy.base)
         player.start()
         rewards = list(begun.rewards)
         times = list(begun.times)
         now = player.time()
-        start = begun.start
-        if start is None:
-            start = now
-        horizon = policy.horizon
-        if horizon is None:
-            horizon = inf
+        start = now if begun.start is None else begun.start
+        horizon = policy.horizon or inf
         while not player.over and len(rewards) != stop:
             decision = len(rewards)
             elapsed = {
@@ -181,6 +174,38 @@ def is_number(value: object) -> TypeGuard[float]:
 def is_count(value: object) -> TypeGuard[int]:
     """Return whether a value is a positive integer."""
     return is_seed(value) and value != 0
+
+
+def is_positive(value: object) -> TypeGuard[float]:
+    """Return whether a value is a positive number."""
+    return is_number(value) and value > 0
+
+
+def is_weight(value: object) -> TypeGuard[float]:
+    """Return whether a value is a number that is not negative."""
+    return is_number(value) and value >= 0
+
+
+_UNITS: Final = ("decision", "time")
+
+Checks: TypeAlias = dict[str, tuple[Callable[[Any], bool], str]]
+"""Checks of options: for each a function, and the kind of valid values."""
+
+CHECKS: Final[Checks] = {
+    "futures": (is_count, "a positive integer"),
+    "horizon_by": (_UNITS.__contains__, '"decision" or "time"'),
+    "terminal_value": (callable, "a callable of the environment"),
+    "discount": (lambda value: is_weight(value) and value <= 1, "a number from 0 to 1"),
+    "discount_by": (_UNITS.__contains__, '"decision" or "time"'),
+    "budget": (is_count, "a number of branches or None"),
+    "margin": (is_weight, "a number that is not negative"),
+}
+"""The checks of the options of planners."""
+
+_HORIZON: Final = 'a number of decisions, a positive time with horizon_by="time", or None'
+
+_OPTIONAL: Final = ("horizon", "terminal_value", "budget")
+"""The options that may be None."""
 
 
 # -- values ---------------------------------------------------------------------------------------
@@ -260,9 +285,10 @@ def action_values(
         method=method,
         time_limit=time_limit,
     )
-    if _is_planned(env):
-        return _base_value(env, base)
-    rollouts = Rollouts(env, policy)
+    player = player_of(env, base)
+    if player.is_planned:
+        return _base_value(player)
+    rollouts = Rollouts(player, policy)
     candidates = range(len(rollouts.actions))
     with progress_bar(len(candidates) * futures, progress, "branch") as bar:
         for number in [1] * futures if progress else [futures]:
@@ -272,18 +298,9 @@ def action_values(
     return rollouts.values(best)
 
 
-def _is_planned(env: Environment) -> bool:
-    """Return whether a planner already tries a candidate in an environment."""
-    episode = pending_view(env, "planning").episode
-    return episode.where is Where.PLAN
-
-
-def _base_value(
-    env: Environment,
-    base: Policy,
-) -> ActionValues:
+def _base_value(player: Player) -> ActionValues:
     """Return the base's answer as the best action, as planners act in branches."""
-    return estimate([player_of(env, base).decide()], [[]], 0)
+    return estimate([player.decide()], [[]], 0)
 
 
 class Rollouts:
@@ -303,7 +320,7 @@ class Rollouts:
 
     def __init__(
         self,
-        env: Environment,
+        player: Player,
         policy: RolloutPolicy,
         *,
         planner: bool = False,
@@ -312,10 +329,9 @@ class Rollouts:
 
         For a ``planner``, leave out masked candidates, and add ``RULE``.
         """
-        self.env = env
+        self.env = player.env
         self.policy = policy
-        player = player_of(env, policy.base)
-        player.check_base()
+        player.check()
         episode = player.episode
         is_timed = "time" in (policy.discount_by, policy.horizon_by)
         if is_timed and episode.clock is None:
@@ -324,22 +340,18 @@ class Rollouts:
             )
         self.actions = player.candidates(policy.actions, legal=planner)
         rules = [index for index, action in enumerate(self.actions) if action is RULE]
-        self.rule = len(self.actions)
-        if rules:
-            self.rule = rules[0]
-        self.added = planner and not rules and len(self.actions) > 1
+        number = len(self.actions)
+        self.rule = rules[0] if rules else number
+        self.added = planner and not rules and number > 1
         if self.added:
             self.actions.append(RULE)
         self.returns: list[list[float]] = [[] for _ in self.actions]
         self.rollouts: dict[Indices, list[Rollout]] = {}
-        number = episode.turns
-        if isinstance(player.agent.policy, AskingPolicy):
-            number = player.agent.answered
-        name = crc32(player.name.encode(errors="surrogatepass"))
+        agent = player.agent
         self._entropy = [
             episode.seed,
-            number,
-            name,
+            agent.answered if isinstance(agent.policy, AskingPolicy) else episode.turns,
+            crc32(player.name.encode(errors="surrogatepass")),
             _KEY,
         ]
         if policy.seed is not None:
@@ -371,11 +383,13 @@ class Rollouts:
         tries: list[Try] = []
         for index in candidates:
             begin = len(self.returns[index])
-            end = 1
-            if self.reseeds:
-                end = begin + number
+            end = begin + number if self.reseeds else 1
             tries += [((index,), future) for future in range(begin, end)]
         self.record(tries, self.make(tries))
+
+    def trying(self, tries: Sequence[Try]) -> partial[Rollout]:
+        """Return the function that makes tries in branches."""
+        return partial(try_out, tries=tries, actions=self.actions, policy=self.policy)
 
     def make(self, tries: Sequence[Try]) -> list[Rollout]:
         """Make rollouts, each in a branch."""
@@ -384,15 +398,9 @@ class Rollouts:
             futures = [future for _, future in tries]
             known = self.seeds(1 + max(futures, default=0))
             seeds = [known[future] for future in futures]
-        function = partial(
-            try_out,
-            tries=tries,
-            actions=self.actions,
-            policy=self.policy,
-        )
         return branch(
             self.env,
-            function,
+            self.trying(tries),
             len(tries),
             method=self.policy.method,
             seeds=seeds,
@@ -409,6 +417,20 @@ class Rollouts:
             self.returns[indices[0]].append(sum(rollout.rewards))
             self.rollouts.setdefault(indices, []).append(rollout)
 
+    def search(self, budget: int) -> Indices:
+        """Try candidates; return the best ones for the next decisions."""
+        left = list(range(len(self.actions)))
+        for rounds in range(ceil(log2(len(left))), 0, -1):
+            most = budget // len(left)
+            number = min(max(1, most // rounds), most)
+            budget -= number * len(left)
+            self.add(left, number)
+            if rounds > 1:
+                left.sort(key=self.mean, reverse=True)
+                left = sorted(left[: (len(left) + 1) // 2])
+        best = max(left, key=self.mean)
+        return (best,)
+
     def is_better_than_rule(self, indices: Indices) -> bool:
         """Return whether candidates have a larger return than the rule.
 
@@ -420,10 +442,8 @@ class Rollouts:
         if not self.reseeds:
             return self.exact_return(indices) > self.exact_return(rule)
         begin = max(map(len, self.returns))
-        number = max(_FRESH, self.policy.futures)
-        futures = range(begin, begin + number)
-        tries: list[Try] = [(indices, future) for future in futures]
-        tries += [(rule, future) for future in futures]
+        futures = range(begin, begin + max(_FRESH, self.policy.futures))
+        tries = list(product((indices, rule), futures))
         returns = np.array([sum(rollout.rewards) for rollout in self.make(tries)])
         planned, ruled = np.split(returns, 2)
         gains = planned - ruled
@@ -496,49 +516,20 @@ class RolloutPolicy:
     time_limit: float = 600.0
     budget: int | None = None
     margin: float = 1.0
+    _checks: ClassVar[Checks] = CHECKS
+    _rollouts: ClassVar[type[Rollouts]] = Rollouts
 
     def __post_init__(self) -> None:
-        horizon = self.horizon
-        if self.horizon_by == "time":
-            has_horizon = is_number(horizon) and horizon > 0
-        else:
-            has_horizon = is_count(horizon)
-        units = ("decision", "time")
-        has_value = self.terminal_value is None or callable(self.terminal_value)
-        self._check_options(
-            {
-                "horizon_by": (self.horizon_by in units, '"decision" or "time"'),
-                "discount_by": (self.discount_by in units, '"decision" or "time"'),
-                "futures": (is_count(self.futures), "a positive integer"),
-                "horizon": (
-                    horizon is None or has_horizon,
-                    'a number of decisions, a positive time with horizon_by="time", or None',
-                ),
-                "discount": (
-                    is_number(self.discount) and 0 <= self.discount <= 1,
-                    "a number from 0 to 1",
-                ),
-                "terminal_value": (has_value, "a callable of the environment"),
-                "margin": (
-                    is_number(self.margin) and self.margin >= 0,
-                    "a number that is not negative",
-                ),
-                "budget": (
-                    self.budget is None or is_count(self.budget),
-                    "a number of branches or None",
-                ),
-            }
-        )
+        horizon = is_count if self.horizon_by == "decision" else is_positive
+        checks = self._checks | {"horizon": (horizon, _HORIZON)}
+        for name, (is_valid, kind) in checks.items():
+            value = vars(self)[name]
+            is_left_out = value is None and name in _OPTIONAL
+            if not is_left_out and not is_valid(value):
+                raise OptionValueError(f"{name} must be {kind}, not {short_repr(value)}")
         self.seed = checked_seed(self.seed)
         if isinstance(self.actions, Iterable) and not isinstance(self.actions, (str, Mapping)):
             self.actions = list(self.actions)  # the first decision would use up an iterator
-
-    def _check_options(self, options: dict[str, tuple[bool, str]]) -> None:
-        """Refuse options. For each there is whether it is valid, and the kind of valid values."""
-        for name, (is_valid, kind) in options.items():
-            if not is_valid:
-                value = short_repr(getattr(self, name))
-                raise OptionValueError(f"{name} must be {kind}, not {value}")
 
     def choose(self, env: Environment) -> ActionValues:
         """Find the best candidate for the pending decision of an environment.
@@ -554,9 +545,10 @@ class RolloutPolicy:
             OptionValueError: The budget is too small to try each candidate.
             BaseException: As ``action_values``.
         """
-        if _is_planned(env):
-            return _base_value(env, self.base)
-        rollouts = Rollouts(env, self, planner=True)
+        player = player_of(env, self.base)
+        if player.is_planned:
+            return _base_value(player)
+        rollouts = self._rollouts(player, self, planner=True)
         number = len(rollouts.actions)
         budget = self.budget
         if budget is None:
@@ -567,28 +559,10 @@ class RolloutPolicy:
             )
         if number == 1:
             return rollouts.values(0)
-        best = self._search(rollouts, budget)
+        best = rollouts.search(budget)
         if rollouts.is_better_than_rule(best):
             return rollouts.values(best[0])
         return rollouts.values(rollouts.rule)
-
-    def _search(
-        self,
-        rollouts: Rollouts,
-        budget: int,
-    ) -> Indices:
-        """Try candidates; return the best ones for the next decisions."""
-        left = list(range(len(rollouts.actions)))
-        for rounds in range(ceil(log2(len(left))), 0, -1):
-            most = budget // len(left)
-            number = min(max(1, most // rounds), most)
-            budget -= number * len(left)
-            rollouts.add(left, number)
-            if rounds > 1:
-                left.sort(key=rollouts.mean, reverse=True)
-                left = sorted(left[: (len(left) + 1) // 2])
-        best = max(left, key=rollouts.mean)
-        return (best,)
 
     def __call__(
         self, observation: Observation, info: Info, *, _environment: Environment

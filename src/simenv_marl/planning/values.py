@@ -73,24 +73,15 @@ def estimate(
     """
     counts = np.array([*map(len, returns)], np.int64)
     table = np.full((len(counts), counts.max()), np.nan)
-    means = np.full(len(counts), np.nan)
-    errors = np.full(len(counts), np.nan)
+    means, errors = np.full((2, len(counts)), np.nan)
     for index, values in enumerate(returns):
         table[index, : len(values)] = values
         if values:
             means[index] = np.mean(values)
         if len(values) > 1:
             errors[index] = np.std(values, ddof=1) / np.sqrt(len(values))
-    correlation = correlation_of(table)
-    return ActionValues(
-        tuple(actions),
-        means,
-        errors,
-        counts,
-        actions[best],
-        table,
-        correlation,
-    )
+    found = correlation_of(table)
+    return ActionValues(tuple(actions), means, errors, counts, actions[best], table, found)
 
 
 def correlation_of(

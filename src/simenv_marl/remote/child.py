@@ -5,7 +5,6 @@ that the simulator never blocks; errors show the last part of it. The simulator 
 group, which ends with it.
 """
 
-import atexit
 import os
 import select
 import signal
@@ -14,7 +13,6 @@ from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
 from typing import Final, Literal, NoReturn, TypeAlias
-from weakref import WeakSet, finalize
 
 from ..errors import (
     ProcessDiedError,
@@ -56,9 +54,6 @@ MOST_FRAMES: Final = 100_000
 Announced calls, updates and removals count.
 """
 
-MOST_BYTES: Final = 1 << 30
-"""The number of bytes that may come between two calls."""
-
 MOST_WAITS: Final = 20
 """The time that the frames between two calls may take, as a multiple of ``timeout``."""
 
@@ -93,8 +88,7 @@ class Child:
     _closed = False
     _exit_code_lost = False
     _buffer = b""  # of received bytes
-    _bytes = 0  # since the latest call, as the frames
-    _frames = 0
+    _frames = 0  # since the latest call
     _running_since = 0.0
     _seed: int | None = None  # to send with the next answer
 
@@ -125,7 +119,6 @@ class Child:
                 f"{command[0]!r} cannot be started: {describe_error(error)}"
             ) from error
         self.pid = self._popen.pid
-        _children.add(self)
         try:
             guardian.guard(self.pid)
             self.hello = self.receive()
@@ -133,58 +126,57 @@ class Child:
             self.close(patience=0.0)
             raise
         self._check_hello()
-        self.points = frozenset(self.hello["points"])
-        self.can = frozenset(self.hello["can"])
 
     def _start(self) -> None:
         """Start the process with its pipes."""
         command, _, env, cwd = self.launch
-        child_reading, self._writing = os.pipe()
+        ends: list[int] = []
         try:
-            self._reading, child_writing = os.pipe()
-        except BaseException:
-            os.close(child_reading)
-            os.close(self._writing)
-            raise
-        try:
+            ends += os.pipe()
+            ends += os.pipe()
+            theirs = ends[::3]  # to read from and to write to
             self._popen = Popen(
                 command,
                 stdin=DEVNULL,
                 stderr=PIPE,
                 bufsize=0,
-                pass_fds=(child_reading, child_writing),
+                pass_fds=theirs,
                 env={
                     **(os.environ if env is None else env),
-                    DESCRIPTORS: f"{child_reading},{child_writing}",
+                    DESCRIPTORS: ",".join(map(str, theirs)),
                 },
                 cwd=cwd,
                 # so that its group can be ended, and a terminal's interrupts miss it
                 start_new_session=True,
             )
         except BaseException:
-            os.close(self._writing)
-            os.close(self._reading)
+            for end in ends:
+                os.close(end)
             raise
-        finally:
-            os.close(child_reading)
-            os.close(child_writing)
+        for end in theirs:
+            os.close(end)
+        _, self._writing, self._reading, _ = ends
         assert self._popen.stderr is not None
         self._stderr = self._popen.stderr
         for descriptor in (self._reading, self._writing, self._stderr.fileno()):
             os.set_blocking(descriptor, False)
 
     def _check_hello(self) -> None:
-        self.hello.setdefault("can", [])
-        hello = short_repr(self.hello)
-        if "hello" not in self.hello:
-            self.fail(f"began with {hello}, not with a hello")
-        if not is_integer(self.hello["hello"], VERSION):
-            version = short_repr(self.hello["hello"])
-            self.fail(f"speaks version {version} of the wire; this is version {VERSION}")
-        for key in ("points", "can"):
-            names = self.hello.get(key)
+        hello = {"can": [], **self.hello}
+        if "hello" not in hello:
+            self.fail(f"began with {short_repr(hello)}, not with a hello")
+        version = hello["hello"]
+        if not is_integer(version, VERSION):
+            self.fail(
+                f"speaks version {short_repr(version)} of the wire; this is version {VERSION}"
+            )
+        for names in (hello.get("points"), hello["can"]):
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                self.fail(f'has said {hello}; its "points" and "can" must be lists of strings')
+                self.fail(
+                    f'has said {short_repr(hello)}; its "points" and "can" must be lists of strings'
+                )
+        self.points = frozenset(hello["points"])
+        self.can = frozenset(hello["can"])
 
     def __str__(self) -> str:
         return f"the process {self.pid} ({self.launch[0][0]})"
@@ -226,37 +218,39 @@ class Child:
             self.fail(f"has {error}")
         if time is not None:
             self.time = time
-        if "end" in frame:
-            self.state = "idle"
-        elif "decide" in frame:
-            due = self.number + 1
-            if not is_integer(frame["decide"], due):
-                self.fail(f"has made call {short_repr(frame['decide'])} where call {due} was due")
-            self.number = due
-            self.rule_frame = None
-            self.state = "waiting"
-        elif {"update", "remove", *self.can & {"expect"}} & frame.keys():
-            self._check_flood()
-        elif {"decided", "expect"} & frame.keys():
-            self._refuse(frame, ', which is not due, or not in the "can" of its hello')
-        else:
-            self._refuse(frame, ", which is not a frame of the wire")
+        match frame:
+            case {"decide": number}:
+                due = self.number + 1
+                if not is_integer(number, due):
+                    self.fail(f"has made call {short_repr(number)} where call {due} was due")
+                self.number = due
+                self.rule_frame = None
+                self.state = "waiting"
+            case {"end": _}:
+                self.state = "idle"
+            case {"update": _} | {"remove": _}:
+                self._check_flood()
+            case {"expect": _} if "expect" in self.can:
+                self._check_flood()
+            case {"expect": _} | {"decided": _}:
+                self._refuse(frame, ', which is not due, or not in the "can" of its hello')
+            case _:
+                self._refuse(frame, ", which is not a frame of the wire")
         return frame
 
     def _set_running(self) -> None:
         """Begin to count the frames until the next call."""
         self.state = "running"
         self._frames = 0
-        self._bytes = 0
         self._running_since = monotonic()
 
     def _check_flood(self) -> None:
-        """Count a frame between two calls; limit the number, size and time of such frames."""
+        """Count a frame between two calls; limit the number and time of such frames."""
         self._frames += 1
-        if self._frames > MOST_FRAMES or self._bytes > MOST_BYTES:
+        if self._frames > MOST_FRAMES:
             self.fail(
-                f"has sent {self._frames:,} frames of {self._bytes:,} bytes since its latest call,"
-                " and neither a call nor an end"
+                f"has sent {self._frames:,} frames since its latest call, and neither a call nor an"
+                " end"
             )
         limit = MOST_WAITS * self.timeout
         if monotonic() - self._running_since > limit:
@@ -283,14 +277,15 @@ class Child:
             self.answer(RULE)
             if "decided" not in self.can:
                 return RULE
-            frame = self.receive()
-            if "value" not in frame or not is_integer(frame.get("decided"), self.number):
-                self._refuse(
-                    frame,
-                    f' where {{"decided": {self.number}, "value": ...}} was due: the decision of'
-                    " its rule",
-                )
-            self.rule_frame = frame
+            match self.receive():
+                case {"decided": number, "value": _} as frame if is_integer(number, self.number):
+                    self.rule_frame = frame
+                case frame:
+                    self._refuse(
+                        frame,
+                        f' where {{"decided": {self.number}, "value": ...}} was due: the decision'
+                        " of its rule",
+                    )
         return self.rule_frame["value"]
 
     def answer(self, value: Model) -> None:
@@ -347,15 +342,16 @@ class Child:
             line += part
             if len(line) >= LONGEST:
                 self.fail(f"has sent a line of more than {LONGEST:,} bytes")
-        self._bytes += len(line)
         try:
             frame = decode(line)
         except WireError as error:
             self.fail(f"has sent {error}")
-        report = frame.get("error")
-        if isinstance(report, dict):
-            kind, text, trace = (report.get(key) or "" for key in ("type", "text", "trace"))
-            self.fail(f"has raised {kind or 'an error'}: {text}\n{trace}".rstrip(), RemoteError)
+        if "error" in frame:
+            match frame["error"]:
+                case {**report}:
+                    kind, text, trace = (report.get(key) or "" for key in ("type", "text", "trace"))
+                    kind = kind or "an error"
+                    self.fail(f"has raised {kind}: {text}\n{trace}".rstrip(), RemoteError)
         return frame
 
     def send(self, lines: bytes) -> None:
@@ -507,24 +503,3 @@ class Child:
             return f"was killed by {signal.Signals(-code).name}"
         except ValueError:
             return f"was killed by signal {-code}"
-
-
-# -- at the end of this process -------------------------------------------------------------------
-
-_children: Final[WeakSet[Child]] = WeakSet()
-
-
-def _close_all() -> None:
-    """Close all simulators. Their inputs end first, so that this process waits for all together."""
-    children = [child for child in _children if child.usable]
-    for child in children:
-        child.break_off()
-        child.close_input()
-    for child in children:
-        child.close()
-
-
-# ``atexit`` calls the latest function first: this one before the finalizers of environments, whose
-# function the first finalizer registers.
-finalize(Child, int).detach()
-atexit.register(_close_all)

@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 
 from ..core import acquire, release
-from ..decision import BY_NAME, Definition
+from ..decision import Definition
 from ..errors import (
     BranchError,
     DefinitionError,
@@ -39,7 +39,6 @@ class ProcessSimulation(SimulationInterface):
     the process.
 
     Attributes:
-        points: The decision points with their definitions.
         result: The result that the process sent at the end of the latest episode; None before.
     """
 
@@ -98,7 +97,7 @@ class ProcessSimulation(SimulationInterface):
         self.timeout = float(timeout)
         self.env = None if env is None else dict(env)
         self.cwd = cwd
-        self.points = _by_function(points)
+        self._points = _checked_points(points)
         self.result: Model = None
 
     def __del__(self) -> None:
@@ -106,11 +105,12 @@ class ProcessSimulation(SimulationInterface):
             self._child.close()
 
     def __getstate__(self) -> dict[str, Model]:
-        points = dict(zip(self._names(), self.points.values(), strict=True))
-        return {**vars(self), "points": points, "_child": None, "_episode": None}
+        return {**vars(self), "_child": None, "_episode": None}
 
-    def __setstate__(self, state: dict[str, Model]) -> None:
-        vars(self).update(state, points=_by_function(state["points"]))
+    @property
+    def points(self) -> dict[DecisionFunction, Definition]:
+        """The decision points with their definitions."""
+        return {decision_function(name): part for name, part in self._points.items()}
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -148,8 +148,7 @@ class ProcessSimulation(SimulationInterface):
     def _begin(self, child: Child, start: bytes) -> None:
         """Begin an episode in a process with a line, and wait for the first frame."""
         self._child = child
-        names = self._names()
-        missing = [name for name in names if name not in child.points]
+        missing = [name for name in self._points if name not in child.points]
         if missing:
             child.fail(
                 f"has no decision point {', '.join(missing)}; it has"
@@ -157,7 +156,7 @@ class ProcessSimulation(SimulationInterface):
                 UnknownPointError,
             )
         try:
-            self._episode = RemoteEpisode(child, names, start)
+            self._episode = RemoteEpisode(child, self._points, start)
         except BaseException:
             child.break_off()
             raise
@@ -234,9 +233,6 @@ class ProcessSimulation(SimulationInterface):
             )
         child.reseed(int(seed))
 
-    def _names(self) -> list[str]:
-        return [getattr(function, BY_NAME) for function in self.points]
-
 
 def _command_words(command: StrPath | Sequence[StrPath]) -> list[str]:
     """Return the program and its arguments, as strings."""
@@ -249,8 +245,8 @@ def _command_words(command: StrPath | Sequence[StrPath]) -> list[str]:
     )
 
 
-def _by_function(points: Mapping[str, Definition]) -> dict[DecisionFunction, Definition]:
-    """Return the definitions by the decision functions of their names."""
+def _checked_points(points: Mapping[str, Definition]) -> dict[str, Definition]:
+    """Copy the definitions by name, or refuse them."""
     if not isinstance(points, Mapping) or not points:
         raise DefinitionError(
             f"points must be a dict from names to definitions, not {short_repr(points)}"
@@ -261,4 +257,4 @@ def _by_function(points: Mapping[str, Definition]) -> dict[DecisionFunction, Def
                 "points must be a dict from the process's names to definitions, the results of"
                 f" make_step, not {short_repr(name)}: {short_repr(definition)}"
             )
-    return {decision_function(name): definition for name, definition in points.items()}
+    return dict(points)

@@ -90,25 +90,22 @@ def encode_answer(number: int, value: Model) -> bytes:
 
 def _to_json(value: Model, path: str = "") -> Json:
     """Convert a value to JSON data; ``path`` is its place in the frame, for the error."""
-    if value is None or isinstance(value, (str, int)):
-        return value
-    if isinstance(value, float):
-        return float(value) if isfinite(value) else {"float": repr(float(value))}
-    if isinstance(value, (np.ndarray, np.generic)):
-        return _to_json(value.tolist(), path)
-    if isinstance(value, (list, tuple)):
-        return [_to_json(item, f"{path}[{index}]") for index, item in enumerate(value)]
-    if isinstance(value, Mapping):
-        for key in value:
-            if not isinstance(key, str):
-                raise _not_json(key, path, "the keys of JSON must be strings")
-        return {key: _to_json(item, f"{path}[{key!r}]") for key, item in value.items()}
-    raise _not_json(value, path, "it is not JSON")
-
-
-def _not_json(value: Model, path: str, reason: str) -> WireError:
+    match value:
+        case None | str() | int():
+            return value
+        case float():
+            return float(value) if isfinite(value) else {"float": repr(float(value))}
+        case np.ndarray() | np.generic():
+            return _to_json(value.tolist(), path)
+        case list() | tuple():
+            return [_to_json(item, f"{path}[{index}]") for index, item in enumerate(value)]
+        case Mapping() if all(isinstance(key, str) for key in value):
+            return {key: _to_json(item, f"{path}[{key!r}]") for key, item in value.items()}
     place = f" (at {path})" if path else ""
-    return WireError(f"{short_repr(value)} cannot be sent to a process: {reason}{place}")
+    raise WireError(
+        f"{short_repr(value)} cannot be sent to a process: it is not JSON data, or has keys that"
+        f" are no strings{place}"
+    )
 
 
 def decode(line: bytes) -> Frame:
@@ -146,27 +143,32 @@ def check_frame(frame: Frame, points: Collection[str]) -> float | None:
             " separate line"
         )
     calls: list[Frame] = []
-    if "end" in frame:
-        end = frame["end"]
-        if not isinstance(end, dict) or type(end.get("truncated", False)) is not bool:
+    match frame:
+        case _ if kinds and KEYS[kinds[0]] is _CALL:
+            calls = [frame]
+        case {"end": {**end}} if isinstance(end.get("truncated", False), bool):
+            pass
+        case {"end": wrong}:
             raise WireError(
-                f'sent the end {short_repr(end)}; it must be an object with "truncated" (true or'
+                f'sent the end {short_repr(wrong)}; it must be an object with "truncated" (true or'
                 ' false) and "result"'
             )
-    elif "expect" in frame:
-        calls = frame["expect"]
-        if not isinstance(calls, list) or not all(
-            isinstance(call, dict) and call.keys() <= _CALL for call in calls
-        ):
+        case {"expect": [*items]} if all(map(_is_call, items)):
+            calls = items
+        case {"expect": items}:
             raise WireError(
-                f'sent "expect" with {short_repr(calls)}; it must be a list of objects with'
+                f'sent "expect" with {short_repr(items)}; it must be a list of objects with'
                 ' "point", "entity" and "args"'
             )
-    elif kinds and KEYS[kinds[0]] is _CALL:
-        calls = [frame]
-    times = [_check_call(call, points) for call in calls]
-    known_times = [time for time in times if time is not None]
-    return known_times[-1] if known_times else None
+    latest: float | None = None
+    for call in calls:
+        time = _check_call(call, points)
+        latest = latest if time is None else time
+    return latest
+
+
+def _is_call(item: Json) -> bool:
+    return isinstance(item, dict) and item.keys() <= _CALL
 
 
 def _check_call(frame: Frame, points: Collection[str]) -> float | None:

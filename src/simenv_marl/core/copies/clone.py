@@ -68,7 +68,7 @@ def clone(
     environment. ``unwrapped.simulation`` exists only there.
 
     A clone ends when it is closed or collected, and with the user's process. Then, and at a reset,
-    a forked clone does not unwind or close the episode in which it was cloned; a replayed one has
+    a forked clone does not unwind or close the episode of its original; a replayed one has
     an episode for itself, and does.
 
     Args:
@@ -105,7 +105,7 @@ def clone(
     session = Session(original.plan) if fork is None else RemoteSession(original, fork)
     try:
         if isinstance(session, Session):
-            with preserve_generators():  # the model may draw from those of the process
+            with preserve_generators():  # because the model may draw from these
                 session.replay(original)
         twin = view.cloned(session)
         twin.begin_branch()
@@ -254,7 +254,7 @@ def _call_on_clone(
     env: Any, function: Callable[[Any, int], Result], number: int, method: str | None
 ) -> Result:
     """Call a function in this process on a clone."""
-    with preserve_generators():  # the function and the model may draw from those of the process
+    with preserve_generators():  # because the function and the model may draw from these
         try:
             twin = clone(env, method=method)
             try:

@@ -71,7 +71,7 @@ _this = _Process()
 
 
 def _begin_process() -> None:
-    """In a forked process, also one that the user has forked: leave what belongs to the parent."""
+    """In a forked process, also in a fork of the user: leave the parent's descriptors."""
     global _this
     _this.leave()
     _this = _Process()
@@ -239,7 +239,7 @@ def fork(
         other: The other end, if this process uses the new one. Then the new process ends with this
             one, otherwise with the processes above this one.
     """
-    flush()  # else both processes would write what is buffered
+    flush()  # else both processes would write the buffered output
     lives = _this.lives
     try:
         if other is not None:
@@ -273,7 +273,7 @@ def pipe() -> tuple[Connection, Connection]:
 def _as_socket(connection: Connection) -> socket.socket:
     """Return the socket that a connection is."""
     same = socket.socket(fileno=os.dup(connection.fileno()))
-    same.setblocking(True)  # whatever the default time limit of sockets is
+    same.setblocking(True)  # because users may set a default time limit of sockets
     return same
 
 

@@ -1,7 +1,7 @@
 """Pickles for other processes: simulations, decision functions, policies, results and errors.
 
-Objects that can be imported are pickled by reference, all others by value, such as those of a
-script or a notebook.
+Objects that can be imported are pickled by reference, all others by value, such as the objects of
+a script or a notebook.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _reduce_error(error: BaseException) -> Reduced | None:
         return None
     _, args, *state = builtin.__reduce__(error)
     attributes: dict[str, Any] = {**state[0]} if state else {}
-    attributes.pop("obj", None)  # that of an AttributeError may refer to the whole model
+    attributes.pop("obj", None)  # it may be the whole model, in an AttributeError
     return _rebuild_error, (kind, args, attributes | {"__notes__": error_notes(error)})
 
 
@@ -153,7 +153,7 @@ _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
 
 
 def _reduce_function(function: FunctionType) -> Reduced | None:
-    """Return how another process finds or makes a function to which its name does not lead."""
+    """Return how another process finds or makes a function that its name does not find."""
     place = function.__module__, function.__qualname__
     named = _import(*place)
     if named is function:

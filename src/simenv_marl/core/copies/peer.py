@@ -95,7 +95,7 @@ def receive(connection: Connection, seconds: float = inf) -> bytes | None:
 
 
 def flush() -> None:
-    """Write out what the standard streams have buffered."""
+    """Write out the buffers of the standard streams."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(Exception):
             stream.flush()

@@ -42,10 +42,10 @@ _fields: Final = attrgetter(*FIELDS)
 
 
 class Report(NamedTuple):
-    """What views read of an episode after a request.
+    """The state of an episode after a request, as far as views read it.
 
     Attributes:
-        is_whole: Whether it has all agents, and not only those that have changed.
+        is_whole: Whether it has all agents, or only the changed ones.
         round: The present round. None where it is played in turns.
         time: The simulation's time. None if it has none.
         agents: For each agent its name, the number of its point, and its ``FIELDS``.
@@ -222,7 +222,7 @@ class Host:
         return method(self._view.session, *args)
 
     def reseed(self, seed: int) -> None:
-        """Draw the simulation's future chance anew, and that of this process."""
+        """Draw the future chance of the simulation and of this process anew."""
         seed_globals(seed, PROCESS)
         self._view.session.reseed(seed)
 
@@ -253,7 +253,7 @@ class RemoteSession(BaseSession):
     episode: Mirror | None
 
     def __init__(self, original: BaseSession, fork: Fork) -> None:
-        """Take over a process in which the episode of a session goes on."""
+        """Take over a process that continues the episode of a session."""
         super().__init__(original.plan, Where.CLONE)
         self.restore(copy.deepcopy(original.snapshot()))
         self.exclusive = fork.lock
@@ -326,11 +326,11 @@ class RemoteSession(BaseSession):
         self._fork.request(Host.ask, Session.check_reseed)
 
     def reseed(self, seed: int) -> None:
-        """Draw the simulation's future chance anew, and that of the clone's process."""
+        """Draw the future chance of the simulation and of the clone's process anew."""
         self._fork.request(Host.reseed, seed)
 
     def recording(self) -> Recording:
-        """Return what a replay of the episode needs."""
+        """Return the recording for a replay of the episode."""
         recording: Recording = self._fork.request(Host.ask, Session.recording)
         return recording
 

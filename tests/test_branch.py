@@ -34,6 +34,7 @@ from simenv_marl.errors import (
     OptionValueError,
     ReentrancyError,
     ViewError,
+    WorkerError,
 )
 from tests.core.test_global_rng import world
 from tests.processes import ROOT, gone
@@ -144,7 +145,7 @@ def test_an_error_that_cannot_be_pickled_is_named():
         error.held = (step for step in ())
         raise error
 
-    with pytest.raises(BranchError, match="cannot be pickled: Unpicklable: 1") as caught:
+    with pytest.raises(WorkerError, match="cannot be pickled: Unpicklable: 1") as caught:
         branch(trip(), fail, 1, method="fork")
     assert "in fail" in str(caught.value.__cause__)
 

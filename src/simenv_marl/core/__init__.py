@@ -14,7 +14,7 @@ This module lists the interface of the core. The rooms of the package use nothin
 from ..simulation import Action, Model, Observation
 from .copies.clone import branch, clone, pending_view
 from .copies.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
-from .copies.peer import Peer, serve
+from .copies.peer import Peer, pack_request, serve
 from .episodes.agent import Agent
 from .episodes.base import BaseSession, checked_seed, close_all
 from .episodes.decision import Decision
@@ -75,7 +75,8 @@ __all__ = [  # noqa: RUF022 - by subject
     "two_arguments", "waits", "when_answered",
     # Copies and other processes.
     "Peer", "acquire", "branch", "clone", "pack", "pack_outcome", "pack_plainly",
-    "pending_view", "portable", "release", "reuse_resources", "serve", "unpack", "unpack_outcome",
+    "pack_request", "pending_view", "portable", "release", "reuse_resources", "serve", "unpack",
+    "unpack_outcome",
     # Values.
     "ILLEGAL", "MASK", "action_check", "as_json", "blank", "duplicate",
     "explain_arguments", "joined", "observation_cast", "same", "source_name",

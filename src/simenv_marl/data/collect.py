@@ -163,7 +163,7 @@ def learners_plan(
         if isinstance(policy, LeftToRule):
             policy = policy.policy
         callables[key] = _follow_rule if policy is RULE else policy
-    options = {**options, "policies": policy_keys(callables, rewarded=True, alone=alone)}
+    options = {**options, "policies": policy_keys(callables, alone=alone)}
     others = None
     if all_points:
         others = PolicyKey(len(policies), BatchPolicy(_follow_rule, alone=alone))

@@ -86,11 +86,9 @@ class View:
         metadata: Its name, and the render modes of its simulation.
         render_mode: The form of the result of ``render``.
         in_rounds: Whether all agents are updated when a step returns.
-        waits_for_one: Whether its branches wait for one agent only.
     """
 
     in_rounds = False
-    waits_for_one = False
     _option = ""  # the option that only this view takes
 
     def __init__(self, plan: Plan) -> None:
@@ -120,15 +118,16 @@ class View:
         self.session = session
         self._lock = session.lock
         self._finalizer = weakref.finalize(self, session.abandon) if owned else None
-        self.metadata = self.metadata_of(plan)
-        self.render_mode = plan.options.render_mode
-        self._shows = plan.options.shows
-        self._frames: list[Model] = []
         self._roster = plan.roster  # the decision points of the agents that are known beforehand
-        self._spaces: dict[str, tuple[Space, Space]] = {}  # of observations and of actions
-        self._clear()
         if attributes:  # because ``vars`` makes the attributes of an object slower
             vars(self).update(attributes)
+        else:
+            self.metadata = self.metadata_of(plan)
+            self.render_mode = plan.options.render_mode
+            self._shows = plan.options.shows
+            self._frames: list[Model] = []
+            self._spaces: dict[str, tuple[Space, Space]] = {}  # of observations and of actions
+            self._clear()
         self.set_up()
 
     @classmethod

@@ -221,7 +221,6 @@ class PlannerEnv(SimulationEnv):
     of the agent, which can be stepped; policies or rules answer for all other agents.
     """
 
-    waits_for_one = True
     _branched = False  # whether it is a branch, or a clone
 
     def set_up(self) -> None:

@@ -42,7 +42,6 @@ from ..core import (
     split_batch,
     stacker,
     two_arguments,
-    waits,
 )
 from ..core import Answers as PendingAnswers
 from ..decision import DecisionPoint
@@ -89,9 +88,8 @@ class BatchPolicy:
             infos: An info for each.
             identities: The seed of the episode and the number of the decision, for each.
         """
-        if self.takes_identities:
-            return self.policy(observations, infos, identities)
-        return self.policy(observations, infos)
+        more = (identities,) if self.takes_identities else ()
+        return self.policy(observations, infos, *more)
 
     def group(self, point: Point) -> Group:
         """Return the group of the decisions at a point."""
@@ -144,31 +142,22 @@ class AskingKey(AskingPolicy, PolicyKey):
         PolicyKey.__init__(self, place, batch_policy)
 
 
-def policy_keys(
-    policies: Mapping[Any, Any],
-    *,
-    rewarded: bool = False,
-    alone: bool = False,
-) -> dict[Any, Any]:
+def policy_keys(policies: Mapping[Any, Any], *, alone: bool = False) -> dict[Any, Any]:
     """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
     Args:
         policies: The policies, by agent or point.
-        rewarded: Whether episodes wait for all policies. Otherwise, a policy that answers one
-            decision at a time is called where it decides, unless it must be awaited.
         alone: Whether all policies answer one decision at a time.
     """
     batch_policies: dict[int, BatchPolicy] = {}
     keys = dict(policies)
     for place, (key, policy) in enumerate(policies.items()):
-        is_alone = is_asked_alone(policy)
-        is_called = is_alone and not rewarded and not waits(policy)
-        if policy is RULE or not callable(policy) or is_called:
+        if policy is RULE or not callable(policy):
             continue
         batch_policy = batch_policies.setdefault(id(policy), BatchPolicy(policy, alone=alone))
         batch_policy.keys.append(key)
         keys[key] = PolicyKey(place, batch_policy)
-        if is_alone:
+        if is_asked_alone(policy):
             keys[key] = AskingKey(place, batch_policy, policy)
     return keys
 

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext, suppress
 from importlib import import_module
-from math import ceil
+from math import ceil, inf
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
 from time import monotonic
@@ -28,6 +28,7 @@ from ..core import (
     pack,
     pack_outcome,
     pack_plainly,
+    pack_request,
     serve,
     unpack,
     unpack_outcome,
@@ -147,7 +148,7 @@ def spread(
     # Outcomes are packed in the worker, because each backend passes errors on in its own way.
     parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as=form)
     call = joblib.delayed(pack_outcome)
-    outcomes = parallel(call(pack, _work, parcel, os.getpid(), part) for part in parts)
+    outcomes = parallel(call(_work, parcel, os.getpid(), part) for part in parts)
     results: list[Result] = []
     try:
         for part, outcome in zip(parts, outcomes, strict=True):
@@ -188,53 +189,49 @@ SECONDS_TO_CLOSE: Final = 10.0
 """The seconds that a worker may take to close its object and to end."""
 
 
-class _Host:
-    """Serves an object in a worker. The first request makes it."""
-
-    def __init__(self) -> None:
-        self._hosted: Any = None
-
-    def make(self, function: Callable[..., object], *args: object) -> None:
-        """Make the object."""
-        self._hosted = function(*args)
-
-    def call(self, method: str, *args: object) -> object:
-        """Call a method of the object."""
-        return getattr(self._hosted, method)(*args)
-
-    def abandon(self) -> None:
-        """Close the object. Warn of errors instead of raising them."""
-        if self._hosted is not None:
-            self._hosted.abandon()
-
-
-def _serve(connection: Connection, other_end: Connection | None) -> None:
-    """Run a worker.
+def _serve(connection: Connection, other_end: Connection | None, recipe: bytes) -> None:
+    """Make an object in a worker, and serve it in a list.
 
     Args:
         connection: The connection to the user.
         other_end: The user's end, if a fork has copied it.
+        recipe: The packed function that makes the object, and its arguments.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # because the user's process handles an interrupt
     if other_end is not None:
         other_end.close()
-    host = _Host()
+    served: list[Any] = []
+
+    def make() -> None:
+        function, arguments = unpack(recipe)
+        served.append(function(*arguments))
+
     try:
-        serve(connection, host)
+        serve(connection, served, make)
     finally:
-        host.abandon()
+        for each in served:
+            each.abandon()
+
+
+def _call(served: list[Any], method: str, *args: object) -> Any:
+    """In a worker, call a method of its object."""
+    return getattr(served[0], method)(*args)
 
 
 class _Worker(Peer):
     """A process with a part of the simulations."""
 
-    def __init__(self, context: Any, number: int, part: range) -> None:
+    def __init__(self, context: Any, number: int, part: range, recipe: bytes) -> None:
         """Start the process."""
         self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
         connection, theirs = context.Pipe()
+        super().__init__(connection)
         copied = connection if context.get_start_method() == "fork" else None
         self._process = context.Process(
-            target=_serve, args=(theirs, copied), name=f"simenv_marl {self.name}", daemon=True
+            target=_serve,
+            args=(theirs, copied, recipe),
+            name=f"simenv_marl {self.name}",
+            daemon=True,
         )
         with theirs:
             try:
@@ -242,7 +239,6 @@ class _Worker(Peer):
             except BaseException:
                 connection.close()
                 raise
-        super().__init__(connection, [self._process.sentinel])
 
     def lost(self) -> WorkerError:
         """Make the error that says how the worker died."""
@@ -309,7 +305,7 @@ class WorkerPool:
             if not isinstance(context, BaseContext):
                 context = multiprocessing.get_context("spawn" if context is None else context)
         except (TypeError, ValueError):
-            methods = ", ".join(map(repr, multiprocessing.get_all_start_methods()))
+            methods = multiprocessing.get_all_start_methods()
             raise OptionValueError(
                 f"context must be one of {methods}, or a context of multiprocessing, not"
                 f" {short_repr(context)}"
@@ -318,9 +314,7 @@ class WorkerPool:
         cuts = [number * place // workers for place in range(workers + 1)]
         self._parts = list(map(range, cuts, cuts[1:]))
         try:
-            self._recipes = [
-                pack_plainly(("make", (make, *arguments, part))) for part in self._parts
-            ]
+            self._recipes = [pack_plainly((make, (*arguments, part))) for part in self._parts]
         except Exception as error:
             raise OptionValueError(
                 "the simulation, its points or its options cannot be sent to another process"
@@ -337,30 +331,33 @@ class WorkerPool:
         """Start all workers, and have them make their objects."""
         try:
             for number, part in enumerate(self._parts):
-                self._workers.append(_Worker(self._context, number, part))
-            self._exchange(self._recipes)
+                self._workers.append(_Worker(self._context, number, part, self._recipes[number]))
+            self._exchange([])
         except BaseException:
             self.abandon()
             raise
         self._is_broken = False
 
-    def _exchange(self, messages: Iterable[bytes]) -> list[Any]:
-        """Send each worker its request. Return all results, or raise the first error."""
+    def _exchange(self, requests: Iterable[bytes], seconds: float = inf) -> list[Any]:
+        """Send each worker its request, if there are any. Return the results of the responses.
+
+        Raises:
+            TimeoutError: Not all of them came within some seconds. The pool is broken.
+            WorkerError: A worker has died. The pool is broken.
+            BaseException: The first error of an object.
+        """
+        deadline = monotonic() + seconds
         try:
-            for worker, message in zip(self._workers, messages, strict=True):
-                worker.send_packed(message)
-            outcomes = [worker.receive() for worker in self._workers]
+            for worker, request in zip(self._workers, requests, strict=False):
+                worker.send(request)
+            responses = [worker.receive(deadline - monotonic()) for worker in self._workers]
         except BaseException:
             self._is_broken = True
             self.failed = True
             raise
-        return self._results(outcomes)
-
-    def _results(self, outcomes: Iterable[tuple[Any, BaseException | None] | None]) -> list[Any]:
-        """Return the results of outcomes that have come, or raise the first error."""
         results = []
-        for worker, outcome in zip(self._workers, outcomes, strict=False):
-            result, error = outcome or (None, None)
+        for worker, response in zip(self._workers, responses, strict=True):
+            result, error = unpack_outcome(response)
             if error is not None:
                 annotate(error, f"simenv_marl: in {worker.name}")
                 raise error
@@ -387,21 +384,21 @@ class WorkerPool:
                 "the workers belong to the process from which this one was forked; make a new"
                 " environment"
             )
-        if self._is_broken:
-            if method != "reset":
-                raise WorkerError(
-                    "a worker is dead, or a wait for it was interrupted; reset() starts new workers"
-                )
+        if self._is_broken and method == "reset":
             self.abandon()
             self._start()
-        messages = []
+        if self._is_broken:
+            raise WorkerError(
+                "a worker is dead, or a wait for it was interrupted; reset() starts new workers"
+            )
+        requests = []
         for part in self._parts:
             own = [_share_of(argument, part) for argument in arguments]
-            messages.append(pack_plainly(("call", (method, *own))))
+            requests.append(pack_request(_call, method, *own))
         moves = method in ("reset", "step")
         if moves:
             self.failed = True  # until all simulations have moved
-        results = self._exchange(messages)
+        results = self._exchange(requests)
         if moves:
             self.failed = False
         return results
@@ -412,21 +409,18 @@ class WorkerPool:
         Raises:
             BaseException: The first error of an object.
         """
-        deadline = monotonic() + SECONDS_TO_CLOSE
-        workers = [] if self._is_broken or os.getpid() != self._home else self._workers
-        outcomes = []
         try:
-            with suppress(WorkerError):  # because a dead worker has nothing to close
-                for worker in workers:
-                    worker.send("call", ("close",))
-                for worker in workers:
-                    outcomes.append(worker.receive(max(deadline - monotonic(), 0.0)))
-            if None in outcomes:
+            if not self._is_broken and os.getpid() == self._home:
+                requests = [pack_request(_call, "close")] * len(self._workers)
+                self._exchange(requests, SECONDS_TO_CLOSE)
+        except (WorkerError, TimeoutError) as error:
+            if not self._is_broken:
+                raise
+            if isinstance(error, TimeoutError):  # a dead worker has nothing to close
                 warn_user(
                     f"workers did not close within {SECONDS_TO_CLOSE} s and are killed",
                     ResourceWarning,
                 )
-            self._results(outcomes)
         finally:
             self.abandon()
 

@@ -14,10 +14,12 @@ import copy
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from functools import partial
+from itertools import islice
 from math import inf
 from multiprocessing.connection import Connection, wait
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -25,23 +27,28 @@ from ...errors import (
     BranchError,
     OptionValueError,
     ViewError,
-    WorkerError,
     annotate,
     close_after,
     describe_error,
-    did_you_mean,
     short_repr,
 )
-from ..episodes.base import BaseSession
+from ..episodes.base import checked_seed
 from ..episodes.session import Session
 from ..plans.policies import Where
 from ..switching.context import preserve_generators
 from ..switching.generators import PROCESS, is_seed, seed_globals
 from ..switching.resources import reuse_resources
-from .forks import CAN_FORK, Fork, flush
-from .host import DEEPEST, DEPTH, Host, separator_of
-from .mirror import RemoteSession
-from .packing import pack_outcome, pack_plainly, unpack_outcome
+from .forks import CAN_FORK, Fork
+from .packing import pack_plainly, unpack, unpack_outcome
+from .peer import PeerLostError, serve
+from .remote import Host, RemoteSession
+from .separation import separator_of
+
+DEEPEST: Final = 4
+"""The largest depth of nested branches. Each level can run as many branches as there are cores."""
+
+DEPTH: Final[ContextVar[int]] = ContextVar("simenv_marl.branch", default=0)
+"""The depth of this branch."""
 
 Result = TypeVar("Result")
 EnvType = TypeVar("EnvType")
@@ -62,7 +69,7 @@ def clone(
     environment. ``unwrapped.simulation`` exists only there.
 
     A clone ends when it is closed or collected, and with the user's process. Then, and at a reset,
-    a forked clone does not unwind or close the episode in which it was cloned; a replayed one has
+    a forked clone does not unwind or close the episode of its original; a replayed one has
     an episode for itself, and does.
 
     Args:
@@ -85,20 +92,27 @@ def clone(
         BaseException: Any exception of ``reseed``.
     """
     view = _checked_view(env, "clone", method, time_limit)
-    original: BaseSession = view.session
+    original: Session | RemoteSession = view.session
     if seed is not None:
-        if not is_seed(seed):
-            raise OptionValueError(
-                f"seed must be a non-negative integer or None, not {short_repr(seed)}"
-            )
+        seed = checked_seed(seed)
         original.check_reseed()
-    session = _session_like(original, view, method, time_limit)
+    fork: Fork | None = None
+    if isinstance(original, RemoteSession):
+        fork = original.fork(method, time_limit)
+    else:
+        separate = separator_of(original.episode, method)
+        if separate is not None:
+            fork = Fork.begin(partial(Host.serve, view, separate), time_limit)
+    session = Session(original.plan) if fork is None else RemoteSession(original, fork)
     try:
+        if isinstance(session, Session):
+            with preserve_generators():  # because the model may draw from these
+                session.replay(original)
         twin = view.cloned(session)
         twin.begin_branch()
         made = copy.deepcopy(env, {id(view): twin})  # copies each wrapper with its state
         if seed is not None:
-            session.reseed(int(seed))
+            session.reseed(seed)
     except BaseException as error:
         close_after(error, session.close, "the clone")
         raise
@@ -156,7 +170,7 @@ def branch(
             continuation.
     """
     view = _checked_view(env, "branch", method, time_limit)
-    if isinstance(n, bool) or not isinstance(n, int) or n < 0:
+    if not is_seed(n):
         raise OptionValueError(f"n must be a non-negative integer, not {short_repr(n)}")
     if seeds is not None:
         _check_seeds(seeds, n)
@@ -168,11 +182,12 @@ def branch(
             " decides in the branches, and branches them again; use action_values or RolloutPolicy,"
             " which let a base policy decide there"
         )
-    if isinstance(view.session, RemoteSession) and env is view:
+    is_remote = isinstance(view.session, RemoteSession)
+    if is_remote and env is view:
         branch_there = partial(
             branch, function=function, n=n, method=method, seeds=seeds, time_limit=time_limit
         )
-        results: list[Result] = view.session.call(env, branch_there, (), inf)
+        results: list[Result] = view.call(branch_there)
         return results
 
     def call(continuation: Any, number: int) -> Result:
@@ -182,19 +197,20 @@ def branch(
             twin.begin_branch()
             twin.session.move_to(Where.CLONE)
             if seeds is not None:
-                seed_globals(int(seeds[number]), PROCESS)
-                twin.session.reseed(int(seeds[number]))
+                seed = int(seeds[number])
+                seed_globals(seed, PROCESS)
+                twin.session.reseed(seed)
             return function(continuation, number)
         finally:
             DEPTH.reset(token)
 
-    if isinstance(view.session, RemoteSession):  # whose wrappers are in this process
-        return [_call_on_clone(env, call, number, method) for number in range(n)]
-    separate = separator_of(view, method)
-    if separate is not None:
-        return _call_in_forks(partial(call, env), n, separate, time_limit)
+    if not is_remote:  # otherwise, the wrappers are in this process
+        separate = separator_of(view.session.episode, method)
+        if separate is not None:
+            return _call_in_forks(partial(call, env), n, separate, time_limit)
+        method = "replay"
     with reuse_resources():
-        return [_call_on_clone(env, call, number, "replay") for number in range(n)]
+        return [_call_on_clone(env, call, number, method) for number in range(n)]
 
 
 def pending_view(env: Any, user: str) -> Any:
@@ -210,10 +226,7 @@ def _checked_view(env: Any, user: str, method: str | None, time_limit: float) ->
     """Check the arguments of a ``user`` of an environment; return the unwrapped environment."""
     view = pending_view(env, user)
     if method not in (None, "fork", "replay"):
-        suggestion = did_you_mean(method, ["fork", "replay"])
-        raise OptionValueError(
-            f"method must be None, 'fork' or 'replay', not {short_repr(method)}{suggestion}"
-        )
+        raise OptionValueError(f"method must be None, 'fork' or 'replay', not {short_repr(method)}")
     if method == "fork" and not (CAN_FORK and view.driver == "greenlet"):
         raise OptionValueError(
             'method="fork" needs Linux, and driver="greenlet": a forked process does not have the'
@@ -235,37 +248,6 @@ def _check_seeds(seeds: Sequence[int], n: int) -> None:
         )
 
 
-def _session_like(
-    original: BaseSession, view: Any, method: str | None, time_limit: float
-) -> BaseSession:
-    """Make a session that stands at the decision of another one."""
-    fork = _fork_of(original, view, method)
-    if fork is None:
-        replayed = Session(original.plan)
-        try:
-            with preserve_generators():  # the model may draw from those of the process
-                replayed.replay(original)
-        except BaseException as error:
-            close_after(error, replayed.close, "the clone")
-            raise
-        return replayed
-    remote = RemoteSession(original, fork, time_limit)
-    try:
-        remote.begin(view, view.waits_for_one)
-    except BaseException as error:
-        close_after(error, remote.close, "the clone")
-        raise
-    return remote
-
-
-def _fork_of(original: BaseSession, view: Any, method: str | None) -> Fork | None:
-    """Fork a process for a clone. None if the episode is replayed."""
-    if isinstance(original, RemoteSession):
-        return None if method == "replay" else original.fork(method)
-    separate = separator_of(view, method)
-    return None if separate is None else Fork.begin(Host(view).serve, separate, wait=True)
-
-
 # -- branches: clones for one call ----------------------------------------------------------------
 
 
@@ -273,18 +255,19 @@ def _call_on_clone(
     env: Any, function: Callable[[Any, int], Result], number: int, method: str | None
 ) -> Result:
     """Call a function in this process on a clone."""
-    twin: Any = None
-    with preserve_generators():  # the function and the model may draw from those of the process
+    with preserve_generators():  # because the function and the model may draw from these
         try:
             twin = clone(env, method=method)
-            result = function(twin, number)
+            try:
+                result = function(twin, number)
+            except BaseException as error:
+                close_after(error, twin.unwrapped.close, "the branch")
+                raise
+            twin.unwrapped.close()
         except BaseException as error:
             annotate(error, f"simenv_marl: in branch {number}")
-            if twin is not None:
-                close_after(error, twin.unwrapped.close, "the branch")
             raise
-        twin.unwrapped.close()
-        return result
+    return result
 
 
 def _call_in_forks(
@@ -294,64 +277,57 @@ def _call_in_forks(
     results: dict[int, Result] = {}
     running: dict[Connection, tuple[int, Fork, float]] = {}  # with the number and the deadline
     cores = len(os.sched_getaffinity(0))
-    started = 0
-
-    def main(connection: Connection) -> None:
-        message = pack_outcome(_pack_result, function, started)
-        flush()
-        connection.send_bytes(message)
-
+    numbers = iter(range(n))
     try:
-        while started < n or running:
-            while started < n and len(running) < cores:
-                fork = Fork.begin(main, separate, wait=False)
-                fork.limit(time_limit)  # of the parts of a message; the wait for it is below
-                running[fork.connection] = started, fork, time.monotonic() + time_limit
-                started += 1
+        while len(results) < n:
+            for number in islice(numbers, cores - len(running)):
+                first = partial(_call_and_pack, separate, function, number)
+                fork = Fork.begin(partial(serve, served=None, first=first), time_limit)
+                running[fork.connection] = number, fork, time.monotonic() + time_limit
             oldest, _, deadline = next(iter(running.values()))
-            left = deadline - time.monotonic()
-            ready = wait(list(running), None if left == inf else max(left, 0.0))
+            left = None if deadline == inf else max(deadline - time.monotonic(), 0.0)
+            ready = wait(list(running), left)
             if not ready:
                 raise BranchError(
                     f"branch {oldest} was stopped: it took longer than {time_limit} s"
                 )
             for connection in [connection for connection in running if connection in ready]:
                 number, fork, _ = running.pop(connection)
-                message = fork.receive()
-                how = fork.end()
-                if not message:
-                    raise BranchError(f"branch {number} has died without a result, {how}")
-                results[number] = _result(number, message)
+                results[number] = _result_of(number, fork)
     finally:
         for _, fork, _ in running.values():
-            fork.end()
+            fork.end("")
     return [results[number] for number in range(n)]
 
 
-def _result(number: int, message: bytes) -> Any:
-    """Unpack the result of a branch, or raise its exception."""
-    error: BaseException | None
+def _call_and_pack(
+    separate: Callable[[], None], function: Callable[[int], object], number: int
+) -> bytes:
+    """In a branch, call a function; return its result as bytes."""
+    separate()
+    result = function(number)
     try:
-        result, error = unpack_outcome(message)
-    except Exception as problem:  # not everything that can be pickled can be unpickled
-        error = _unpicklable(problem)
-        error.__cause__ = problem
+        packed = pack_plainly(result)
+        unpack(packed)  # not everything that can be pickled can be unpickled
+    except Exception as error:
+        raise BranchError(
+            f"it returned a value that cannot be pickled ({describe_error(error)})"
+        ) from error
+    return packed
+
+
+def _result_of(number: int, fork: Fork) -> Any:
+    """Return the result of a branch, or raise its exception."""
+    try:
+        response = fork.receive()
+    except PeerLostError:
+        fork.end(f"branch {number} has died without a result, ")
+        raise BranchError(fork.gone) from None
+    fork.end("")
+    result, error = unpack_outcome(response)
     if error is None:
-        return result
+        return unpack(result)
     if not isinstance(error, Exception):  # an exit or an interrupt must not be raised here
         raise BranchError(f"branch {number} has raised {describe_error(error)}") from error
-    if type(error) is WorkerError:
-        raise BranchError(f"branch {number}: {error}") from error.__cause__ or error.__context__
     annotate(error, f"simenv_marl: in branch {number}")
     raise error
-
-
-def _pack_result(result: object) -> bytes:
-    try:
-        return pack_plainly(result)
-    except Exception as error:
-        raise _unpicklable(error) from error
-
-
-def _unpicklable(error: Exception) -> BranchError:
-    return BranchError(f"it returned a value that cannot be pickled ({describe_error(error)})")

@@ -6,19 +6,22 @@ import _signal  # type: ignore[import-not-found]  # without the enums of signal,
 import gc
 import os
 import select
-import signal
 import socket
-import struct
 import sys
 import warnings
-import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from errno import EMFILE
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Final
+from typing import Final, TypeVar
 
-from ...errors import BranchError
+from ...errors import BranchError, annotate
+from ...simulation import Model
+from ..switching.context import ExclusiveLock
+from .packing import unpack_outcome
+from .peer import Peer, PeerLostError, flush, pack_request, receive
 
 CAN_FORK: Final = sys.platform == "linux"
 """Whether processes can be forked: elsewhere, nothing ends a busy one with its user's process."""
@@ -26,83 +29,67 @@ CAN_FORK: Final = sys.platform == "linux"
 if CAN_FORK:
     import fcntl
 
-_KILL: Final = int(signal.SIGKILL)
+Result = TypeVar("Result")
 
-_TIME: Final = struct.Struct("ll")
-"""A time limit of a socket: seconds and microseconds."""
-
-_LONGEST: Final = 1e9
-"""The number of seconds from which on there is no limit."""
+# -- this process ---------------------------------------------------------------------------------
 
 
-# -- the first process ----------------------------------------------------------------------------
+@dataclass
+class _Process:
+    """The descriptors of this process that concern its forks and its user.
 
-
-class _Life:
-    """A pipe whose write end only this process has. Its end ends the forks of this process.
-
+    The end of a life, a pipe whose write end only one process has, ends all forks of that process.
     A signal of the kernel ends them, because a process that is busy would not notice the end of a
     pipe. The kernel's other signal, at the end of a parent, is of no use: it comes at the end of
     the thread that has forked.
-    """
-
-    def __init__(self) -> None:
-        self.reading, self.writing = os.pipe()
-
-    def leave(self) -> None:
-        """In a fork: close the write end. The read end stays open where the fork watches it."""
-        os.close(self.writing)
-        self.reading = -1
-        self.writing = -1
-
-    def __del__(self) -> None:
-        for descriptor in (self.reading, self.writing):
-            with suppress(OSError):
-                os.close(descriptor)
-
-
-class _Process:
-    """The lives and connections of this process.
 
     Attributes:
-        life: A weak reference to the life on which all forks of this process depend.
         lives: The read ends of the lives of the processes above this one.
         connection: The connection to the process that uses this one.
+        life: The read end and the write end of this process's own life, once it has forked.
     """
 
-    def __init__(self, lives: tuple[int, ...] = (), connection: Connection | None = None) -> None:
-        self.life: Callable[[], _Life | None] = lambda: None
-        self.lives = lives
-        self.connection = connection
+    lives: tuple[int, ...] = ()
+    connection: Connection | None = None
+    life: tuple[int, int] | None = None
 
-    def own_life(self) -> _Life:
-        """Return the life on which all forks of this process depend."""
-        life = self.life()
-        if life is None:
-            try:
-                life = _Life()
-            except OSError as error:
-                raise exhausted(error) from error
-            self.life = weakref.ref(life)
-        return life
+    def own_life(self) -> int:
+        """Return the read end of the life of this process."""
+        if self.life is None:
+            self.life = os.pipe()
+        return self.life[0]
+
+    def leave(self) -> None:
+        """In a fork, close the descriptors that keep the other end from being closed."""
+        if self.life is not None:
+            os.close(self.life[1])
+        if self.connection is not None:
+            self.connection.close()
 
 
 _this = _Process()
 
 
 def _begin_process() -> None:
-    """In a forked process, also one that the user has forked: leave what belongs to the parent."""
+    """In a forked process, also in a fork of the user: leave the parent's descriptors."""
     global _this
-    life = _this.life()
-    if life is not None:  # else the parent's end would go unnoticed as long as this process lives
-        life.leave()
-    if _this.connection is not None:
-        _this.connection.close()
+    _this.leave()
     _this = _Process()
 
 
 if CAN_FORK:
     os.register_at_fork(after_in_child=_begin_process)
+
+
+def _begin_fork(lives: tuple[int, ...], connection: Connection) -> None:
+    """In a fork of this module, end with the lives, and leave interrupts to the user."""
+    global _this
+    gc.freeze()  # the collector would write to the memory that is shared, and so copy it
+    _this = _Process(lives, connection)
+    for life in lives:
+        _end_with(life)
+    _signal.signal(_signal.SIGINT, _signal.SIG_IGN)
+    _signal.set_wakeup_fd(-1)
 
 
 def _end_with(descriptor: int) -> None:
@@ -111,7 +98,7 @@ def _end_with(descriptor: int) -> None:
     os.dup2(own, descriptor, inheritable=False)  # because each opening has one owner
     os.close(own)
     fcntl.fcntl(descriptor, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(descriptor, fcntl.F_SETSIG, _KILL)
+    fcntl.fcntl(descriptor, fcntl.F_SETSIG, _signal.SIGKILL)
     fcntl.fcntl(descriptor, fcntl.F_SETFL, os.O_NONBLOCK | os.O_ASYNC)
     end = select.poll()
     end.register(descriptor, select.POLLHUP)
@@ -119,192 +106,175 @@ def _end_with(descriptor: int) -> None:
         os._exit(1)
 
 
-def exhausted(error: OSError) -> BranchError:
-    """Make the error that says that there are no more descriptors or processes."""
-    return BranchError(f"no process can be forked: {error}; close some clones")
-
-
 # -- forks ----------------------------------------------------------------------------------------
 
 
-class Fork:
-    """A forked process, and the connection to it.
+class Fork(Peer):
+    """A forked process. It serves an object.
 
     Attributes:
+        lock: Lets one thread at a time wait for the process.
         process: The number of the process.
-        connection: The connection to it.
-        life: The life on which it depends, which must not be freed before.
     """
 
     def __init__(
-        self, process: int, connection: Connection, life: _Life | None, *, is_child: bool
+        self,
+        process: int,
+        connection: Connection,
+        limit: float,
+        reap: Callable[[], object] | None = None,
     ) -> None:
-        """Take over a process: a child of this process, or a child's."""
-        self.process = process
-        self.connection = connection
-        self.life = life
-        self._is_child = is_child
-        self._owner = os.getpid()
-        self._alive = True
-
-    @classmethod
-    def begin(
-        cls,
-        main: Callable[[Connection], None],
-        separate: Callable[[], None],
-        *,
-        wait: bool,
-        outlives: bool = False,
-    ) -> Fork:
-        """Fork a process that runs a function with its end of the connection, and then ends.
+        """Take over a process.
 
         Args:
-            main: The function.
-            separate: Separates the new process from this one.
-            wait: Whether this process may go on to change shared things, and so waits until they
-                are separated.
-            outlives: Whether the new process goes on when this one ends, and ends with the
-                processes above this one.
+            process: Its number.
+            connection: The connection to it.
+            limit: The time that an answer may take, in seconds.
+            reap: Lets its parent wait for its end. None: this process is its parent.
+        """
+        super().__init__(connection)
+        self.lock = ExclusiveLock()
+        self.process = process
+        self._limit = limit
+        self._reap = reap
+        self._owner = os.getpid()
+        self._gone: str | None = None
+
+    @classmethod
+    def begin(cls, main: Callable[[Connection], None], limit: float) -> Fork:
+        """Fork this process: see ``fork``. The new process ends with this one.
 
         Raises:
             BranchError: There are no more descriptors or processes. Nothing is left behind.
         """
-        life = None if outlives else _this.own_life()
-        lives = _this.lives if life is None else (*_this.lives, life.reading)
-        try:
-            here, there = Pipe()
-        except OSError as error:
-            raise exhausted(error) from error
+        here, there = pipe()
         with there:
-            try:
-                process = _start(here, there, lives, separate, wait=wait)
-            except BaseException:
-                here.close()
-                raise
-            if process == 0:
-                try:
-                    here.close()
-                    main(there)
-                finally:
-                    os._exit(0)  # without any of the parent's exit handlers
-        return cls(process, here, life, is_child=True)
+            process = fork(main, there, here)
+        return cls(process, here, limit)
 
     @property
-    def usable(self) -> bool:
-        """Whether the process was not ended, and belongs to this one, which may be a fork."""
-        return self._alive and self._owner == os.getpid()
+    def gone(self) -> str | None:
+        """Why it can answer no requests. None if it can."""
+        if self._owner != os.getpid():
+            return "it belongs to another process"
+        return self._gone
 
-    def limit(self, seconds: float) -> None:
-        """Limit the time for which a message is awaited."""
-        limit = _TIME.pack(0, 0)  # no limit
-        if seconds < _LONGEST:
-            whole, part = divmod(max(seconds, 1e-6), 1)
-            limit = _TIME.pack(int(whole), int(part * 1e6))
-        with _as_socket(self.connection) as same:
-            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+    def start(self) -> Model:
+        """Wait for the first response; return its result. After an error, the process ends."""
+        with self.watch():
+            return result_of(self.receive(self._limit))
 
-    def receive(self) -> bytes:
-        """Receive a message. An empty one means that the process has ended.
+    def request(self, method: Callable[..., Result], *args: object) -> Result:
+        """Call a method of the served object; return its result.
 
         Raises:
-            TimeoutError: It did not come within the limit.
+            BranchError: The process has ended, or takes longer than the limit and is ended.
+            ReentrancyError: Another thread waits for the process.
+            BaseException: Any exception there, with its traceback as a note.
         """
-        return receive(self.connection)
+        request = pack_request(method, *args)
+        with self.watch():
+            self.send(request)
+            response = self.receive(self._limit)
+        result: Result = result_of(response)
+        return result
 
-    def end(self) -> str:
-        """End the process; return how it has ended. In a fork of this process, only forget it."""
-        alive, self._alive = self._alive, False
-        if not alive:
-            return "its process has ended"
-        how = self._kill() if self._owner == os.getpid() else "its process has ended"
-        self.life = None
+    @contextmanager
+    def watch(self) -> Iterator[None]:
+        """Send a request and wait for the response inside.
+
+        The process ends if the response does not come, or if an interrupt ends the wait.
+        """
+        with self.lock:
+            self._check()
+            try:
+                yield
+            except TimeoutError:
+                self.end(f"it was ended, because it took longer than {self._limit} s; ")
+            except PeerLostError:
+                self.end("its process has died, ")
+            except BaseException:  # an interrupt: the response would be taken for the next one
+                self.end("it was ended by an interrupt; ")
+                raise
+            if self._gone is not None:
+                self._check()
+
+    def _check(self) -> None:
+        if self.gone is not None:
+            raise BranchError(f"the clone is gone: {self.gone}")
+
+    def end(self, why: str) -> None:
+        """End the process, for a reason. In a fork of this process, only forget it."""
+        if self._gone is not None:
+            return
+        self._gone = why  # an interrupt may come before the rest
+        if self._owner == os.getpid():
+            self._gone += self._kill()
         self.connection.close()
-        return how
 
     def _kill(self) -> str:
-        if self._is_child or not self._has_ended():
+        """Kill the process; return how it has ended."""
+        # If it has closed its connection, its number may be another process's.
+        if self._reap is None or receive(self.connection, 0) != b"":
             with suppress(ProcessLookupError):
-                os.kill(self.process, signal.SIGKILL)
-        if self._is_child:
-            with suppress(ChildProcessError):  # the user has waited for it
-                code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
-                return f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
-        return "its process has ended"
-
-    def _has_ended(self) -> bool:
-        """Whether the process has closed its connection: its number may be another process's."""
-        try:
-            return self.connection.poll(0) and self.receive() == b""
-        except OSError:
-            return True
+                os.kill(self.process, _signal.SIGKILL)
+        if self._reap is not None:
+            with suppress(Exception):  # the parent may be gone, or busy; then it waits later
+                self._reap()
+            return "its process has ended"
+        code = 0
+        with suppress(ChildProcessError):  # the user has waited for it
+            code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
+        return f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
 
 
-def _start(
-    here: Connection,
-    there: Connection,
-    lives: tuple[int, ...],
-    separate: Callable[[], None],
-    *,
-    wait: bool,
+def fork(
+    main: Callable[[Connection], None], connection: Connection, other: Connection | None
 ) -> int:
-    """Fork a process. Return its number, and 0 in that process.
+    """Fork a process that runs a function with a connection, and then ends. Return its number.
 
     Args:
-        here: This process's end of the connection.
-        there: The other end.
-        lives: The lives with which the process ends.
-        separate: Separates it from this process.
-        wait: Whether to return after that.
-
-    Raises:
-        BranchError: There are no more processes.
+        main: The function, which must ``serve`` something.
+        connection: The connection.
+        other: The other end, if this process uses the new one. Then the new process ends with this
+            one, otherwise with the processes above this one.
     """
-    global _this
-    flush()  # else both processes would write what is buffered
+    flush()  # else both processes would write the buffered output
+    lives = _this.lives
     try:
-        # Python 3.12 warns because the child never releases locks that other threads hold.
-        silent = warnings.catch_warnings(action="ignore") if sys.version_info >= (3, 12) else None
-        with silent or nullcontext():
+        if other is not None:
+            lives = *lives, _this.own_life()
+        with warnings.catch_warnings(action="ignore"):  # of locks that other threads hold
             process = os.fork()
     except OSError as error:
         raise exhausted(error) from error
     if process == 0:
         try:
-            gc.freeze()  # the collector would write to the memory that is shared, and so copy it
-            _this = _Process(lives, there)
-            for life in lives:
-                _end_with(life)
-            _signal.signal(_signal.SIGINT, _signal.SIG_IGN)  # an interrupt is for the user
-            _signal.set_wakeup_fd(-1)
-            separate()
-            if wait:
-                there.send_bytes(b".")
-        except BaseException:
-            os._exit(1)
-    elif wait:
-        _await_separation(process, here, there)
+            if other is not None:
+                other.close()
+            _begin_fork(lives, connection)
+            main(connection)
+        finally:
+            os._exit(0)  # without any of the parent's exit handlers
     return process
 
 
-def _await_separation(process: int, here: Connection, there: Connection) -> None:
-    separated = b""
+# -- connections ----------------------------------------------------------------------------------
+
+
+def pipe() -> tuple[Connection, Connection]:
+    """Return two connected ends. Raise a ``BranchError`` if there are no more descriptors."""
     try:
-        there.close()  # else the end of the process would go unnoticed
-        separated = receive(here)
-    finally:
-        if not separated:  # it has died, or an interrupt has ended the wait
-            os.kill(process, _signal.SIGKILL)
-            os.waitpid(process, 0)
-    if not separated:
-        raise BranchError("the forked process died before it was separated from this one")
+        return Pipe()
+    except OSError as error:
+        raise exhausted(error) from error
 
 
-@contextmanager
-def _as_socket(connection: Connection) -> Iterator[socket.socket]:
-    """Use a connection as the socket that it is."""
-    with socket.socket(fileno=os.dup(connection.fileno())) as same:
-        same.setblocking(True)  # whatever the default time limit of sockets is
-        yield same
+def _as_socket(connection: Connection) -> socket.socket:
+    """Return the socket that a connection is."""
+    same = socket.socket(fileno=os.dup(connection.fileno()))
+    same.setblocking(True)  # because users may set a default time limit of sockets
+    return same
 
 
 def send_connection(through: Connection, connection: Connection) -> None:
@@ -313,29 +283,25 @@ def send_connection(through: Connection, connection: Connection) -> None:
         socket.send_fds(same, [b"."], [connection.fileno()])
 
 
-def receive_connection(through: Connection) -> Connection | None:
-    """Receive a connection. None if there are no more descriptors."""
+def receive_connection(through: Connection) -> Connection:
+    """Receive a connection. Raise a ``BranchError`` if there are no more descriptors."""
     with _as_socket(through) as same:
         descriptors = socket.recv_fds(same, 1, 1)[1]
-    return Connection(descriptors[0]) if descriptors else None
+    if not descriptors:
+        raise exhausted(OSError(EMFILE, os.strerror(EMFILE)))
+    return Connection(descriptors[0])
 
 
-def receive(connection: Connection) -> bytes:
-    """Receive a message. An empty one means that the other end was closed.
-
-    Raises:
-        TimeoutError: It did not come within the time limit of the connection.
-    """
-    try:
-        return connection.recv_bytes()
-    except BlockingIOError as error:
-        raise TimeoutError from error
-    except (EOFError, OSError):
-        return b""
+def result_of(response: bytes) -> Model:
+    """Return the result in a response of a fork, or raise its error."""
+    result, error = unpack_outcome(response)
+    if error is None:
+        return result
+    annotate(error, f"simenv_marl: in a clone, where it was raised by{error.__cause__}")
+    BaseException.__setattr__(error, "__cause__", None)  # its class may be frozen
+    raise error
 
 
-def flush() -> None:
-    """Write out what the standard streams have buffered."""
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(Exception):
-            stream.flush()
+def exhausted(error: OSError) -> BranchError:
+    """Make the error that says that there are no more descriptors or processes."""
+    return BranchError(f"no process can be forked: {error}; close some clones")

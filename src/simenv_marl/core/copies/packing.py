@@ -1,7 +1,7 @@
 """Pickles for other processes: simulations, decision functions, policies, results and errors.
 
-Objects that can be imported are pickled by reference, all others by value, such as those of a
-script or a notebook.
+Objects that can be imported are pickled by reference, all others by value, such as the objects of
+a script or a notebook.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import reduce
 from importlib import import_module
-from types import FunctionType, GetSetDescriptorType, MemberDescriptorType
+from types import FunctionType
 from typing import Any, Final
 from uuid import uuid4
 from weakref import WeakKeyDictionary, WeakValueDictionary
@@ -49,20 +49,18 @@ unpack: Final = pickle.loads
 """Unpickles an object that ``pack`` or ``pack_plainly`` has pickled."""
 
 
-def pack_outcome(
-    pack_result: Callable[[Any], bytes], function: Callable[..., object], *args: object
-) -> bytes:
+def pack_outcome(function: Callable[..., object], *args: object) -> bytes:
     """Call a function, and pack its result, or the error that it raises."""
     try:
-        return pickle.dumps((pack_result(function(*args)), None), 5)
+        return pack_plainly((function(*args), None))
     except BaseException as error:
-        return pickle.dumps((None, pack_error(error)), 5)
+        return pack_plainly((None, pack_error(error)))
 
 
 def unpack_outcome(parcel: bytes) -> tuple[Any, BaseException | None]:
     """Unpack a result, or None and an error, that ``pack_outcome`` has packed."""
-    result, error = pickle.loads(parcel)
-    return (unpack(result), None) if error is None else (None, unpack_error(error))
+    result, error = unpack(parcel)
+    return result, None if error is None else unpack_error(error)
 
 
 class Pickler(cloudpickle.Pickler):
@@ -88,77 +86,62 @@ class RemoteTraceback(Exception):
     """The cause of an error from another process. Its message is the traceback there."""
 
 
-def pack_error(error: BaseException) -> bytes:
-    """Pickle an error with its traceback.
+def pack_error(error: BaseException) -> tuple[bytes, str]:
+    """Pickle an error, and format its traceback.
 
     An error that cannot be pickled becomes a ``WorkerError``.
     """
+    told = describe_error(error)
     try:
         text = "".join(traceback.format_exception(error))
     except Exception:  # formatting runs code of the error's class, which may fail
-        text = describe_error(error)
+        text = told
     try:
         parcel = pack(error)
-        unpack(parcel)  # because a class may define pickling that works only in one direction
+        # A class may define pickling that works in one direction only, or have slots.
+        is_whole = describe_error(unpack(parcel)) == told
     except Exception:
-        other = WorkerError(
-            f"another process raised an error that cannot be pickled: {describe_error(error)}"
-        )
+        is_whole = False
+    if not is_whole:
+        other = WorkerError(f"another process raised an error that cannot be pickled: {told}")
         other.__notes__ = error_notes(error)
         parcel = pack(other)
-    return pickle.dumps((parcel, text), 5)
+    return parcel, text
 
 
-def unpack_error(parcel: bytes) -> BaseException:
+def unpack_error(packed: tuple[bytes, str]) -> BaseException:
     """Rebuild an error. Its cause becomes the traceback in the other process."""
-    inner, text = pickle.loads(parcel)
-    error: BaseException = unpack(inner)
+    parcel, text = packed
+    error: BaseException = unpack(parcel)
     # Not by an assignment, because the error's class may be frozen.
     BaseException.__setattr__(error, "__cause__", RemoteTraceback(f"\n\n{text}"))
     return error
 
 
-_IN_PYTHON: Final = 1 << 9
-"""The flag of classes that were made at run time, as all classes written in Python are."""
+def _builtin(kind: type) -> Any:
+    """Return the first base of an error's class that is not written in Python."""
+    in_python = 1 << 9  # the flag of classes that are made at run time
+    return next(base for base in kind.__mro__ if not base.__flags__ & in_python)
 
 
 def _reduce_error(error: BaseException) -> Reduced | None:
     """Return how to rebuild an error without ``__init__``. None if its class defines pickling."""
-    roots = (BaseExceptionGroup, BaseException, object)
-    kinds = [kind for kind in type(error).__mro__ if kind not in roots]
-    for kind in kinds:
-        if kind.__flags__ & _IN_PYTHON and {"__reduce__", "__reduce_ex__"} & vars(kind).keys():
-            return None
-    args = error.args
-    if isinstance(error, BaseExceptionGroup):
-        args = (error.message, error.exceptions)
-    members = {name: getattr(error, name) for kind in kinds for name in _members(kind, error)}
-    attributes = vars(error) | {"__notes__": error_notes(error)}
-    return _rebuild_error, (type(error), args, members | {"args": args}, attributes)
+    kind: Any = type(error)
+    builtin = _builtin(kind)
+    if (kind.__reduce__, kind.__reduce_ex__) != (builtin.__reduce__, builtin.__reduce_ex__):
+        return None
+    _, args, *state = builtin.__reduce__(error)
+    attributes: dict[str, Any] = {**state[0]} if state else {}
+    attributes.pop("obj", None)  # it may be the whole model, in an AttributeError
+    return _rebuild_error, (kind, args, attributes | {"__notes__": error_notes(error)})
 
 
-def _members(kind: type, error: BaseException) -> list[str]:
-    """Return the names of the slots of an error's class that have a value."""
-    return [
-        name
-        for name, member in vars(kind).items()
-        if isinstance(member, (MemberDescriptorType, GetSetDescriptorType))
-        and not name.startswith("__")
-        # The ``obj`` of an AttributeError may refer to the whole model.
-        and name != "obj"
-        and hasattr(error, name)
-    ]
-
-
-def _rebuild_error(
-    kind: type, args: tuple[Any, ...], members: dict[str, Any], attributes: dict[str, Any]
-) -> BaseException:
-    builtin: Any = next(base for base in kind.__mro__ if not base.__flags__ & _IN_PYTHON)
+def _rebuild_error(kind: type, args: tuple[Any, ...], attributes: dict[str, Any]) -> BaseException:
+    builtin = _builtin(kind)
     error: BaseException = builtin.__new__(kind, *args)
-    for name, value in members.items():
-        if value is not None or getattr(error, name, error) is not None:
-            BaseException.__setattr__(error, name, value)
-    vars(error).update(attributes)
+    builtin.__init__(error, *args)
+    for name, value in attributes.items():
+        BaseException.__setattr__(error, name, value)
     return error
 
 
@@ -170,7 +153,7 @@ _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
 
 
 def _reduce_function(function: FunctionType) -> Reduced | None:
-    """Return how another process finds or makes a function to which its name does not lead."""
+    """Return how another process finds or makes a function that its name does not find."""
     place = function.__module__, function.__qualname__
     named = _import(*place)
     if named is function:

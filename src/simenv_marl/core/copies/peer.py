@@ -1,24 +1,18 @@
-"""One request to another process: a name and arguments there, and the response back.
+"""One request to another process: a method and its arguments there, and the response back.
 
 A process ``serve``s an object, whose methods its user calls by a ``Peer``. Each message is pickled.
-A wait for an answer ends when the other process ends.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from math import inf
+from multiprocessing.connection import Connection
 
-from .forks import receive
-from .packing import pack_outcome, pack_plainly, unpack, unpack_outcome
-
-
-class Response(NamedTuple):
-    """The result of a request, or its error."""
-
-    result: Any
-    error: BaseException | None
+from ...simulation import Model
+from .packing import pack_outcome, pack_plainly, unpack
 
 
 class PeerLostError(Exception):
@@ -32,68 +26,76 @@ class Peer:
         connection: The connection to the process.
     """
 
-    def __init__(self, connection: Connection, sentinels: Sequence[int] = ()) -> None:
-        """Use a connection. The ``sentinels`` are ready when the process has ended."""
+    def __init__(self, connection: Connection) -> None:
         self.connection = connection
-        self._sentinels = sentinels
 
-    def send(self, name: str, args: tuple[Any, ...]) -> None:
-        """Send a request. Raise the error of ``lost`` if the process has ended."""
-        self.send_packed(pack_plainly((name, args)))
-
-    def send_packed(self, message: bytes) -> None:
-        """Send a request that is packed. Raise the error of ``lost`` if the process has ended."""
+    def send(self, request: bytes) -> None:
+        """Send a request of ``pack_request``. Raise the error of ``lost`` if the process ended."""
         try:
-            self.connection.send_bytes(message)
+            self.connection.send_bytes(request)
         except OSError as error:
             raise self.lost() from error
 
-    def receive(self, seconds: float | None = None) -> Response | None:
-        """Wait for the outcome of a request. None if it does not come within some seconds.
+    def receive(self, seconds: float = inf) -> bytes:
+        """Wait for a response, which ``unpack_outcome`` unpacks.
 
         Raises:
+            TimeoutError: It did not come within some seconds.
             PeerLostError: The process has ended. A subclass may raise another error.
-            TimeoutError: The outcome did not come within the limit of the connection.
         """
-        if self._sentinels or seconds is not None:
-            if not wait([self.connection, *self._sentinels], seconds):
-                return None
-            if not self._has_message():
-                raise self.lost()
-        parcel = receive(self.connection)
-        if not parcel:
+        response = receive(self.connection, seconds)
+        if response is None:
+            raise TimeoutError
+        if not response:
             raise self.lost()
-        return Response(*unpack_outcome(parcel))
-
-    def _has_message(self) -> bool:
-        try:
-            return self.connection.poll()
-        except OSError:  # on Windows, where the other end is closed
-            return False
+        return response
 
     def lost(self) -> Exception:
         """Make the error for the end of the process. A subclass may say how it has ended."""
         return PeerLostError("the other process has ended")
 
 
-def serve(connection: Connection, served: object, after: Callable[[], None] | None = None) -> None:
+def pack_request(method: Callable[..., object], *args: object) -> bytes:
+    """Pack a request to call a method of the object that the other process serves."""
+    return pack_plainly((method, args))
+
+
+def serve(connection: Connection, served: object, first: Callable[[], object]) -> None:
     """Answer requests to call methods of an object until the other end is closed.
 
-    Args:
-        connection: The connection to the user.
-        served: The object.
-        after: Called after each request.
+    The first response comes without a request: the result of a function.
     """
 
-    def call(message: bytes) -> Any:
-        name, args = unpack(message)
-        return getattr(served, name)(*args)
+    def call(request: bytes) -> Model:
+        method, args = unpack(request)
+        return method(served, *args)
 
-    while message := receive(connection):
-        outcome = pack_outcome(pack_plainly, call, message)
-        if after is not None:
-            after()
-        try:
-            connection.send_bytes(outcome)
-        except OSError:  # the user's process has ended
-            return
+    response = pack_outcome(first)
+    with suppress(OSError):  # the user's process has ended
+        while True:
+            flush()
+            connection.send_bytes(response)
+            request = receive(connection)
+            if not request:
+                return
+            response = pack_outcome(call, request)
+
+
+def receive(connection: Connection, seconds: float = inf) -> bytes | None:
+    """Receive a message. An empty one means that the other end was closed.
+
+    None if there is no message within some seconds.
+    """
+    try:
+        if seconds < inf and not connection.poll(seconds):
+            return None
+        return connection.recv_bytes()
+    except (EOFError, OSError):
+        return b""
+
+
+def flush() -> None:
+    """Write out the buffers of the standard streams."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(Exception):
+            stream.flush()

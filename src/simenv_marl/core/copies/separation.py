@@ -14,16 +14,19 @@ import socket
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from selectors import BaseSelector
 from subprocess import Popen
 from threading import Thread
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
+from ...errors import BranchError
+from ..episodes.episode import Episode
 from ..switching.awaiting import policy_loops
-from ..switching.opened import Resource, new_epolls
+from ..switching.opened import new_epolls
 from .forks import CAN_FORK, exhausted
 
 if CAN_FORK:
@@ -46,10 +49,6 @@ class Loop(Protocol):
         """Whether it is closed."""
 
 
-_Inode = tuple[int, int]
-"""The device and the number of a file."""
-
-
 @dataclass
 class _Opening:
     """An opening of a file: its flags and offset, and the descriptors that share the offset."""
@@ -59,46 +58,26 @@ class _Opening:
     descriptors: list[int]
 
 
-def separator(loops: Iterable[Loop] = ()) -> Callable[[], None]:
-    """Return a function that separates forked children, and their loops, from this process."""
-    try:
-        python = random.getstate()
-        files = _open_files()
-    except OSError as error:
-        raise exhausted(error) from error
+def separator_of(episode: Episode | None, method: str | None) -> Callable[[], None] | None:
+    """Return a function that separates forks of this process from it.
 
-    def separate() -> None:
-        random.setstate(python)  # Python reseeds it after a fork
-        for inode, openings in files.items():
-            descriptors = [number for opening in openings for number in opening.descriptors]
-            # The garbage collector, or a thread that is not here, may have closed it since.
-            if all(_inode(number) == inode for number in descriptors):
-                _reopen(openings)
-        for loop in loops:
-            _separate_loop(loop)
-        torch = sys.modules.get("torch")
-        if torch is not None:
-            torch.set_num_threads(1)  # because torch would wait for threads that are not here
+    None if the episode is replayed.
 
-    return separate
-
-
-# -- obstacles ------------------------------------------------------------------------------------
-
-
-def obstacles_of(opened: Iterable[Resource] | None) -> tuple[list[str], list[Loop]]:
-    """Return what keeps a simulation from going on in a fork, and the loops that can go on there.
-
-    Args:
-        opened: The resources that the simulation has opened.
+    Raises:
+        BranchError: The method is "fork", which is not possible.
     """
-    sockets: dict[int, str] = {}
+    if episode is None or method == "replay" or not CAN_FORK:
+        return None
+    if episode.plan.options.driver != "greenlet":
+        return None
+    driver = episode.driver
+    if not driver.reachable:
+        driver.enter()  # raises the error that names the thread
+    held: dict[int, str] = {}
     others: list[str] = []
-    for resource in opened or ():
+    for resource in driver.opened or ():
         if isinstance(resource, socket.socket):
-            number = resource.fileno()
-            if number >= 0:
-                sockets[number] = f"a socket (descriptor {number})"
+            held[resource.fileno()] = "a socket"
         elif isinstance(resource, Thread):
             if resource.is_alive():
                 others.append("a thread")
@@ -106,16 +85,42 @@ def obstacles_of(opened: Iterable[Resource] | None) -> tuple[list[str], list[Loo
             code = resource.returncode if isinstance(resource, Popen) else resource.exitcode
             if code is None:
                 others.append(f"a child process ({resource.pid})")
-    epolls = new_epolls()
-    loops = event_loops() if sockets or epolls else []
-    continued = [loop for loop in loops if loop._ssock.fileno() in sockets]
-    for loop in continued:  # their sockets are made anew
-        sockets.pop(loop._ssock.fileno(), None)
-        sockets.pop(loop._csock.fileno(), None)
-    selectors = {loop._selector.fileno() for loop in loops if hasattr(loop._selector, "fileno")}
-    for number in sorted(epolls - selectors):
-        others.append(f"an epoll object (descriptor {number})")
-    return [*sockets.values(), *others], continued
+    held.pop(-1, None)  # of closed sockets
+    held |= dict.fromkeys(new_epolls(), "an epoll object")
+    loops = event_loops() if held else []
+    for loop in loops:  # forks get others behind the same descriptors
+        for part in (loop._ssock, loop._csock, loop._selector):
+            if hasattr(part, "fileno"):
+                held.pop(part.fileno(), None)
+    others += [f"{name} (descriptor {number})" for number, name in sorted(held.items())]
+    if others and method == "fork":
+        raise BranchError(
+            f"a forked process cannot continue with {', '.join(others)} that the simulation has"
+            ' opened; use method="replay"'
+        )
+    if others:
+        return None
+    try:
+        files = _open_files()
+    except OSError as error:
+        raise exhausted(error) from error
+    return partial(_separate, random.getstate(), files, loops)
+
+
+def _separate(python: tuple[Any, ...], files: list[list[_Opening]], loops: list[Loop]) -> None:
+    """In a fork, restore Python's generator, reopen files, and separate loops."""
+    random.setstate(python)  # Python reseeds it after a fork
+    try:
+        for openings in files:
+            with suppress(FileNotFoundError):  # the garbage collector has closed it since
+                _reopen(openings)
+    except OSError as error:
+        raise exhausted(error) from error
+    for loop in loops:
+        _separate_loop(loop)
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        torch.set_num_threads(1)  # because torch would wait for threads that are not here
 
 
 def event_loops() -> list[Loop]:
@@ -146,37 +151,28 @@ def _separate_loop(loop: Loop) -> None:
 # -- files ----------------------------------------------------------------------------------------
 
 
-def _open_files() -> Mapping[_Inode, list[_Opening]]:
-    """Return the openings of the regular files of this process, but for standard streams."""
-    files: dict[_Inode, list[_Opening]] = {}
-    standard = [_inode(number) for number in range(3)]  # branches share them with their parent
+def _open_files() -> list[list[_Opening]]:
+    """Return the openings of each regular file of this process, but for standard streams."""
+    files: dict[tuple[int, int], list[_Opening]] = {}
+    standard: set[tuple[int, int]] = set()  # branches share them with their parent
     for number in sorted(map(int, os.listdir(_DESCRIPTORS))):
-        inode = _inode(number)
-        if inode is None or inode in standard or not stat.S_ISREG(os.fstat(number).st_mode):
-            continue
-        with suppress(OSError):  # a descriptor that only stands for a path
-            flags = fcntl.fcntl(number, fcntl.F_GETFL) & _FLAGS
+        with suppress(OSError):  # it is closed, no file, or only stands for a path
             offset = os.lseek(number, 0, os.SEEK_CUR)
-            _add_opening(files.setdefault(inode, []), number, flags, offset)
-    return files
-
-
-def _add_opening(openings: list[_Opening], number: int, flags: int, offset: int) -> None:
-    for opening in openings:
-        is_equal = opening.flags == flags and opening.offset == offset
-        if is_equal and _share_offset(opening.descriptors[0], number):
-            opening.descriptors.append(number)
-            return
-    openings.append(_Opening(flags, offset, [number]))
-
-
-def _inode(number: int) -> _Inode | None:
-    """Return what identifies the file behind a descriptor. None if the descriptor is closed."""
-    try:
-        status = os.fstat(number)
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino
+            status = os.fstat(number)
+            inode = status.st_dev, status.st_ino
+            if number < 3:
+                standard.add(inode)
+            elif stat.S_ISREG(status.st_mode) and inode not in standard:
+                flags = fcntl.fcntl(number, fcntl.F_GETFL) & _FLAGS
+                openings = files.setdefault(inode, [])
+                for opening in openings:
+                    is_alike = (opening.flags, opening.offset) == (flags, offset)
+                    if is_alike and _share_offset(opening.descriptors[0], number):
+                        opening.descriptors.append(number)
+                        break
+                else:
+                    openings.append(_Opening(flags, offset, [number]))
+    return list(files.values())
 
 
 def _share_offset(one: int, other: int) -> bool:

@@ -177,10 +177,6 @@ class BaseSession(ABC):
         """
 
     @abstractmethod
-    def end(self) -> None:
-        """End the current episode, or raise a ``ReentrancyError`` if that is not possible here."""
-
-    @abstractmethod
     def close(self) -> None:
         """End the current episode, and close the simulation."""
 

@@ -41,10 +41,6 @@ class Round:
         """The number of actions in the episode, other than ``RULE``."""
         return self.used + self.unused
 
-    def load(self, acted: set[str]) -> None:
-        """Take over the names of the agents that have acted in a clone."""
-        self.acted = acted
-
     def begin(self, actions: dict[str, Action]) -> None:
         """Begin a round with checked actions."""
         self.actions = actions

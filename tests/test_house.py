@@ -37,8 +37,6 @@ FOREIGN_WRITES = {
     "core/switching/driver.py error.__traceback__": "the same",
     "core/switching/greenlets.py body.parent": "greenlet has no other way",
     "core/switching/greenlets.py self._body.gr_context": "the same",
-    "core/switching/greenlets.py driver._loop": "in a function that the driver makes for itself",
-    "core/switching/greenlets.py driver._running_loop": "the same",
     "remote/callbacks.py sys.unraisablehook": "Python installs its hook by assignment",
 }
 """Writes of another object's fields, each with its reason."""

@@ -16,6 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
+from sys import modules
 from threading import Thread, local
 from types import coroutine
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
@@ -27,8 +28,9 @@ from ...errors import SimulationError, WrongThreadError, annotate
 from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import STACKS, Interceptor, spawner_of
 from ...plugins import Plugins
-from ...simulation import Model, Sentinel
-from .exits import LoopExit, SimulationExit, is_exit
+from ...simulation import RULE, Model, Sentinel
+from .exits import ASYNCIO, SimulationExit, is_exit, make_exit
+from .loops import NO_LOOP, swap_loop
 from .opened import Resource, watch_resources
 
 WAIT: Final = Sentinel("WAIT")
@@ -48,10 +50,10 @@ class Receiver(Protocol):
     """An episode, as the handlers of events use it."""
 
     def receive_end(self) -> Sentinel:
-        """Handle the end of ``run``. Return ``WAIT``, or raise the error of ``run``."""
+        """Handle the end of ``run``. Return ``WAIT``, or raise the error of ``run``.
 
-    def receive_refusal(self) -> NoReturn:
-        """Raise the error of a decision that the driver has refused."""
+        After a refused decision, raise the error of that.
+        """
 
 
 EpisodeType = TypeVar("EpisodeType", contravariant=True)
@@ -84,7 +86,7 @@ Event: TypeAlias = tuple[AnyHandler, Args, Kwargs]
 
 
 class _Ended:
-    """Handles the end of a job."""
+    """Handles the end of a job, and the first event after a refused decision."""
 
     deliver = None
     report = None
@@ -93,20 +95,10 @@ class _Ended:
         return episode.receive_end()
 
 
-class _Refused:
-    """Handles the first event after a refused decision."""
+_ENDED: Final = _Ended()
 
-    deliver = None
-    report = None
-
-    def handle(self, episode: Receiver, args: Args, kwargs: Kwargs) -> NoReturn:
-        episode.receive_refusal()
-
-
-ENDED: Final[Event] = _Ended(), (), BOUND
+ENDED: Final[Event] = _ENDED, (), BOUND
 """The event of the end of a job."""
-
-_REFUSED: Final = _Refused()
 
 
 class _Identity(local):
@@ -140,12 +132,13 @@ class Driver(ABC):
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_outcome", "_refused",
-        "_spawned", "_stack", "caller", "ended", "events", "forked", "given_up", "idle", "opened",
-        "plugins", "stale",
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_loop", "_outcome",
+        "_refused", "_running_loop", "_spawned", "_stack", "_users_loop", "caller", "ended",
+        "events", "forked", "given_up", "idle", "opened", "plugins", "stale",
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
+    _leave: Callable[..., Model]  # passes an event to the user, and returns the reply
     _shares_thread = True  # with its user
 
     def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
@@ -172,7 +165,10 @@ class Driver(ABC):
         self.forked = False
         self._exiting = False
         self._job: Callable[[], Model] | None = None
-        self._context: Context | None = None  # of the job, until it begins
+        self._context = Context()  # of the job, until it begins
+        self._running_loop: Callable[[], object] | None = None  # None until asyncio is imported
+        self._loop = NO_LOOP  # of the simulation, while it waits
+        self._users_loop = NO_LOOP
         self._outcome: list[Model] = []  # the result of the job, or its error
         self._refused: WrongThreadError | None = None  # until the user gets it
 
@@ -244,27 +240,18 @@ class Driver(ABC):
         return self.take_outcome()
 
     def take_outcome(self) -> Model:
-        """Return the result of the job that has ended, or raise its error."""
+        """Return the result of the job that has ended, or raise its error, or that of a refusal."""
         outcome = self._outcome
         if len(outcome) > 1:
             raise outcome.pop()  # the waiting stack must not keep the error
+        if self._refused is not None:
+            raise self._refusal(self._refused)
         return outcome.pop()
-
-    def clear_exit(self) -> None:
-        """Free the frames of the exit that has ended the job.
-
-        They must be freed in the thread of the stack, because the model's greenlets can unwind in
-        no other one.
-        """
-        error = self._outcome[-1]
-        if isinstance(error, SimulationExit):
-            error.__traceback__ = None
-            error.__context__ = None
 
     @property
     def failed(self) -> bool:
-        """Whether the job that has ended has raised an error."""
-        return len(self._outcome) > 1
+        """Whether ``take_outcome`` raises an error."""
+        return len(self._outcome) > 1 or self._refused is not None
 
     def unwind(self) -> list[BaseException]:
         """Raise ``SimulationExit`` in the job until it ends, or give it up, after ``enter``.
@@ -304,11 +291,60 @@ class Driver(ABC):
 
     # -- on the simulation's side -----------------------------------------------------------------
 
-    @abstractmethod
     def _decider(
         self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
     ) -> Interceptor:
         """Make the function that sends an event for each call of a hook, and returns its value."""
+        deliver = handler.deliver
+        bind = hook.bind
+
+        def decide(args: Args, kwargs: Kwargs) -> Model:
+            bound = args
+            named = kwargs
+            if kwargs is not BOUND:
+                call = bind(args, kwargs)
+                if call is None:  # a handler has changed the arguments
+                    return rule(*args, **kwargs)
+                bound, named = call
+            if away:
+                self._reply_to(getcurrent())
+            running = self._running_loop
+            if running is None and ASYNCIO in modules:
+                running = self._running_loop = modules[ASYNCIO]._get_running_loop
+            looped = running is not None and (
+                running() is not None or self._users_loop[0] is not None
+            )
+            if looped:
+                self._loop = swap_loop(self._users_loop)
+            leave = self._leave
+            try:
+                reply = leave(handler, bound, named)
+            except BaseException as error:
+                exits = isinstance(error, SimulationExit)
+                if exits or not self.ended:  # else the stack unwinds by itself
+                    self._reply_to(None)
+                    self._enter_loop()
+                if exits:
+                    raise make_exit() from None
+                raise
+            if away:
+                self._reply_to(None)
+            if looped or (running is not None and running() is not None):
+                self._enter_loop()
+            if reply is RULE:
+                return rule(*args, **kwargs) if kwargs else rule(*args)
+            return reply if deliver is None else deliver(reply, *bound, **named)
+
+        return decide
+
+    @abstractmethod
+    def _reply_to(self, receiver: greenlet | None) -> None:
+        """Let the next reply go to a greenlet of the model. None: to the stack itself."""
+
+    def _enter_loop(self) -> None:
+        """Switch from the user's event loop to the simulation's."""
+        self._users_loop = swap_loop(self._loop)
+        self._loop = NO_LOOP
 
     def note_opened(self, resource: Resource) -> None:
         """Note a resource that the simulation has opened."""
@@ -340,15 +376,21 @@ class Driver(ABC):
             job = None
             self.leave_hooks(self._stack)
             self.events = {}
-        self._outcome = [result] if self._refused is None else [None, self.refusal()]
+        self._outcome = [result]
 
     def _explain(self, error: BaseException) -> BaseException:
         """Return the error to raise on the user's side for an error of the simulation."""
-        if self._refused is not None and self._refused is not error:
+        refused = self._refused
+        if refused is not None and refused is not error:
             if isinstance(error, SimulationExit):
-                return self.refusal()
-            annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
-        if type(error) not in (SimulationExit, LoopExit) or self._exiting:
+                return self._refusal(refused)
+            annotate(error, f"simenv_marl: before that, a decision was refused: {refused}")
+        if not isinstance(error, SimulationExit):
+            return error
+        if self._exiting:
+            # Free its frames in this thread, because the model's greenlets can unwind in no other.
+            error.__traceback__ = None
+            error.__context__ = None
             return error
         stray = SimulationError(
             "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet"
@@ -363,7 +405,6 @@ class Driver(ABC):
         self.ended = True
         stack, self._stack = self._stack, None
         self.leave_hooks(stack)
-        self.events = {}
         if stack is not None:
             STACKS.pop(stack, None)
         watch_resources()
@@ -373,12 +414,10 @@ class Driver(ABC):
         stack = self._stack
         if stack is None or STACKS.get(stack) is not self:
             return
-        hooks = (*self.events, *self._handled)
-        for hook in hooks:
+        for hook in (*self.events, *self._handled):
             hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
         if STACKS.get(stack) is not self:  # garbage collection has ended it meanwhile
-            for hook in hooks:
-                hook.leave(stack)
+            self.leave_hooks(stack)
 
     def leave_hooks(self, stack: greenlet | None) -> None:
         """Leave all hooks, so that a stack takes no part in calls until ``enter_hooks``."""
@@ -397,7 +436,7 @@ class Driver(ABC):
         if handler is None:
             return None
         if away or self.forked:
-            obstacle = self._obstacle(away)
+            obstacle = self._obstacle()
             if obstacle is not None:
                 return partial(self.refuse, hook, obstacle)
             self._spawned = True
@@ -407,12 +446,10 @@ class Driver(ABC):
             rule = partial(report, rule, self._decider(hook, rule, handler.report, away), hook)
         return self._decider(hook, rule, handler, away)
 
-    def _obstacle(self, away: bool) -> str | None:
+    def _obstacle(self) -> str | None:
         """Return where a call comes from if the environment cannot be asked there."""
         if self.forked:
             return "a process that the simulation has forked"
-        if not away:
-            return None
         if self._home() is not THREAD.token:
             return "a thread that the simulation has started"
         if self._shares_thread and spawner_of(getcurrent()) is not None:
@@ -430,7 +467,7 @@ class Driver(ABC):
         )
         if self._refused is None and not self.forked:
             self._refused = error
-            self.events = dict.fromkeys(self.events, _REFUSED)
+            self.events = dict.fromkeys(self.events, _ENDED)
             self.enter_hooks()
         raise error
 
@@ -439,10 +476,10 @@ class Driver(ABC):
         self.forked = True
         self.enter_hooks()
 
-    def refusal(self) -> WrongThreadError:
+    def _refusal(self, refused: WrongThreadError) -> WrongThreadError:
         """Make the error that tells the user of a refused decision."""
-        refused, self._refused = self._refused, None
-        error = WrongThreadError(*() if refused is None else refused.args)
+        self._refused = None
+        error = WrongThreadError(*refused.args)
         error.__cause__ = refused
         return error
 

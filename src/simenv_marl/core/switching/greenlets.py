@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from sys import modules
+from contextvars import Context
 from typing import Final
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
 from ...errors import WrongThreadError
-from ...hooks.hook import BOUND, Hook
-from ...hooks.stacks import STACKS, Interceptor
+from ...hooks.stacks import STACKS
 from ...plugins import Plugins
-from ...simulation import RULE, Model
-from .driver import ENDED, THREAD, AnyHandler, Args, Driver, Event, Kwargs
-from .exits import ASYNCIO, SimulationExit, make_exit
+from ...simulation import Model
+from .driver import ENDED, THREAD, Driver, Event
+from .exits import SimulationExit
 from .loops import NO_LOOP, swap_loop
 
 
 class GreenletDriver(Driver):
     """A driver that runs a simulation in a greenlet of the thread that begins the first job."""
 
-    __slots__ = ("_body", "_leave", "_loop", "_running_loop", "_users_loop", "resume")
+    __slots__ = ("_body", "_leave", "resume")
 
     def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
         """Prepare a greenlet."""
         super().__init__(plugins, earlier)
-        self._running_loop: Callable[[], object] | None = None  # None until asyncio is imported
         self._body: greenlet | None = greenlet(self._serve)
         # Or the ``switch`` of a greenlet of the model that waits for an answer.
         self.resume = self._body.switch
         self._leave: Callable[..., Model] = _no_switch  # switches to the user
-        self._loop = NO_LOOP
-        self._users_loop = NO_LOOP
 
     # -- on the user's side -----------------------------------------------------------------------
 
@@ -78,11 +74,11 @@ class GreenletDriver(Driver):
         try:
             self._register()
             while not self.ended:
-                self._loop = NO_LOOP  # each job begins without a loop
                 # Not by ``Context.run``, because that takes a kilobyte of stack.
                 self._body.gr_context = self._context  # type: ignore[union-attr]
-                self._context = None
-                self._users_loop = swap_loop(self._loop)
+                self._context = Context()
+                self._loop = NO_LOOP  # each job begins without a loop
+                self._enter_loop()
                 try:
                     self._work()
                 finally:
@@ -97,65 +93,11 @@ class GreenletDriver(Driver):
         finally:
             self._forget_stack()
 
-    def _resume_here(self) -> None:
-        """Let the next reply go to this greenlet of the model."""
-        self.resume = getcurrent().switch
-
-    def _resume_body(self) -> None:
-        """Let the next reply go to the stack itself, after a greenlet of the model has got one."""
-        if self._body is not None:
-            self.resume = self._body.switch
-
-    def _decider(
-        self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
-    ) -> Interceptor:
-        """Make the function that sends an event for each call of a hook, and returns its value."""
-        deliver = handler.deliver
-        bind = hook.bind
-        driver = self
-
-        def decide(args: Args, kwargs: Kwargs) -> Model:
-            bound = args
-            named = kwargs
-            if kwargs is not BOUND:
-                call = bind(args, kwargs)
-                if call is None:  # a handler has changed the arguments
-                    return rule(*args, **kwargs)
-                bound, named = call
-            if away:
-                driver._resume_here()
-            running = driver._running_loop
-            if running is None and ASYNCIO in modules:
-                running = driver._running_loop = modules[ASYNCIO]._get_running_loop
-            looped = running is not None and (
-                running() is not None or driver._users_loop[0] is not None
-            )
-            if looped:
-                driver._loop = swap_loop(driver._users_loop)
-            leave = driver._leave
-            try:
-                reply = leave(handler, bound, named)
-            except BaseException as error:
-                if not driver.ended:  # else the stack unwinds by itself
-                    driver._resume_body()
-                    driver._enter_loop()
-                    if isinstance(error, SimulationExit):
-                        raise make_exit() from None
-                raise
-            if away:
-                driver._resume_body()
-            if looped or (running is not None and running() is not None):
-                driver._enter_loop()
-            if reply is RULE:
-                return rule(*args, **kwargs) if kwargs else rule(*args)
-            return reply if deliver is None else deliver(reply, *bound, **named)
-
-        return decide
-
-    def _enter_loop(self) -> None:
-        """Switch from the user's event loop to the simulation's."""
-        self._users_loop = swap_loop(self._loop)
-        self._loop = NO_LOOP
+    def _reply_to(self, receiver: greenlet | None) -> None:
+        """Let the next reply go to a greenlet of the model. None: to the stack itself."""
+        receiver = receiver or self._body
+        if receiver is not None:
+            self.resume = receiver.switch
 
 
 def _no_switch(*event: Model) -> Event:

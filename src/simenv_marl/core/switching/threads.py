@@ -9,13 +9,15 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Final
 
+from greenlet import greenlet
+
 from ...errors import WrongThreadError
-from ...hooks.hook import BOUND, Hook
-from ...hooks.stacks import SIMULATION, Interceptor
+from ...hooks.hook import Hook
+from ...hooks.stacks import SIMULATION
 from ...plugins import Plugins
-from ...simulation import RULE, Model, Sentinel
-from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Args, Driver, Event, Kwargs
-from .exits import make_exit
+from ...simulation import Model, Sentinel
+from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Driver, Event
+from .exits import SimulationExit
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds, because Ctrl-C may come before it."""
@@ -122,42 +124,25 @@ class ThreadDriver(Driver):
             self._forget_stack()
 
     def _do(self) -> None:
-        context, self._context = self._context, None
+        context, self._context = self._context, Context()
         try:
-            (context or Context()).run(self._work)
+            context.run(self._work)
         except BaseException as error:  # raised from another thread, so that its user does not wait
             self._outcome = [None, error]
-        context = None
-        self.clear_exit()
+        del context
         if self.forked:
             self.ended = True
             self.take_outcome()  # raises an error here, because this process has no user
         self.idle = True
         self._arrived.put(ENDED)
 
-    def _decider(
-        self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
-    ) -> Interceptor:
-        """Make the function that sends an event for each call of a hook, and returns its value."""
-        deliver = handler.deliver
-        bind = hook.bind
-        send = self._arrived.put
-        receive = self._replies.get
+    def _leave(self, *event: Model) -> Model:
+        """Pass an event to the user, and return the reply."""
+        self._arrived.put(event)
+        reply = self._replies.get()
+        if reply is _EXIT:
+            raise SimulationExit
+        return reply
 
-        def decide(args: Args, kwargs: Kwargs) -> Model:
-            bound = args
-            named = kwargs
-            if kwargs is not BOUND:
-                call = bind(args, kwargs)
-                if call is None:  # a handler has changed the arguments
-                    return rule(*args, **kwargs)
-                bound, named = call
-            send((handler, bound, named))
-            reply = receive()
-            if reply is RULE:
-                return rule(*args, **kwargs)
-            if reply is _EXIT:
-                raise make_exit()
-            return reply if deliver is None else deliver(reply, *bound, **named)
-
-        return decide
+    def _reply_to(self, receiver: greenlet | None) -> None:
+        """Do nothing: while a greenlet of the model waits, its whole thread does."""

@@ -24,25 +24,18 @@ SECONDS_TO_CANCEL: Final = 10.0
 THREAD: Final = "simenv_marl policies"
 """The name of the thread."""
 
-_loops: Final[dict[int, asyncio.AbstractEventLoop]] = {}
-"""The event loops, by process. A forked process inherits the entry of its parent."""
+LOOPS: Final[dict[int, asyncio.AbstractEventLoop]] = {}
+"""The event loops of policies, by process. A forked process inherits the entry of its parent."""
 
 
 def _loop() -> asyncio.AbstractEventLoop:
     """Return the event loop of this process."""
     process = os.getpid()
-    if process not in _loops:
+    if process not in LOOPS:
         loop = asyncio.new_event_loop()
-        if _loops.setdefault(process, loop) is loop:
-            Thread(target=loop.run_forever, name=THREAD, daemon=True).start()
-        else:  # another thread was faster
-            loop.close()
-    return _loops[process]
-
-
-def policy_loops() -> list[asyncio.AbstractEventLoop]:
-    """Return the loops in which policies are awaited."""
-    return list(_loops.values())
+        Thread(target=loop.run_forever, name=THREAD, daemon=True).start()
+        LOOPS[process] = loop
+    return LOOPS[process]
 
 
 class Answer:

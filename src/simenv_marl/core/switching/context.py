@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import random
 from contextlib import suppress
-from copy import deepcopy
 from os import getpid
 from threading import RLock, current_thread, get_ident
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -138,10 +137,6 @@ def load_generators(state: _State) -> None:
     NUMPY.set_state(state.numpy)
 
 
-def _copy_bits(state: _State) -> _State:
-    return state._replace(bits=deepcopy(state.bits))
-
-
 class _Entry(NamedTuple):
     """A state that was put in place: whose it is, in which thread, and the state before."""
 
@@ -157,12 +152,12 @@ class GlobalRandom:
 
     def __init__(self) -> None:
         """Copy the present state, which is used until ``begin`` seeds it."""
-        self._own = _copy_bits(save_generators())
-        if not isinstance(self._own.bits, np.random.MT19937):
-            # ``numpy.random.seed`` can seed no other type.
-            bits = np.random.MT19937()
-            numpy = np.random.RandomState(bits).get_state(legacy=False)
-            self._own = self._own._replace(bits=bits, numpy=numpy)
+        bits = np.random.MT19937()  # ``numpy.random.seed`` can seed no other type
+        generator = np.random.RandomState(bits)
+        state = save_generators()
+        with suppress(ValueError):  # the user has set bits of another type
+            generator.set_state(state.numpy)
+        self._own = _State(state.python, bits, generator.get_state(legacy=False))
 
     def begin(self, seed: int) -> None:
         """Seed both generators, whose state must be in place, with the seed of an episode."""
@@ -209,7 +204,6 @@ class preserve_generators:  # noqa: N801 - it is used like a function
         torch = generator_of_torch()
         self._torch = None if torch is None else torch.get_state()
         self._state = save_generators()
-        load_generators(_copy_bits(self._state))
 
     def __exit__(self, *error: object) -> None:
         load_generators(self._state)

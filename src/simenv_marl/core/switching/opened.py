@@ -10,7 +10,7 @@ from multiprocessing.process import BaseProcess
 from socket import socket
 from subprocess import Popen
 from threading import Thread
-from typing import Final, Protocol
+from typing import Final
 
 from greenlet import getcurrent
 
@@ -30,10 +30,6 @@ _PATCHES: Final[list[tuple[type, str, Callable[..., None], Callable[..., None]]]
 """The patched methods: class, name, original and patch. Empty while there are no simulations."""
 
 
-_EPOLLS_BEFORE: Final[set[int]] = set()
-"""The descriptors of the epoll objects that the process had when this module was imported."""
-
-
 def _epolls() -> set[int]:
     """Return the descriptors of the epoll objects of this process."""
     numbers: set[int] = set()
@@ -45,19 +41,13 @@ def _epolls() -> set[int]:
     return numbers
 
 
+_EPOLLS_BEFORE: Final = _epolls()
+"""The descriptors of the epoll objects that the process had when this module was imported."""
+
+
 def new_epolls() -> set[int]:
     """Return the descriptors of the epoll objects that the process has made since then."""
     return _epolls() - _EPOLLS_BEFORE
-
-
-_EPOLLS_BEFORE.update(_epolls())
-
-
-class Owner(Protocol):
-    """A driver, for which the resources of its simulation are noted."""
-
-    def note_opened(self, resource: Resource) -> None:
-        """Note a resource that the simulation has opened."""
 
 
 def watch_resources() -> None:
@@ -80,19 +70,17 @@ def watch_resources() -> None:
 def _noting(method: Callable[..., None]) -> Callable[..., None]:
     @wraps(method)
     def note(self: Resource, *args: object, **kwargs: object) -> None:
-        driver: Owner | None = stack_of(getcurrent()) if STACKS else None
-        if driver is None:
-            method(self, *args, **kwargs)
-            return
-        if isinstance(self, Thread):
-            self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
+        driver = stack_of(getcurrent()) if STACKS else None
+        if driver is not None:
+            driver.note_opened(self)
+            if isinstance(self, Thread):
+                self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
         method(self, *args, **kwargs)
-        driver.note_opened(self)
 
     return note
 
 
-def _run_registered(driver: Owner, run: Callable[[], None]) -> None:
+def _run_registered(driver: object, run: Callable[[], None]) -> None:
     """Run a thread that a simulation has started, as a stack of that simulation's driver."""
     # ``getcurrent()`` is in no variable, because tracebacks keep variables, and greenlets crash
     # where the root of a thread outlives the thread.

@@ -573,8 +573,9 @@ class Episode(EpisodeState):
         After a refused decision, raise the error of that.
         """
         self.running = not self.driver.idle  # it still runs after a refused decision
-        self._failed_in_model = self.driver.failed
+        self._failed_in_model = True  # where the next line raises
         result = self.driver.take_outcome()
+        self._failed_in_model = False
         self.finish(truncated=result is TRUNCATED)
         return WAIT
 

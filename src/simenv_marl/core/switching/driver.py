@@ -171,8 +171,13 @@ class Driver(ABC):
         self._users_loop = NO_LOOP
         self._outcome: list[Model] = []  # the result of the job, or its error
         self._refused: WrongThreadError | None = None  # until the user gets it
+        self._prepare_stack()
 
     # -- on the user's side -----------------------------------------------------------------------
+
+    @abstractmethod
+    def _prepare_stack(self) -> None:
+        """Prepare the stack of ``_serve``, which the first job begins."""
 
     @abstractmethod
     def enter(self, *, direct: bool = True) -> None:
@@ -247,11 +252,6 @@ class Driver(ABC):
         if self._refused is not None:
             raise self._refusal(self._refused)
         return outcome.pop()
-
-    @property
-    def failed(self) -> bool:
-        """Whether ``take_outcome`` raises an error."""
-        return len(self._outcome) > 1 or self._refused is not None
 
     def unwind(self) -> list[BaseException]:
         """Raise ``SimulationExit`` in the job until it ends, or give it up, after ``enter``.

@@ -14,7 +14,6 @@ from greenlet import greenlet
 from ...errors import WrongThreadError
 from ...hooks.hook import Hook
 from ...hooks.stacks import SIMULATION
-from ...plugins import Plugins
 from ...simulation import Model, Sentinel
 from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Driver, Event
 from .exits import SimulationExit
@@ -32,16 +31,14 @@ class ThreadDriver(Driver):
 
     Only one of the two threads runs at a time. They pass replies and events through two queues. An
     interrupt may leave something in a queue, or lose an event. So replies between two jobs are
-    ignored, and each job has a queue of events.
+    ignored, and each job has a queue of events. ``caller`` is always None.
     """
 
     __slots__ = ("_arrived", "_replies", "_thread")
 
     _shares_thread = False
 
-    def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
-        """Prepare a thread. ``caller`` is always None."""
-        super().__init__(plugins, earlier)
+    def _prepare_stack(self) -> None:
         self._replies: SimpleQueue[Model] = SimpleQueue()
         self._arrived: SimpleQueue[Event] = SimpleQueue()
         self._thread: Thread | None = None

@@ -18,10 +18,10 @@ from inspect import (
     iscoroutinefunction,
     isgeneratorfunction,
 )
-from threading import current_thread, local
+from threading import current_thread, main_thread
 from types import FunctionType
 from typing import Any, Final
-from weakref import WeakValueDictionary, finalize
+from weakref import WeakValueDictionary
 
 from greenlet import getcurrent, greenlet
 
@@ -54,25 +54,10 @@ Bound = tuple[Args, Kwargs]
 Binding = Callable[[FunctionType], Model]
 """``staticmethod`` or ``classmethod``."""
 
-_ROOTS: Final[set[greenlet]] = set()
-"""Roots of threads without simulations. Hooks without handlers run their rule there at once."""
-
-
-class _ThreadRoot(local):
-    """Keeps the root of a thread in ``_ROOTS`` until the thread ends."""
-
-    _lifetime: set[object] | None = None
-
-    def register(self, root: greenlet) -> None:
-        """Register the root of the current thread."""
-        if self._lifetime is None:
-            self._lifetime = set()  # freed with the thread
-            # A root that outlives its thread makes greenlets crash.
-            finalize(self._lifetime, _ROOTS.discard, root)
-        _ROOTS.add(root)
-
-
-_THREAD_ROOT: Final = _ThreadRoot()
+_MAIN: Final[set[greenlet]] = set()
+"""The root of the main thread, if it has called hooks. Those without handlers run their rule there
+at once. It has no root of another thread, because greenlets crash where one outlives its thread.
+"""
 
 
 # -- wrappers -------------------------------------------------------------------------------------
@@ -223,7 +208,7 @@ class Interceptors(dict[greenlet | None, Interceptor]):
 
     Attributes:
         hook: The hook.
-        roots: The roots of threads whose calls run the rule at once.
+        roots: The roots of threads whose calls run the rule at once: ``_MAIN`` or none.
     """
 
     __slots__ = ("hook", "roots")
@@ -231,7 +216,7 @@ class Interceptors(dict[greenlet | None, Interceptor]):
     def __init__(self, hook: Hook) -> None:
         super().__init__()
         self.hook = hook
-        self.roots = _ROOTS
+        self.roots = _MAIN
 
     def __reduce__(self) -> tuple[Any, ...]:
         return getattr, (self.hook, "interceptors")
@@ -240,7 +225,7 @@ class Interceptors(dict[greenlet | None, Interceptor]):
         """Intercept calls away from all simulations; None: such calls run the function again."""
         if interceptor is None:
             self.pop(None, None)
-            self.roots = _ROOTS
+            self.roots = _MAIN
         else:
             self[None] = interceptor
             self.roots = set()
@@ -387,9 +372,10 @@ class Hook:
         evaluation = driver or EVALUATING.get(here)
         decide = None if driver is None else driver.interceptor(self)
         if here.parent is None and here not in STACKS:
-            if here not in _ROOTS:
-                _THREAD_ROOT.register(here)
-            self.threads.add(current_thread().name)
+            thread = current_thread()
+            if thread is main_thread():
+                _MAIN.add(here)
+            self.threads.add(thread.name)
         plugins = None if evaluation is None else evaluation.plugins
         return self.around(decide or self.run_rule, plugins)
 
@@ -409,7 +395,6 @@ class Hook:
                 the handlers of the plugins.
             plugins: The plugins of the simulation's environment.
         """
-        _ROOTS.discard(stack)
         if decide is None and plugins not in self.slot:
             self.leave(stack)
         else:

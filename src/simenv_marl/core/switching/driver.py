@@ -414,10 +414,12 @@ class Driver(ABC):
         stack = self._stack
         if stack is None or STACKS.get(stack) is not self:
             return
-        for hook in (*self.events, *self._handled):
+        hooks = (*self.events, *self._handled)
+        for hook in hooks:
             hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
         if STACKS.get(stack) is not self:  # garbage collection has ended it meanwhile
-            self.leave_hooks(stack)
+            for hook in hooks:
+                hook.leave(stack)
 
     def leave_hooks(self, stack: greenlet | None) -> None:
         """Leave all hooks, so that a stack takes no part in calls until ``enter_hooks``."""

@@ -26,7 +26,7 @@ from greenlet import getcurrent, greenlet
 
 from ...errors import SimulationError, WrongThreadError, annotate
 from ...hooks.hook import BOUND, Hook
-from ...hooks.stacks import STACKS, Interceptor, spawner_of
+from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
 from ...simulation import RULE, Model, Sentinel
 from .exits import ASYNCIO, SimulationExit, is_exit, make_exit
@@ -41,9 +41,6 @@ SECONDS_TO_UNWIND: Final = 5.0
 
 UNWINDING_TRIES: Final = 1000
 """How often ``SimulationExit`` is raised. A SimPy model loses one of its processes at each try."""
-
-Args = tuple[Model, ...]
-Kwargs = dict[str, Model]
 
 
 class Receiver(Protocol):

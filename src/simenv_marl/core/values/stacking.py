@@ -12,10 +12,10 @@ from typing import Any, Final
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
-from gymnasium.vector.utils import concatenate
 from numpy.typing import NDArray
 
 from ...simulation import Action, Observation
+from .spaces import parts_of
 
 Stacker = Callable[..., Any]
 """``stack(items, out=None)`` stacks elements of a space.
@@ -36,25 +36,20 @@ def stacker(space: Space[Any], *, cast: bool = False) -> Stacker:
         cast: Whether the elements already have the space's dtype and shape, as observations have.
     """
     if isinstance(space, (Dict, Tuple)):
-        parts = space.items() if isinstance(space, Dict) else enumerate(space)
-        stackers = {key: stacker(part, cast=cast) for key, part in parts}
+        stackers = {key: stacker(part, cast=cast) for key, part in parts_of(space).items()}
 
         def stack_parts(items: Sequence[Observation], out: Any = None) -> Any:
             stacks = {
                 key: stack([item[key] for item in items], None if out is None else out[key])
                 for key, stack in stackers.items()
             }
-            if isinstance(space, Dict):
-                return stacks
-            return tuple(stacks.values())
+            return stacks if isinstance(space, Dict) else tuple(stacks.values())
 
         return stack_parts
     if not isinstance(space, (Box, Discrete, MultiBinary, MultiDiscrete)):
 
         def stack_objects(items: Sequence[Observation], out: Any = None) -> Any:
-            if out is None:
-                return np.fromiter(items, object)
-            return concatenate(space, items, out)
+            return np.fromiter(items, object) if out is None else tuple(items)
 
         return stack_objects
     dtype = space.dtype

@@ -441,8 +441,7 @@ class Driver(ABC):
             self._spawned = True
         rule = hook.rule
         if handler.report is not None:
-            report = _report if hook.kind == "function" else _report_later
-            rule = partial(report, rule, self._decider(hook, rule, handler.report, away), hook)
+            rule = _reporting(hook, self._decider(hook, rule, handler.report, away))
         return self._decider(hook, rule, handler, away)
 
     def _obstacle(self) -> str | None:
@@ -483,19 +482,19 @@ class Driver(ABC):
         return error
 
 
-def _report(
-    rule: Callable[..., Model], report: Interceptor, hook: Hook, /, *args: Model, **kwargs: Model
-) -> Model:
-    """Run a rule, and pass its decision and the bound call to an interceptor."""
-    decision = rule(*args, **kwargs)
-    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
-    return decision
+def _reporting(hook: Hook, send: Interceptor) -> Callable[..., Model]:
+    """Make a function that runs a rule, and sends its decision with the bound call."""
+    rule = hook.rule
 
+    def report(decision: Model, args: Args, kwargs: Kwargs) -> Model:
+        send((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
+        return decision
 
-@coroutine
-def _report_later(
-    rule: Callable[..., Model], report: Interceptor, hook: Hook, /, *args: Model, **kwargs: Model
-) -> Generator[Model, Model, Model]:
-    decision = yield from rule(*args, **kwargs)
-    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
-    return decision
+    if hook.kind == "function":
+        return lambda *args, **kwargs: report(rule(*args, **kwargs), args, kwargs)
+
+    @coroutine
+    def report_later(*args: Model, **kwargs: Model) -> Generator[Model, Model, Model]:
+        return report((yield from rule(*args, **kwargs)), args, kwargs)
+
+    return report_later

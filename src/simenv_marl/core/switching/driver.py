@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
 from sys import modules
-from threading import Thread, local
+from threading import local
 from types import coroutine
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 from weakref import WeakSet, ref
@@ -28,7 +28,7 @@ from ...errors import SimulationError, WrongThreadError, annotate
 from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
-from ...simulation import RULE, Model, Sentinel
+from ...simulation import RULE, Function, Model, Sentinel
 from .exits import ASYNCIO, SimulationExit, is_exit, make_exit
 from .loops import NO_LOOP, swap_loop
 from .opened import Resource, watch_resources
@@ -66,7 +66,7 @@ class EventHandler(Protocol[EpisodeType]):
     """
 
     @property
-    def deliver(self) -> Callable[..., Model] | None:
+    def deliver(self) -> Function | None:
         """Return the function that makes the value of the call."""
 
     @property
@@ -101,10 +101,10 @@ ENDED: Final[Event] = _ENDED, (), BOUND
 class _Identity(local):
     """What identifies a thread. Unlike the thread's number, it is never used for another thread."""
 
-    token: set[None] | type[Thread] = Thread  # seen by finalizers that run while a token is made
+    token: object = object  # seen by finalizers that run while a token is made
 
     def __init__(self) -> None:
-        self.token = set[None]()  # because it can be referenced weakly
+        self.token = set()  # because it can be referenced weakly
 
 
 THREAD: Final = _Identity()
@@ -135,7 +135,7 @@ class Driver(ABC):
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
-    _leave: Callable[..., Model]  # passes an event to the user, and returns the reply
+    _leave: Function  # passes an event to the user, and returns the reply
     _shares_thread = True  # with its user
 
     def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
@@ -288,9 +288,7 @@ class Driver(ABC):
 
     # -- on the simulation's side -----------------------------------------------------------------
 
-    def _decider(
-        self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
-    ) -> Interceptor:
+    def _decider(self, hook: Hook, rule: Function, handler: AnyHandler, away: bool) -> Interceptor:
         """Make the function that sends an event for each call of a hook, and returns its value."""
         deliver = handler.deliver
         bind = hook.bind
@@ -482,7 +480,7 @@ class Driver(ABC):
         return error
 
 
-def _reporting(hook: Hook, send: Interceptor) -> Callable[..., Model]:
+def _reporting(hook: Hook, send: Interceptor) -> Function:
     """Make a function that runs a rule, and sends its decision with the bound call."""
     rule = hook.rule
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from operator import le
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Space, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from numpy import ndarray
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import MaskError, short_repr
 from ...simulation import Action
 from .spaces import ILLEGAL as ILLEGAL
-from .spaces import by_parts, duplicate
+from .spaces import Array, Space, by_parts, duplicate
 
 Check = Callable[[Action], Action]
 """Takes an action. Returns it in the form that its mapping receives, or ``ILLEGAL``."""
@@ -35,7 +35,7 @@ _SMALL = 16  # up to this many elements, comparing Python floats is faster than 
 # -- checks ----------------------------------------------------------------------------------------
 
 
-def action_check(space: Space[Any], *, clips: bool = False) -> Check:
+def action_check(space: Space, *, clips: bool = False) -> Check:
     """Make the function that checks actions against a space.
 
     The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action
@@ -94,7 +94,7 @@ def _box_check(space: Box, clips: bool) -> Check:
     high, *_ = highs or [0.0]
     kinds = "iu" if is_integer else "iuf"
 
-    def is_legal(array: NDArray[Any]) -> bool:
+    def is_legal(array: Array) -> bool:
         if len(lows) > _SMALL:
             return bool(((array >= space.low) & (array <= space.high)).all())
         numbers = array.ravel().tolist()
@@ -140,7 +140,7 @@ def _box_check(space: Box, clips: bool) -> Check:
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def mask_cast(space: Space[Any]) -> Callable[[ArrayLike], Mask]:
+def mask_cast(space: Space) -> Callable[[ArrayLike], Mask]:
     """Make the function that casts a mask of the legal actions to np.int8.
 
     It raises ``MaskError`` for another shape, for values other than 0 and 1, and if no action is
@@ -182,7 +182,7 @@ def mask_cast(space: Space[Any]) -> Callable[[ArrayLike], Mask]:
     return cast
 
 
-def open_mask(space: Space[Any]) -> Mask:
+def open_mask(space: Space) -> Mask:
     """Make the mask of an action space that allows every action."""
     if isinstance(space, Discrete):
         return np.ones(space.n, np.int8)
@@ -190,7 +190,7 @@ def open_mask(space: Space[Any]) -> Mask:
     return tuple(open_mask(Discrete(size)) for size in space.nvec.ravel())
 
 
-def mask_allows(space: Space[Any], mask: Mask, action: Action) -> bool:
+def mask_allows(space: Space, mask: Mask, action: Action) -> bool:
     """Return whether a mask that ``mask_cast`` returned allows an action of the space."""
     if isinstance(space, Discrete):
         return bool(mask[action - int(space.start)])
@@ -199,7 +199,7 @@ def mask_allows(space: Space[Any], mask: Mask, action: Action) -> bool:
     return all(part[choice] for part, choice in zip(mask, choices, strict=True))
 
 
-def only_choice(space: Space[Any], mask: Mask | None) -> Action:
+def only_choice(space: Space, mask: Mask | None) -> Action:
     """Return the only legal action of a space; None if there are several.
 
     ``mask`` is a mask of ``mask_cast``. None: all actions are legal.

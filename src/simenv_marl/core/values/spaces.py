@@ -10,10 +10,11 @@ import sys
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from sys import getrefcount
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from gymnasium import spaces
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from numpy import ndarray
 from numpy.typing import NDArray
 
@@ -26,6 +27,13 @@ ILLEGAL: Final = Sentinel("ILLEGAL")
 Cast = Callable[[Observation], Observation]
 """Takes an observation. Returns it cast to its space's dtype, with no memory shared."""
 
+Space: TypeAlias = spaces.Space[Any]
+
+CompoundSpace = Dict | Tuple[Any]
+"""Spaces whose elements have parts."""
+
+Array: TypeAlias = NDArray[Any]
+
 ArraySpace = Box | MultiBinary | MultiDiscrete
 """Spaces whose elements are arrays."""
 
@@ -33,7 +41,7 @@ ArraySpace = Box | MultiBinary | MultiDiscrete
 # -- casts ----------------------------------------------------------------------------------------
 
 
-def observation_cast(space: Space[Any]) -> Cast:
+def observation_cast(space: Space) -> Cast:
     """Make the function that casts observations to a space.
 
     It raises ``ObservationError`` for an observation that does not fit the space.
@@ -67,7 +75,7 @@ def _references_to_fresh_argument() -> int:
     if not getattr(sys, "_is_gil_enabled", lambda: True)():
         return -1
 
-    def count(value: NDArray[Any]) -> int:
+    def count(value: Array) -> int:
         return getrefcount(value)
 
     array = np.zeros(1)
@@ -85,7 +93,7 @@ def _array_cast(space: ArraySpace) -> Cast:
     dtype = space.dtype
     shape = space.shape
 
-    def cast(value: Observation) -> NDArray[Any]:
+    def cast(value: Observation) -> Array:
         if type(value) is ndarray and value.dtype is dtype and value.shape == shape:
             # An array without any other reference needs no copy.
             if value.base is None and getrefcount(value) <= _FRESH:
@@ -96,7 +104,7 @@ def _array_cast(space: ArraySpace) -> Cast:
     return cast
 
 
-def _convert(value: Observation, space: ArraySpace) -> NDArray[Any]:
+def _convert(value: Observation, space: ArraySpace) -> Array:
     """Convert an observation that is not yet an array of a space's dtype and shape."""
     dtype: np.dtype[Any] = space.dtype
     try:
@@ -143,14 +151,14 @@ def _discrete_cast(space: Discrete) -> Cast:
     return cast
 
 
-def parts_of(space: Dict | Tuple[Any]) -> dict[Any, Space[Any]]:
+def parts_of(space: CompoundSpace) -> dict[Any, Space]:
     """Return the spaces of the parts of a space, by key or by place."""
     return dict(space.spaces if isinstance(space, Dict) else enumerate(space.spaces))
 
 
 def by_parts(
-    space: Dict | Tuple[Any],
-    make: Callable[[Space[Any]], Cast],
+    space: CompoundSpace,
+    make: Callable[[Space], Cast],
     refuse: Callable[[Observation], Observation],
 ) -> Cast:
     """Make the function that calls a function for each part of a value, and joins the results.
@@ -181,7 +189,7 @@ def by_parts(
     return call
 
 
-def _parts_cast(space: Dict | Tuple[Any]) -> Cast:
+def _parts_cast(space: CompoundSpace) -> Cast:
     def refuse(value: Observation) -> NoReturn:
         names = list(parts_of(space))
         expected = f"keys {names}" if isinstance(space, Dict) else f"{len(names)} parts"
@@ -232,7 +240,7 @@ def same(one: Observation, other: Observation) -> bool:
     return bool(one == other)
 
 
-def blank(space: Space[Any]) -> Observation:
+def blank(space: Space) -> Observation:
     """Make the blank observation of an agent that was not observed yet.
 
     It is zero, clipped into the space. For a space without a zero (text, graphs, ...) it is a fixed

@@ -64,12 +64,12 @@ def locate(key: Key, own: Definitions = _NONE) -> DecisionPoint:
     ``own`` are the points of the simulation itself, some of which are in no module.
     """
     if not isinstance(key, str):
-        return point_for(find_hook(key, UnknownPointError))
+        return point_for(find_hook(key))
     for point in own:
         if point.name == key and hasattr(point.function, BY_NAME):
             return point
     decorated = registered().get(key)
-    return point_for(find_hook(key, UnknownPointError)) if decorated is None else decorated
+    return point_for(find_hook(key)) if decorated is None else decorated
 
 
 def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
@@ -86,7 +86,7 @@ def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
 def owner_class(point: DecisionPoint) -> type | None:
     """Return the class of which a point is a method. None if it is no method, or is gone."""
     try:
-        owner, _ = resolve(point.name, UnknownPointError)
+        owner, _ = resolve(point.name)
     except (UnknownPointError, PatchError):
         return None
     return owner if isinstance(owner, type) else None

@@ -221,14 +221,14 @@ class Interceptors(dict[greenlet | None, Interceptor]):
     def __reduce__(self) -> tuple[Any, ...]:
         return getattr, (self.hook, "interceptors")
 
-    def intercept_elsewhere(self, interceptor: Interceptor | None) -> None:
-        """Intercept calls away from all simulations; None: such calls run the function again."""
-        if interceptor is None:
+    def intercept_elsewhere(self, wanted: bool) -> None:
+        """Intercept calls away from all simulations, or let them run the function again."""
+        if wanted:
+            self[None] = self.hook.run_rule
+            self.roots = set()
+        else:
             self.pop(None, None)
             self.roots = _MAIN
-        else:
-            self[None] = interceptor
-            self.roots = set()
 
 
 class Hook:
@@ -313,11 +313,6 @@ class Hook:
         self.definition = self.definition or definition
 
     @property
-    def stale(self) -> bool:
-        """Whether other code has replaced the function while no wrapper was in its place."""
-        return False
-
-    @property
     def letters(self) -> str:
         """The letters of the function's name in lower case, for the default name of its agent."""
         return re.sub("[^a-z]", "", self.name.rpartition(".")[2].lower()) or "agent"
@@ -377,7 +372,7 @@ class Hook:
                 _MAIN.add(here)
             self.threads.add(thread.name)
         plugins = None if evaluation is None else evaluation.plugins
-        return self.around(decide or self.run_rule, plugins)
+        return self.around(decide, plugins)
 
     # -- interceptors -----------------------------------------------------------------------------
 
@@ -398,17 +393,18 @@ class Hook:
         if decide is None and plugins not in self.slot:
             self.leave(stack)
         else:
-            self.interceptors[stack] = self.around(decide or self.run_rule, plugins)
+            self.interceptors[stack] = self.around(decide, plugins)
 
     def leave(self, stack: greenlet) -> None:
         """Remove the interceptor of a stack, if there is one."""
         self.interceptors.pop(stack, None)
 
-    def around(self, inner: Interceptor, plugins: Hashable | None) -> Interceptor:
-        """Return an interceptor that runs handlers around ``inner``.
+    def around(self, decide: Interceptor | None, plugins: Hashable | None) -> Interceptor:
+        """Return an interceptor that runs handlers around ``decide``, or else around the rule.
 
         These are the handlers of the plugins, if there are any, or of the whole process.
         """
+        inner = decide or self.run_rule
         slot = self.slot.get(plugins) or self.slot.get(None)
         if slot is None:
             return inner
@@ -490,8 +486,7 @@ class Hook:
             # Meanwhile, garbage collection may close an environment and remove its handlers.
             if present == self.handlers:
                 break
-        changed = bool(self.slot) or self.rule is not self.function
-        self.interceptors.intercept_elsewhere(self.run_rule if changed else None)
+        self.interceptors.intercept_elsewhere(bool(self.slot) or self.rule is not self.function)
         for stack in list(self.interceptors):
             driver = None if stack is None else STACKS.get(stack)
             if driver is not None:

@@ -51,19 +51,18 @@ class Answer:
         """
         self._value = value
         self._error: BaseException | None = None
-        self._report = report
         self._future: Future[None] | None = None
         if isawaitable(value):
-            self._future = asyncio.run_coroutine_threadsafe(self._await(), _loop())
+            self._future = asyncio.run_coroutine_threadsafe(self._await(report), _loop())
         else:
             report(self)
 
-    async def _await(self) -> None:
+    async def _await(self, report: Callable[[Answer], None]) -> None:
         try:
             self._value = await self._value
         except BaseException as error:  # also an exit, because it would end the loop
             self._error = error
-        self._report(self)
+        report(self)
 
     def cancel(self) -> None:
         """Cancel an answer that is on its way. It is reported when its coroutine has ended."""

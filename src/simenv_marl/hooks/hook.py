@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Hashable
-from functools import partial, update_wrapper
+from functools import cached_property, partial, update_wrapper
 from inspect import (
     Parameter,
     Signature,
@@ -143,8 +143,10 @@ class _Code(str):
         return str(self)
 
 
-def _make_binder(signature: Signature) -> Any:
+def _make_binder(signature: Signature | None) -> Callable[..., Bound]:
     """Make a function that returns its arguments: by position where possible, with defaults."""
+    if signature is None:
+        return lambda *args, **kwargs: (args, kwargs)
     parameters: list[Parameter] = []
     args = ""
     kwargs = ""
@@ -163,7 +165,8 @@ def _make_binder(signature: Signature) -> Any:
         "defaults": {name: p.default for name, p in signature.parameters.items()},
     }
     exec(f"def bind{Signature(parameters)}: return ({args}), {{{kwargs}}}", scope)
-    return scope["bind"]
+    bind: Callable[..., Bound] = scope["bind"]
+    return bind
 
 
 def unbind(value: object) -> object:
@@ -286,11 +289,10 @@ class Hook:
         self.rule = function
         self.name = name
         self.bound = bound
-        self.kind = kind_of(function, name) if kind is None else kind
+        self.kind = kind or kind_of(function, name)
         self.positions = _POSITIONS[self.kind]
         self.exposed = exposed
         self.signature = signature_of(function, follow_wrapped=False)
-        self._binder: Callable[..., Bound] | None = None  # made at the first use
         self.interceptors = Interceptors(self)
         self.threads: set[str] = set()
         self.definition: Any = None
@@ -346,14 +348,14 @@ class Hook:
 
         None if the function does not take it.
         """
-        if self.signature is None:
-            return args, kwargs
-        if self._binder is None:
-            self._binder = _make_binder(self.signature)
         try:
             return self._binder(*args, **kwargs)
         except TypeError:
             return None
+
+    @cached_property
+    def _binder(self) -> Callable[..., Bound]:
+        return _make_binder(self.signature)
 
     def _intercept(self, args: Args, kwargs: Kwargs) -> Model:
         """Run a call on a stack without an interceptor, or refuse it with a ``WrongThreadError``.

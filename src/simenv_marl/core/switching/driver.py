@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
 from sys import modules
-from threading import local
+from threading import Thread, local
 from types import coroutine
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
 from weakref import WeakSet, ref
@@ -130,8 +130,8 @@ class Driver(ABC):
 
     __slots__ = (
         "__weakref__", "_context", "_exiting", "_handled", "_home", "_job", "_loop", "_outcome",
-        "_refused", "_running_loop", "_spawned", "_stack", "_users_loop", "caller", "ended",
-        "events", "forked", "given_up", "idle", "opened", "plugins", "stale",
+        "_refused", "_running_loop", "_spawned", "_stack", "_thread", "_users_loop", "caller",
+        "ended", "events", "forked", "given_up", "idle", "opened", "plugins", "stale",
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
@@ -149,6 +149,7 @@ class Driver(ABC):
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.events: Mapping[Hook, AnyHandler] = {}
         self._stack: greenlet | None = None
+        self._thread: Thread | None = None  # that was made for the stack
         self._home: Callable[[], object] = ref(THREAD.token)  # the thread of the stack
         self._spawned = False  # whether other greenlets have decided on this stack
         self.caller: greenlet | None = None
@@ -168,13 +169,12 @@ class Driver(ABC):
         self._users_loop = NO_LOOP
         self._outcome: list[Model] = []  # the result of the job, or its error
         self._refused: WrongThreadError | None = None  # until the user gets it
-        self._prepare_stack()
 
     # -- on the user's side -----------------------------------------------------------------------
 
     @abstractmethod
-    def _prepare_stack(self) -> None:
-        """Prepare the stack of ``_serve``, which the first job begins."""
+    def _prepare_job(self) -> None:
+        """Make the stack, which runs ``_serve``, or forget what came after its latest job."""
 
     @abstractmethod
     def enter(self, *, direct: bool = True) -> None:
@@ -204,6 +204,7 @@ class Driver(ABC):
             events: The handlers of the events that it sends, by hook.
             context: The context variables of the job. None: a copy of the user's.
         """
+        self._prepare_job()
         self._job = job
         self.events = events or {}
         self._refused = None

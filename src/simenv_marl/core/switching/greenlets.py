@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextvars import Context
 from typing import Final
 
@@ -21,13 +20,14 @@ class GreenletDriver(Driver):
 
     __slots__ = ("_leave", "resume")
 
-    def _prepare_stack(self) -> None:
-        self._stack = greenlet(self._serve)
-        # Or the ``switch`` of a greenlet of the model that waits for an answer.
-        self.resume = self._stack.switch
-        self._leave: Callable[..., Model] = _no_switch  # switches to the user
-
     # -- on the user's side -----------------------------------------------------------------------
+
+    def _prepare_job(self) -> None:
+        if self._stack is None:
+            stack = greenlet(self._serve)
+            # Or the ``switch`` of a greenlet of the model that waits for an answer.
+            self.resume = stack.switch
+            self._stack = stack  # last, because an interrupt may come before
 
     def enter(self, *, direct: bool = True) -> None:
         """Prepare to resume the simulation from the current greenlet."""

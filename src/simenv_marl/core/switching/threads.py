@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import Context
 from queue import Empty, SimpleQueue
@@ -12,10 +11,9 @@ from typing import Final
 from greenlet import greenlet
 
 from ...errors import WrongThreadError
-from ...hooks.hook import Hook
 from ...hooks.stacks import SIMULATION
 from ...simulation import Model, Sentinel
-from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Driver, Event
+from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event
 from .exits import SimulationExit
 
 _LONGEST_WAIT: Final = 1.0
@@ -34,31 +32,20 @@ class ThreadDriver(Driver):
     ignored, and each job has a queue of events. ``caller`` is always None.
     """
 
-    __slots__ = ("_arrived", "_replies", "_thread")
+    __slots__ = ("_arrived", "_replies")
 
     _shares_thread = False
 
-    def _prepare_stack(self) -> None:
-        self._replies: SimpleQueue[Model] = SimpleQueue()
-        self._arrived: SimpleQueue[Event] = SimpleQueue()
-        self._thread: Thread | None = None
-
     # -- in the user's thread ---------------------------------------------------------------------
 
-    def begin(
-        self,
-        job: Callable[[], Model],
-        events: Mapping[Hook, AnyHandler] | None = None,
-        context: Context | None = None,
-    ) -> None:
-        """Prepare a job, and start the thread if there is none."""
-        with suppress(Empty):
-            while True:
-                self._replies.get_nowait()
-        self._arrived = SimpleQueue()
-        super().begin(job, events, context)
+    def _prepare_job(self) -> None:
+        self._arrived: SimpleQueue[Event] = SimpleQueue()
         if self._thread is not None:
+            with suppress(Empty):
+                while True:
+                    self._replies.get_nowait()
             return
+        self._replies: SimpleQueue[Model] = SimpleQueue()
         self._thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
         try:
             self._thread.start()

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial, wraps
+from itertools import starmap
 from multiprocessing.process import BaseProcess
 from socket import socket
 from subprocess import Popen
@@ -26,8 +27,8 @@ _OPENERS: Final = (
 )
 """The methods that open something."""
 
-_PATCHES: Final[list[tuple[type, str, Callable[..., None], Callable[..., None]]]] = []
-"""The patched methods: class, name, original and patch. Empty while there are no simulations."""
+_UNDO: Final[list[Callable[[], None]]] = []
+"""The functions that restore the patched methods. Empty while there are no simulations."""
 
 
 def _epolls() -> set[int]:
@@ -52,22 +53,19 @@ def new_epolls() -> set[int]:
 
 def watch_resources() -> None:
     """Note the resources that simulations open, while there are simulations."""
-    if bool(STACKS) == bool(_PATCHES):
+    if bool(STACKS) == bool(_UNDO):
         return
     with LOCK:
-        if not _PATCHES:
-            for owner, name in _OPENERS:
-                original = vars(owner)[name]
-                patch = _noting(original)
-                setattr(owner, name, patch)
-                _PATCHES.append((owner, name, original, patch))
-        while _PATCHES and not STACKS:
-            patched, name, original, patch = _PATCHES.pop()
-            if vars(patched)[name] is patch:  # else other code replaced it, and may still call it
-                setattr(patched, name, original)
+        if not _UNDO:
+            _UNDO.extend(starmap(_patch, _OPENERS))
+        while _UNDO and not STACKS:
+            _UNDO.pop()()
 
 
-def _noting(method: Callable[..., None]) -> Callable[..., None]:
+def _patch(owner: type, name: str) -> Callable[[], None]:
+    """Let a method note what simulations open by it. Return the function that restores it."""
+    method: Callable[..., None] = vars(owner)[name]
+
     @wraps(method)
     def note(self: Resource, *args: object, **kwargs: object) -> None:
         driver = stack_of(getcurrent()) if STACKS else None
@@ -77,7 +75,12 @@ def _noting(method: Callable[..., None]) -> Callable[..., None]:
                 self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
         method(self, *args, **kwargs)
 
-    return note
+    def restore() -> None:
+        if vars(owner)[name] is note:  # else other code replaced it, and may still call it
+            setattr(owner, name, method)
+
+    setattr(owner, name, note)
+    return restore
 
 
 def _run_registered(driver: object, run: Callable[[], None]) -> None:

@@ -174,7 +174,7 @@ class Driver(ABC):
 
     @abstractmethod
     def _prepare_job(self) -> None:
-        """Make the stack, which runs ``_serve``, or forget replies that came after its latest job."""
+        """Make the stack, which runs ``_serve``, or forget replies after its latest job."""
 
     @abstractmethod
     def enter(self, *, direct: bool = True) -> None:

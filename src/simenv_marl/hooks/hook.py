@@ -392,10 +392,7 @@ class Hook:
                 the handlers of the plugins.
             plugins: The plugins of the simulation's environment.
         """
-        if decide is None and plugins not in self.slot:
-            self.leave(stack)
-        else:
-            self.interceptors[stack] = self.around(decide, plugins)
+        self.interceptors[stack] = self.around(decide, plugins)
 
     def leave(self, stack: greenlet) -> None:
         """Remove the interceptor of a stack, if there is one."""

@@ -367,7 +367,7 @@ class Hook:
     def _interceptor_at(self, here: greenlet) -> Interceptor:
         driver = (stack_of(here) or spawner_of(here)) if STACKS else None
         evaluation = driver or EVALUATING.get(here)
-        decide = None if driver is None else driver.interceptor(self)
+        decide = self.run_rule if driver is None else driver.interceptor(self)
         if here.parent is None and here not in STACKS:
             thread = current_thread()
             if thread is main_thread():
@@ -381,15 +381,14 @@ class Hook:
     def enter(
         self,
         stack: greenlet,
-        decide: Interceptor | None,
+        decide: Interceptor,
         plugins: Hashable | None,
     ) -> None:
         """Enter an interceptor for calls on the stack of a simulation.
 
         Args:
             stack: The stack.
-            decide: The interceptor that decides instead of the rule. None: the rule decides, with
-                the handlers of the plugins.
+            decide: The interceptor inside the handlers: ``run_rule``, or one that decides.
             plugins: The plugins of the simulation's environment.
         """
         self.interceptors[stack] = self.around(decide, plugins)
@@ -398,12 +397,11 @@ class Hook:
         """Remove the interceptor of a stack, if there is one."""
         self.interceptors.pop(stack, None)
 
-    def around(self, decide: Interceptor | None, plugins: Hashable | None) -> Interceptor:
-        """Return an interceptor that runs handlers around ``decide``, or else around the rule.
+    def around(self, inner: Interceptor, plugins: Hashable | None) -> Interceptor:
+        """Return an interceptor that runs handlers around ``inner``.
 
         These are the handlers of the plugins, if there are any, or of the whole process.
         """
-        inner = decide or self.run_rule
         slot = self.slot.get(plugins) or self.slot.get(None)
         if slot is None:
             return inner

@@ -423,8 +423,8 @@ class Driver(ABC):
             for hook in (*self.events, *self._handled):
                 hook.leave(stack)
 
-    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
-        """Return the interceptor of a hook's calls. None if the rule decides.
+    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor:
+        """Return the interceptor of a hook's calls: ``run_rule`` if it sends no events.
 
         Args:
             hook: The hook.
@@ -432,7 +432,7 @@ class Driver(ABC):
         """
         handler = self.events.get(hook)
         if handler is None:
-            return None
+            return hook.run_rule
         if away or self.forked:
             obstacle = self._obstacle()
             if obstacle is not None:

@@ -29,7 +29,7 @@ from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
 from ...simulation import RULE, Function, Model, Sentinel
-from .exits import ASYNCIO, SimulationExit, is_exit, make_exit
+from .exits import ASYNCIO, LoopExit, SimulationExit, is_exit, make_exit
 from .loops import NO_LOOP, swap_loop
 from .opened import Resource, watch_resources
 
@@ -381,20 +381,19 @@ class Driver(ABC):
             if isinstance(error, SimulationExit):
                 return self._refusal(refused)
             annotate(error, f"simenv_marl: before that, a decision was refused: {refused}")
-        if not isinstance(error, SimulationExit):
-            return error
-        if self._exiting:
+        if self._exiting and isinstance(error, SimulationExit):
             # Free its frames in this thread, because the model's greenlets can unwind in no other.
             error.__traceback__ = None
             error.__context__ = None
-            return error
-        stray = SimulationError(
-            "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet"
-            " or a thread of that episode has kept; end all of these with their episode (cancel"
-            " them in stop or in a finally)"
-        )
-        stray.__cause__ = error
-        return stray
+        elif type(error) in (SimulationExit, LoopExit):  # a check raises a subclass
+            stray = SimulationError(
+                "the simulation raised a SimulationExit of an earlier episode, which a task, a"
+                " greenlet or a thread of that episode has kept; end all of these with their"
+                " episode (cancel them in stop or in a finally)"
+            )
+            stray.__cause__ = error
+            return stray
+        return error
 
     def _forget_stack(self) -> None:
         """Unregister the stack. From now on it takes no part in decisions."""

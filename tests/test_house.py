@@ -35,10 +35,8 @@ FOREIGN_WRITES = {
     "core/plans/options.py function.__doc__": "help() reads a docstring there",
     "core/switching/driver.py error.__context__": "frees the frames of an exit in their thread",
     "core/switching/driver.py error.__traceback__": "the same",
-    "core/switching/greenlets.py body.parent": "greenlet has no other way",
-    "core/switching/greenlets.py self._body.gr_context": "the same",
-    "core/switching/greenlets.py driver._loop": "in a function that the driver makes for itself",
-    "core/switching/greenlets.py driver._running_loop": "the same",
+    "core/switching/greenlets.py stack.parent": "greenlet has no other way",
+    "core/switching/greenlets.py self._stack.gr_context": "the same",
     "remote/callbacks.py sys.unraisablehook": "Python installs its hook by assignment",
 }
 """Writes of another object's fields, each with its reason."""

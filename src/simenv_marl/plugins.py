@@ -18,6 +18,7 @@ from .decision import decision_points
 from .errors import (
     HandlerError,
     PatchError,
+    UnknownPointError,
     UnknownTargetError,
     name_of,
     short_repr,
@@ -165,12 +166,14 @@ def _expose_function(function: Any) -> Any:
 def _find_target(target: Any) -> Hook:
     """Find the hook of a function, an exposed iterable, or a name for one of these."""
     try:
-        return find_hook(target, UnknownTargetError)
-    except (UnknownTargetError, PatchError):
+        return find_hook(target)
+    except (UnknownPointError, PatchError) as error:
         # A function that was exposed inside another function: the latest of this name.
         for hook in reversed(hooks()):
             if hook.exposed and hook.name == target:
                 return hook
+        if isinstance(error, UnknownPointError):
+            raise UnknownTargetError(*error.args) from None
         raise
 
 

@@ -53,7 +53,7 @@ def test_observations_are_cast(space, value, expected):
         (BOX, [1, 2, 3], r"shape \(3,\)"),
         (BOX, [[1], [2, 3]], "does not fit"),
         (BOX, ["a", "b"], "not numeric"),
-        (BYTES, [0, np.inf], "not finite"),
+        (BYTES, [0, np.inf], "cannot hold"),
         (BYTES, [0, 256], "cannot hold"),
         (BYTES, [-1, 0], "cannot hold"),
         *((DIAL, value, "must be an integer") for value in (6.5, "6x", None, np.inf)),

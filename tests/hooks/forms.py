@@ -3,7 +3,6 @@
 import asyncio
 import statistics
 
-from simenv_marl.errors import UnknownTargetError
 from simenv_marl.hooks.places import resolve
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
@@ -50,5 +49,5 @@ def found(name, how):
     """A dotted name, or what it leads to."""
     if how == "by name":
         return name
-    owner, attribute = resolve(name, UnknownTargetError)
+    owner, attribute = resolve(name)
     return getattr(owner, attribute)

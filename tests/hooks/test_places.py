@@ -14,7 +14,7 @@ from greenlet import getcurrent, greenlet
 
 from simenv_marl import aec_env
 from simenv_marl.decision import registered
-from simenv_marl.errors import PatchError, UnknownTargetError
+from simenv_marl.errors import PatchError
 from simenv_marl.hooks.handlers import Installation
 from simenv_marl.hooks.hook import Hook, hook_of, made_with, unwrap
 from simenv_marl.hooks.places import find_hook, places_of, resolve
@@ -121,9 +121,9 @@ def test_an_error_of_a_module_is_its_own(tmp_path, monkeypatch):
     (tmp_path / "raising_model.py").write_text("raise ZeroDivisionError\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ModuleNotFoundError, match="no_such_package_at_all"):
-        resolve("broken_model.Model.method", UnknownTargetError)
+        resolve("broken_model.Model.method")
     with pytest.raises(ZeroDivisionError):
-        resolve("raising_model.Model.method", UnknownTargetError)
+        resolve("raising_model.Model.method")
 
 
 # -- set and put back ------------------------------------------------------------------------------
@@ -163,7 +163,7 @@ def test_a_patch_that_fails_half_way_is_undone(error, raised, monkeypatch):
     gc.collect()
     assert market.price is shop.price is refusing.alias is original
     assert hook_of(vars(_Hiding)["look"]) is None
-    kept = Installation([(find_hook(LOOK, UnknownTargetError), None)])
+    kept = Installation([(find_hook(LOOK), None)])
     kept.uninstall()
     assert not kept.complete  # so that an environment that is used again sets all of it again
 
@@ -226,12 +226,12 @@ def test_modules_may_come_while_names_are_looked_for(monkeypatch):
 @pytest.mark.parametrize("end", ["close", "drop"])
 def test_patches_of_other_code_stay_and_the_point_can_be_used_afterwards(form, end):
     name, call, expected = FORMS[form]
-    owner, attribute = resolve(name, UnknownTargetError)
+    owner, attribute = resolve(name)
     before, points = vars(owner).get(attribute), {name: define(agent="one_0")}
     for _ in range(3):
         env = aec_env(calling(call), points)
         env.reset()
-        hook = find_hook(name, UnknownTargetError)
+        hook = find_hook(name)
         with mock.patch.object(owner, attribute, return_value="mocked"):
             if end == "close":
                 env.close()

@@ -175,7 +175,7 @@ def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached_and
     assert with_handlers(lambda: function(3), *entries) == (7 + 5) * 10 + 1
     assert seen == [((6,), {"more": 5}), ((7,), {"more": 5, "_result": 12}), "plain"]
     assert repr(ChangedArgs(1, b=2)) == "ChangedArgs(1, b=2)"
-    assert repr(ChangedResult("x")) == "ChangedResult('x')"
+    assert repr(ChangedResult("x")) == "ChangedResult(value='x')"
 
 
 @EVERYWHERE

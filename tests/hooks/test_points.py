@@ -240,7 +240,7 @@ def test_environments_of_a_base_class_and_of_a_subclass_get_along(points):
 @pytest.mark.parametrize("end", ["close", "collect", "collect in mid-episode"])
 @pytest.mark.parametrize("name", ["Trader.rounded", "Trader.opening", "Broker.bid", "price"])
 def test_patches_last_until_the_last_environment_is_gone(name, end):
-    owner, attribute = resolve(f"{MARKET}.{name}", UnknownPointError)
+    owner, attribute = resolve(f"{MARKET}.{name}")
     before = vars(owner).get(attribute)
     simulation = calling(Broker().day, lambda: market.price("tea"))
     envs = [aec_env(simulation, {f"{MARKET}.{name}": define()}) for _ in range(3)]

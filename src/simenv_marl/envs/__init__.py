@@ -69,8 +69,7 @@ def generate_env(
     base.adapt(plan)  # raises errors at once
 
     def initialise(self: object, **changes: Any) -> None:
-        current = plan_of(simulation, points, options) if plan.is_stale else plan
-        base.__init__(self, current.amended(changes))
+        base.__init__(self, plan.amended(changes))
 
     names = ", ".join(point.hook.name for point in plan.active)
     return type(

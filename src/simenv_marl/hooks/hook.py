@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Hashable
-from functools import partial, update_wrapper
+from functools import cached_property, partial, update_wrapper
 from inspect import (
     Parameter,
     Signature,
@@ -18,10 +18,10 @@ from inspect import (
     iscoroutinefunction,
     isgeneratorfunction,
 )
-from threading import current_thread, local
+from threading import current_thread, main_thread
 from types import FunctionType
 from typing import Any, Final
-from weakref import WeakValueDictionary, finalize
+from weakref import WeakValueDictionary
 
 from greenlet import getcurrent, greenlet
 
@@ -54,25 +54,10 @@ Bound = tuple[Args, Kwargs]
 Binding = Callable[[FunctionType], Model]
 """``staticmethod`` or ``classmethod``."""
 
-_ROOTS: Final[set[greenlet]] = set()
-"""Roots of threads without simulations. Hooks without handlers run their rule there at once."""
-
-
-class _ThreadRoot(local):
-    """Keeps the root of a thread in ``_ROOTS`` until the thread ends."""
-
-    _lifetime: set[object] | None = None
-
-    def register(self, root: greenlet) -> None:
-        """Register the root of the current thread."""
-        if self._lifetime is None:
-            self._lifetime = set()  # freed with the thread
-            # A root that outlives its thread makes greenlets crash.
-            finalize(self._lifetime, _ROOTS.discard, root)
-        _ROOTS.add(root)
-
-
-_THREAD_ROOT: Final = _ThreadRoot()
+_MAIN: Final[set[greenlet]] = set()
+"""The root of the main thread, if it has called hooks. Those without handlers run their rule there
+at once. It has no root of another thread, because greenlets crash where one outlives its thread.
+"""
 
 
 # -- wrappers -------------------------------------------------------------------------------------
@@ -158,8 +143,10 @@ class _Code(str):
         return str(self)
 
 
-def _make_binder(signature: Signature) -> Any:
+def _make_binder(signature: Signature | None) -> Callable[..., Bound]:
     """Make a function that returns its arguments: by position where possible, with defaults."""
+    if signature is None:
+        return lambda *args, **kwargs: (args, kwargs)
     parameters: list[Parameter] = []
     args = ""
     kwargs = ""
@@ -178,7 +165,8 @@ def _make_binder(signature: Signature) -> Any:
         "defaults": {name: p.default for name, p in signature.parameters.items()},
     }
     exec(f"def bind{Signature(parameters)}: return ({args}), {{{kwargs}}}", scope)
-    return scope["bind"]
+    bind: Callable[..., Bound] = scope["bind"]
+    return bind
 
 
 def unbind(value: object) -> object:
@@ -223,7 +211,7 @@ class Interceptors(dict[greenlet | None, Interceptor]):
 
     Attributes:
         hook: The hook.
-        roots: The roots of threads whose calls run the rule at once.
+        roots: The roots of threads whose calls run the rule at once: ``_MAIN`` or none.
     """
 
     __slots__ = ("hook", "roots")
@@ -231,19 +219,19 @@ class Interceptors(dict[greenlet | None, Interceptor]):
     def __init__(self, hook: Hook) -> None:
         super().__init__()
         self.hook = hook
-        self.roots = _ROOTS
+        self.roots = _MAIN
 
     def __reduce__(self) -> tuple[Any, ...]:
         return getattr, (self.hook, "interceptors")
 
-    def intercept_elsewhere(self, interceptor: Interceptor | None) -> None:
-        """Intercept calls away from all simulations; None: such calls run the function again."""
-        if interceptor is None:
-            self.pop(None, None)
-            self.roots = _ROOTS
-        else:
-            self[None] = interceptor
+    def intercept_elsewhere(self, wanted: bool) -> None:
+        """Intercept calls away from all simulations, or let them run the function again."""
+        if wanted:
+            self[None] = self.hook.run_rule
             self.roots = set()
+        else:
+            self.pop(None, None)
+            self.roots = _MAIN
 
 
 class Hook:
@@ -301,11 +289,10 @@ class Hook:
         self.rule = function
         self.name = name
         self.bound = bound
-        self.kind = kind_of(function, name) if kind is None else kind
+        self.kind = kind or kind_of(function, name)
         self.positions = _POSITIONS[self.kind]
         self.exposed = exposed
         self.signature = signature_of(function, follow_wrapped=False)
-        self._binder: Callable[..., Bound] | None = None  # made at the first use
         self.interceptors = Interceptors(self)
         self.threads: set[str] = set()
         self.definition: Any = None
@@ -326,11 +313,6 @@ class Hook:
     def __setstate__(self, definition: Any) -> None:
         """Set the definition after unpickling, unless the hook has one of this process."""
         self.definition = self.definition or definition
-
-    @property
-    def stale(self) -> bool:
-        """Whether other code has replaced the function while no wrapper was in its place."""
-        return False
 
     @property
     def letters(self) -> str:
@@ -366,14 +348,14 @@ class Hook:
 
         None if the function does not take it.
         """
-        if self.signature is None:
-            return args, kwargs
-        if self._binder is None:
-            self._binder = _make_binder(self.signature)
         try:
             return self._binder(*args, **kwargs)
         except TypeError:
             return None
+
+    @cached_property
+    def _binder(self) -> Callable[..., Bound]:
+        return _make_binder(self.signature)
 
     def _intercept(self, args: Args, kwargs: Kwargs) -> Model:
         """Run a call on a stack without an interceptor, or refuse it with a ``WrongThreadError``.
@@ -385,35 +367,31 @@ class Hook:
     def _interceptor_at(self, here: greenlet) -> Interceptor:
         driver = (stack_of(here) or spawner_of(here)) if STACKS else None
         evaluation = driver or EVALUATING.get(here)
-        decide = None if driver is None else driver.interceptor(self)
+        decide = self.run_rule if driver is None else driver.interceptor(self)
         if here.parent is None and here not in STACKS:
-            if here not in _ROOTS:
-                _THREAD_ROOT.register(here)
-            self.threads.add(current_thread().name)
+            thread = current_thread()
+            if thread is main_thread():
+                _MAIN.add(here)
+            self.threads.add(thread.name)
         plugins = None if evaluation is None else evaluation.plugins
-        return self.around(decide or self.run_rule, plugins)
+        return self.around(decide, plugins)
 
     # -- interceptors -----------------------------------------------------------------------------
 
     def enter(
         self,
         stack: greenlet,
-        decide: Interceptor | None,
+        decide: Interceptor,
         plugins: Hashable | None,
     ) -> None:
         """Enter an interceptor for calls on the stack of a simulation.
 
         Args:
             stack: The stack.
-            decide: The interceptor that decides instead of the rule. None: the rule decides, with
-                the handlers of the plugins.
+            decide: The interceptor inside the handlers: ``run_rule``, or one that decides.
             plugins: The plugins of the simulation's environment.
         """
-        _ROOTS.discard(stack)
-        if decide is None and plugins not in self.slot:
-            self.leave(stack)
-        else:
-            self.interceptors[stack] = self.around(decide or self.run_rule, plugins)
+        self.interceptors[stack] = self.around(decide, plugins)
 
     def leave(self, stack: greenlet) -> None:
         """Remove the interceptor of a stack, if there is one."""
@@ -505,8 +483,7 @@ class Hook:
             # Meanwhile, garbage collection may close an environment and remove its handlers.
             if present == self.handlers:
                 break
-        changed = bool(self.slot) or self.rule is not self.function
-        self.interceptors.intercept_elsewhere(self.run_rule if changed else None)
+        self.interceptors.intercept_elsewhere(bool(self.slot) or self.rule is not self.function)
         for stack in list(self.interceptors):
             driver = None if stack is None else STACKS.get(stack)
             if driver is not None:

@@ -25,7 +25,7 @@ from typing import Any, Final, Protocol
 
 from ...errors import BranchError
 from ..episodes.episode import Episode
-from ..switching.awaiting import policy_loops
+from ..switching.awaiting import LOOPS
 from ..switching.opened import new_epolls
 from .forks import CAN_FORK, exhausted
 
@@ -130,7 +130,7 @@ def event_loops() -> list[Loop]:
         return []
     kind = events.BaseSelectorEventLoop
     # The collector does not list frozen objects, and users may freeze the loop of policies.
-    known = [*gc.get_objects(), *policy_loops()]
+    known = [*gc.get_objects(), *LOOPS.values()]
     return [thing for thing in known if isinstance(thing, kind) and not thing.is_closed()]
 
 

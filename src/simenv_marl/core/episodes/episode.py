@@ -36,7 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from math import inf
-from typing import NoReturn, Protocol
+from typing import Protocol
 from weakref import ref
 
 from greenlet import getcurrent
@@ -589,17 +589,16 @@ class Episode(EpisodeState):
     # -- ends -------------------------------------------------------------------------------------
 
     def receive_end(self) -> Sentinel:
-        """Handle the end of ``run``: end the agents' episodes, or raise the error of ``run``."""
-        self.running = False
-        self._failed_in_model = self.driver.failed
+        """Handle the end of ``run``: end the agents' episodes, or raise the error of ``run``.
+
+        After a refused decision, raise the error of that.
+        """
+        self.running = not self.driver.idle  # it still runs after a refused decision
+        self._failed_in_model = True  # where the next line raises
         result = self.driver.take_outcome()
+        self._failed_in_model = False
         self.finish(truncated=result is TRUNCATED)
         return WAIT
-
-    def receive_refusal(self) -> NoReturn:
-        """Raise the error of a decision that the driver has refused."""
-        self._failed_in_model = True
-        raise self.driver.refusal()
 
     def finish(self, *, truncated: bool) -> None:
         """End the episode of all live agents."""

@@ -247,11 +247,6 @@ class Plan:
         """The name of the simulation's class or factory."""
         return source_name(self.subject.source).rpartition(".")[2]
 
-    @property
-    def is_stale(self) -> bool:
-        """Whether other code has replaced a function that the plan patches."""
-        return any(hook.stale for hook, _ in self.patches)
-
     def policy_of(self, agent: str, point: Point) -> Policy:
         """Return the policy that answers for an agent. None if the environment's user answers."""
         policy = self.policies.get(agent) or point.policy

@@ -67,7 +67,7 @@ def locate(key: Key, own: Definitions = _NONE) -> DecisionPoint:
         for points in ({point.name: point for point in own}, registered()):
             if key in points:
                 return points[key]
-    return point_for(find_hook(key, UnknownPointError))
+    return point_for(find_hook(key))
 
 
 def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
@@ -84,7 +84,7 @@ def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
 def owner_class(point: DecisionPoint) -> type | None:
     """Return the class of a method. None for other points, or if the class is gone."""
     try:
-        owner, _ = resolve(point.name, UnknownPointError)
+        owner, _ = resolve(point.name)
     except (UnknownPointError, PatchError):
         return None
     return owner if isinstance(owner, type) else None

@@ -24,25 +24,18 @@ SECONDS_TO_CANCEL: Final = 10.0
 THREAD: Final = "simenv_marl policies"
 """The name of the thread."""
 
-_loops: Final[dict[int, asyncio.AbstractEventLoop]] = {}
-"""The event loops, by process. A forked process inherits the entry of its parent."""
+LOOPS: Final[dict[int, asyncio.AbstractEventLoop]] = {}
+"""The event loops of policies, by process. A forked process inherits the entry of its parent."""
 
 
 def _loop() -> asyncio.AbstractEventLoop:
     """Return the event loop of this process."""
     process = os.getpid()
-    if process not in _loops:
+    if process not in LOOPS:
         loop = asyncio.new_event_loop()
-        if _loops.setdefault(process, loop) is loop:
-            Thread(target=loop.run_forever, name=THREAD, daemon=True).start()
-        else:  # another thread was faster
-            loop.close()
-    return _loops[process]
-
-
-def policy_loops() -> list[asyncio.AbstractEventLoop]:
-    """Return the loops in which policies are awaited."""
-    return list(_loops.values())
+        Thread(target=loop.run_forever, name=THREAD, daemon=True).start()
+        LOOPS[process] = loop
+    return LOOPS[process]
 
 
 class Answer:
@@ -58,19 +51,18 @@ class Answer:
         """
         self._value = value
         self._error: BaseException | None = None
-        self._report = report
         self._future: Future[None] | None = None
         if isawaitable(value):
-            self._future = asyncio.run_coroutine_threadsafe(self._await(), _loop())
+            self._future = asyncio.run_coroutine_threadsafe(self._await(report), _loop())
         else:
             report(self)
 
-    async def _await(self) -> None:
+    async def _await(self, report: Callable[[Answer], None]) -> None:
         try:
             self._value = await self._value
         except BaseException as error:  # also an exit, because it would end the loop
             self._error = error
-        self._report(self)
+        report(self)
 
     def cancel(self) -> None:
         """Cancel an answer that is on its way. It is reported when its coroutine has ended."""

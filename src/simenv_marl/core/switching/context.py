@@ -8,13 +8,15 @@ runs.
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from contextlib import suppress
-from copy import deepcopy
+from functools import partial
 from os import getpid
 from threading import RLock, current_thread, get_ident
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from numpy.random import MT19937, RandomState
 
 from ...errors import ReentrancyError, WrongThreadError
 from ...hooks.stacks import SIMULATION, outside_simulation
@@ -112,34 +114,22 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
 # -- states of the global generators --------------------------------------------------------------
 
 
-class _State(NamedTuple):
-    """A state of the global generators.
+def save_generators(generator: RandomState = NUMPY) -> Callable[[], None]:
+    """Return a function that puts the present state of the global generators in place.
 
-    Attributes:
-        python: The state of Python's generator.
-        bits: NumPy's bit generator.
-        numpy: The state of NumPy's generator, with the bits that it has drawn in advance.
+    This is Python's state, and NumPy's or that of another generator for NumPy: its bit generator,
+    and its state with the bits that it has drawn in advance.
     """
+    python = random.getstate()
+    bits = generator._bit_generator
+    numpy = generator.get_state(legacy=False)
 
-    python: tuple[Any, ...]
-    bits: np.random.BitGenerator
-    numpy: dict[str, Any]
+    def load() -> None:
+        random.setstate(python)
+        LEGACY.set_bit_generator(bits)
+        NUMPY.set_state(numpy)
 
-
-def save_generators() -> _State:
-    """Return the state of the global generators."""
-    return _State(random.getstate(), NUMPY._bit_generator, NUMPY.get_state(legacy=False))
-
-
-def load_generators(state: _State) -> None:
-    """Put a saved state of the global generators in place."""
-    random.setstate(state.python)
-    LEGACY.set_bit_generator(state.bits)
-    NUMPY.set_state(state.numpy)
-
-
-def _copy_bits(state: _State) -> _State:
-    return state._replace(bits=deepcopy(state.bits))
+    return load
 
 
 class _Entry(NamedTuple):
@@ -147,7 +137,7 @@ class _Entry(NamedTuple):
 
     owner: GlobalRandom
     thread: int
-    before: _State | None
+    before: Callable[[], None] | None
 
 
 class GlobalRandom:
@@ -157,12 +147,10 @@ class GlobalRandom:
 
     def __init__(self) -> None:
         """Copy the present state, which is used until ``begin`` seeds it."""
-        self._own = _copy_bits(save_generators())
-        if not isinstance(self._own.bits, np.random.MT19937):
-            # ``numpy.random.seed`` can seed no other type.
-            bits = np.random.MT19937()
-            numpy = np.random.RandomState(bits).get_state(legacy=False)
-            self._own = self._own._replace(bits=bits, numpy=numpy)
+        own = RandomState(MT19937())  # ``numpy.random.seed`` can seed no other type
+        with suppress(ValueError):  # the user's bits are of another type
+            own.set_state(NUMPY.get_state(legacy=False))
+        self._load_own = save_generators(own)
 
     def begin(self, seed: int) -> None:
         """Seed both generators, whose state must be in place, with the seed of an episode."""
@@ -180,18 +168,18 @@ class GlobalRandom:
                 " has only one state of the global generators; run them one after the other, or in"
                 " separate processes"
             )
-        before: _State | None = None
+        before = None
         if not entered or entered[-1].owner is not self:
             before = save_generators()
-            load_generators(self._own)
+            self._load_own()
         entered.append(_Entry(self, thread, before))
 
     def leave(self) -> None:
         """Restore the state that was in place before."""
         before = self._entered.pop().before
         if before is not None:
-            self._own = save_generators()
-            load_generators(before)
+            self._load_own = save_generators()
+            before()
 
     def leave_all(self) -> None:
         """Leave as often as this state was entered in a row."""
@@ -207,11 +195,10 @@ class preserve_generators:  # noqa: N801 - it is used like a function
 
     def __enter__(self) -> None:
         torch = generator_of_torch()
-        self._torch = None if torch is None else torch.get_state()
-        self._state = save_generators()
-        load_generators(_copy_bits(self._state))
+        self._loads = [save_generators()]
+        if torch is not None:
+            self._loads.append(partial(torch.set_state, torch.get_state()))
 
     def __exit__(self, *error: object) -> None:
-        load_generators(self._state)
-        if self._torch is not None:
-            generator_of_torch().set_state(self._torch)
+        for load in self._loads:
+            load()

@@ -16,6 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
+from sys import modules
 from threading import Thread, local
 from types import coroutine
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
@@ -25,10 +26,11 @@ from greenlet import getcurrent, greenlet
 
 from ...errors import SimulationError, WrongThreadError, annotate
 from ...hooks.hook import BOUND, Hook
-from ...hooks.stacks import STACKS, Interceptor, spawner_of
+from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
-from ...simulation import Model, Sentinel
-from .exits import LoopExit, SimulationExit, is_exit
+from ...simulation import RULE, Function, Model, Sentinel
+from .exits import ASYNCIO, LoopExit, SimulationExit, is_exit, make_exit
+from .loops import NO_LOOP, swap_loop
 from .opened import Resource, watch_resources
 
 WAIT: Final = Sentinel("WAIT")
@@ -40,18 +42,15 @@ SECONDS_TO_UNWIND: Final = 5.0
 UNWINDING_TRIES: Final = 1000
 """How often ``SimulationExit`` is raised. A SimPy model loses one of its processes at each try."""
 
-Args = tuple[Model, ...]
-Kwargs = dict[str, Model]
-
 
 class Receiver(Protocol):
     """An episode, as the handlers of events use it."""
 
     def receive_end(self) -> Sentinel:
-        """Handle the end of ``run``. Return ``WAIT``, or raise the error of ``run``."""
+        """Handle the end of ``run``. Return ``WAIT``, or raise the error of ``run``.
 
-    def receive_refusal(self) -> NoReturn:
-        """Raise the error of a decision that the driver has refused."""
+        After a refused decision, raise the error of that.
+        """
 
 
 EpisodeType = TypeVar("EpisodeType", contravariant=True)
@@ -67,7 +66,7 @@ class EventHandler(Protocol[EpisodeType]):
     """
 
     @property
-    def deliver(self) -> Callable[..., Model] | None:
+    def deliver(self) -> Function | None:
         """Return the function that makes the value of the call."""
 
     @property
@@ -87,7 +86,7 @@ Job: TypeAlias = tuple[Callable[[], Model], Mapping[Hook, AnyHandler]]
 
 
 class _Ended:
-    """Handles the end of a job."""
+    """Handles the end of a job, and the first event after a refused decision."""
 
     deliver = None
     report = None
@@ -96,29 +95,19 @@ class _Ended:
         return episode.receive_end()
 
 
-class _Refused:
-    """Handles the first event after a refused decision."""
+_ENDED: Final = _Ended()
 
-    deliver = None
-    report = None
-
-    def handle(self, episode: Receiver, args: Args, kwargs: Kwargs) -> NoReturn:
-        episode.receive_refusal()
-
-
-ENDED: Final[Event] = _Ended(), (), BOUND
+ENDED: Final[Event] = _ENDED, (), BOUND
 """The event of the end of a job."""
-
-_REFUSED: Final = _Refused()
 
 
 class _Identity(local):
     """What identifies a thread. Unlike the thread's number, it is never used for another thread."""
 
-    token: set[None] | type[Thread] = Thread  # seen by finalizers that run while a token is made
+    token: object = object  # seen by finalizers that run while a token is made
 
     def __init__(self) -> None:
-        self.token = set[None]()  # because it can be referenced weakly
+        self.token = set()  # because it can be referenced weakly
 
 
 THREAD: Final = _Identity()
@@ -143,12 +132,13 @@ class Driver(ABC):
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_exiting", "_handled", "_home", "_outcome", "_prepare",
-        "_refused", "_spawned", "_stack", "caller", "ended", "events", "forked", "given_up", "idle",
-        "opened", "plugins", "stale",
+        "__weakref__", "_context", "_exiting", "_handled", "_home", "_loop", "_outcome", "_prepare",
+        "_refused", "_running_loop", "_spawned", "_stack", "_thread", "_users_loop", "caller",
+        "ended", "events", "forked", "given_up", "idle", "opened", "plugins", "stale",
     )  # fmt: skip
 
     resume: Callable[[Model], Event]
+    _leave: Function  # passes an event to the user, and returns the reply
     _shares_thread = True  # with its user
 
     def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
@@ -162,6 +152,7 @@ class Driver(ABC):
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.events: Mapping[Hook, AnyHandler] = {}
         self._stack: greenlet | None = None
+        self._thread: Thread | None = None  # that was made for the stack
         self._home: Callable[[], object] = ref(THREAD.token)  # the thread of the stack
         self._spawned = False  # whether other greenlets have decided on this stack
         self.caller: greenlet | None = None
@@ -175,11 +166,18 @@ class Driver(ABC):
         self.forked = False
         self._exiting = False
         self._prepare: Callable[[], Job] | None = None  # until the job begins
-        self._context: Context | None = None  # of the job, until it begins
+        self._context = Context()  # of the job, until it begins
+        self._running_loop: Callable[[], object] | None = None  # None until asyncio is imported
+        self._loop = NO_LOOP  # of the simulation, while it waits
+        self._users_loop = NO_LOOP
         self._outcome: list[Model] = []  # the result of the job, or its error
         self._refused: WrongThreadError | None = None  # until the user gets it
 
     # -- on the user's side -----------------------------------------------------------------------
+
+    @abstractmethod
+    def _make_stack(self) -> None:
+        """Make the stack, which runs ``_serve``, or forget replies after its latest job."""
 
     @abstractmethod
     def enter(self, *, direct: bool = True) -> None:
@@ -203,6 +201,7 @@ class Driver(ABC):
             prepare: Returns the job. It runs on the stack, too, where decisions follow the rule
                 until it has returned.
         """
+        self._make_stack()
         self._prepare = prepare
         self.events = {}
         self._refused = None
@@ -241,27 +240,13 @@ class Driver(ABC):
         return self.take_outcome()
 
     def take_outcome(self) -> Model:
-        """Return the result of the job that has ended, or raise its error."""
+        """Return the result of the job that has ended, or raise its error, or that of a refusal."""
         outcome = self._outcome
         if len(outcome) > 1:
             raise outcome.pop()  # the waiting stack must not keep the error
+        if self._refused is not None:
+            raise self._refusal(self._refused)
         return outcome.pop()
-
-    def clear_exit(self) -> None:
-        """Free the frames of the exit that has ended the job.
-
-        They must be freed in the thread of the stack, because the model's greenlets can unwind in
-        no other one.
-        """
-        error = self._outcome[-1]
-        if isinstance(error, SimulationExit):
-            error.__traceback__ = None
-            error.__context__ = None
-
-    @property
-    def failed(self) -> bool:
-        """Whether the job that has ended has raised an error."""
-        return len(self._outcome) > 1
 
     def unwind(self) -> list[BaseException]:
         """Raise ``SimulationExit`` in the job until it ends, or give it up, after ``enter``.
@@ -301,11 +286,58 @@ class Driver(ABC):
 
     # -- on the simulation's side -----------------------------------------------------------------
 
-    @abstractmethod
-    def _decider(
-        self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
-    ) -> Interceptor:
+    def _decider(self, hook: Hook, rule: Function, handler: AnyHandler, away: bool) -> Interceptor:
         """Make the function that sends an event for each call of a hook, and returns its value."""
+        deliver = handler.deliver
+        bind = hook.bind
+
+        def decide(args: Args, kwargs: Kwargs) -> Model:
+            bound = args
+            named = kwargs
+            if kwargs is not BOUND:
+                call = bind(args, kwargs)
+                if call is None:  # a handler has changed the arguments
+                    return rule(*args, **kwargs)
+                bound, named = call
+            if away:
+                self._reply_to(getcurrent())
+            running = self._running_loop
+            if running is None and ASYNCIO in modules:
+                running = self._running_loop = modules[ASYNCIO]._get_running_loop
+            looped = running is not None and (
+                running() is not None or self._users_loop[0] is not None
+            )
+            if looped:
+                self._loop = swap_loop(self._users_loop)
+            leave = self._leave
+            try:
+                reply = leave(handler, bound, named)
+            except BaseException as error:
+                exits = isinstance(error, SimulationExit)
+                if exits or not self.ended:  # else the stack unwinds by itself
+                    self._reply_to(None)
+                    self._enter_loop()
+                if exits:
+                    raise make_exit() from None
+                raise
+            if away:
+                self._reply_to(None)
+            if looped or (running is not None and running() is not None):
+                self._enter_loop()
+            if reply is RULE:
+                return rule(*args, **kwargs) if kwargs else rule(*args)
+            return reply if deliver is None else deliver(reply, *bound, **named)
+
+        return decide
+
+    @abstractmethod
+    def _reply_to(self, receiver: greenlet | None) -> None:
+        """Let the next reply go to a greenlet of the model. None: to the stack itself."""
+
+    def _enter_loop(self) -> None:
+        """Switch from the user's event loop to the simulation's."""
+        self._users_loop = swap_loop(self._loop)
+        self._loop = NO_LOOP
 
     def note_opened(self, resource: Resource) -> None:
         """Note a resource that the simulation has opened."""
@@ -343,30 +375,34 @@ class Driver(ABC):
             prepare = job = None
             self.leave_hooks(self._stack)
             self.events = {}
-        self._outcome = [result] if self._refused is None else [None, self.refusal()]
+        self._outcome = [result]
 
     def _explain(self, error: BaseException) -> BaseException:
         """Return the error to raise on the user's side for an error of the simulation."""
-        if self._refused is not None and self._refused is not error:
+        refused = self._refused
+        if refused is not None and refused is not error:
             if isinstance(error, SimulationExit):
-                return self.refusal()
-            annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
-        if type(error) not in (SimulationExit, LoopExit) or self._exiting:
-            return error
-        stray = SimulationError(
-            "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet"
-            " or a thread of that episode has kept; end all of these with their episode (cancel"
-            " them in stop or in a finally)"
-        )
-        stray.__cause__ = error
-        return stray
+                return self._refusal(refused)
+            annotate(error, f"simenv_marl: before that, a decision was refused: {refused}")
+        if self._exiting and isinstance(error, SimulationExit):
+            # Free its frames in this thread, because the model's greenlets can unwind in no other.
+            error.__traceback__ = None
+            error.__context__ = None
+        elif type(error) in (SimulationExit, LoopExit):  # a check raises a subclass
+            stray = SimulationError(
+                "the simulation raised a SimulationExit of an earlier episode, which a task, a"
+                " greenlet or a thread of that episode has kept; end all of these with their"
+                " episode (cancel them in stop or in a finally)"
+            )
+            stray.__cause__ = error
+            return stray
+        return error
 
     def _forget_stack(self) -> None:
         """Unregister the stack. From now on it takes no part in decisions."""
         self.ended = True
         stack, self._stack = self._stack, None
         self.leave_hooks(stack)
-        self.events = {}
         if stack is not None:
             STACKS.pop(stack, None)
         watch_resources()
@@ -389,8 +425,8 @@ class Driver(ABC):
             for hook in (*self.events, *self._handled):
                 hook.leave(stack)
 
-    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
-        """Return the interceptor of a hook's calls. None if the rule decides.
+    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor:
+        """Return the interceptor of a hook's calls: ``run_rule`` if it sends no events.
 
         Args:
             hook: The hook.
@@ -398,24 +434,21 @@ class Driver(ABC):
         """
         handler = self.events.get(hook)
         if handler is None:
-            return None
+            return hook.run_rule
         if away or self.forked:
-            obstacle = self._obstacle(away)
+            obstacle = self._obstacle()
             if obstacle is not None:
                 return partial(self.refuse, hook, obstacle)
             self._spawned = True
         rule = hook.rule
         if handler.report is not None:
-            report = _report if hook.kind == "function" else _report_later
-            rule = partial(report, rule, self._decider(hook, rule, handler.report, away), hook)
+            rule = _reporting(hook, self._decider(hook, rule, handler.report, away))
         return self._decider(hook, rule, handler, away)
 
-    def _obstacle(self, away: bool) -> str | None:
+    def _obstacle(self) -> str | None:
         """Return where a call comes from if the environment cannot be asked there."""
         if self.forked:
             return "a process that the simulation has forked"
-        if not away:
-            return None
         if self._home() is not THREAD.token:
             return "a thread that the simulation has started"
         if self._shares_thread and spawner_of(getcurrent()) is not None:
@@ -433,7 +466,7 @@ class Driver(ABC):
         )
         if self._refused is None and not self.forked:
             self._refused = error
-            self.events = dict.fromkeys(self.events, _REFUSED)
+            self.events = dict.fromkeys(self.events, _ENDED)
             self.enter_hooks()
         raise error
 
@@ -442,27 +475,27 @@ class Driver(ABC):
         self.forked = True
         self.enter_hooks()
 
-    def refusal(self) -> WrongThreadError:
+    def _refusal(self, refused: WrongThreadError) -> WrongThreadError:
         """Make the error that tells the user of a refused decision."""
-        refused, self._refused = self._refused, None
-        error = WrongThreadError(*() if refused is None else refused.args)
+        self._refused = None
+        error = WrongThreadError(*refused.args)
         error.__cause__ = refused
         return error
 
 
-def _report(
-    rule: Callable[..., Model], report: Interceptor, hook: Hook, /, *args: Model, **kwargs: Model
-) -> Model:
-    """Run a rule, and pass its decision and the bound call to an interceptor."""
-    decision = rule(*args, **kwargs)
-    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
-    return decision
+def _reporting(hook: Hook, send: Interceptor) -> Function:
+    """Make a function that runs a rule, and sends its decision with the bound call."""
+    rule = hook.rule
 
+    def report(decision: Model, args: Args, kwargs: Kwargs) -> Model:
+        send((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
+        return decision
 
-@coroutine
-def _report_later(
-    rule: Callable[..., Model], report: Interceptor, hook: Hook, /, *args: Model, **kwargs: Model
-) -> Generator[Model, Model, Model]:
-    decision = yield from rule(*args, **kwargs)
-    report((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
-    return decision
+    if hook.kind == "function":
+        return lambda *args, **kwargs: report(rule(*args, **kwargs), args, kwargs)
+
+    @coroutine
+    def report_later(*args: Model, **kwargs: Model) -> Generator[Model, Model, Model]:
+        return report((yield from rule(*args, **kwargs)), args, kwargs)
+
+    return report_later

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from functools import partial
 from sys import modules
-from typing import TYPE_CHECKING, Final
+from traceback import walk_stack
+from typing import TYPE_CHECKING, Any, Final
 
 from greenlet import getcurrent, greenlet
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 ASYNCIO: Final = "asyncio.events"
 """The module that knows a thread's running event loop. If it is not imported, no loop runs."""
 
-Context = dict[str, object]
+Context = dict[str, Any]
 """The context that an event loop passes to its exception handler."""
 
 
@@ -86,12 +86,7 @@ def _spare_hub(hub: Model) -> None:
 
 def _is_closing_loop() -> bool:
     close = modules["asyncio"].Runner.close.__code__
-    frame = sys._getframe()
-    while frame.f_back is not None:
-        if frame.f_code is close:
-            return True
-        frame = frame.f_back
-    return False
+    return any(frame.f_code is close for frame, _ in walk_stack(None))
 
 
 def _silence(loop: AbstractEventLoop) -> None:
@@ -109,8 +104,5 @@ def _report_task(
 ) -> None:
     """Report an exception of a loop, unless its task was unwound or the loop was closed."""
     error = context.get("exception")
-    if error is None:
-        if not loop.is_closed():
-            report(loop, context)
-    elif isinstance(error, BaseException) and not is_exit(error):
+    if not (loop.is_closed() if error is None else is_exit(error)):
         report(loop, context)

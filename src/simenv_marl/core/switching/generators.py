@@ -245,10 +245,8 @@ def reseed_generators(simulation: Model, seed: int) -> int:
                 generator.seed(_integer(stream))
             case RandomState():
                 generator.set_state(RandomState(MT19937(stream)).get_state())
-            case Generator():
-                _seed_bits(generator.bit_generator, stream)
-            case BitGenerator():
-                _seed_bits(generator, stream)
+            case Generator(bit_generator=bits) | (BitGenerator() as bits):
+                _seed_bits(bits, stream)
     return len(generators)
 
 

@@ -6,11 +6,12 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial, wraps
+from itertools import starmap
 from multiprocessing.process import BaseProcess
 from socket import socket
 from subprocess import Popen
 from threading import Thread
-from typing import Final, Protocol
+from typing import Final
 
 from greenlet import getcurrent
 
@@ -26,12 +27,8 @@ _OPENERS: Final = (
 )
 """The methods that open something."""
 
-_PATCHES: Final[list[tuple[type, str, Callable[..., None], Callable[..., None]]]] = []
-"""The patched methods: class, name, original and patch. Empty while there are no simulations."""
-
-
-_EPOLLS_BEFORE: Final[set[int]] = set()
-"""The descriptors of the epoll objects that the process had when this module was imported."""
+_UNDO: Final[list[Callable[[], None]]] = []
+"""The functions that restore the patched methods. Empty while there are no simulations."""
 
 
 def _epolls() -> set[int]:
@@ -45,54 +42,48 @@ def _epolls() -> set[int]:
     return numbers
 
 
+_EPOLLS_BEFORE: Final = _epolls()
+"""The descriptors of the epoll objects that the process had when this module was imported."""
+
+
 def new_epolls() -> set[int]:
     """Return the descriptors of the epoll objects that the process has made since then."""
     return _epolls() - _EPOLLS_BEFORE
 
 
-_EPOLLS_BEFORE.update(_epolls())
-
-
-class Owner(Protocol):
-    """A driver, for which the resources of its simulation are noted."""
-
-    def note_opened(self, resource: Resource) -> None:
-        """Note a resource that the simulation has opened."""
-
-
 def watch_resources() -> None:
     """Note the resources that simulations open, while there are simulations."""
-    if bool(STACKS) == bool(_PATCHES):
+    if bool(STACKS) == bool(_UNDO):
         return
     with LOCK:
-        if not _PATCHES:
-            for owner, name in _OPENERS:
-                original = vars(owner)[name]
-                patch = _noting(original)
-                setattr(owner, name, patch)
-                _PATCHES.append((owner, name, original, patch))
-        while _PATCHES and not STACKS:
-            patched, name, original, patch = _PATCHES.pop()
-            if vars(patched)[name] is patch:  # else other code replaced it, and may still call it
-                setattr(patched, name, original)
+        if not _UNDO:
+            _UNDO.extend(starmap(_patch, _OPENERS))
+        while _UNDO and not STACKS:
+            _UNDO.pop()()
 
 
-def _noting(method: Callable[..., None]) -> Callable[..., None]:
+def _patch(owner: type, name: str) -> Callable[[], None]:
+    """Let a method note what simulations open by it. Return the function that restores it."""
+    method: Callable[..., None] = vars(owner)[name]
+
     @wraps(method)
     def note(self: Resource, *args: object, **kwargs: object) -> None:
-        driver: Owner | None = stack_of(getcurrent()) if STACKS else None
-        if driver is None:
-            method(self, *args, **kwargs)
-            return
-        if isinstance(self, Thread):
-            self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
+        driver = stack_of(getcurrent()) if STACKS else None
+        if driver is not None:
+            driver.note_opened(self)
+            if isinstance(self, Thread):
+                self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
         method(self, *args, **kwargs)
-        driver.note_opened(self)
 
-    return note
+    def restore() -> None:
+        if vars(owner)[name] is note:  # else other code replaced it, and may still call it
+            setattr(owner, name, method)
+
+    setattr(owner, name, note)
+    return restore
 
 
-def _run_registered(driver: Owner, run: Callable[[], None]) -> None:
+def _run_registered(driver: object, run: Callable[[], None]) -> None:
     """Run a thread that a simulation has started, as a stack of that simulation's driver."""
     # ``getcurrent()`` is in no variable, because tracebacks keep variables, and greenlets crash
     # where the root of a thread outlives the thread.

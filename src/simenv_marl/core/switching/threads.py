@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from contextvars import Context
 from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Final
 
+from greenlet import greenlet
+
 from ...errors import WrongThreadError
-from ...hooks.hook import BOUND, Hook
-from ...hooks.stacks import SIMULATION, Interceptor
-from ...plugins import Plugins
-from ...simulation import RULE, Model, Sentinel
-from .driver import ENDED, SECONDS_TO_UNWIND, AnyHandler, Args, Driver, Event, Job, Kwargs
-from .exits import make_exit
+from ...hooks.stacks import SIMULATION
+from ...simulation import Model, Sentinel
+from .driver import ENDED, SECONDS_TO_UNWIND, Driver, Event
+from .exits import SimulationExit
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds, because Ctrl-C may come before it."""
@@ -30,31 +29,23 @@ class ThreadDriver(Driver):
 
     Only one of the two threads runs at a time. They pass replies and events through two queues. An
     interrupt may leave something in a queue, or lose an event. So replies between two jobs are
-    ignored, and each job has a queue of events.
+    ignored, and each job has a queue of events. ``caller`` is always None.
     """
 
-    __slots__ = ("_arrived", "_replies", "_thread")
+    __slots__ = ("_arrived", "_replies")
 
     _shares_thread = False
 
-    def __init__(self, plugins: Plugins | None = None, earlier: Driver | None = None) -> None:
-        """Prepare a thread. ``caller`` is always None."""
-        super().__init__(plugins, earlier)
-        self._replies: SimpleQueue[Model] = SimpleQueue()
-        self._arrived: SimpleQueue[Event] = SimpleQueue()
-        self._thread: Thread | None = None
-
     # -- in the user's thread ---------------------------------------------------------------------
 
-    def begin(self, prepare: Callable[[], Job]) -> None:
-        """Prepare a job, and start the thread if there is none."""
-        with suppress(Empty):
-            while True:
-                self._replies.get_nowait()
-        self._arrived = SimpleQueue()
-        super().begin(prepare)
+    def _make_stack(self) -> None:
+        self._arrived: SimpleQueue[Event] = SimpleQueue()
         if self._thread is not None:
+            with suppress(Empty):
+                while True:
+                    self._replies.get_nowait()
             return
+        self._replies: SimpleQueue[Model] = SimpleQueue()
         self._thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
         try:
             self._thread.start()
@@ -117,42 +108,25 @@ class ThreadDriver(Driver):
             self._forget_stack()
 
     def _do(self) -> None:
-        context, self._context = self._context, None
+        context, self._context = self._context, Context()
         try:
-            (context or Context()).run(self._work)
+            context.run(self._work)
         except BaseException as error:  # raised from another thread, so that its user does not wait
             self._outcome = [None, error]
-        context = None
-        self.clear_exit()
+        del context
         if self.forked:
             self.ended = True
             self.take_outcome()  # raises an error here, because this process has no user
         self.idle = True
         self._arrived.put(ENDED)
 
-    def _decider(
-        self, hook: Hook, rule: Callable[..., Model], handler: AnyHandler, away: bool
-    ) -> Interceptor:
-        """Make the function that sends an event for each call of a hook, and returns its value."""
-        deliver = handler.deliver
-        bind = hook.bind
-        send = self._arrived.put
-        receive = self._replies.get
+    def _leave(self, *event: Model) -> Model:
+        """Pass an event to the user, and return the reply."""
+        self._arrived.put(event)
+        reply = self._replies.get()
+        if reply is _EXIT:
+            raise SimulationExit
+        return reply
 
-        def decide(args: Args, kwargs: Kwargs) -> Model:
-            bound = args
-            named = kwargs
-            if kwargs is not BOUND:
-                call = bind(args, kwargs)
-                if call is None:  # a handler has changed the arguments
-                    return rule(*args, **kwargs)
-                bound, named = call
-            send((handler, bound, named))
-            reply = receive()
-            if reply is RULE:
-                return rule(*args, **kwargs)
-            if reply is _EXIT:
-                raise make_exit()
-            return reply if deliver is None else deliver(reply, *bound, **named)
-
-        return decide
+    def _reply_to(self, receiver: greenlet | None) -> None:
+        """Do nothing: while a greenlet of the model waits, its whole thread does."""

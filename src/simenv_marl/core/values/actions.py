@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Callable
+from functools import partial
+from operator import le
+from typing import Final
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Space, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from numpy import ndarray
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import MaskError, short_repr
-from ...simulation import Action, Sentinel
-from .spaces import duplicate, parts_of
-
-ILLEGAL: Final = Sentinel("ILLEGAL")
-"""An action check returns this for an action outside its space."""
+from ...simulation import Action
+from .spaces import ILLEGAL as ILLEGAL
+from .spaces import Array, Space, by_parts, duplicate
 
 Check = Callable[[Action], Action]
 """Takes an action. Returns it in the form that its mapping receives, or ``ILLEGAL``."""
@@ -35,7 +35,7 @@ _SMALL = 16  # up to this many elements, comparing Python floats is faster than 
 # -- checks ----------------------------------------------------------------------------------------
 
 
-def action_check(space: Space[Any], *, clips: bool = False) -> Check:
+def action_check(space: Space, *, clips: bool = False) -> Check:
     """Make the function that checks actions against a space.
 
     The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action
@@ -49,7 +49,7 @@ def action_check(space: Space[Any], *, clips: bool = False) -> Check:
         case Box():
             return _box_check(space, clips)
         case Dict() | Tuple():
-            return _parts_check(space, clips)
+            return by_parts(space, partial(action_check, clips=clips), lambda action: ILLEGAL)
 
     def check(action: Action) -> Action:
         try:
@@ -58,31 +58,6 @@ def action_check(space: Space[Any], *, clips: bool = False) -> Check:
         except Exception:  # some spaces raise for a value outside
             pass
         return ILLEGAL
-
-    return check
-
-
-def _parts_check(space: Dict | Tuple[Any], clips: bool) -> Check:
-    is_dict = isinstance(space, Dict)
-    checks = {key: action_check(part, clips=clips) for key, part in parts_of(space).items()}
-
-    def check(action: Action) -> Action:
-        if not isinstance(action, Mapping if is_dict else (tuple, list)):
-            return ILLEGAL
-        if len(action) != len(checks):
-            return ILLEGAL
-        checked = {}
-        for key, check_part in checks.items():
-            try:
-                part = check_part(action[key])
-            except KeyError:
-                return ILLEGAL
-            if part is ILLEGAL:
-                return ILLEGAL
-            checked[key] = part
-        if is_dict:
-            return checked
-        return tuple(checked.values())
 
     return check
 
@@ -113,20 +88,17 @@ def _box_check(space: Box, clips: bool) -> Check:
     lows = space.low.ravel().tolist()
     highs = space.high.ravel().tolist()
     is_scalar = len(lows) == 1
-    is_small = len(lows) <= _SMALL
     is_integer = dtype.kind in "iu"
     takes_float = is_scalar and not is_integer
-    low = lows[0] if is_scalar else 0.0
-    high = highs[0] if is_scalar else 0.0
+    low, *_ = lows or [0.0]
+    high, *_ = highs or [0.0]
     kinds = "iu" if is_integer else "iuf"
 
-    def is_legal(array: NDArray[Any]) -> bool:
-        if not is_small:
+    def is_legal(array: Array) -> bool:
+        if len(lows) > _SMALL:
             return bool(((array >= space.low) & (array <= space.high)).all())
-        return all(
-            least <= value <= most
-            for least, value, most in zip(lows, array.ravel().tolist(), highs, strict=True)
-        )
+        numbers = array.ravel().tolist()
+        return all(map(le, lows, numbers)) and all(map(le, numbers, highs))
 
     def check(action: Action) -> Action:
         if type(action) is ndarray and action.dtype is dtype and action.shape == shape:
@@ -168,7 +140,7 @@ def _box_check(space: Box, clips: bool) -> Check:
 # -- masks ----------------------------------------------------------------------------------------
 
 
-def mask_cast(space: Space[Any]) -> Callable[[ArrayLike], Mask]:
+def mask_cast(space: Space) -> Callable[[ArrayLike], Mask]:
     """Make the function that casts a mask of the legal actions to np.int8.
 
     It raises ``MaskError`` for another shape, for values other than 0 and 1, and if no action is
@@ -197,32 +169,28 @@ def mask_cast(space: Space[Any]) -> Callable[[ArrayLike], Mask]:
                 f"the mask {short_repr(value)} has shape {mask.shape}; {short_repr(space)} needs"
                 f" {shape}"
             )
-        if mask.dtype.char not in _ONE_BYTE:
-            numbers = mask
-            mask = numbers.astype(bool)
-            if not (mask == numbers).all():
-                raise MaskError(f"the mask {short_repr(value)} has values other than 0 and 1")
-        marks = mask.tobytes()  # comparing bytes is faster than three calls of NumPy
-        if marks.strip(b"\0\1"):
+        marks = mask if mask.dtype.char in _ONE_BYTE else mask.astype(bool)
+        legal = marks.tobytes()  # comparing bytes is faster than three calls of NumPy
+        if legal.strip(b"\0\1") or (marks is not mask and not (marks == mask).all()):
             raise MaskError(f"the mask {short_repr(value)} has values other than 0 and 1")
-        if 1 not in marks:
+        if 1 not in legal:
             raise MaskError(
                 f"the mask {short_repr(value)} leaves no legal action of {short_repr(space)}"
             )
-        return mask.astype(int8)
+        return marks.astype(int8)
 
     return cast
 
 
-def open_mask(space: Space[Any]) -> Mask:
+def open_mask(space: Space) -> Mask:
     """Make the mask of an action space that allows every action."""
     if isinstance(space, Discrete):
         return np.ones(space.n, np.int8)
     assert isinstance(space, MultiDiscrete)
-    return tuple(np.ones(size, np.int8) for size in space.nvec.ravel())
+    return tuple(open_mask(Discrete(size)) for size in space.nvec.ravel())
 
 
-def mask_allows(space: Space[Any], mask: Mask, action: Action) -> bool:
+def mask_allows(space: Space, mask: Mask, action: Action) -> bool:
     """Return whether a mask that ``mask_cast`` returned allows an action of the space."""
     if isinstance(space, Discrete):
         return bool(mask[action - int(space.start)])
@@ -231,20 +199,17 @@ def mask_allows(space: Space[Any], mask: Mask, action: Action) -> bool:
     return all(part[choice] for part, choice in zip(mask, choices, strict=True))
 
 
-def only_choice(space: Space[Any], mask: Mask | None) -> Action:
+def only_choice(space: Space, mask: Mask | None) -> Action:
     """Return the only legal action of a space; None if there are several.
 
     ``mask`` is a mask of ``mask_cast``. None: all actions are legal.
     """
-    match space:
-        case Discrete():
-            if mask is None and space.n == 1:
-                return int(space.start)
-            if mask is not None and np.count_nonzero(mask) == 1:
-                return int(space.start + np.argmax(mask))
-        case MultiDiscrete():
-            parts = open_mask(space) if mask is None else mask
-            if all(np.count_nonzero(part) == 1 for part in parts):
-                choices = np.array([np.argmax(part) for part in parts]).reshape(space.shape)
-                return (choices + space.start).astype(space.dtype)
-    return None
+    if not isinstance(space, (Discrete, MultiDiscrete)):
+        return None
+    if mask is None:
+        mask = open_mask(space)
+    choices = [np.flatnonzero(part) for part in (mask if isinstance(mask, tuple) else (mask,))]
+    if any(len(legal) != 1 for legal in choices):
+        return None
+    choice = np.reshape(choices, space.shape or ()) + space.start
+    return int(choice) if isinstance(space, Discrete) else choice.astype(space.dtype)

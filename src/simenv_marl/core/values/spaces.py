@@ -10,18 +10,29 @@ import sys
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from sys import getrefcount
-from typing import Any, Final
+from typing import Any, Final, NoReturn, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from gymnasium import spaces
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from numpy import ndarray
 from numpy.typing import NDArray
 
 from ...errors import ObservationError, short_repr
 from ...simulation import Observation, Sentinel
 
+ILLEGAL: Final = Sentinel("ILLEGAL")
+"""An action check returns this for an action outside its space."""
+
 Cast = Callable[[Observation], Observation]
 """Takes an observation. Returns it cast to its space's dtype, with no memory shared."""
+
+Space: TypeAlias = spaces.Space[Any]
+
+CompoundSpace = Dict | Tuple[Any]
+"""Spaces whose elements have parts."""
+
+Array: TypeAlias = NDArray[Any]
 
 ArraySpace = Box | MultiBinary | MultiDiscrete
 """Spaces whose elements are arrays."""
@@ -30,7 +41,7 @@ ArraySpace = Box | MultiBinary | MultiDiscrete
 # -- casts ----------------------------------------------------------------------------------------
 
 
-def observation_cast(space: Space[Any]) -> Cast:
+def observation_cast(space: Space) -> Cast:
     """Make the function that casts observations to a space.
 
     It raises ``ObservationError`` for an observation that does not fit the space.
@@ -64,7 +75,7 @@ def _references_to_fresh_argument() -> int:
     if not getattr(sys, "_is_gil_enabled", lambda: True)():
         return -1
 
-    def count(value: NDArray[Any]) -> int:
+    def count(value: Array) -> int:
         return getrefcount(value)
 
     array = np.zeros(1)
@@ -82,7 +93,7 @@ def _array_cast(space: ArraySpace) -> Cast:
     dtype = space.dtype
     shape = space.shape
 
-    def cast(value: Observation) -> NDArray[Any]:
+    def cast(value: Observation) -> Array:
         if type(value) is ndarray and value.dtype is dtype and value.shape == shape:
             # An array without any other reference needs no copy.
             if value.base is None and getrefcount(value) <= _FRESH:
@@ -93,7 +104,7 @@ def _array_cast(space: ArraySpace) -> Cast:
     return cast
 
 
-def _convert(value: Observation, space: ArraySpace) -> NDArray[Any]:
+def _convert(value: Observation, space: ArraySpace) -> Array:
     """Convert an observation that is not yet an array of a space's dtype and shape."""
     dtype: np.dtype[Any] = space.dtype
     try:
@@ -112,13 +123,8 @@ def _convert(value: Observation, space: ArraySpace) -> NDArray[Any]:
             f"the observation {short_repr(value)} has dtype {array.dtype}, which is not numeric"
         )
     if dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, dtype):
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ObservationError(
-                f"the observation {short_repr(value)} is not finite, and {dtype} holds only finite"
-                " numbers"
-            )
         limits = np.iinfo(dtype)
-        if array.min() < limits.min or array.max() > limits.max:
+        if not (array.min() >= limits.min and array.max() <= limits.max):  # also for NaN
             raise ObservationError(
                 f"the observation {short_repr(value)} has numbers that {dtype} cannot hold"
             )
@@ -145,32 +151,54 @@ def _discrete_cast(space: Discrete) -> Cast:
     return cast
 
 
-def parts_of(space: Dict | Tuple[Any]) -> dict[Any, Space[Any]]:
+def parts_of(space: CompoundSpace) -> dict[Any, Space]:
     """Return the spaces of the parts of a space, by key or by place."""
-    if isinstance(space, Dict):
-        return dict(space)
-    return dict(enumerate(space))
+    return dict(space.spaces if isinstance(space, Dict) else enumerate(space.spaces))
 
 
-def _parts_cast(space: Dict | Tuple[Any]) -> Cast:
+def by_parts(
+    space: CompoundSpace,
+    make: Callable[[Space], Cast],
+    refuse: Callable[[Observation], Observation],
+) -> Cast:
+    """Make the function that calls a function for each part of a value, and joins the results.
+
+    Args:
+        space: The space of the values.
+        make: Makes the function for the space of a part. If that returns ``ILLEGAL``, the result is
+            ``ILLEGAL``.
+        refuse: Called with a value that does not have these parts.
+    """
     is_tuple = isinstance(space, Tuple)
-    casts = {key: observation_cast(part) for key, part in parts_of(space).items()}
-    number = len(casts)
+    functions = {key: make(part) for key, part in parts_of(space).items()}
 
-    def cast(value: Observation) -> Observation:
+    def call(value: Observation) -> Observation:
         try:
-            if len(value) == number and (not is_tuple or isinstance(value, (tuple, list))):
-                parts = {key: part(value[key]) for key, part in casts.items()}
+            if len(value) == len(functions) and (not is_tuple or isinstance(value, (tuple, list))):
+                parts = {}
+                for key, function in functions.items():
+                    part = function(value[key])
+                    if part is ILLEGAL:
+                        return ILLEGAL
+                    parts[key] = part
                 return tuple(parts.values()) if is_tuple else parts
-        except (TypeError, KeyError):
+        except (TypeError, LookupError):
             pass
-        expected = f"{number} parts" if is_tuple else f"keys {short_repr(list(casts))}"
+        return refuse(value)
+
+    return call
+
+
+def _parts_cast(space: CompoundSpace) -> Cast:
+    def refuse(value: Observation) -> NoReturn:
+        names = list(parts_of(space))
+        expected = f"keys {names}" if isinstance(space, Dict) else f"{len(names)} parts"
         raise ObservationError(
             f"the observation {short_repr(value)} must have exactly the {expected} of"
             f" {short_repr(space)}"
         )
 
-    return cast
+    return by_parts(space, observation_cast, refuse)
 
 
 # -- copies, comparisons, blanks ------------------------------------------------------------------
@@ -212,7 +240,7 @@ def same(one: Observation, other: Observation) -> bool:
     return bool(one == other)
 
 
-def blank(space: Space[Any]) -> Observation:
+def blank(space: Space) -> Observation:
     """Make the blank observation of an agent that was not observed yet.
 
     It is zero, clipped into the space. For a space without a zero (text, graphs, ...) it is a fixed
@@ -221,10 +249,8 @@ def blank(space: Space[Any]) -> Observation:
     match space:
         case Box():
             return np.zeros(space.shape, space.dtype).clip(space.low, space.high)
-        case Discrete():
-            return np.clip(0, space.start, space.start + space.n - 1).astype(space.dtype)
-        case MultiDiscrete():
-            return np.clip(0, space.start, space.start + space.nvec - 1).astype(space.dtype)
+        case Discrete(n=size) | MultiDiscrete(nvec=size):
+            return np.clip(0, space.start, space.start + size - 1).astype(space.dtype)
         case MultiBinary():
             return np.zeros(space.shape, space.dtype)
         case Dict():

@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
-from gymnasium.vector.utils import concatenate
-from numpy.typing import NDArray
+from gymnasium.spaces import Dict, Discrete, Tuple
 
 from ...simulation import Action, Observation
+from .spaces import Array, ArraySpace, Space, parts_of
 
 Stacker = Callable[..., Any]
 """``stack(items, out=None)`` stacks elements of a space.
@@ -28,7 +27,7 @@ SMALL: Final = 1024
 """The size in bytes up to which another copy of an observation takes less time than it saves."""
 
 
-def stacker(space: Space[Any], *, cast: bool = False) -> Stacker:
+def stacker(space: Space, *, cast: bool = False) -> Stacker:
     """Make the function that stacks elements of a space. The stack shares no memory with them.
 
     Args:
@@ -36,32 +35,27 @@ def stacker(space: Space[Any], *, cast: bool = False) -> Stacker:
         cast: Whether the elements already have the space's dtype and shape, as observations have.
     """
     if isinstance(space, (Dict, Tuple)):
-        parts = space.items() if isinstance(space, Dict) else enumerate(space)
-        stackers = {key: stacker(part, cast=cast) for key, part in parts}
+        stackers = {key: stacker(part, cast=cast) for key, part in parts_of(space).items()}
 
         def stack_parts(items: Sequence[Observation], out: Any = None) -> Any:
             stacks = {
                 key: stack([item[key] for item in items], None if out is None else out[key])
                 for key, stack in stackers.items()
             }
-            if isinstance(space, Dict):
-                return stacks
-            return tuple(stacks.values())
+            return stacks if isinstance(space, Dict) else tuple(stacks.values())
 
         return stack_parts
-    if not isinstance(space, (Box, Discrete, MultiBinary, MultiDiscrete)):
+    if not isinstance(space, (Discrete, ArraySpace)):
 
         def stack_objects(items: Sequence[Observation], out: Any = None) -> Any:
-            if out is None:
-                return np.fromiter(items, object)
-            return concatenate(space, items, out)
+            return np.fromiter(items, object) if out is None else tuple(items)
 
         return stack_objects
     dtype = space.dtype
     shape = space.shape or ()
     is_small = np.empty(shape, dtype).nbytes <= SMALL
 
-    def stack(items: Sequence[Observation], out: NDArray[Any] | None = None) -> NDArray[Any]:
+    def stack(items: Sequence[Observation], out: Array | None = None) -> Array:
         if out is None:
             out = np.empty((len(items), *shape), dtype)
         if not out.size:
@@ -91,7 +85,7 @@ def stack_masks(masks: Sequence[Any]) -> Any:
     return _map(np.stack, masks)
 
 
-def taken(stack: Any, index: NDArray[Any] | int) -> Any:
+def taken(stack: Any, index: Array | int) -> Any:
     """Take the rows of a stack with the given indices, in that order."""
     return _map(lambda arrays: arrays[0][index], [stack])
 
@@ -103,7 +97,7 @@ def joined(stacks: Sequence[Any]) -> Any:
     return _map(np.concatenate, stacks)
 
 
-def _map(function: Callable[[Sequence[NDArray[Any]]], Any], stacks: Sequence[Any]) -> Any:
+def _map(function: Callable[[Sequence[Array]], Any], stacks: Sequence[Any]) -> Any:
     """Call a function with the arrays at the same place of several stacks, for each place."""
     match stacks[0]:
         case Mapping() as first:

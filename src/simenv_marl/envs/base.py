@@ -76,7 +76,8 @@ class View:
         reset             by the user                               all
         begin             at the first decision of a reset          AEC, parallel, single, joint
         step              by the user                               all
-        read, validate    by vector environments, in place of step  single, joint
+        read_all,         by vector environments, in place of step  single, joint
+        read_end, validate
         _clear            when an episode ends                      AEC, parallel, single
         check_pending     before a branch or a clone is made        View, planner
         begin_branch      in a new branch or clone                  planner

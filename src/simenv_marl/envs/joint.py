@@ -1,8 +1,8 @@
 """The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -206,6 +206,20 @@ class SimulationJointEnv(OneAgentView):
         results = self.joint.read(episode, self._last_time)
         self._last_time = results[-1].get("time")
         return results
+
+    @classmethod
+    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
+        """Return the observations, rewards and infos of the latest step of several views."""
+        results = [view.read(view.episode) for view in views]
+        return (
+            [observation for observation, *_ in results],
+            [reward for _, reward, *_ in results],
+            [info for *_, info in results],
+        )
+
+    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
+        """Return how an episode has ended: whether terminated, whether truncated."""
+        return episode.terminated, episode.truncated
 
     def validate(self, action: Action) -> Action:
         """Validate a joint action, as far as possible before the simulation moves."""

@@ -5,10 +5,10 @@ A planner gets the view of the agent that it decides for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -140,11 +140,9 @@ class SimulationEnv(OneAgentView):
         if self._shows:
             self.show_step()
         agent = self.own_agent
-        terminated = agent.ended
-        truncated = False
-        if episode.pending is None and not terminated:
-            terminated = episode.terminated
-            truncated = episode.truncated
+        terminated = truncated = False
+        if episode.pending is None:
+            terminated, truncated = self.read_end(episode)
         return (
             agent.observation,
             agent.reward,
@@ -153,17 +151,21 @@ class SimulationEnv(OneAgentView):
             agent.info,
         )
 
-    def read(self, episode: EpisodeState) -> StepResult:
-        """Return the results of a step."""
-        agent = self.own_agent
-        is_over = episode.pending is None and not agent.ended
+    @classmethod
+    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
+        """Return the observations, rewards and infos of the latest step of several views."""
+        agents = [view.own_agent for view in views]
         return (
-            agent.observation,
-            agent.reward,
-            agent.ended or (is_over and episode.terminated),
-            is_over and episode.truncated,
-            agent.info,
+            [agent.observation for agent in agents],
+            [agent.reward for agent in agents],
+            [agent.info for agent in agents],
         )
+
+    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
+        """Return how an episode has ended for the agent: whether terminated, whether truncated."""
+        if self.own_agent.ended:
+            return True, False
+        return episode.terminated, episode.truncated
 
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision, before the simulation moves."""

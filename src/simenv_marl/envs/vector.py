@@ -1,8 +1,7 @@
 """The vector view: many copies of a simulation, stepped together."""
 
 import weakref
-from collections.abc import Iterator, Mapping, Sequence, Sized
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence, Sized
 from copy import deepcopy
 from itertools import chain
 from multiprocessing.context import BaseContext
@@ -49,6 +48,30 @@ VIEWS: Final[Mapping[str, type[SimulationEnv | SimulationJointEnv]]] = {
     "joint": SimulationJointEnv,
 }
 """The views that can be stepped together."""
+
+
+class _Guard:
+    """Refuses all other calls during a call, and all calls after the end."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._is_closed = False
+
+    def close(self) -> None:
+        """Refuse all calls from now on."""
+        self._is_closed = True
+
+    def __enter__(self) -> None:
+        if self._is_closed:
+            raise ClosedError("the environment is closed; make a new one")
+        if not self._lock.acquire(blocking=False):
+            raise ReentrancyError(
+                "the environment was used from inside its own simulations or mappings, or while"
+                " another thread was stepping, resetting or closing it"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
 
 
 class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
@@ -132,7 +155,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         else:
             self._simulations = SimulationBatch(plan, *settings, range(self.num_envs))
         weakref.finalize(self, self._simulations.abandon)
-        self._lock = Lock()
+        self._guard = _Guard()
         self.closed = False
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -161,7 +184,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             BaseException: Any exception of a simulation or a mapping, with a note that names the
                 simulation. Then all of them need a reset; the ones after it have not been reset.
         """
-        with self._exclusive():
+        with self._guard:
             seeds = self._seeds(seed)
             chosen, options = self._chosen(options)
             results = self._simulations.ask("reset", seeds, options, chosen)
@@ -190,7 +213,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             BaseException: Any exception of a simulation or a mapping, with a note that names the
                 simulation. Then all of them need a reset.
         """
-        with self._exclusive():
+        with self._guard:
             self._check_begun()
             if self._mode == AutoresetMode.DISABLED and self._ended.any():
                 numbers = self._ended.nonzero()[0][:10].tolist()
@@ -345,7 +368,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
             ClosedError: The environment is closed.
             BaseException: Any exception of a sub-environment.
         """
-        with self._exclusive():
+        with self._guard:
             return tuple(chain.from_iterable(self._simulations.ask("call", name, args, kwargs)))
 
     def get_attr(self, name: str) -> tuple[Model, ...]:
@@ -366,7 +389,7 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         if not isinstance(values, (list, tuple)):
             values = [values] * self.num_envs
         self._check_number(values, "values")
-        with self._exclusive():
+        with self._guard:
             self._simulations.ask("set_attr", name, list(values))
 
     @property  # type: ignore[misc]  # it cannot be set, because each has its own
@@ -396,26 +419,13 @@ class SimulationVectorEnv(VectorEnv[Observation, Action, Any]):
         """
         if self.closed:
             return
-        with self._exclusive():
+        with self._guard:
             try:
                 self._simulations.close()
             finally:
                 self.closed = self._simulations.idle
-
-    @contextmanager
-    def _exclusive(self) -> Iterator[None]:
-        """Refuse all other calls during a call."""
-        if self.closed:
-            raise ClosedError("the environment is closed; make a new one")
-        if not self._lock.acquire(blocking=False):
-            raise ReentrancyError(
-                "the environment was used from inside its own simulations or mappings, or while"
-                " another thread was stepping, resetting or closing it"
-            )
-        try:
-            yield
-        finally:
-            self._lock.release()
+                if self.closed:
+                    self._guard.close()
 
     def __del__(self) -> None:
         """Leave the end to the finalizer, which warns. Gymnasium before 1.3 raises here."""

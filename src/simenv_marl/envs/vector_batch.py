@@ -72,6 +72,7 @@ class SimulationBatch:
                 annotate(error, f"simenv_marl: in sub-environment {number}")
                 self.abandon()
                 raise
+        self._view = view
         self.views = [view.of_session(session) for session in self._sessions]
         self._stack = stacker(space, cast=True)
         self._stacked = create_empty_array(space, len(part))
@@ -132,19 +133,23 @@ class SimulationBatch:
             if is_over:
                 self._begin(place)
         episodes = self._move(actions, ended)
-        rewards = []
-        terminations, truncations = np.zeros((2, len(episodes)), np.bool_)
+        views: Any = self.views  # all of one class
+        self._observations, earned, news = self._view.read_all(views)
+        rewards = np.array(earned, np.float64)
+        if self._first is None:
+            rewards[ended] = 0.0
+        terminations = np.zeros(len(episodes), np.bool_)
+        truncations = np.zeros(len(episodes), np.bool_)
         infos = []
-        for place, number in enumerate(self._part):
-            results = self.views[place].read(episodes[place])
-            observation, reward, terminated, truncated, info = results
-            self._observations[place] = observation
-            rewards.append(0.0 if ended[place] else reward)
-            # Where the agent has ended during the reset, a later step reports it.
-            if (terminated or truncated) and not episodes[place].unreported_end:
-                terminations[place] = terminated
-                truncations[place] = truncated
+        is_eventful = any(news) or None in [episode.pending for episode in episodes]
+        for place, number in enumerate(self._part if is_eventful else ()):
+            episode = episodes[place]
+            info = news[place]
+            if episode.over and not episode.unreported_end:  # a later step reports that end
+                view = self.views[place]
+                terminations[place], truncations[place] = view.read_end(episode)
                 if self._mode == AutoresetMode.SAME_STEP:
+                    observation = self._observations[place]
                     infos.append((number, {"final_obs": observation, "final_info": info}))
                     info = self._begin(place)
             if info:
@@ -154,7 +159,7 @@ class SimulationBatch:
                 view.show_step()
         return (
             self._stack_observations(),
-            np.array(rewards, np.float64),
+            rewards,
             terminations,
             truncations,
             infos,
@@ -165,6 +170,9 @@ class SimulationBatch:
         episodes = [session.episode for session in self._sessions if session.episode]
         if len(episodes) < len(self._sessions):  # a view was closed
             raise next(s.refusal() for s in self._sessions if s.episode is None)
+        if self._first is not None:  # all of them move
+            step_all(episodes, actions, self._fail)
+            return episodes
         places = [place for place, is_over in enumerate(ended) if not is_over]
         step_all(
             [episodes[place] for place in places],

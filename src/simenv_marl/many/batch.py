@@ -494,13 +494,7 @@ def step_all(
             events.append(episode.driver.resume(replies.pop()))
         events.reverse()
         for episode in episodes:
-            handler, args, kwargs = events.pop()
-            try:
-                reply = handler.handle(episode, args, kwargs)
-            finally:
-                del handler, args, kwargs  # they must keep nothing alive that the model frees
-            if not episode.has_to_wait(reply):
-                episode.advance(reply)
+            episode.receive(events)
     except BaseException as error:
         events.clear()  # because the error's traceback refers to it
         for other in episodes:

@@ -195,7 +195,8 @@ class Agent:
         if self.delegated:
             return episode.ask(self, args, kwargs)
         arguments = self.arguments
-        if not (arguments.is_single and args and arguments.first() is args[0]):
+        first = arguments.first  # a variable, because calling an attribute is slower
+        if not (arguments.is_single and args and first() is args[0]):
             self.keep(episode, args, kwargs)
         if not episode.is_plain:
             return episode.decide(self, args, kwargs)
@@ -205,7 +206,7 @@ class Agent:
                 return self
             # The same as in ``update``, because its calls take 5 % of a decision.
             point = self.point
-            pay = point.reward_mapping  # variables, because calling an attribute is slower
+            pay = point.reward_mapping
             observe = point.observation_mapping
             cast = point.cast
             reward = pay(*args, **kwargs) if kwargs else pay(*args)

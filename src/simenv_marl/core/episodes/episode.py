@@ -156,17 +156,10 @@ class Episode(EpisodeState):
         Raises:
             NoDecisionError: There is no decision for the environment's user.
         """
-        # Out of the list, because a caller must not keep arguments that the model may free.
-        handler, args, kwargs = events.pop()
         try:
             if at_first_event is not None:
                 at_first_event()
-            reply = handler.handle(self, args, kwargs)
-            del handler, args, kwargs
-            if type(reply) is Agent:
-                self.latest = self.pending = reply
-            elif reply is not WAIT:
-                self.advance(reply)
+            self.receive(events)
             is_over = self.outcome is not RUNNING
             if not is_over and self.consulted is None and self.agents:
                 self.update_all()
@@ -289,12 +282,18 @@ class Episode(EpisodeState):
                 return
             del handler, args, kwargs  # they must keep nothing alive that the model frees
 
-    def has_to_wait(self, reply: Model) -> bool:
-        """Return whether the episode waits for an answer or is over. Note the waiting agent."""
+    def receive(self, events: list[Event]) -> None:
+        """Handle the last event of a list, and go on to the user's next decision, or to the end.
+
+        The event leaves the list, because a caller must not keep arguments that the model may free.
+        """
+        handler, args, kwargs = events.pop()
+        reply = handler.handle(self, args, kwargs)
         if type(reply) is Agent:
             self.latest = self.pending = reply
-            return True
-        return reply is WAIT
+        elif reply is not WAIT:
+            del handler, args, kwargs
+            self.advance(reply)
 
     # -- decisions --------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ import pickle
 import sys
 import types
 import weakref
+from functools import partial, wraps
 from types import SimpleNamespace
 from unittest import mock
 
@@ -48,6 +49,16 @@ def rule(first, second=2, *, third=3):
     return first, second, third
 
 
+def on_a_stack(test):
+    """Run a test on a stack of its own: calls on the main thread's run the rule at once."""
+
+    @wraps(test)
+    def run(*args, **kwargs):
+        greenlet(partial(test, *args, **kwargs)).switch()
+
+    return run
+
+
 @pytest.mark.parametrize(
     ("function", "args", "kwargs"),
     [
@@ -62,6 +73,7 @@ def rule(first, second=2, *, third=3):
         (lambda: 0, (), {}),
     ],
 )
+@on_a_stack
 def test_an_interceptor_gets_the_arguments_as_they_were_passed(function, args, kwargs):
     hook = Hook(function, "somewhere.Model.function")
     made, other = hook.make_wrapper("one"), hook.make_wrapper("other")
@@ -76,6 +88,7 @@ def test_an_interceptor_gets_the_arguments_as_they_were_passed(function, args, k
     assert unwrap(made) is unwrap(function) is function
 
 
+@on_a_stack
 def test_a_wrapper_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
     scope = {"__name__": "__main__"}
     exec("def function(number): return number", scope)

@@ -30,6 +30,7 @@ from ...errors import (
     annotate,
     close_after,
     describe_error,
+    did_you_mean,
     short_repr,
 )
 from ..episodes.base import checked_seed
@@ -226,7 +227,10 @@ def _checked_view(env: Any, user: str, method: str | None, time_limit: float) ->
     """Check the arguments of a ``user`` of an environment; return the unwrapped environment."""
     view = pending_view(env, user)
     if method not in (None, "fork", "replay"):
-        raise OptionValueError(f"method must be None, 'fork' or 'replay', not {short_repr(method)}")
+        raise OptionValueError(
+            f"method must be None, 'fork' or 'replay', not {short_repr(method)}"
+            f"{did_you_mean(method, ('fork', 'replay'))}"
+        )
     if method == "fork" and not (CAN_FORK and view.driver == "greenlet"):
         raise OptionValueError(
             'method="fork" needs Linux, and driver="greenlet": a forked process does not have the'

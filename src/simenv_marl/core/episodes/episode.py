@@ -35,7 +35,7 @@ functions run their rule.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from math import inf
+from sys import maxsize
 from typing import Protocol
 from weakref import ref
 
@@ -123,7 +123,7 @@ class Episode(EpisodeState):
         self.running = True
         self._failed_in_model = False
         self._entities: dict[tuple[DecisionHandler, int], Agent] = {}  # by the id of the entity
-        self._most_steps: float = plan.options.max_steps or inf
+        self._most_steps = plan.options.max_steps or maxsize
         self.is_plain = not (in_rounds or self.skips)
         self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
@@ -558,7 +558,7 @@ class Episode(EpisodeState):
         self._tape_size = 0
         for name, other in self.agents.items():
             if other is not agent:
-                self._most_steps = inf  # ``max_steps`` counts the steps of other agents
+                self._most_steps = maxsize  # ``max_steps`` counts the steps of other agents
                 other.delegate(self.plan.policy_of(name, other.point))
                 self.others[name] = other
         self.agents = {agent.name: agent}

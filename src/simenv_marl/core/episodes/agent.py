@@ -90,6 +90,9 @@ class RunningEpisode(Protocol):
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent."""
 
+    def finish(self, *, truncated: bool) -> None:
+        """End the episode of all live agents."""
+
     def take_items(self) -> list[Model]:
         """Return the items of the latest call that was split."""
 
@@ -269,6 +272,11 @@ class Agent:
     def begin_apply(self) -> None:
         """Let the agent's calls run the rule, on the simulation's side."""
         self._applying += 1
+
+    @property
+    def is_applying(self) -> bool:
+        """Whether its ``apply`` runs, on the simulation's side."""
+        return self._applying > 0
 
     def end_apply(self) -> None:
         """Undo ``begin_apply``."""

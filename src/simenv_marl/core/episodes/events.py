@@ -14,7 +14,7 @@ from ...simulation import RULE, Action, Model
 from ..plans.mappings import adapt
 from ..plans.plan import Plan, Remover
 from ..plans.point import Args, Kwargs, Point, Policy
-from ..switching.driver import AnyHandler
+from ..switching.driver import WAIT, AnyHandler
 from ..values.actions import ILLEGAL
 from .agent import Agent, RunningEpisode
 from .arguments import restore
@@ -90,9 +90,10 @@ class RemovalHandler:
     """Handles calls that end agents. It changes nothing in the simulation: the function runs."""
 
     deliver = None
-    report = None
 
-    def __init__(self) -> None:
+    def __init__(self, report: AnyHandler | None) -> None:
+        """Handle calls of a function. ``report`` handles their ends."""
+        self.report = report
         self._removals: list[tuple[PointHandler | None, Namer]] = []
 
     def add(self, handler: PointHandler | None, remover: Remover) -> None:
@@ -116,6 +117,20 @@ class RemovalHandler:
             if agent is not None and handler in (None, agent.handler):
                 episode.end_agent(agent)
         return RULE
+
+
+class LastHandler:
+    """Handles the ends of calls that end agents, where no decision may ever come after the last."""
+
+    deliver = None
+    report = None
+
+    def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
+        """End the episode if no agent is left. Return ``WAIT`` then, else None."""
+        if episode.agents:
+            return None
+        episode.finish(truncated=False)
+        return WAIT
 
 
 def _name_of_end_agent(episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
@@ -170,6 +185,8 @@ class RuleHandler:
         if type(name) is str:
             agent = episode.agents.get(name) or episode.others.get(name)
         if agent is None or agent.point is not point:
+            return
+        if agent.is_applying:  # its own ``apply`` runs the rule
             return
         episode.blame(agent)
         action = self._action(decision, args, kwargs, agent)
@@ -248,8 +265,9 @@ def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:
         if handler.point.split is not None:
             by_hook[handler.point.hook] = SplitHandler(handler)
     removals: dict[Hook, RemovalHandler] = {}
+    last = LastHandler() if plan.complete and plan.options.max_steps else None
     for remover in plan.removers:
-        removal = removals.setdefault(remover.hook, RemovalHandler())
+        removal = removals.setdefault(remover.hook, RemovalHandler(last))
         removal.add(None if remover.point is None else by_point[remover.point], remover)
     by_hook.update(removals)
     roster: dict[str, tuple[PointHandler, Policy, bool]] = {}

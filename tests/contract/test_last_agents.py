@@ -1,0 +1,151 @@
+"""``max_steps``, where no agent can decide any more and the model goes on."""
+
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    SimulationInterface,
+    aec_env,
+    joint_env,
+    make_step,
+    parallel_env,
+    single_env,
+)
+from tests.worlds.models import define
+
+GRAZE = f"{__name__}.Sheep.graze"
+SHEEP = ["sheep_0", "sheep_1"]
+
+
+class Sheep:
+    def __init__(self, meadow, number):
+        self.meadow = meadow
+        self.name = f"sheep_{number}"
+
+    def graze(self):
+        return 0
+
+    def die(self):
+        self.meadow.living.remove(self)
+
+
+class Meadow(SimulationInterface):
+    """Its last sheep die in the third year. It goes on for years without any."""
+
+    by_name = False
+
+    def reset(self, seed=None):
+        self.living = [Sheep(self, number) for number in range(2)]
+        self.years = 0
+
+    def expected_calls(self, point):
+        return [(sheep,) for sheep in self.living]
+
+    def run(self):
+        while self.years < 1000:
+            self.years += 1
+            for sheep in self.living:
+                sheep.graze()
+            if self.years == 3:
+                for sheep in list(self.living):
+                    if self.by_name:
+                        self.end_agent(sheep.name)
+                    sheep.die()
+
+
+class Named(Meadow):
+    by_name = True
+
+
+def flock(**changes):
+    return {GRAZE: define(agent=lambda sheep: sheep.name, reward_mapping=lambda _: 1.0, **changes)}
+
+
+POINTS = {
+    Meadow: flock(removed_by=[f"{__name__}.Sheep.die"]),
+    Named: flock(),
+}
+
+
+def play(env):
+    """Play an episode of any view; return the number of its steps."""
+    env.reset(seed=1)
+    if hasattr(env, "agent_iter"):
+        agents = []
+        for agent in env.agent_iter():
+            agents.append(agent)
+            env.step(None if env.terminations[agent] else 1)
+        return len(agents)
+    steps = 0
+    over = False
+    while not over:
+        steps += 1
+        if hasattr(env, "possible_agents"):
+            env.step(dict.fromkeys(env.agents, 1))
+            over = not env.agents
+            continue
+        action = 1 if isinstance(env.action_space, spaces.Discrete) else dict.fromkeys(SHEEP, 1)
+        *_, terminated, truncated, _ = env.step(action)
+        assert not truncated
+        over = terminated
+    return steps
+
+
+@pytest.mark.parametrize("kind", POINTS)
+@pytest.mark.parametrize(
+    ("view", "options", "steps"),
+    [
+        (aec_env, {"possible_agents": SHEEP}, 8),
+        (parallel_env, {"possible_agents": SHEEP}, 3),
+        (joint_env, {"possible_agents": SHEEP}, 3),
+        (single_env, {"agent": "sheep_0"}, 3),
+    ],
+)
+def test_an_episode_ends_with_the_last_agent_of_its_roster(view, options, steps, kind):
+    env = view(kind, POINTS[kind], max_steps=500, **options)
+    for _ in range(2):
+        assert play(env) == steps
+        assert env.unwrapped.simulation.years == 3
+    env.close()
+
+
+def test_a_dead_agent_is_gone_from_the_model_when_the_episode_ends():
+    env = single_env(Meadow, POINTS[Meadow], agent="sheep_1", max_steps=500)
+    play(env)
+    assert "sheep_1" not in [sheep.name for sheep in env.simulation.living]
+
+
+def test_a_simulation_without_a_limit_of_steps_runs_to_its_end():
+    env = parallel_env(Meadow, POINTS[Meadow], possible_agents=SHEEP)
+    play(env)
+    assert env.simulation.years == 1000
+
+
+def test_an_apply_that_calls_its_function_reports_no_action_of_the_rule():
+    class Tank:
+        @make_step(
+            observation_space=spaces.Discrete(9),
+            observation_space_mapping=lambda tank: 0,
+            action_space=spaces.Discrete(5),
+            apply=lambda action, tank: tank.fill() + action,
+            reward_mapping=lambda tank: 0.0,
+            rule_action_mapping=int,
+        )
+        def fill(self):
+            return 3
+
+    class Plant:
+        def reset(self):
+            self.tank = Tank()
+            self.filled = []
+
+        def run(self):
+            for _ in range(4):
+                self.filled.append(self.tank.fill())
+
+    env = single_env(Plant, Tank.fill)
+    env.reset(seed=1)
+    infos = [env.step(action)[4] for action in (1, RULE, 2)]
+    assert env.simulation.filled == [4, 3, 5]
+    assert infos == [{}, {"rule_action": 3}, {}]

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
+import mmap
+import struct
+from collections.abc import Callable
 from contextvars import Context
+from functools import cache
+from platform import machine
+from sys import modules, platform
 from typing import Final
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
-from ...errors import WrongThreadError
+from ...errors import WrongThreadError, warn_user
 from ...hooks.stacks import STACKS
 from ...simulation import Model
 from .driver import ENDED, THREAD, Driver, Event
@@ -24,7 +31,7 @@ class GreenletDriver(Driver):
 
     def _make_stack(self) -> None:
         if self._stack is None:
-            stack = greenlet(self._serve)
+            stack = greenlet(begin_stack(self._serve))
             # Or the ``switch`` of a greenlet of the model that waits for an answer.
             self.resume = stack.switch
             self._stack = stack  # last, because an interrupt may come before
@@ -68,7 +75,7 @@ class GreenletDriver(Driver):
 
     # -- on the simulation's side -----------------------------------------------------------------
 
-    def _serve(self, _: Model) -> None:
+    def _serve(self) -> None:
         try:
             self._register()
             while not self.ended:
@@ -104,3 +111,97 @@ def _no_switch(*event: Model) -> Event:
 
 _given_up: Final[list[greenlet]] = []
 """The stacks that did not unwind. Freeing a greenlet would resume it, at an arbitrary moment."""
+
+
+# -- the begin of a stack -------------------------------------------------------------------------
+
+# Some libraries read the native stack of their caller: torch does so for the message of each error.
+# They follow return addresses to the begin of the stack. A greenlet has no begin: above it lies the
+# stack of its starter, which has changed since, and reading that kills the process. So the stack of
+# a simulation begins with a function in machine code, for which no unwind table exists. There
+# native stack traces end.
+
+_CODES: Final = {
+    # endbr64; push rbp; xor ebp, ebp; mov rax, ADDRESS; call rax; pop rbp; ret
+    "x86_64": ("f3 0f 1e fa 55 31 ed 48 b8", "ff d0 5d c3"),
+}
+"""By processor: the code before and after the address of a function.
+
+It calls that function with its own first argument, and returns the result.
+"""
+
+_METH_O: Final = 0x0008  # a method of one argument
+
+
+_MAKE: Final = ctypes.PYFUNCTYPE(
+    ctypes.py_object, ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p
+)(("PyCFunction_NewEx", ctypes.pythonapi))
+"""Makes a function from a ``PyMethodDef``, its ``self`` and its module."""
+
+
+class _MethodDef(ctypes.Structure):
+    """A ``PyMethodDef``, as C functions of Python are declared."""
+
+    _fields_ = (
+        ("name", ctypes.c_char_p),
+        ("function", ctypes.c_void_p),
+        ("flags", ctypes.c_int),
+        ("doc", ctypes.c_char_p),
+    )
+
+
+_TRACERS: Final = ("torch",)
+"""Libraries that read the native stack at each error."""
+
+
+@cache
+def _definition() -> _MethodDef | None:
+    """Return a method that calls its ``self``. None on systems where it cannot be made."""
+    code = _CODES.get(machine()) if platform == "linux" else None
+    if code is None:
+        return None
+    call = ctypes.cast(ctypes.pythonapi.PyObject_CallNoArgs, ctypes.c_void_p).value
+    memory = mmap.mmap(-1, mmap.PAGESIZE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    memory.write(bytes.fromhex(code[0]) + struct.pack("<Q", call) + bytes.fromhex(code[1]))
+    page = ctypes.c_char.from_buffer(memory)
+    address = ctypes.addressof(page)
+    refused = ctypes.CDLL(None).mprotect(
+        ctypes.c_void_p(address), ctypes.c_size_t(mmap.PAGESIZE), mmap.PROT_READ | mmap.PROT_EXEC
+    )
+    if refused:  # the system is hardened
+        return None
+    _PAGES.append(page)
+    return _MethodDef(b"begin", address, _METH_O, None)
+
+
+_PAGES: Final[list[ctypes.c_char]] = []
+"""The page of the code, which must stay."""
+
+
+def begin_stack(function: Callable[[], Model]) -> Callable[..., Model]:
+    """Return a function of one ignored argument that begins a stack, and calls a function there.
+
+    Where that is not possible, the result is a plain function. Then the user is warned of libraries
+    that read native stacks.
+    """
+    definition = _definition()
+    if definition is None:
+        warn_of_native_traces()
+        return lambda _: function()
+    made: Callable[..., Model] = _MAKE(ctypes.addressof(definition), function, None)
+    return made
+
+
+def traced_by() -> list[str]:
+    """Return the imported libraries whose errors would kill the process in a greenlet here."""
+    return [] if _definition() else [name for name in _TRACERS if name in modules]
+
+
+@cache
+def warn_of_native_traces() -> None:
+    """Warn once of imported libraries that read native stacks."""
+    if names := traced_by():
+        warn_user(
+            f"on this system an error of {', '.join(names)} inside the model kills the process"
+            ' with the greenlet driver, also an error that the model handles; use driver="thread"'
+        )

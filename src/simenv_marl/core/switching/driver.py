@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
-from sys import modules
+from sys import exception, modules
 from threading import Thread, local
 from types import coroutine
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, TypeVar
@@ -292,6 +292,8 @@ class Driver(ABC):
         bind = hook.bind
 
         def decide(args: Args, kwargs: Kwargs) -> Model:
+            if type(exception()) is GeneratorExit:  # see ``interceptor``
+                return hook.rule(*args, **kwargs)
             bound = args
             named = kwargs
             if kwargs is not BOUND:
@@ -427,6 +429,10 @@ class Driver(ABC):
 
     def interceptor(self, hook: Hook, away: bool = True) -> Interceptor:
         """Return the interceptor of a hook's calls: ``run_rule`` if it sends no events.
+
+        It lets the rule decide also while a generator is closed, because that may be a process of
+        an earlier episode: another one frees it, perhaps in the garbage collector, where a switch
+        would be fatal.
 
         Args:
             hook: The hook.

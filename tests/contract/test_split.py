@@ -94,6 +94,184 @@ def test_infos_have_the_part_of_each_item_in_what_the_rule_decided():
     assert seen == [None, None, None, *PLAIN.log[0]]
 
 
+def rule_actions(env, answers, seed=None):
+    """Play an episode; return the action of the rule in each info, by agent."""
+    env.reset(seed=seed)
+    seen = []
+    for agent in env.agent_iter():
+        *_, terminated, truncated, info = env.last()
+        seen.append((agent, info.get("rule_action")))
+        env.step(None if terminated or truncated else answers[agent])
+    return seen
+
+
+def test_only_items_that_the_rule_has_answered_have_its_action():
+    env = aec_env(Day, points(rule_action_mapping=int))
+    seen = rule_actions(env, {"s_0": RULE, "s_1": 7, "s_2": RULE}, seed=5)
+    numbers = [(first, None, last) for first, _, last in PLAIN.log]
+    agents = ("s_0", "s_1", "s_2")
+    assert seen[:3] == [(agent, None) for agent in agents]
+    for place, agent in enumerate(agents):
+        assert [number for name, number in seen[3:] if name == agent] == [
+            call[place] for call in numbers
+        ]
+
+
+class Ward:
+    """Gives beds. The rule of a call calls for another ward first; processes call in turns."""
+
+    def __init__(self, names, inner=None):
+        self.names = names
+        self.inner = inner
+
+    def assign(self, number):
+        if self.inner is not None:
+            self.inner.assign(number + 5)
+        return [number] * len(self.names)
+
+    def assign_later(self, number):
+        yield
+        return [number] * len(self.names)
+
+
+class Nested:
+    def reset(self):
+        self.ward = Ward("abc", Ward("xy"))
+
+    def run(self):
+        for number in range(3):
+            self.ward.assign(number)
+
+
+class Overlapping:
+    def reset(self):
+        self.wards = [Ward("abc"), Ward("xy")]
+
+    def run(self):
+        calls = [ward.assign_later(number) for number, ward in enumerate(self.wards, 1)]
+        for _ in range(2):
+            for call in calls:
+                next(call, None)
+        self.wards[0].names = []
+        for ward in self.wards:
+            for _ in ward.assign_later(7):
+                pass
+
+
+def beds(function):
+    return {
+        function: define(
+            split=lambda ward, number: ward.names,
+            agent=lambda name: name,
+            rule_action_mapping=int,
+        )
+    }
+
+
+@pytest.mark.parametrize("by_policy", ["", "b", "bx", "ay"])
+def test_nested_and_overlapping_calls_know_the_actions_of_their_own_rule(by_policy):
+    answers = {name: 9 if name in by_policy else RULE for name in "abcxy"}
+
+    def told(env):
+        seen = rule_actions(env, answers)
+        return {
+            name: {number for agent, number in seen if agent == name} - {None} for name in answers
+        }
+
+    expected = {"a": {0, 1, 2}, "b": {0, 1, 2}, "c": {0, 1, 2}, "x": {5, 6, 7}, "y": {5, 6, 7}}
+    assert told(aec_env(Nested, beds(Ward.assign))) == {
+        name: set() if name in by_policy else actions for name, actions in expected.items()
+    }
+    expected = {"a": {1}, "b": {1}, "c": {1}, "x": {2, 7}, "y": {2, 7}}
+    assert told(aec_env(Overlapping, beds(Ward.assign_later))) == {
+        name: set() if name in by_policy else actions for name, actions in expected.items()
+    }
+
+
+class Hospital:
+    """Three patients wish for one of two beds, in one call."""
+
+    def __init__(self):
+        self.given = []
+
+    def reset(self):
+        self.day = 0
+
+    def give(self, patients):
+        return [0 for _ in patients]
+
+    def run(self):
+        for self.day in range(2):
+            self.given.append(self.give("abc"))
+
+    def expected_calls(self, point):
+        return [(self, "abc")]
+
+
+def free(name, hospital, patients, *, _answers):
+    return [1, *(int(bed not in _answers) for bed in (1, 2))]
+
+
+SEQUENCE = {
+    "split": lambda hospital, patients: patients,
+    "agent": lambda name: name,
+    "action_space": spaces.Discrete(3),
+    "observation_space": spaces.Box(0, 9, (2,)),
+    "observation_space_mapping": lambda name, *, _answers: [len(_answers), sum(_answers, 0)],
+}
+
+
+def test_items_see_the_answers_to_the_items_before():
+    env = aec_env(Hospital, {Hospital.give: define(**SEQUENCE, action_mask_mapping=free)})
+    env.reset()
+    seen = []
+    for agent in env.agent_iter(6):
+        observation, *_, info = env.last()
+        seen.append((agent, *observation.tolist(), info["action_mask"].tolist()))
+        legal = info["action_mask"].nonzero()[0]
+        env.step(int(legal[-1]))
+    day = [("a", 0, 0, [1, 1, 1]), ("b", 1, 2, [1, 1, 0]), ("c", 2, 3, [1, 0, 0])]
+    assert seen == day * 2
+    assert env.simulation.given == [[2, 1, 0]] * 2
+
+
+def test_answers_are_choices_actions_of_apply_or_the_rule():
+    got = []
+
+    def note(name, *, _answers):
+        got.append((name, *_answers))
+        return [0, 0]
+
+    given = SEQUENCE | {"observation_space_mapping": note}
+    del given["action_space"]
+    for changes in (
+        {"action_space": spaces.Discrete(3), "choices": lambda name, *, _answers: ["p", "q", "r"]},
+        {"action_space": spaces.Discrete(3), "apply": lambda action, name: f"bed {action}"},
+    ):
+        got.clear()
+        env = aec_env(Hospital, {Hospital.give: define(**given, **changes)})
+        env.reset()
+        for action in (1, RULE, 2):
+            env.step(action)
+        first = "q" if "choices" in changes else 1
+        assert got[:3] == [("a",), ("b",), ("c",)]  # when the episode begins
+        assert got[3:5] == [("b", first), ("c", first, RULE)]
+
+
+def test_items_are_observed_before_their_call_without_answers():
+    env = parallel_env(Hospital, {Hospital.give: define(**SEQUENCE)})
+    observations, _ = env.reset()
+    assert [seen.tolist() for seen in observations.values()] == [[0, 0]] * 3
+    env.step({"a": 2, "b": 1, "c": 0})
+    assert env.simulation.given == [[2, 1, 0]]
+
+
+def test_answers_are_given_to_split_calls_alone():
+    mapping = {"observation_space_mapping": lambda hospital, *, _answers: [0, 0]}
+    with pytest.raises(DefinitionError, match="_answers"):
+        aec_env(Hospital, {Hospital.give: define(**mapping)})
+
+
 def test_all_views_and_policies_answer_items():
     env = parallel_env(Day, points())
     env.reset(seed=5)

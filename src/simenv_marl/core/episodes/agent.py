@@ -93,9 +93,6 @@ class RunningEpisode(Protocol):
     def finish(self, *, truncated: bool) -> None:
         """End the episode of all live agents."""
 
-    def take_items(self) -> list[Model]:
-        """Return the items of the latest call that was split."""
-
     def blame(self, agent: Agent) -> None:
         """Note the agent that notes of errors name."""
 
@@ -180,6 +177,8 @@ class Agent:
         self._applying = 0
 
     # -- decisions --------------------------------------------------------------------------------
+
+    reports_itself = False
 
     @property
     def deliver(self) -> Callable[..., Model] | None:

@@ -60,7 +60,6 @@ from ..switching.driver import WAIT, AnyHandler, Driver, Event
 from ..values.actions import ILLEGAL
 from ..values.spaces import duplicate
 from .agent import Agent, Clock, DecisionHandler
-from .arguments import restore, weaken
 from .base import LONGEST_TAPE, Replay
 from .decision import Decision
 from .events import Handlers
@@ -94,7 +93,7 @@ class Episode(EpisodeState):
     """
 
     __slots__ = (
-        "_context", "_entities", "_failed_in_model", "_handlers", "_items", "_most_steps",
+        "_context", "_entities", "_failed_in_model", "_handlers", "_most_steps",
         "_plugins", "_split", "_tape_size", "driver", "is_plain", "latest", "replay", "running",
         "session", "simulation", "tape",
     )  # fmt: skip
@@ -129,7 +128,6 @@ class Episode(EpisodeState):
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
         self._split: SplitCall | None = None
-        self._items: list[Model] = []
         for name, prepared in self._handlers.roster.items():
             self.agents[name] = Agent(name, *prepared, self.clock, self._plugins)
 
@@ -434,16 +432,9 @@ class Episode(EpisodeState):
         if event is not None:
             return event
         self._split = None
-        if call.handler.report is not None:
-            self._items = [weaken(item) for item in call.items]
         reply = call.reply()
         del call  # it has the items, which the model may free
         return self.driver.resume(reply)
-
-    def take_items(self) -> list[Model]:
-        """Return the items of the latest call that was split, for the decision of its rule."""
-        items, self._items = self._items, []
-        return [restore(item) for item in items]
 
     # -- agents -----------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from ...simulation import RULE, Action, Model
 from ..plans.mappings import adapt
 from ..plans.plan import Plan, Remover
 from ..plans.point import Args, Kwargs, Point, Policy
-from ..switching.driver import WAIT, AnyHandler
+from ..switching.driver import WAIT, AnyHandler, Observer
 from ..values.actions import ILLEGAL
 from .agent import Agent, RunningEpisode
 from .arguments import restore
@@ -36,6 +36,8 @@ class PointHandler:
         self.point = point
         self.report: AnyHandler | None = RuleHandler(point) if point.reports_rule else None
         self._warnings: set[str] = set()
+
+    reports_itself = False
 
     @property
     def deliver(self) -> Callable[..., Model] | None:
@@ -86,15 +88,18 @@ class PointHandler:
         )
 
 
-class RemovalHandler:
+class RemovalHandler(Observer):
     """Handles calls that end agents. It changes nothing in the simulation: the function runs."""
 
-    deliver = None
-
-    def __init__(self, report: AnyHandler | None) -> None:
-        """Handle calls of a function. ``report`` handles their ends."""
-        self.report = report
+    def __init__(self, last: AnyHandler | None) -> None:
+        """Handle calls of a function. ``last`` handles their ends."""
+        self._last = last
         self._removals: list[tuple[PointHandler | None, Namer]] = []
+
+    @property
+    def report(self) -> AnyHandler | None:
+        """Handles the ends of calls."""
+        return self._last
 
     def add(self, handler: PointHandler | None, remover: Remover) -> None:
         """Let calls end agents of a point. None: any agents."""
@@ -119,11 +124,8 @@ class RemovalHandler:
         return RULE
 
 
-class LastHandler:
+class LastHandler(Observer):
     """Handles the ends of calls that end agents, where no decision may ever come after the last."""
-
-    deliver = None
-    report = None
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """End the episode if no agent is left. Return ``WAIT`` then, else None."""
@@ -157,26 +159,17 @@ def _name_of_entity(
     return episode.named_before(handler, args[0]) if name is None else name
 
 
-class RuleHandler:
+class RuleHandler(Observer):
     """Handles the decisions that the rule of a point has made."""
-
-    deliver = None
-    report = None
 
     def __init__(self, point: Point) -> None:
         self._point = point
         self._inverse = inverse(point.definition) or {}
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> None:
-        """Note the action for a decision. ``args``: the decision, and its call's arguments."""
-        decision, call_args, call_kwargs = args
-        point = self._point
-        if point.split is None:
+        """Note the actions for decisions. ``args``: each, with the arguments of its call."""
+        for decision, call_args, call_kwargs in args:
             self._note(episode, decision, call_args, call_kwargs)
-            return
-        for place, item in enumerate(episode.take_items()):
-            piece = point.part_of(decision, item, place, call_args, call_kwargs)
-            self._note(episode, piece, (item, *call_args), call_kwargs)
 
     def _note(self, episode: RunningEpisode, decision: Model, args: Args, kwargs: Kwargs) -> None:
         point = self._point

@@ -9,6 +9,8 @@ from types import coroutine
 from typing import Protocol
 
 from ...errors import SimulationError
+from ...hooks.hook import BOUND
+from ...hooks.stacks import Interceptor
 from ...simulation import RULE, Model
 from ..plans.point import Args, Kwargs
 from ..switching.driver import Event
@@ -25,6 +27,8 @@ class SplittingEpisode(RunningEpisode, Protocol):
 class SplitHandler:
     """Handles the calls at a decision point whose definition splits them."""
 
+    reports_itself = True
+
     def __init__(self, items: DecisionHandler) -> None:
         """Handle calls of a point. ``items`` handles the decision of each item."""
         self._items = items
@@ -37,16 +41,24 @@ class SplitHandler:
         items = [] if split is None else list(split(*args, **kwargs))
         if not items:
             return RULE
-        episode.begin_split(SplitCall(self._items, items, args, kwargs))
-        return self._items.handle(episode, (items[0], *args), kwargs)
+        call = SplitCall(self._items, items, args, kwargs)
+        episode.begin_split(call)
+        _, item_args, item_kwargs = call.event()
+        del call
+        return self._items.handle(episode, item_args, item_kwargs)
 
-    def deliver(self, reply: Model, *args: Model, **kwargs: Model) -> Model:
-        """On the simulation's side, turn the replies to the items into the value of the call."""
+    def deliver(
+        self, send: Interceptor | None, reply: Model, *args: Model, **kwargs: Model
+    ) -> Model:
+        """On the simulation's side, turn the replies to the items into the value of the call.
+
+        ``send`` reports the decisions of the rule.
+        """
         replies = reply.pop()  # the user's side keeps no reference to the items
         items = reply.pop()
         kind = self._point.hook.kind
         gather = coroutine(self._gather) if kind == "coroutine" else self._gather
-        value: Model = gather(items, replies, args, kwargs)
+        value: Model = gather(send, items, replies, args, kwargs)
         if kind != "function":
             return value
         try:
@@ -56,11 +68,18 @@ class SplitHandler:
         raise AssertionError("a function does not wait")
 
     def _gather(
-        self, items: list[Model], replies: list[Model], args: Args, kwargs: Kwargs
+        self,
+        send: Interceptor | None,
+        items: list[Model],
+        replies: list[Model],
+        args: Args,
+        kwargs: Kwargs,
     ) -> Generator[Model, Model, Model]:
         """Return the value of the call. Run the rule once, when an item first needs it."""
         point = self._point
         hook = point.hook
+        is_left_to_rule = all(reply is RULE for reply in replies)
+        by_rule: list[tuple[Model, Args, Kwargs]] = []
         decisions: list[Model] = []
         result: Model = RULE
         for place, (item, reply) in enumerate(zip(items, replies, strict=True)):
@@ -68,16 +87,23 @@ class SplitHandler:
             if reply is RULE:
                 if result is RULE:
                     result = yield from _value(hook.rule(*args, **kwargs), hook.kind)
+                if is_left_to_rule and (result is RULE or send is None):
+                    return result
                 if result is RULE:
                     raise SimulationError(
                         f"the rule of {hook.name}, in another process, decides for all items of a"
                         " call or for none; answer all of them by RULE, or none"
                     )
                 decision = point.part_of(result, item, place, args, kwargs)
+                by_rule.append((decision, (item, *args), kwargs))
             elif point.deliver is not None:
                 value = point.deliver(reply, item, *args, **kwargs)
                 decision = yield from _value(value, hook.kind)
             decisions.append(decision)
+        if send is not None and by_rule:
+            send(tuple(by_rule), BOUND)
+        if is_left_to_rule:
+            return result
         if point.gather is None:
             return decisions
         return point.gather(items, decisions, *args, **kwargs)
@@ -101,18 +127,22 @@ class SplitCall:
     kwargs: Kwargs
     replies: list[Model] = field(default_factory=list)
 
+    def event(self) -> Event:
+        """Return the event of the first item without a reply."""
+        kwargs = self.kwargs
+        point = self.handler.point
+        if point.gives_answers:
+            answers = [point.answer_of(reply) for reply in self.replies]
+            kwargs = {**kwargs, "_answers": answers}
+        return self.handler, (self.items[len(self.replies)], *self.args), kwargs
+
     def next_event(self, reply: Model) -> Event | None:
         """Note the reply to an item. Return the event of the next one, or None at the end."""
         self.replies.append(reply)
-        place = len(self.replies)
-        if place == len(self.items):
-            return None
-        return self.handler, (self.items[place], *self.args), self.kwargs
+        return None if len(self.replies) == len(self.items) else self.event()
 
     def reply(self) -> Model:
         """Return the reply to the call."""
-        if all(reply is RULE for reply in self.replies):
-            return RULE
         return [self.items, self.replies]
 
 

@@ -7,7 +7,7 @@ by the name of the function's parameter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from inspect import Parameter
 from typing import Final, TypeAlias
@@ -18,6 +18,9 @@ from ...simulation import POSITIONAL, Model, signature_of
 
 GIVEN: Final = ("_simulation", "_rule", "_answers")
 """The keyword-only parameters that the library itself gives."""
+
+BOUND_LATER: Final = ("_simulation", "_rule")
+"""Those of them that are bound when the simulation is there."""
 
 Taken: TypeAlias = "frozenset[int | str] | None"
 """The numbers of positional arguments, and the names of keyword arguments. None: all."""
@@ -50,7 +53,13 @@ def taken_by(mappings: Iterable[Mapped]) -> Taken:
     return all_taken
 
 
-def adapt(function: Callable[..., Model], name: str, hook: Hook, leading: int = 0) -> Mapped:
+def adapt(
+    function: Callable[..., Model],
+    name: str,
+    hook: Hook,
+    leading: int = 0,
+    given: Collection[str] = (),
+) -> Mapped:
     """Make a mapping callable with all arguments of a hook's calls.
 
     Args:
@@ -58,6 +67,7 @@ def adapt(function: Callable[..., Model], name: str, hook: Hook, leading: int = 
         name: The parameter of ``make_step`` that it was given for.
         hook: The decision function.
         leading: The number of the mapping's arguments that come before the call's.
+        given: The keyword arguments that the library adds to each call.
 
     Raises:
         DefinitionError: The mapping requires an argument that no call has.
@@ -67,7 +77,7 @@ def adapt(function: Callable[..., Model], name: str, hook: Hook, leading: int = 
         return Mapped(function, None)
     theirs = hook.signature.parameters.values()
     their_names = [""] * leading + [p.name for p in theirs if p.kind in POSITIONAL]
-    their_keys = {p.name for p in theirs if p.kind is Parameter.KEYWORD_ONLY}
+    their_keys = {p.name for p in theirs if p.kind is Parameter.KEYWORD_ONLY} | {*given}
     their_kinds = {p.kind for p in theirs}
     has_open_places = Parameter.VAR_POSITIONAL in their_kinds
     has_open_keys = Parameter.VAR_KEYWORD in their_kinds
@@ -99,7 +109,7 @@ def adapt(function: Callable[..., Model], name: str, hook: Hook, leading: int = 
                 continue  # it is bound already
             if key in their_names:
                 places[key] = their_names.index(key)
-            elif key in their_keys or (required and (has_open_keys or key in GIVEN)):
+            elif key in their_keys or (required and (has_open_keys or key in BOUND_LATER)):
                 keys.add(key)
     try:
         own.bind(*range(max(end, leading)), **dict.fromkeys((*places, *keys)))

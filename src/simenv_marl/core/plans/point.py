@@ -21,7 +21,7 @@ from ...errors import (
     short_repr,
 )
 from ...hooks.hook import BOUND
-from ...simulation import Action, Model, Observation, asks_for, signature_of
+from ...simulation import RULE, Action, Model, Observation, asks_for, signature_of
 from ..values import actions, spaces
 from ..values.actions import ILLEGAL, MASK, Mask
 from .mappings import Mapped, adapt, taken_by
@@ -56,6 +56,10 @@ _WITHOUT_ITEM = ("split", "gather", "part")
 """The callables of a definition that do not get an item of a split call first."""
 
 
+_WITHOUT_ANSWERS = (*_WITHOUT_ITEM, "apply", "rule_action_mapping")
+"""The callables of a definition that do not get the answers to earlier items of a split call."""
+
+
 class Applier(Protocol):
     """An agent whose action is applied on the simulation's side."""
 
@@ -81,6 +85,7 @@ class Point:
         applies: Whether an ``apply`` gets the action, on the simulation's side.
         reports_rule: Whether the decisions of the rule are reported.
         expects_one: Whether one object makes all decisions, because the definition names no agents.
+        gives_answers: Whether a callable asks for the answers to the items before.
         needs_simulation: Whether a callable asks for the simulation.
         name_agent: A callable of the call's arguments that names the agent, if ``agent`` is None.
         observation_mapping, reward_mapping: The mappings, callable with all arguments.
@@ -104,10 +109,10 @@ class Point:
 
     __slots__ = (
         "__weakref__", "_calls", "agent", "applies", "cast", "check", "convert", "definition",
-        "deliver", "expects_one", "gather", "hook", "legal", "masked_parts", "name_agent",
-        "needs_simulation", "observation_mapping", "part", "policy", "removed_by", "reports_rule",
-        "reward_mapping", "rule_action_mapping", "split", "taken_keys", "taken_places",
-        "takes_for_observation", "takes_for_reward",
+        "deliver", "expects_one", "gather", "gives_answers", "hook", "legal", "masked_parts",
+        "name_agent", "needs_simulation", "observation_mapping", "part", "policy", "removed_by",
+        "reports_rule", "reward_mapping", "rule_action_mapping", "split", "taken_keys",
+        "taken_places", "takes_for_observation", "takes_for_reward",
     )  # fmt: skip
 
     def __init__(
@@ -146,6 +151,8 @@ class Point:
         self.expects_one = definition.agent is None and hook.bound
         callables = (*vars(definition).values(), *definition.removed_by.values())
         self.needs_simulation = any(asks_for(part, "_simulation") for part in callables)
+        asks_for_answers = any(asks_for(part, "_answers") for part in callables)
+        self.gives_answers = definition.split is not None and asks_for_answers
         self.fit_callables(None)
 
     def bind(self, simulation: Model) -> Point:
@@ -204,14 +211,25 @@ class Point:
             leading += 1
         if name == "rule_action_mapping" and signature_of(function) is None:  # such as int
             return Mapped(lambda decision, *args, **kwargs: function(decision), None)
-        return adapt(function, name, self.hook, leading)
+        gives_answers = self.gives_answers and name not in _WITHOUT_ANSWERS
+        return adapt(function, name, self.hook, leading, ("_answers",) * gives_answers)
 
     def decisions_of(self, call: Sequence[Model]) -> list[tuple[Args, Kwargs]]:
         """Return the bound arguments of the decisions of a call: one, or one for each item."""
         args, kwargs = self.hook.bind(tuple(call), BOUND) or (tuple(call), BOUND)
         if self.split is None:
             return [(args, kwargs)]
-        return [((item, *args), kwargs) for item in self.split(*args, **kwargs)]
+        items = self.split(*args, **kwargs)
+        if self.gives_answers:
+            kwargs = {**kwargs, "_answers": []}
+        return [((item, *args), kwargs) for item in items]
+
+    def answer_of(self, reply: Model) -> Model:
+        """Return the decision, the action or the choice that a reply contains, or ``RULE``."""
+        if reply is RULE:
+            return RULE
+        answer = reply[1] if self.applies else reply
+        return answer[0] if self.definition.choices is not None else answer
 
     def part_of(self, result: Model, item: Model, place: int, args: Args, kwargs: Kwargs) -> Model:
         """Return the part of the rule's result that is for an item of a split call."""

@@ -63,7 +63,11 @@ class EventHandler(Protocol[EpisodeType]):
         deliver: Turns the reply, on the simulation's side, into the value of the call. It gets the
             reply and the call's arguments. None if the reply is the value.
         report: Handles the decisions of the rule. None if they are not reported.
+        reports_itself: Whether ``deliver`` sends the decisions of the rule. It gets the function
+            that sends them first, or None.
     """
+
+    reports_itself: bool
 
     @property
     def deliver(self) -> Function | None:
@@ -85,11 +89,20 @@ Job: TypeAlias = tuple[Callable[[], Model], Mapping[Hook, AnyHandler]]
 """A function to run on the stack, and the handlers of the events that it sends, by hook."""
 
 
-class _Ended:
-    """Handles the end of a job, and the first event after a refused decision."""
+class Observer:
+    """The base class of handlers whose events ask for no decision."""
 
     deliver = None
-    report = None
+    reports_itself = False
+
+    @property
+    def report(self) -> AnyHandler | None:
+        """Return None: there is no decision."""
+        return None
+
+
+class _Ended(Observer):
+    """Handles the end of a job, and the first event after a refused decision."""
 
     def handle(self, episode: Receiver, args: Args, kwargs: Kwargs) -> Sentinel:
         return episode.receive_end()
@@ -286,14 +299,20 @@ class Driver(ABC):
 
     # -- on the simulation's side -----------------------------------------------------------------
 
-    def _decider(self, hook: Hook, rule: Function, handler: AnyHandler, away: bool) -> Interceptor:
+    def _decider(
+        self,
+        hook: Hook,
+        rule: Function,
+        handler: AnyHandler,
+        deliver: Function | None,
+        away: bool,
+    ) -> Interceptor:
         """Make the function that sends an event for each call of a hook, and returns its value."""
-        deliver = handler.deliver
         bind = hook.bind
 
         def decide(args: Args, kwargs: Kwargs) -> Model:
             if type(exception()) is GeneratorExit:  # see ``interceptor``
-                return hook.rule(*args, **kwargs)
+                return rule(*args, **kwargs)
             bound = args
             named = kwargs
             if kwargs is not BOUND:
@@ -447,9 +466,15 @@ class Driver(ABC):
                 return partial(self.refuse, hook, obstacle)
             self._spawned = True
         rule = hook.rule
+        deliver = handler.deliver
+        send = None
         if handler.report is not None:
-            rule = _reporting(hook, self._decider(hook, rule, handler.report, away))
-        return self._decider(hook, rule, handler, away)
+            send = self._decider(hook, _ignore, handler.report, None, away)
+        if handler.reports_itself and deliver is not None:
+            deliver = partial(deliver, send)
+        elif send is not None:
+            rule = _reporting(hook, send)
+        return self._decider(hook, rule, handler, deliver, away)
 
     def _obstacle(self) -> str | None:
         """Return where a call comes from if the environment cannot be asked there."""
@@ -489,12 +514,16 @@ class Driver(ABC):
         return error
 
 
+def _ignore(*args: Model) -> None:
+    """Do nothing, in place of a rule, where no decision of the rule can be reported."""
+
+
 def _reporting(hook: Hook, send: Interceptor) -> Function:
     """Make a function that runs a rule, and sends its decision with the bound call."""
     rule = hook.rule
 
     def report(decision: Model, args: Args, kwargs: Kwargs) -> Model:
-        send((decision, *(hook.bind(args, kwargs) or (args, kwargs))), BOUND)
+        send(((decision, *(hook.bind(args, kwargs) or (args, kwargs))),), BOUND)
         return decision
 
     if hook.kind == "function":

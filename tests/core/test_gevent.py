@@ -151,3 +151,35 @@ def test_a_model_that_waits_in_the_hub_unwinds(how):
         assert unwound == [1]
         """
     )
+
+
+PATCHED = """
+    import signal
+    from gevent import monkey
+    monkey.patch_all({})
+    signal.alarm(30)
+    from simenv_marl import clone, single_env
+    from simenv_marl.errors import SimulationError
+    from tests.worlds.models import decision, script
+
+    decide = decision()
+    model = script(lambda simulation: [decide() for _ in range(3)])
+    try:
+        env = single_env(model, decide, driver=driver)
+    except SimulationError as error:
+        print(error)
+    else:
+        env.reset(seed=1)
+        env.step(1)
+        with clone(env, method="replay") as twin:
+            twin.step(2)
+        env.close()
+    print("end")
+"""
+
+
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+def test_threads_that_gevent_has_replaced_are_refused(driver):
+    told = run_code(f"driver = {driver!r}", PATCHED.format(""))
+    assert "patch_all(thread=False, queue=False)" in told
+    assert run_code(f"driver = {driver!r}", PATCHED.format("thread=False, queue=False")) == "end\n"

@@ -220,3 +220,12 @@ def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(
     assert len(caught) == 1
     go_on.set()
     stuck.join(10)
+
+
+def test_an_error_before_the_first_job_of_a_thread_reaches_its_caller(monkeypatch):
+    def fail():
+        raise MemoryError("no room for the stack")
+
+    monkeypatch.setattr("simenv_marl.core.switching.driver.watch_resources", fail)
+    with pytest.raises(MemoryError, match="no room"):
+        single_env(script(lambda simulation: None), decision(), driver="thread")

@@ -160,7 +160,11 @@ class Driver(ABC):
         Args:
             plugins: The handlers that take part in the simulation.
             earlier: The driver of the same simulation that this one replaces.
+
+        Raises:
+            SimulationError: gevent has replaced threads or queues.
         """
+        _refuse_replaced_threads()
         self.plugins = plugins
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.events: Mapping[Hook, AnyHandler] = {}
@@ -512,6 +516,18 @@ class Driver(ABC):
         error = WrongThreadError(*refused.args)
         error.__cause__ = refused
         return error
+
+
+def _refuse_replaced_threads() -> None:
+    """Refuse threads and queues of gevent, because their locks wait in its hub, not in threads."""
+    monkey = modules.get("gevent.monkey")
+    needed = ("threading", "queue")
+    replaced = [] if monkey is None else [n for n in needed if monkey.is_module_patched(n)]
+    if replaced:
+        raise SimulationError(
+            f"gevent.monkey has replaced {' and '.join(replaced)}, which simulations need as they"
+            " are; call gevent.monkey.patch_all(thread=False, queue=False)"
+        )
 
 
 def _ignore(*args: Model) -> None:

@@ -98,7 +98,12 @@ class ThreadDriver(Driver):
     # -- in the simulation's thread ---------------------------------------------------------------
 
     def _serve(self) -> None:
-        self._register()
+        try:
+            self._register()
+        except BaseException as error:  # its user waits for the first job
+            self._outcome = [None, error]
+            self._arrived.put(ENDED)
+            return
         try:
             while not self.ended and (reply := self._replies.get()) is not _END:
                 if reply is _JOB:

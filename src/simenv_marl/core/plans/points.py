@@ -184,7 +184,7 @@ def _inherited(point: DecisionPoint) -> Definition | None:
 def _named(key: object, points: Iterable[DecisionPoint]) -> DecisionPoint | None:
     """Return the one of some points that a key names."""
     for point in points:
-        if key == point.name or unwrap(key) is point.function:
+        if unwrap(key) is point.function or portable(key) == point.name:
             return point
     return None
 

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
+from itertools import chain
 from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias, cast
 from weakref import finalize
 
@@ -42,6 +43,7 @@ from .points import (
     agent_names,
     find_points,
     locate,
+    overrides,
     own_points,
     owner_class,
     portable,
@@ -204,6 +206,7 @@ class Plan:
             of the points.
         complete: Whether ``roster`` contains all possible agents.
         removers: The functions whose calls end agents.
+        overrides: The functions that override each of the points, and are no points.
         plugins: The handlers for this environment's simulation only. None if there are none.
         patches: The hooks, and the handlers with their hooks, that must be set while an environment
             is in use.
@@ -221,6 +224,7 @@ class Plan:
     roster: Mapping[str, Point]
     complete: bool
     removers: tuple[Remover, ...]
+    overrides: Mapping[Point, Collection[Hook]]
     plugins: Plugins | None
     patches: tuple[tuple[Hook, Handler | None], ...]
 
@@ -448,7 +452,12 @@ def _resolve(subject: Subject, options: Options) -> Plan:
     plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
     handlers = [] if plugins is None else plugins.handlers
     removers = _removers(points, subject)
-    hooks = (*definitions, *(remover.hook for remover in removers))
+    others = {
+        point: [hook for hook in overrides(point.hook) if hook not in definitions]
+        for point in points
+        if has_user or by_agent or point.policy is not None
+    }
+    hooks = (*definitions, *(remover.hook for remover in removers), *chain(*others.values()))
     ruled = set(agents.values()) - {point.agent for point in points}
     return Plan(
         subject,
@@ -466,6 +475,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         roster=roster,
         complete=complete,
         removers=removers,
+        overrides=others,
         plugins=plugins,
         patches=(
             *dict.fromkeys(hooks).items(),

@@ -24,7 +24,7 @@ from weakref import WeakSet, ref
 
 from greenlet import getcurrent, greenlet
 
-from ...errors import SimulationError, WrongThreadError, annotate
+from ...errors import SimulationError, WrongThreadError, annotate, warn_user
 from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
@@ -83,6 +83,23 @@ Event: TypeAlias = tuple[AnyHandler, Args, Kwargs]
 
 Job: TypeAlias = tuple[Callable[[], Model], Mapping[Hook, AnyHandler]]
 """A function to run on the stack, and the handlers of the events that it sends, by hook."""
+
+
+class Notice:
+    """Warns of the first call of some functions. The calls are no events: the functions run."""
+
+    deliver = None
+    report = None
+
+    def __init__(self, message: str) -> None:
+        self._message = message
+
+    def handle(self, hook: Hook, args: Args, kwargs: Kwargs) -> Model:
+        """Run the function of a hook where it was called."""
+        message, self._message = self._message, ""
+        if message:
+            warn_user(message)
+        return hook.run_rule(args, kwargs)
 
 
 class _Ended:
@@ -435,6 +452,8 @@ class Driver(ABC):
         handler = self.events.get(hook)
         if handler is None:
             return hook.run_rule
+        if isinstance(handler, Notice):
+            return partial(handler.handle, hook)
         if away or self.forked:
             obstacle = self._obstacle()
             if obstacle is not None:

@@ -21,7 +21,7 @@ from ...errors import (
     warn_user,
 )
 from ...hooks.handlers import Installation
-from ...simulation import Model, make_simulation, passing
+from ...simulation import Model, make_simulation, optional_method, passing
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -94,7 +94,8 @@ class Session(BaseSession):
     def _take_simulation(self, simulation: Model) -> None:
         self._simulation = simulation
         self._reset = passing(simulation.reset, "seed", "options")
-        close = getattr(simulation, "close", None)
+        close = optional_method(simulation, "close")
+        close = close or optional_method(simulation, "close", last=True)
         self._closer = None if close is None else passing(close, "last")
         self.handlers = handlers_of(self.plan, simulation)
 
@@ -212,7 +213,7 @@ class Session(BaseSession):
 
     def _make_clock(self) -> Clock | None:
         """Make the clock of the simulation. None if it has no time."""
-        time = getattr(self._simulation, "time", None)
+        time = optional_method(self._simulation, "time")
         if time is None:
             return None
         if self.plan.plugins is not None or self._rng is not None:
@@ -279,8 +280,8 @@ class Session(BaseSession):
 
     def ask(self, name: str, *args: Any) -> Model:
         """Call a method of the simulation, or raise ``NotImplementedError`` if it has none."""
-        method = getattr(self._simulation, name, None)
-        if not callable(method):
+        method = optional_method(self._simulation, name, *args)
+        if method is None:
             raise NotImplementedError(f"{type(self._simulation).__name__} has no method {name}()")
         with self.context():
             return method(*args)
@@ -359,7 +360,7 @@ class Session(BaseSession):
 
     def check_reseed(self) -> None:
         """Raise a ``BranchError`` unless the simulation's future chance can be drawn anew."""
-        if self._rng is None and not callable(getattr(self._simulation, "reseed", None)):
+        if self._rng is None and optional_method(self._simulation, "reseed", 0) is None:
             raise BranchError(
                 f"seeds= needs a way to reseed {type(self._simulation).__name__}: give it a method"
                 " reseed(seed), which may call simenv_marl.reseed_generators(self, seed), or make"
@@ -368,11 +369,11 @@ class Session(BaseSession):
 
     def reseed(self, seed: int) -> None:
         """Draw the simulation's future chance anew, and its own global generators."""
-        reseed = getattr(self._simulation, "reseed", None)
+        reseed = optional_method(self._simulation, "reseed", seed)
         with self.context():
             if self._rng is not None:
                 seed_globals(seed, ENVIRONMENT)
-            if callable(reseed):
+            if reseed is not None:
                 try:
                     reseed(seed)
                 except BaseException as error:

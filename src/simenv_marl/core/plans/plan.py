@@ -31,7 +31,7 @@ from ...hooks.handlers import Handler
 from ...hooks.hook import Hook
 from ...hooks.stacks import outside_simulation
 from ...plugins import Plugins
-from ...simulation import RULE, Model, SimulationInterface, make_simulation
+from ...simulation import RULE, Model, SimulationInterface, make_simulation, optional_method
 from ..switching.driver import Driver
 from ..switching.greenlets import GreenletDriver
 from ..switching.threads import ThreadDriver
@@ -387,6 +387,7 @@ def make_plan(
     own = own_points(inspected)
     kind = inspected if isinstance(inspected, type) else type(inspected)
     modes = getattr(inspected, "render_modes", ("ansi", "human", "rgb_array"))
+    arguments = ("self", "mode") if inspected is kind else ("mode",)
     subject = Subject(
         source,
         variant,
@@ -395,7 +396,7 @@ def make_plan(
         planner_view,
         find_points(points, own, empty=not has_user),
         own,
-        modes if hasattr(inspected, "render") else [],
+        modes if optional_method(inspected, "render", *arguments) else [],
         getattr(inspected, "render_fps", 4),
         issubclass(kind, SimulationInterface),
         prototype,

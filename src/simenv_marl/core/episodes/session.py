@@ -17,10 +17,12 @@ from ...errors import (
     OptionValueError,
     ReentrancyError,
     annotate,
+    listed,
     short_repr,
     warn_user,
 )
 from ...hooks.handlers import Installation
+from ...hooks.places import is_outdated
 from ...simulation import Model, make_simulation, optional_method, passing
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
@@ -45,8 +47,8 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation", "context",
-        "episode", "handlers", "unmatched_names",
+        "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation",
+        "_warned_of_outdated", "context", "episode", "handlers", "unmatched_names",
     )  # fmt: skip
 
     episode: Episode | None
@@ -67,6 +69,7 @@ class Session(BaseSession):
         self.context: Callable[..., environment_context] = partial(
             environment_context, plan.plugins, self._rng, self.lock
         )
+        self._warned_of_outdated = False
         self._close: Callable[..., Model] | None = None  # set by a reset, called once
         self._installed: Installation | None = Installation(plan.patches)
         prototype = plan.claim_prototype()
@@ -140,12 +143,24 @@ class Session(BaseSession):
                     self._close_simulation(last=False)
                 if self._installed is None or not self._installed.complete:
                     self._installed = Installation(self.plan.patches)
+                self._warn_of_outdated()
                 self.options = options
                 self.seed = self.seed_for(seed)
                 self._enter_ready_driver(driver)
                 return self._begin(self.seed, in_rounds, replay)
             finally:
                 self._state = State.NEW if self.episode is None else State.OVER
+
+    def _warn_of_outdated(self) -> None:
+        """Warn once of functions that were defined again since they were named."""
+        names = [hook.name for hook, _ in self.plan.patches if is_outdated(hook)]
+        if names and not self._warned_of_outdated:
+            self._warned_of_outdated = True
+            warn_user(
+                "these were defined again, by a reload or a cell that ran again:"
+                f" {listed(names)}. Calls of the new functions are no decisions here; name them in"
+                " points=, and make the environment anew"
+            )
 
     def _enter_ready_driver(self, entered: Driver) -> None:
         """Replace the driver if it cannot run another job. ``entered``: the context's driver."""

@@ -50,6 +50,7 @@ def test_a_simulation_parameter_that_is_not_keyword_only_is_refused(part):
         aec_env(Model, {CHOOSE: define(**{part: mapping})})
 
 
+@pytest.mark.filterwarnings("ignore:.* override")
 def test_an_episode_without_a_decision_names_the_functions_that_override_the_point():
     env = single_env(Derived, {CHOOSE: define()})
     with pytest.raises(

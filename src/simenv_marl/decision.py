@@ -25,7 +25,7 @@ from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, name_of, short_repr
 from .hooks.hook import Hook, hook_of, hooks
-from .hooks.places import decorate
+from .hooks.places import decorate, is_outdated
 from .hooks.stacks import DIFFERENCES, EVALUATING
 from .simulation import Function, Model
 
@@ -368,7 +368,8 @@ def registered() -> dict[str, DecisionPoint]:
 
     These references are weak, so that a model is collected with its points.
     """
-    return {hook.name: hook for hook in hooks() if hook.definition is not None}
+    decorated = [hook for hook in hooks() if hook.definition is not None]
+    return {hook.name: hook for hook in decorated if not is_outdated(hook)}
 
 
 def decision_points() -> list[str]:

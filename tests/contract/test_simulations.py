@@ -6,7 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simenv_marl import TRUNCATED, SimulationInterface, aec_env, generate_env, single_env
+from simenv_marl import (
+    TRUNCATED,
+    SimulationInterface,
+    aec_env,
+    generate_env,
+    joint_env,
+    parallel_env,
+    single_env,
+)
 from simenv_marl.errors import NoDecisionError, NotResetError, OptionValueError, SimulationError
 from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, script
 
@@ -323,3 +331,110 @@ def test_decisions_in_mappings_and_policies_run_their_rule():
     assert decisions(play(env, 3)) == ["agent_0", "agent_0"]
     assert set(seen) == {0}
     assert env.unwrapped.simulation.log == [3, 1, 3]
+
+
+# -- attributes and methods of the model's own ----------------------------------------------------
+
+OPTIONAL = ("time", "close", "stop", "expected_calls", "state", "render", "reseed")
+OTHERS = {
+    "numbers": dict.fromkeys(OPTIONAL, 3.5),
+    "texts": dict.fromkeys(OPTIONAL, "open"),
+    "methods": {
+        name: lambda self, one, two: 1 / 0 for name in OPTIONAL if name != "expected_calls"
+    },
+    "properties": {name: property(lambda self: 1 / 0) for name in OPTIONAL},
+}
+
+
+@pytest.mark.parametrize("own", OTHERS.values(), ids=OTHERS)
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
+def test_attributes_that_cannot_be_optional_methods_are_ignored(make, own):
+    env = make(type("Own", (Simulation,), own), Model.decide)
+    with pytest.raises(NotImplementedError, match=r"has no method state\(\)"):
+        env.unwrapped.state()
+    for _ in range(2):  # the second reset stops the first episode
+        env.reset(seed=1)
+    if make is aec_env:
+        env.step(1)
+        assert "time" not in env.last()[4]
+    env.close()
+    with pytest.warns(UserWarning, match="it has none"):
+        make(type("Own", (Simulation,), own), Model.decide, render_mode="human")
+    with pytest.raises(OptionValueError, match=r"has no method time\(\)"):
+        make(type("Own", (Simulation,), own), Model.decide, discount_rate=1.0).reset()
+
+
+def test_attributes_may_be_set_by_the_reset():
+    class Own(Simulation):
+        def reset(self):
+            super().reset()
+            self.time = 0.0
+            self.state = "open"
+            self.stop = self.close = None
+
+    env = aec_env(Own, Model.decide)
+    env.reset()
+    env.reset()
+    assert "time" not in env.last()[4]
+    env.close()
+
+
+def test_optional_methods_may_have_further_parameters_with_defaults():
+    log = []
+
+    class Own(Simulation):
+        def time(self, unit="h"):
+            return 2.0
+
+        def stop(self, *reasons):
+            log.append("stop")
+
+        def close(self, *, last=False, force=False):
+            log.append(("close", last))
+
+        def render(self, mode, size=3):
+            return mode
+
+    env = aec_env(Own, Model.decide, render_mode="ansi")
+    env.reset()
+    assert env.last()[4]["time"] == 2.0
+    assert env.render() == "ansi"
+    env.close()
+    assert log == ["stop", ("close", True)]
+
+
+@pytest.mark.parametrize("method", [lambda self: [], lambda self, point, number: []])
+def test_expected_calls_without_its_parameter_are_refused(method):
+    kind = type("Own", (Simulation,), {"expected_calls": method})
+    with pytest.raises(SimulationError, match=r"def expected_calls\(self, point\)"):
+        aec_env(kind, Model.decide)
+
+
+async def _wait(self):
+    Model().decide()
+
+
+def _yield(self):
+    yield Model().decide()
+
+
+async def _do_both(self):
+    yield Model().decide()
+
+
+@pytest.mark.parametrize("name", ["run", "reset"])
+@pytest.mark.parametrize(
+    ("function", "kind", "line"),
+    [
+        (_wait, "a coroutine function", "asyncio.run(self.{}_model())"),
+        (_yield, "a generator function", "for _ in self.{}_model(): pass"),
+        (_do_both, "an async generator function", "async for _ in self.{}_model(): pass"),
+    ],
+)
+def test_a_run_that_runs_nothing_when_it_is_called_is_refused(function, kind, line, name):
+    model = type("Own", (Simulation,), {name: function})
+    for source in (model, model(), lambda: model()):
+        with pytest.raises(SimulationError, match=rf"{name}\(\) of Own is {kind}") as raised:
+            aec_env(source, Model.decide)
+        assert f"def {name}(self): " in str(raised.value)
+        assert line.format(name) in str(raised.value)

@@ -13,7 +13,7 @@ import pytest
 from simenv_marl import RULE, aec_env, parallel_env, simulate, simulate_many, single_env, vector_env
 from simenv_marl.core.switching import generators as rng
 from simenv_marl.errors import UnknownPointError
-from tests.worlds.models import calling, decision
+from tests.worlds.models import calling, decision, define, script
 from tests.worlds.models import play as play_in_turns
 
 DRAWS = "draws from the global generator"
@@ -227,3 +227,93 @@ def test_turns_are_no_standstill(heard) -> None:
         # Two rounds of three leave the pending agent out.
         env.step({("one", "two")[number // 3 % 2]: 1} if number % 3 == 0 else {})
     assert heard("stands still") == []
+
+
+# -- functions that override a point --------------------------------------------------------------
+
+
+class Tank:
+    def drain(self):
+        return "rule"
+
+    @staticmethod
+    def fill(amount):
+        return "rule"
+
+
+class Deaf(Tank):
+    def drain(self):
+        return "deaf"
+
+    @staticmethod
+    def fill(amount):
+        return "deaf"
+
+
+class Loud(Tank):
+    def drain(self):
+        return super().drain()
+
+
+class Named(Tank):
+    def drain(self):
+        return Tank.drain(self)
+
+
+def tanks(*kinds):
+    return calling(*[lambda kind=kind: kind().drain() for kind in kinds for _ in range(2)])
+
+
+OVERRIDE = "objects of these classes are no agents"
+DRAIN = f"{__name__}.Tank.drain"
+
+
+def test_a_function_that_overrides_a_point_is_warned_of_at_its_first_call(heard) -> None:
+    env = aec_env(tanks(Tank, Deaf), {DRAIN: define()})
+    env.reset()
+    env.step(1)
+    assert not heard(OVERRIDE)
+    env.step(1)
+    (text,) = heard(OVERRIDE)
+    assert f"{__name__}.Deaf.drain override {DRAIN}" in text
+    assert env.unwrapped.simulation.log == [1, 1, "deaf", "deaf"]
+    play_in_turns(env, 1)
+    assert len(heard(OVERRIDE)) == 1
+    env.close()
+    assert not hasattr(Deaf.drain, "__wrapped__")
+
+
+def test_a_static_function_that_overrides_a_point_is_warned_of(heard) -> None:
+    model = calling(lambda: Tank.fill(1), lambda: Deaf.fill(2))
+    assert simulate(model, {}, points={f"{__name__}.Tank.fill": define()}).log == ["rule", "deaf"]
+    assert not heard(OVERRIDE)  # the rule decides everywhere
+    model = calling(lambda: Tank.fill(1), lambda: Deaf.fill(2))
+    points = {f"{__name__}.Tank.fill": define()}
+    assert simulate(model, {"fill_0": lambda _: 3}, points=points).log == [3, "deaf"]
+    assert len(heard(OVERRIDE)) == 1
+
+
+@pytest.mark.parametrize(
+    ("model", "points"),
+    [
+        (tanks(Tank, Loud, Named), {DRAIN: define()}),
+        (tanks(Tank), {DRAIN: define()}),
+        (tanks(Tank, Deaf), {DRAIN: define(), f"{__name__}.Deaf.drain": define()}),
+    ],
+)
+def test_an_override_that_decides_is_not_warned_of(model, points, heard) -> None:
+    play_in_turns(aec_env(model, points), 1)
+    assert not heard(OVERRIDE)
+
+
+def test_an_override_may_run_in_a_thread_of_the_model(heard) -> None:
+    def main(simulation):
+        thread = threading.Thread(target=lambda: simulation.log.append(Deaf().drain()))
+        thread.start()
+        thread.join()
+        simulation.log.append(Tank().drain())
+
+    env = single_env(script(main), {DRAIN: define()})
+    env.reset()
+    env.step(4)
+    assert env.unwrapped.simulation.log == ["deaf", 4]

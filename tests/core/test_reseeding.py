@@ -1,10 +1,18 @@
 """``reseed_generators`` finds and seeds a simulation's generators in place, ``Streams`` by name."""
 
 import copy
+import datetime
+import enum
 import functools
+import math
+import os
 import pickle
 import random
+import subprocess
+import sys
 from collections import deque
+from dataclasses import dataclass
+from pathlib import PurePosixPath
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +23,7 @@ from hypothesis import strategies as st
 from simenv_marl import Streams, reseed_generators
 from simenv_marl.errors import OptionValueError, SimulationError
 from tests.core.test_global_rng import world
+from tests.processes import ROOT
 
 
 class Slotted:
@@ -149,6 +158,90 @@ def test_a_stream_depends_on_the_seed_and_its_name_alone():
     names = ["a", "b", "ab", "ba", "a\0", "", "\0", "\u00e4", *map(str, range(300))]
     assert len(set(draws(Streams(3), *names) + draws(Streams(4), *names))) == 2 * len(names)
     assert draws(Streams(), "a") != draws(Streams(), "a")
+
+
+class Part(enum.Enum):
+    PUMP = "pump"
+    VALVE = "valve"
+
+
+@dataclass(frozen=True)
+class Place:
+    row: int
+    tags: frozenset[str]
+
+    def method(self):
+        """Bound to a place, which equals others, it is a name as well."""
+
+
+@dataclass(eq=False)
+class Entity:
+    row: int
+
+    def method(self):
+        """Bound to an entity, it is no name."""
+
+
+NAMES = [
+    "a",
+    3,
+    -3,
+    10**400,
+    2.5,
+    math.inf,
+    None,
+    b"a",
+    (),
+    ("pump", 2),
+    ("pump", (2,)),
+    ("pump", "2"),
+    "('pump', 2)",
+    frozenset(["a", "b", ("c", 1)]),
+    Part.PUMP,
+    Part.VALVE,
+    Place(1, frozenset("abcdef")),
+    Place(2, frozenset()),
+    Place(2, frozenset()).method,
+    Place,
+    datetime.date(2026, 1, 2),
+    PurePosixPath("/a/b"),
+    "3",
+    "None",
+]
+
+
+def test_names_may_be_any_value_and_are_the_same_in_every_process():
+    here = draws(Streams(3), *NAMES)
+    assert len(set(here)) == len(here)
+    code = "from tests.core.test_reseeding import *; print(draws(Streams(3), *NAMES))"
+    for seed in "12":
+        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": f"{ROOT / 'src'}"}
+        command = [sys.executable, "-c", code]
+        text = subprocess.check_output(command, cwd=ROOT, env=environment, text=True)
+        assert text.strip() == str(here)
+
+
+def test_text_names_have_their_numbers_of_old():
+    assert draws(Streams(3), "a", "pump 2") == [0.6653036503847838, 0.9648250980937277]
+
+
+def test_equal_names_have_one_generator():
+    for alike in [(3, 3.0, np.int64(3)), (1, True), (2.5, np.float32(2.5)), ("a", np.str_("a"))]:
+        assert len({*draws(Streams(3), alike[0])} | {draws(Streams(3), n)[0] for n in alike}) == 1
+
+
+@pytest.mark.parametrize(
+    "name", [object(), Entity(1), Entity(1).method, ("pump", Entity(1)), lambda: 0, math.nan]
+)
+def test_names_that_no_other_process_finds_are_refused(name):
+    with pytest.raises(OptionValueError, match=r'or a tuple of these, such as \("pump", 2\)'):
+        Streams(3)[name]
+
+
+@pytest.mark.parametrize("name", [[1], ("pump", [1]), {}])
+def test_names_without_a_hash_are_refused(name):
+    with pytest.raises(TypeError, match="unhashable type"):
+        Streams(3)[name]
 
 
 @pytest.mark.parametrize("reseed", [Streams.reseed, reseed_generators])

@@ -322,3 +322,90 @@ def work_in_vain(what: str) -> None:
         loky.backend.process.LokyProcess.start = refuse
     first = max(run(), run())  # joblib keeps some for the next time
     assert any(run() <= first for _ in range(6))  # some of it goes a little later
+
+
+MAIN_SCRIPT = """
+from simenv_marl import simulate_many, vector_env
+from tests.worlds.models import define
+
+def zero(*args):
+    return 0.0
+
+def pair(*args):
+    return [1.0, 2.0]
+
+class Base:
+    def drain(self):
+        return 0
+
+class Tank(Base):
+    pass
+
+def choose():
+    return 0
+
+class Yard:
+    @define(agent="yard")
+    def open(self):
+        return 0
+
+class Sim:
+    def reset(self):
+        self.log = []
+
+    def run(self):
+        self.log.append((Tank().drain(), choose(), Yard().open()))
+
+class Owner(Sim):
+    points = {{"__main__.choose": define()}}
+
+    def expected_calls(self, point):
+        assert point == "__main__.choose", point
+        return [()]
+
+def log_of(simulation):
+    return simulation.log
+
+def ones(observations):
+    return [1] * len(observations)
+
+if __name__ == "__main__":
+    decided = {definition}
+    for model, points in [
+        (Sim, {{"__main__.Tank.drain": decided}}),
+        (Sim, {{"__main__.choose": decided}}),
+        (Sim, {{choose: decided}}),
+        (Sim, "__main__.Yard.open"),
+        (Owner, None),
+    ]:
+        key = points if isinstance(points, str) else next(iter(points or model.points))
+        for _ in range(2):
+            logs = simulate_many(
+                model, {{key: ones}}, points=points, seeds=[1, 2], collect=log_of, workers=2
+            )
+            print(logs)
+        envs = vector_env(model, points, num_envs=2, workers=2)
+        envs.reset()
+        envs.step([1, 1])
+        envs.close()
+"""
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [
+        "define()",
+        "define(observation_space_mapping=pair, action_space_mapping=abs, reward_mapping=zero)",
+    ],
+)
+def test_points_of_a_script_are_found_in_workers_by_name(definition, tmp_path):
+    """They are pickled by value with lambdas, and else found in the imported script."""
+    path = tmp_path / "script.py"
+    path.write_text(MAIN_SCRIPT.format(definition=definition), encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT}"}
+    done = subprocess.run(
+        [sys.executable, path], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    tank, chosen, yard = [f"[[{log}], [{log}]]" for log in ("(1, 0, 0)", "(0, 1, 0)", "(0, 0, 1)")]
+    assert done.stdout.splitlines() == [tank] * 2 + [chosen] * 4 + [yard] * 2 + [chosen] * 2

@@ -18,7 +18,7 @@ from ..core import (
     duplicate,
 )
 from ..errors import InvalidActionError, ViewError, short_repr
-from ..simulation import RULE
+from ..simulation import RULE, optional_method
 from .base import OneAgentView, StepResult
 
 
@@ -142,7 +142,7 @@ class SimulationJointEnv(OneAgentView):
         """Combine the agents. If a simulation announces them, reset one to find them."""
         session = self.session
         if not session.plan.complete:
-            if not hasattr(session.simulation, "expected_calls"):
+            if optional_method(session.simulation, "expected_calls", "point") is None:
                 points = ", ".join(
                     point.hook.name for point in session.plan.active if point.agent is None
                 )

@@ -287,7 +287,8 @@ class Hook:
             bound = "." in local_name
         self.function = function
         self.rule = function
-        self.name = name
+        # A worker of multiprocessing imports the user's script under the first name.
+        self.name = name.replace("__mp_main__.", "__main__.", 1)
         self.bound = bound
         self.kind = kind or kind_of(function, name)
         self.positions = _POSITIONS[self.kind]

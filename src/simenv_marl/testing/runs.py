@@ -55,6 +55,7 @@ from ..simulation import (
     Action,
     Model,
     make_simulation,
+    optional_method,
     passing,
 )
 from .fingerprint import STEP, Fingerprint, fingerprint
@@ -259,10 +260,10 @@ class Run:
         """Record the fingerprint of the simulation."""
         with outside_simulation():  # decision functions run their rule here
             simulation = self.simulation
-            state = getattr(simulation, "state", None)
+            state = optional_method(simulation, "state")
             if self._state_of is not None:
                 self.parts |= fingerprint("fingerprint", self._state_of(simulation))
-            elif callable(state):
+            elif state is not None:
                 self.parts |= fingerprint("state()", state())
             else:
                 self.parts |= fingerprint("simulation", simulation)

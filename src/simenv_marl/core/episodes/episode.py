@@ -34,7 +34,7 @@ functions run their rule.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from sys import maxsize
 from typing import Protocol
 from weakref import ref
@@ -44,7 +44,7 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel
+from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
 from ..plans.plan import Plan
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
@@ -93,9 +93,9 @@ class Episode(EpisodeState):
     """
 
     __slots__ = (
-        "_context", "_entities", "_failed_in_model", "_handlers", "_most_steps",
-        "_plugins", "_split", "_tape_size", "driver", "is_plain", "latest", "replay", "running",
-        "session", "simulation", "tape",
+        "_context", "_entities", "_expected_calls", "_failed_in_model", "_handlers",
+        "_most_steps", "_plugins", "_split", "_tape_size", "driver", "is_plain", "latest",
+        "replay", "running", "session", "simulation", "tape",
     )  # fmt: skip
 
     def __init__(
@@ -115,6 +115,7 @@ class Episode(EpisodeState):
         self.session: Callable[[], EpisodeOwner | None] = ref(session)
         self.simulation = simulation
         self.driver = driver
+        self._expected_calls = optional_method(simulation, "expected_calls", "point")
         self._context = session.context
         self._handlers = session.handlers
         self._plugins = plan.plugins
@@ -493,11 +494,9 @@ class Episode(EpisodeState):
         """
         pending, self.pending = self.pending, None  # so that an action from a mapping is refused
         in_rounds = self.round is not None
-        expected_calls = getattr(self.simulation, "expected_calls", None)
-        if expected_calls is not None:
-            for agent, (args, kwargs) in self._announced(expected_calls).items():
-                if agent is not pending and (in_rounds or not agent.decided):
-                    agent.keep(self, args, kwargs)
+        for agent, (args, kwargs) in self._announced().items():
+            if agent is not pending and (in_rounds or not agent.decided):
+                agent.keep(self, args, kwargs)
         if truncated:
             self.finish(truncated=True)
             return
@@ -513,11 +512,12 @@ class Episode(EpisodeState):
                 agent.forget_choices()  # ``legal`` returns them again when it decides
         self.pending = pending
 
-    def _announced(
-        self, expected_calls: Callable[[str], Iterable[Args]]
-    ) -> dict[Agent, tuple[Args, Kwargs]]:
+    def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
         """Return the agents that ``expected_calls`` announces, with the arguments of their call."""
         announced: dict[Agent, tuple[Args, Kwargs]] = {}
+        expected_calls = self._expected_calls
+        if expected_calls is None:
+            return announced
         for plan_point in self.plan.active:
             handler = self._handlers.by_point[plan_point]
             point = handler.point
@@ -670,7 +670,7 @@ class Episode(EpisodeState):
         self.outcome = RUNNING  # it moves until it is unwound
         problems: list[BaseException] = []
         try:
-            stop = getattr(self.simulation, "stop", None)
+            stop = optional_method(self.simulation, "stop")
             try:
                 if stop is not None:
                     stop()

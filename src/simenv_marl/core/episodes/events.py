@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 
 from ...decision import inverse
-from ...errors import InvalidActionError, short_repr, warn_user
+from ...errors import InvalidActionError, listed, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...simulation import RULE, Action, Model
 from ..plans.mappings import adapt
 from ..plans.plan import Plan, Remover
 from ..plans.point import Args, Kwargs, Point, Policy
-from ..switching.driver import WAIT, AnyHandler, Observer
+from ..switching.driver import WAIT, AnyHandler, Notice, Observer
 from ..values.actions import ILLEGAL
 from .agent import Agent, RunningEpisode
 from .arguments import restore
@@ -263,6 +263,13 @@ def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:
         removal = removals.setdefault(remover.hook, RemovalHandler(last))
         removal.add(None if remover.point is None else by_point[remover.point], remover)
     by_hook.update(removals)
+    for point, hooks in plan.overrides.items():
+        notice = Notice(
+            f"{listed([hook.name for hook in hooks])} override {point.hook.name}: objects of these"
+            " classes are no agents, and their own rule decides. Name the functions in points=,"
+            " too, or call the decision function in them"
+        )
+        by_hook |= dict.fromkeys(hooks, notice)
     roster: dict[str, tuple[PointHandler, Policy, bool]] = {}
     for name, point in plan.roster.items():
         policy = plan.policy_of(name, point)

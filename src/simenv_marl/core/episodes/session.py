@@ -17,11 +17,13 @@ from ...errors import (
     OptionValueError,
     ReentrancyError,
     annotate,
+    listed,
     short_repr,
     warn_user,
 )
 from ...hooks.handlers import Installation
-from ...simulation import Model, make_simulation, passing
+from ...hooks.places import is_outdated
+from ...simulation import Model, make_simulation, optional_method, passing
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -45,8 +47,8 @@ class Session(BaseSession):
     """
 
     __slots__ = (
-        "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation", "context",
-        "episode", "handlers", "unmatched_names",
+        "_close", "_closer", "_driver", "_installed", "_reset", "_rng", "_simulation",
+        "_warned_of_outdated", "context", "episode", "handlers", "unmatched_names",
     )  # fmt: skip
 
     episode: Episode | None
@@ -67,6 +69,7 @@ class Session(BaseSession):
         self.context: Callable[..., environment_context] = partial(
             environment_context, plan.plugins, self._rng, self.lock
         )
+        self._warned_of_outdated = False
         self._close: Callable[..., Model] | None = None  # set by a reset, called once
         self._installed: Installation | None = Installation(plan.patches)
         prototype = plan.claim_prototype()
@@ -94,7 +97,8 @@ class Session(BaseSession):
     def _take_simulation(self, simulation: Model) -> None:
         self._simulation = simulation
         self._reset = passing(simulation.reset, "seed", "options")
-        close = getattr(simulation, "close", None)
+        close = optional_method(simulation, "close")
+        close = close or optional_method(simulation, "close", last=True)
         self._closer = None if close is None else passing(close, "last")
         self.handlers = handlers_of(self.plan, simulation)
 
@@ -139,12 +143,24 @@ class Session(BaseSession):
                     self._close_simulation(last=False)
                 if self._installed is None or not self._installed.complete:
                     self._installed = Installation(self.plan.patches)
+                self._warn_of_outdated()
                 self.options = options
                 self.seed = self.seed_for(seed)
                 self._enter_ready_driver(driver)
                 return self._begin(self.seed, in_rounds, replay)
             finally:
                 self._state = State.NEW if self.episode is None else State.OVER
+
+    def _warn_of_outdated(self) -> None:
+        """Warn once of functions that were defined again since they were named."""
+        names = [hook.name for hook, _ in self.plan.patches if is_outdated(hook)]
+        if names and not self._warned_of_outdated:
+            self._warned_of_outdated = True
+            warn_user(
+                "these were defined again, by a reload or a cell that ran again:"
+                f" {listed(names)}. Calls of the new functions are no decisions here; name them in"
+                " points=, and make the environment anew"
+            )
 
     def _enter_ready_driver(self, entered: Driver) -> None:
         """Replace the driver if it cannot run another job. ``entered``: the context's driver."""
@@ -212,7 +228,7 @@ class Session(BaseSession):
 
     def _make_clock(self) -> Clock | None:
         """Make the clock of the simulation. None if it has no time."""
-        time = getattr(self._simulation, "time", None)
+        time = optional_method(self._simulation, "time")
         if time is None:
             return None
         if self.plan.plugins is not None or self._rng is not None:
@@ -279,8 +295,8 @@ class Session(BaseSession):
 
     def ask(self, name: str, *args: Any) -> Model:
         """Call a method of the simulation, or raise ``NotImplementedError`` if it has none."""
-        method = getattr(self._simulation, name, None)
-        if not callable(method):
+        method = optional_method(self._simulation, name, *args)
+        if method is None:
             raise NotImplementedError(f"{type(self._simulation).__name__} has no method {name}()")
         with self.context():
             return method(*args)
@@ -359,7 +375,7 @@ class Session(BaseSession):
 
     def check_reseed(self) -> None:
         """Raise a ``BranchError`` unless the simulation's future chance can be drawn anew."""
-        if self._rng is None and not callable(getattr(self._simulation, "reseed", None)):
+        if self._rng is None and optional_method(self._simulation, "reseed", 0) is None:
             raise BranchError(
                 f"seeds= needs a way to reseed {type(self._simulation).__name__}: give it a method"
                 " reseed(seed), which may call simenv_marl.reseed_generators(self, seed), or make"
@@ -368,11 +384,11 @@ class Session(BaseSession):
 
     def reseed(self, seed: int) -> None:
         """Draw the simulation's future chance anew, and its own global generators."""
-        reseed = getattr(self._simulation, "reseed", None)
+        reseed = optional_method(self._simulation, "reseed", seed)
         with self.context():
             if self._rng is not None:
                 seed_globals(seed, ENVIRONMENT)
-            if callable(reseed):
+            if reseed is not None:
                 try:
                     reseed(seed)
                 except BaseException as error:

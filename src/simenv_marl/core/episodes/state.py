@@ -22,7 +22,6 @@ from ...errors import (
 )
 from ...simulation import RULE, Action
 from ..plans.plan import Plan
-from ..plans.points import overrides
 from ..plans.policies import Where
 from ..values.actions import ILLEGAL
 from .round import Round
@@ -259,7 +258,7 @@ def missing_decision(episode: EpisodeState, simulation: str) -> NoDecisionError:
     plan = episode.plan
     hooks = [point.hook for point in plan.active]
     expected = ", ".join(hook.name for hook in hooks)
-    overriding = listed([name for hook in hooks for name in overrides(hook)])
+    overriding = listed([hook.name for point in plan.active for hook in plan.overrides[point]])
     threads = {name for hook in hooks for name in hook.threads} - {current_thread().name}
     hints: list[str] = []
     if overriding:

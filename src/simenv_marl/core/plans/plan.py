@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
+from itertools import chain
 from typing import Any, Final, NamedTuple, NoReturn, Protocol, TypeAlias, cast
 from weakref import finalize
 
@@ -30,7 +31,7 @@ from ...hooks.handlers import Handler
 from ...hooks.hook import Hook
 from ...hooks.stacks import outside_simulation
 from ...plugins import Plugins
-from ...simulation import RULE, Model, SimulationInterface, make_simulation
+from ...simulation import RULE, Model, SimulationInterface, make_simulation, optional_method
 from ..switching.driver import Driver
 from ..switching.greenlets import GreenletDriver
 from ..switching.threads import ThreadDriver
@@ -42,6 +43,7 @@ from .points import (
     agent_names,
     find_points,
     locate,
+    overrides,
     own_points,
     owner_class,
     portable,
@@ -204,6 +206,7 @@ class Plan:
             of the points.
         complete: Whether ``roster`` contains all possible agents.
         removers: The functions whose calls end agents.
+        overrides: The functions that override each of the points, and are no points.
         plugins: The handlers for this environment's simulation only. None if there are none.
         patches: The hooks, and the handlers with their hooks, that must be set while an environment
             is in use.
@@ -221,6 +224,7 @@ class Plan:
     roster: Mapping[str, Point]
     complete: bool
     removers: tuple[Remover, ...]
+    overrides: Mapping[Point, Collection[Hook]]
     plugins: Plugins | None
     patches: tuple[tuple[Hook, Handler | None], ...]
 
@@ -383,6 +387,7 @@ def make_plan(
     own = own_points(inspected)
     kind = inspected if isinstance(inspected, type) else type(inspected)
     modes = getattr(inspected, "render_modes", ("ansi", "human", "rgb_array"))
+    arguments = ("self", "mode") if inspected is kind else ("mode",)
     subject = Subject(
         source,
         variant,
@@ -391,7 +396,7 @@ def make_plan(
         planner_view,
         find_points(points, own, empty=not has_user),
         own,
-        modes if hasattr(inspected, "render") else [],
+        modes if optional_method(inspected, "render", *arguments) else [],
         getattr(inspected, "render_fps", 4),
         issubclass(kind, SimulationInterface),
         prototype,
@@ -448,7 +453,12 @@ def _resolve(subject: Subject, options: Options) -> Plan:
     plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
     handlers = [] if plugins is None else plugins.handlers
     removers = _removers(points, subject)
-    hooks = (*definitions, *(remover.hook for remover in removers))
+    others = {
+        point: [hook for hook in overrides(point.hook) if hook not in definitions]
+        for point in points
+        if has_user or by_agent or point.policy is not None
+    }
+    hooks = (*definitions, *(remover.hook for remover in removers), *chain(*others.values()))
     ruled = set(agents.values()) - {point.agent for point in points}
     return Plan(
         subject,
@@ -466,6 +476,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         roster=roster,
         complete=complete,
         removers=removers,
+        overrides=others,
         plugins=plugins,
         patches=(
             *dict.fromkeys(hooks).items(),

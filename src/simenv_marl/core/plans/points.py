@@ -36,6 +36,7 @@ from ...hooks.places import (
     PlacedHook,
     all_classes,
     find_hook,
+    hook_at,
     is_importable,
     raw_attribute,
     resolve,
@@ -83,6 +84,8 @@ def own_points(simulation: Model) -> dict[DecisionPoint, Definition]:
 
 def owner_class(point: DecisionPoint) -> type | None:
     """Return the class of a method. None for other points, or if the class is gone."""
+    if isinstance(point, PlacedHook):
+        return point.owner if isinstance(point.owner, type) else None
     try:
         owner, _ = resolve(point.name)
     except (UnknownPointError, PatchError):
@@ -90,17 +93,29 @@ def owner_class(point: DecisionPoint) -> type | None:
     return owner if isinstance(owner, type) else None
 
 
-def overrides(point: DecisionPoint) -> list[str]:
-    """Return the dotted names of the functions in derived classes that override a point."""
+def overrides(point: DecisionPoint) -> list[DecisionPoint]:
+    """Return the functions of derived classes that override a point, and do not call it.
+
+    These are no points: they have no definition.
+    """
     owner = owner_class(point)
     if owner is None:
         return []
     attribute = point.name.rpartition(".")[2]
-    return [
-        f"{kind.__module__}.{kind.__qualname__}.{attribute}"
-        for kind in all_classes(owner)
-        if kind is not owner and attribute in vars(kind)
-    ]
+    found: list[DecisionPoint] = []
+    for kind in all_classes(owner):
+        if kind is owner or attribute not in vars(kind):
+            continue
+        code = getattr(unwrap(vars(kind)[attribute]), "__code__", None)
+        names = set() if code is None else set(code.co_names)
+        bases = ["super", *(base.__name__ for base in kind.__mro__)]
+        if attribute in names and not names.isdisjoint(bases):
+            continue
+        with suppress(PatchError):
+            hook = hook_at(f"{kind.__module__}.{kind.__qualname__}.{attribute}", kind, attribute)
+            if hook.definition is None and not getattr(hook, "inherited", False):
+                found.append(hook)
+    return found
 
 
 # -- points with their definitions ----------------------------------------------------------------
@@ -184,7 +199,7 @@ def _inherited(point: DecisionPoint) -> Definition | None:
 def _named(key: object, points: Iterable[DecisionPoint]) -> DecisionPoint | None:
     """Return the one of some points that a key names."""
     for point in points:
-        if key == point.name or unwrap(key) is point.function:
+        if unwrap(key) is point.function or portable(key) == point.name:
             return point
     return None
 

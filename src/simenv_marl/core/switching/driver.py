@@ -24,7 +24,7 @@ from weakref import WeakSet, ref
 
 from greenlet import getcurrent, greenlet
 
-from ...errors import SimulationError, WrongThreadError, annotate
+from ...errors import SimulationError, WrongThreadError, annotate, warn_user
 from ...hooks.hook import BOUND, Hook
 from ...hooks.stacks import STACKS, Args, Interceptor, Kwargs, spawner_of
 from ...plugins import Plugins
@@ -99,6 +99,20 @@ class Observer:
     def report(self) -> AnyHandler | None:
         """Return None: there is no decision."""
         return None
+
+
+class Notice(Observer):
+    """Warns of the first call of some functions. The calls are no events: the functions run."""
+
+    def __init__(self, message: str) -> None:
+        self._message = message
+
+    def handle(self, hook: Hook, args: Args, kwargs: Kwargs) -> Model:
+        """Run the function of a hook where it was called."""
+        message, self._message = self._message, ""
+        if message:
+            warn_user(message)
+        return hook.run_rule(args, kwargs)
 
 
 class _Ended(Observer):
@@ -464,6 +478,8 @@ class Driver(ABC):
         handler = self.events.get(hook)
         if handler is None:
             return hook.run_rule
+        if isinstance(handler, Notice):
+            return partial(handler.handle, hook)
         if away or self.forked:
             obstacle = self._obstacle()
             if obstacle is not None:

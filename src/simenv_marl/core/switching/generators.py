@@ -2,14 +2,15 @@
 
 import random
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from functools import cache
 from gc import get_referents
+from numbers import Real
 from sys import modules
 from threading import current_thread
 from threading import enumerate as enumerate_threads
 from time import process_time_ns, thread_time_ns
-from types import CodeType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, Final
 from weakref import WeakSet
 
@@ -119,7 +120,11 @@ A model that spawns from the same seed never gets this key.
 """
 
 
-class Streams(dict[str, Generator]):
+_OTHERS: Final = 256
+"""The spawn key before a name that is no text. No byte of a text is this number."""
+
+
+class Streams(dict[Hashable, Generator]):
     """The random generators of a model, by name: one for each entity or process.
 
     ::
@@ -130,6 +135,9 @@ class Streams(dict[str, Generator]):
     A generator is made when it is first used. Its numbers depend on the seed and its name alone. So
     further entities, and their actions, change no other entity's chance. This makes runs that
     differ in one action, or in one entity, comparable with few seeds.
+
+    A name is a text, a number, a tuple, or any other value with a hash. Objects whose hash is their
+    identity are refused, because another process could not find their generators.
     """
 
     def __init__(self, seed: int | None = None) -> None:
@@ -141,7 +149,7 @@ class Streams(dict[str, Generator]):
         super().__init__()
         self._key = SeedSequence(None if seed is None else _validate(seed))
 
-    def __missing__(self, name: str) -> Generator:
+    def __missing__(self, name: Hashable) -> Generator:
         return self.setdefault(name, default_rng(self._stream(name)))
 
     def reseed(self, seed: int) -> None:
@@ -154,10 +162,35 @@ class Streams(dict[str, Generator]):
         for name, generator in self.items():
             _seed_bits(generator.bit_generator, self._stream(name))
 
-    def _stream(self, name: str) -> SeedSequence:
-        return SeedSequence(
-            self._key.entropy, spawn_key=(*self._key.spawn_key, _NAMES, *name.encode())
+    def _stream(self, name: Hashable) -> SeedSequence:
+        words = (*name.encode(),) if isinstance(name, str) else (_OTHERS, *_text_of(name).encode())
+        return SeedSequence(self._key.entropy, spawn_key=(*self._key.spawn_key, _NAMES, *words))
+
+
+def _text_of(name: Any) -> str:
+    """Return a text for the name of a stream: the same for equal names, in every process."""
+    match name:
+        case None | bytes():
+            return repr(name)
+        case str():
+            return ascii(str(name))
+        case tuple() | list():
+            return f"({','.join(map(_text_of, name))})"
+        case frozenset():
+            return f"{{{','.join(sorted(map(_text_of, name)))}}}"
+        case dict():
+            return _text_of(frozenset(name.items()))
+        case Real() | np.bool_() if name == name:  # NaN equals nothing
+            number: Any = name
+            return repr(int(number) if number % 1 == 0 else float(number))
+        case type() | FunctionType() if "<" not in name.__qualname__:
+            return f"{name.__module__}.{name.__qualname__}".replace("__mp_main__", "__main__")
+    if type(name).__hash__ is object.__hash__ or isinstance(name, Real):
+        raise OptionValueError(
+            f"a stream cannot be named by {short_repr(name)}: another process could not find it"
+            ' again. Use a text, a number, or a tuple of these, such as ("pump", 2)'
         )
+    return _text_of(name.__reduce_ex__(2))
 
 
 _GENERATORS: Final = (

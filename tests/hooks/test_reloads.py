@@ -1,0 +1,133 @@
+"""Functions that are defined again: by a reload, or by a cell of a notebook that runs again."""
+
+import importlib
+import sys
+import types
+
+import pytest
+
+from simenv_marl import aec_env
+from simenv_marl.errors import NoDecisionError, PatchError
+from simenv_marl.hooks.hook import hook_of
+from tests.worlds.models import define, play
+
+HEAD = """
+from tests.worlds.models import define
+
+class Sim:
+    def reset(self):
+        self.log = []
+
+    def run(self):
+        self.log += [Tank().drain(), Tank().heat(), Kid().drain(), choose(), pick()]
+"""
+MODEL = """
+class Tank:
+    def drain(self):
+        return "rule"
+
+    @define()
+    def heat(self):
+        return "rule"
+
+class Kid(Tank):
+    pass
+
+def choose():
+    return "rule"
+
+@define()
+def pick():
+    return "rule"
+"""
+NAMES = ("Tank.drain", "Tank.heat", "choose", "pick")
+
+
+@pytest.fixture
+def model(monkeypatch):
+    """A module whose code runs again on demand, as reloads and cells do."""
+    module = types.ModuleType("reloaded_model")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec(HEAD + MODEL, vars(module))
+    return module
+
+
+def points_of(model, *names):
+    return {f"{model.__name__}.{name}": define() for name in names}
+
+
+def log_of(env):
+    play(env, 3)
+    return env.unwrapped.simulation.log
+
+
+def test_a_new_environment_decides_in_the_new_functions(model):
+    old = aec_env(model.Sim, points_of(model, *NAMES))
+    assert log_of(old) == [3] * 5
+    exec(MODEL, vars(model))
+    assert log_of(aec_env(model.Sim, points_of(model, *NAMES))) == [3] * 5
+    kid = aec_env(model.Sim, points_of(model, "Kid.drain"))
+    assert log_of(kid) == ["rule", "rule", 3, "rule", "rule"]
+    decorated = aec_env(model.Sim, {model.Tank.heat: None, model.pick: define()})
+    assert log_of(decorated) == ["rule", 3, "rule", "rule", 3]
+    old.close()
+    assert [model.Tank().drain(), model.choose()] == ["rule", "rule"]
+
+
+@pytest.mark.parametrize("name", [*NAMES, "Kid.drain"])
+def test_an_old_environment_warns_of_functions_that_were_defined_again(model, name):
+    env = aec_env(model.Sim, points_of(model, name))
+    env.reset()
+    exec(MODEL, vars(model))
+    again = pytest.warns(UserWarning, match=rf"defined again.*{name}\. Calls")
+    with again, pytest.raises(NoDecisionError):
+        env.reset()
+    with pytest.raises(NoDecisionError):
+        env.reset()  # it has warned once
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_old_function_as_a_key_is_told(model, name):
+    owner, _, attribute = name.rpartition(".")
+    points = {getattr(getattr(model, owner, model), attribute): define()}
+    alive = model.Tank
+    exec(MODEL, vars(model))
+    assert alive is not model.Tank
+    if name == "choose":
+        with pytest.raises(PatchError, match="name its new definition"):
+            aec_env(model.Sim, points)
+        return
+    with pytest.warns(UserWarning, match="defined again"), pytest.raises(NoDecisionError):
+        aec_env(model.Sim, points).reset()
+
+
+def test_points_that_a_new_definition_lacks_are_registered_no_more(model, monkeypatch):
+    monkeypatch.setattr("simenv_marl.decision.hooks", lambda: [*map(hook_of, decorated)])
+    decorated = [model.Tank.heat, model.pick]
+    alive = aec_env(model.Sim)
+    assert alive.possible_agents == ["heat_0", "pick_0"]
+    exec(MODEL.replace("heat", "cool"), vars(model))
+    decorated += [model.Tank.cool, model.pick]
+    assert aec_env(model.Sim).possible_agents == ["cool_0", "pick_0"]
+    exec(MODEL.replace("@define()", ""), vars(model))
+    exec("pick = define(agent='picker')(pick)", vars(model))
+    decorated.append(model.pick)
+    assert aec_env(model.Sim).possible_agents == ["picker"]
+
+
+def test_a_decorator_from_outside_may_run_again(model):
+    for number in range(3):
+        model.Tank.drain = define(agent=f"tank {number}")(model.Tank.drain)
+        env = aec_env(model.Sim, model.Tank.drain)
+        assert env.possible_agents == [f"tank {number}"]
+        assert log_of(env)[0] == 3
+
+
+def test_a_module_on_disk_is_reloaded(tmp_path, monkeypatch):
+    (tmp_path / "reloaded_file.py").write_text(HEAD + MODEL, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("reloaded_file")
+    points = points_of(module, *NAMES)
+    assert log_of(aec_env(module.Sim, points)) == [3] * 5
+    assert log_of(aec_env(importlib.reload(module).Sim, points)) == [3] * 5
+    monkeypatch.delitem(sys.modules, "reloaded_file")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import pairwise, product
+from operator import attrgetter
 from typing import Any, Final
 
+import numpy as np
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import (
     api_test,
@@ -19,12 +22,17 @@ from pettingzoo.test import (
 )
 
 from ..core import Streams, generators_of
-from ..envs import SimulationAECEnv
+from ..envs import VIEWS, SimulationAECEnv
 from ..errors import (
     AgentError,
+    DefinitionError,
     InvalidActionError,
+    MaskError,
+    ObservationError,
+    RewardError,
     SimEnvError,
     error_text,
+    short_repr,
 )
 from ..simulation import (
     RULE,
@@ -54,10 +62,12 @@ from .runs import (
     LimitReached,
     Run,
     Runner,
+    call_within,
     describe_with_place,
     place_of,
     seed_global_generators,
 )
+from .watch import Watch
 
 _TESTS: Final = (
     ("PettingZoo's api_test", "aec", lambda make: api_test(make(), num_cycles=50)),
@@ -75,6 +85,14 @@ _TESTS: Final = (
 )
 """The tests and their views; each test is called with a factory of environments."""
 
+_BLAMED: Final[dict[type[SimEnvError], str]] = {
+    DefinitionError: "callable of labels",
+    MaskError: "action_mask_mapping, or choices,",
+    ObservationError: "observation_space_mapping",
+    RewardError: "reward_mapping",
+}
+"""The mappings that errors of the library blame."""
+
 
 @dataclass(kw_only=True)
 class Check(Runner):
@@ -87,6 +105,9 @@ class Check(Runner):
         most_episodes: The number of episodes of random actions.
         findings: The findings, with their names in ``FINDINGS``.
         checked, statistics, episodes: As in ``CheckReport``, but mutable.
+        stage: The part of the check that is running, in words.
+        refused: The reasons why the plan does not allow a view, by view.
+        left_out: The tests that were left out, by reason.
         plain_runs: The plain runs by seed.
         views: The views that the plan allows. Empty if plain runs fail or decide nothing.
         unstable: Parts of the fingerprint that are not compared.
@@ -106,33 +127,56 @@ class Check(Runner):
         self.views: list[str] = []
         self.unstable: set[str] = set()
         self.sources: set[str] = set()
+        self.stage = "while the simulation was made"
+        self.refused: dict[str, str] = {}
+        self.left_out: dict[str, list[str]] = {}
         self._errors: set[tuple[str, str]] = set()  # by class and place
         self._deadline = time.monotonic() + 4 * self.seconds
 
     def run(self) -> None:
-        """Run the checks, the more basic first: if plain runs fail, the others are left out.
+        """Run the checks within the time limit.
 
         Raises:
             SimEnvError: The simulation, the points or an option is invalid.
         """
         try:
-            self.make_environment("aec")
-            self.check_plain_runs()
-            if self.views:
-                self.check_repetition()
-                self.check_views()
-                self.check_episodes()
-                self.check_conformance()
+            call_within(4 * self.seconds, self.run_checks)
+        except LimitReached:
+            pass
         except SimEnvError:
             raise
         except (Exception, SystemExit) as error:  # of the model's constructor, for example
             self.add_error(error, "while the simulation was made or reset")
+        self.check_conformance()
         if self.is_late:
-            self.add("out_of_time", f"after {4 * self.seconds:g} seconds")
+            self.add("out_of_time", f"after {4 * self.seconds:g} seconds, {self.stage}")
+
+    def run_checks(self) -> None:
+        """Run the checks, the more basic first: if plain runs fail, the others are left out.
+
+        Raises:
+            Exception: A simulation cannot be made, or the arguments of the check are invalid.
+        """
+        self.make_environment("aec")
+        self.check_plain_runs()
+        if not any(run.error for run in self.plain_runs.values()):
+            self.check_repetition()
+            self.check_rules()
+        if self.views:
+            self.check_views()
+            for drawn in (0, 1):
+                known = {"backward_clock", "standing_clock"} & {*self.findings.values()}
+                if not (self.is_late or known):
+                    self.check_clock(drawn, self.max_steps)
+            self.check_episodes()
 
     def report(self, simulation: str) -> CheckReport:
         """Return the report of a simulation with a name."""
         runs = list(self.plain_runs.values())
+        for reason, tests in self.left_out.items():
+            # The rest is a remedy, for those who want that view.
+            because, _, _ = reason.partition(";")
+            self.checked.append(f"Left out: {', '.join(tests)}, because {because}")
         return CheckReport(
             simulation=simulation,
             findings=tuple(sorted(self.findings, key=lambda f: SEVERITIES.index(f.severity))),
@@ -146,6 +190,18 @@ class Check(Runner):
     def is_late(self) -> bool:
         """Whether the time is up."""
         return time.monotonic() >= self._deadline
+
+    @property
+    def left(self) -> float:
+        """The time limit of a test, in seconds."""
+        return max(0.0, min(self.seconds, self._deadline - time.monotonic()))
+
+    @property
+    def obstacle(self) -> str:
+        """The reason why no further tests run; empty if they do."""
+        if any(finding.severity == "error" for finding in self.findings):
+            return "there are errors"
+        return "the time is up" if self.is_late else ""
 
     def add(
         self,
@@ -166,7 +222,24 @@ class Check(Runner):
         key = kind, place_of(error) or error_text(error)
         if key not in self._errors:
             self._errors.add(key)
-            self.add("raises", f"{where}: {describe_with_place(error)}", kind=kind)
+            source = self.mapping_of(error)
+            name = "mapping_raises" if source else "raises"
+            self.add(name, f"{where}: {describe_with_place(error)}", kind=kind, source=source)
+
+    def mapping_of(self, error: BaseException) -> str:
+        """Return the mapping that has raised an error, or that it blames; empty for the model."""
+        for kind, name in _BLAMED.items():
+            if isinstance(error, kind):
+                return f"The {name}"
+        codes = [frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)]
+        # A function, the function of a partial one, or that of an object.
+        forms = [attrgetter(f"{form}__code__") for form in ("", "func.", "__call__.")]
+        for point, code_of in product(self.plan.points, forms):
+            for name, part in vars(point.definition).items():
+                with suppress(AttributeError):
+                    if code_of(part) in codes:
+                        return f"The {name} of {point.hook.name}"
+        return ""
 
     def fails(
         self,
@@ -177,8 +250,13 @@ class Check(Runner):
         """Return whether a run has failed, and add its error."""
         error = run.error
         if isinstance(error, LimitReached):
-            name = "stuck" if run.is_stuck else "out_of_time"
-            self.add(name, f"{where}, after {len(run.calls)} steps")
+            evidence = f"{where}, after {len(run.calls)} steps"
+            with suppress(Exception):  # the simulation may have no clock
+                evidence += f", at the simulated time {run.simulation.time():g}"
+            if run.is_stuck:
+                self.add("stuck", f"{evidence} ({place_of(error)})")
+            elif not self.is_late:  # else the end of the check adds it
+                self.add("out_of_time", evidence)
         # The joint view may be unable to know all agents.
         elif error is not None and not (view == "joint" and isinstance(error, AgentError)):
             self.add_error(error, where)
@@ -218,17 +296,22 @@ class Check(Runner):
         if not takes(make_simulation(self.plan.subject.source).reset, "seed"):
             self.add("unseeded_reset")
         for seed in self.seeds:
+            self.stage = f"in a plain run without any environment, seed {seed}"
             run = self.run_plainly(seed)
             self.plain_runs[seed] = run
             self.sources |= run.draws
-            if self.fails(run, f"in a plain run without any environment, seed {seed}"):
+            if self.fails(run, self.stage):
                 return
         first, *others = self.plain_runs.values()
+        if first.early:
+            calls = [f"{name} at {place}" for name, place in first.early.items()]
+            self.add("early_decisions", "; ".join(calls))
         if not any(run.calls for run in (first, *others)):
             points = ", ".join(point.hook.name for point in self.plan.active)
             self.add("no_decision", points=points)
             return
-        self.views = self.fitting_views()
+        self.refused = self.refused_views()
+        self.views = [view for view in VIEWS if view not in self.refused]
         if any(run.is_cut for run in (first, *others)):
             self.add("cut_runs")
         if others and not any(self.differences(first, run) for run in others):
@@ -237,6 +320,7 @@ class Check(Runner):
     def check_repetition(self) -> None:
         """Repeat a plain run: if it differs, differences of environments mean nothing."""
         seed = self.seeds[0]
+        self.stage = f"in another plain run of seed {seed}"
         first = self.plain_runs[seed]
         again = self.run_plainly(seed)
         # Other states of the global generators show whether the model seeds them.
@@ -253,6 +337,28 @@ class Check(Runner):
         if self.repeats(first, again, "unrepeatable", f"two plain runs of seed {seed}") and parts:
             self.add("unstable", describe_differences(parts))
 
+    def check_rules(self) -> None:
+        """Check the rules for effects and waits that an action does not have."""
+        self.stage = "in a plain run whose rules are watched"
+        watch = Watch(self.state_of, self.plan)
+        self.run_plainly(self.seeds[0], run=watch)
+        for kind in watch.overriding - watch.deciding:
+            self.add("silent_override", kind=f"{kind.__module__}.{kind.__qualname__}")
+        for name, settings in watch.settings.items():
+            self.add("settings", ", ".join(settings), point=name)
+        for point in self.plan.active:
+            name = point.hook.name
+            if name in watch.yielded:
+                value = watch.yielded[name]
+                returns = name in watch.returning or not isinstance(value, (int, float, str, tuple))
+                finding = "waiting_rule" if returns or point.applies else "vanishing"
+                evidence = f"the first value that it yields is {short_repr(value)}"
+                if not self.apply_waits(point, self.seeds[0]):
+                    self.add(finding, evidence, point=name)
+            # An apply takes the place of the rule, with its effects.
+            elif name in watch.changes and not point.applies:
+                self.add("changing_rule", describe_differences(watch.changes[name]), point=name)
+
     # -- environments with RULE throughout --------------------------------------------------------
 
     def check_views(self) -> None:
@@ -266,13 +372,16 @@ class Check(Runner):
         rules = {"policies": policies, "max_steps": None, "skip_forced": False}
         for driver, view, seed in product(drivers, self.views, self.seeds):
             plain = self.plain_runs[seed]
-            if self.is_late or not plain.calls:
+            if self.is_late:
+                return
+            if not plain.calls:
                 continue
             seed_global_generators(seed)
+            where = f"{view} view, driver {driver}, seed {seed}"
+            self.stage = f"in the {where}, with RULE throughout"
             with self.environment(view, driver=driver, **rules) as env:
                 run = self.record_rules(partial(Run.play_rules, env=env, seed=seed), seed)
-            where = f"{view} view, driver {driver}, seed {seed}"
-            if self.fails(run, f"in the {where}, with RULE throughout", view):
+            if self.fails(run, self.stage, view):
                 continue
             if run.draws - self.sources:
                 self.sources |= run.draws
@@ -291,6 +400,29 @@ class Check(Runner):
             f" decisions each): the decisions, and {len(held)} parts that the simulation holds then"
         )
 
+    def check_clock(self, drawn: int, most: int) -> None:
+        """Check that the times of an episode go on.
+
+        The episode has at most ``most`` decisions, of ``drawn`` random actions, or of ``RULE``.
+        """
+        self.stage = f"in an episode of {'random actions' if drawn else 'RULE throughout'}"
+        with self.environment(max_steps=most) as env:
+            run = self.run_randomly(env, self.seeds[0], drawn=drawn)
+        times = run.times
+        for before, now in pairwise(times):
+            if not now >= before:  # NaN is no time
+                self.add("backward_clock", f"{self.stage}: from {before:g} to {now:g}")
+                return
+        half = most // 2
+        is_one_time = len(times) == most and len(set(times[half:])) == 1
+        if not is_one_time or 10 * len(set(run.calls[half:])) > half:
+            return
+        # A longer episode tells a loop from many decisions at one time.
+        if most == self.max_steps:
+            self.check_clock(drawn, 10 * most)
+        else:
+            self.add("standing_clock", f"{self.stage}: {most} decisions, the last at {times[-1]:g}")
+
     @property
     def is_unrepeatable(self) -> bool:
         """Whether the same seed does not give the same run."""
@@ -307,6 +439,7 @@ class Check(Runner):
             for number, seed in enumerate(seeds, 1):
                 if self.is_late:
                     break
+                self.stage = f"in episode {number} of random legal actions, seed {seed}"
                 run = self.run_randomly(env, seed)
                 actors = set()
                 for agent, result in run.results:
@@ -315,7 +448,7 @@ class Check(Runner):
                     if agent.name in actors:
                         record.tally("reward", result[1])
                     actors.add(agent.name)
-                if self.fails(run, f"in episode {number} of random legal actions, seed {seed}"):
+                if self.fails(run, self.stage):
                     if isinstance(run.error, LimitReached):
                         break
                     continue
@@ -331,6 +464,7 @@ class Check(Runner):
             if self.episodes["cut"] == episodes > 0:
                 self.add("cut_runs")
             if episodes == len(seeds) and not self.is_unrepeatable:
+                self.stage = "when an episode was repeated"
                 self.compare_episodes(env, first)
             self.call(partial(env.reset, seed=seeds[0]))  # to close it in mid-episode
 
@@ -341,8 +475,14 @@ class Check(Runner):
         point = statistics.point
         if not (record.decisions or any(point in run.calls for run in self.plain_runs.values())):
             self.add("never_called", point=point)
-        if record.outside:
+        # NaN makes sums NaN, infinite numbers make them infinite.
+        infinite = [r for r in statistics.observations if not np.isfinite(r.minimum + r.maximum)]
+        if infinite:
+            self.add("not_finite", "; ".join(map(str, infinite[:3])), point=point)
+        elif record.outside:
             self.add("outside", record.outside, point=point)
+        if any(self.episodes.values()) and record.decisions > 1 and record.is_blind():
+            self.add("same_observations", f"always {short_repr(record.first)}", point=point)
         if statistics.never_legal:
             actions = ", ".join(map(str, statistics.never_legal[:10]))
             self.add("never_legal", f"actions {actions}", point=point)
@@ -381,7 +521,7 @@ class Check(Runner):
                     return
                 if not self.repeats(first, again, name, f"seed {seed}, the same actions"):
                     return
-            other = self.run_randomly(used, seed, skipped=1)
+            other = self.run_randomly(used, seed, drawn=2)
             acts_alike = len(other.calls) <= 1 or repr(first.actions) == repr(other.actions)
             if not acts_alike and not self.differences(first, other):
                 self.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
@@ -392,21 +532,28 @@ class Check(Runner):
     # -- the tests of PettingZoo and Gymnasium ----------------------------------------------------
 
     def check_conformance(self) -> None:
-        """Run the tests of PettingZoo and Gymnasium, unless they would only repeat errors."""
+        """Run the tests of PettingZoo and Gymnasium, and note why one was left out."""
         passed_tests = []
         for name, view, test in _TESTS:
-            if any(finding.severity == "error" for finding in self.findings):
-                break
-            if self.is_late or view not in self.views or (self.sources and "seed" in name):
-                continue
-            make = partial(self.make_environment, view, max_steps=self.max_steps)
-            run = self.call(partial(test, make))
-            if run.error is None:
-                passed_tests.append(name)
-            elif isinstance(run.error, AssertionError):
-                self.add("failed_test", describe_with_place(run.error), test=name)
-            # The tests ignore masks, or changes of masks.
-            elif not isinstance(run.error, (LimitReached, InvalidActionError)):
-                self.fails(run, f"in {name}", view)
+            fits = "" if view in self.views else self.refused.get(view, "plain runs fail")
+            shares = "the model draws from shared generators"
+            reason = self.obstacle or fits or (shares if self.sources and "seed" in name else "")
+            if not reason:
+                self.stage = f"in {name}"
+                make = partial(self.make_environment, view, max_steps=self.max_steps)
+                run = Run().play(partial(test, make), self.left)
+                if run.error is None:
+                    passed_tests.append(name)
+                elif isinstance(run.error, AssertionError):
+                    self.add("failed_test", describe_with_place(run.error), test=name)
+                # The tests ignore masks, changes of masks, and the bounds of some spaces.
+                elif isinstance(run.error, InvalidActionError):
+                    reason = f"of an illegal action: {error_text(run.error)}"
+                elif isinstance(run.error, LimitReached):
+                    reason = "it takes too long"
+                else:
+                    self.fails(run, self.stage, view)
+            if reason:
+                self.left_out.setdefault(reason, []).append(name)
         if passed_tests:
             self.checked.append(", ".join(passed_tests))

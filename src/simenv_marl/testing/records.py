@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from itertools import chain
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
-from ..core import MASK, Point
+from ..core import MASK, Point, same
 from ..envs.base import StepResult
 from ..errors import short_repr
 from ..simulation import Observation
@@ -45,6 +46,8 @@ class PointRecord:
         point: The decision point.
         decisions: The number of its decisions.
         outside: The first observation outside of its space, in words.
+        first: The first observation.
+        varies: Whether observations differ.
         tallies: The tallies of "reward", "mask", and the parts of "observation".
     """
 
@@ -52,12 +55,16 @@ class PointRecord:
         self.point = point
         self.decisions = 0
         self.outside = ""
+        self.first: Observation = None
+        self.varies = False
         self.tallies: dict[str, Tally] = {}
 
     def add(self, agent: str, result: StepResult) -> None:
         """Add a result of ``last()``, without its reward."""
         observation, _, terminated, truncated, info = result
         self.tally("observation", observation)
+        self.first = observation if self.first is None else self.first
+        self.varies = self.varies or not same(self.first, observation)
         space = self.point.definition.observation_space
         if not (self.outside or space.contains(observation)):
             text = short_repr(observation)
@@ -65,6 +72,11 @@ class PointRecord:
         if not (terminated or truncated):
             self.decisions += 1
             self.tally("mask", info.get(MASK))
+
+    def is_blind(self) -> bool:
+        """Return whether all observations were the same, in a space that has others."""
+        space = deepcopy(self.point.definition.observation_space)  # it keeps its generator
+        return not (self.varies or all(same(self.first, space.sample()) for _ in range(9)))
 
     def tally(self, name: str, value: Observation) -> None:
         """Add a number, an array, or a dict or tuple of these, to its tallies.

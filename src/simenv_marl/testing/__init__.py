@@ -62,9 +62,10 @@ def check_simulation(
     """Check a simulation before its environments are used.
 
     The checks compare plain runs with runs of ``RULE`` throughout in every view that fits; episodes
-    of the same seed in new and used environments and side by side; and observations with their
-    spaces. They watch the rules, and run PettingZoo's and Gymnasium's own tests. Every exception of
-    the model is a finding. The global generators of Python and NumPy keep their states.
+    of the same seed in new and used environments, side by side, and in new processes with other
+    hash seeds; and observations with their spaces. They watch the rules, and run PettingZoo's and
+    Gymnasium's own tests. Every exception of the model is a finding. The global generators of
+    Python and NumPy keep their states.
 
     Args:
         simulation: A simulation (which is copied), its class, or a zero-argument factory.

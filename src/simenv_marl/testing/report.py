@@ -83,6 +83,14 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
         negative or no number here. Let time() return the model's own clock, which only grows in
         an episode.""",
     ),
+    "hash_seed": (
+        "error",
+        "The same seed does not give the same run in another process",
+        """Python hashes strings differently in each process. So the order of a set of strings, or
+        of objects whose hash uses strings, differs, and so does hash(). Sort the set before
+        you iterate over it, or use a dict, whose order is that of insertion. Only setting
+        PYTHONHASHSEED would hide this.""",
+    ),
     "unrepeatable": (
         "error",
         "The same seed does not give the same run",

@@ -193,7 +193,7 @@ class Awaits(Walk):
         return 1
 
 
-@fault("warning", "yields values and returns none", "is 1", "it gets none under an action")
+@fault("warning", "yields values and returns none", ": -1", "it gets none under an action")
 class Yields(Walk):
     def run(self):
         for number in range(self.steps):
@@ -277,18 +277,28 @@ def test_overrides_that_are_points_or_call_super_are_sound():
     clean(check_simulation(SoundHerd, herd(Animal), episodes=2))
 
 
-@fault("note", "before run()", "in reset", "no environment is asked")
+@fault("warning", "before run()", "in reset", "no environment is asked")
 class DecidesEarly(Walk):
     def reset(self, seed=None):
         super().reset(seed)
         self.place = self.choose()
 
 
-@fault("note", "before run()", "in __init__")
+@fault("warning", "before run()", "in __init__")
 class DecidesWhenMade(Walk):
     def __init__(self):
         super().reset(1)
         self.first = self.choose()
+
+
+@fault("note", "while the model is made or reset", "in play", "a history that no agent")
+class HasAHistory(Walk):
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.play()
+
+    def play(self):
+        self.place = self.choose()
 
 
 # -- clocks ---------------------------------------------------------------------------------------

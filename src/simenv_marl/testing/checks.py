@@ -306,9 +306,10 @@ class Check(Runner):
             if self.fails(run, self.stage):
                 return
         first, *others = self.plain_runs.values()
-        if first.early:
-            calls = [f"{name} at {place}" for name, place in first.early.items()]
-            self.add("early_decisions", "; ".join(calls))
+        for name, place in first.early.items():
+            # A reset that calls more of the model may play its history, which no agent decides.
+            is_direct = place.endswith(("in reset", "in __init__"))
+            self.add("early_decisions" if is_direct else "history", place, point=name)
         if not any(run.calls for run in (first, *others)):
             points = ", ".join(point.hook.name for point in self.plan.active)
             self.add("no_decision", points=points)
@@ -347,20 +348,17 @@ class Check(Runner):
         self.run_plainly(self.seeds[0], run=watch)
         for kind in watch.overriding - watch.deciding:
             self.add("silent_override", kind=f"{kind.__module__}.{kind.__qualname__}")
-        for name, settings in watch.settings.items():
-            self.add("settings", ", ".join(settings), point=name)
-        for point in self.plan.active:
-            name = point.hook.name
-            if name in watch.yielded:
-                value = watch.yielded[name]
-                returns = name in watch.returning or not isinstance(value, (int, float, str, tuple))
-                finding = "waiting_rule" if returns or point.applies else "vanishing"
-                evidence = f"the first value that it yields is {short_repr(value)}"
-                if not self.apply_waits(point, self.seeds[0]):
-                    self.add(finding, evidence, point=name)
-            # An apply takes the place of the rule, with its effects.
-            elif name in watch.changes and not point.applies:
-                self.add("changing_rule", describe_differences(watch.changes[name]), point=name)
+        points = {point.hook: point for point in self.plan.active}
+        for (finding, hook), evidence in watch.found.items():
+            # An apply takes the place of the rule, with its effects, and may wait as well.
+            point = points.get(hook)
+            if point is None:
+                continue
+            fits = finding != "settings" and point.applies
+            if fits and finding != "changing_rule":
+                fits = self.apply_waits(point, self.seeds[0])
+            if not fits:
+                self.add(finding, evidence, point=hook.name)
 
     # -- environments with RULE throughout --------------------------------------------------------
 

@@ -185,10 +185,11 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
         may be a generator function, which yields them, too.""",
     ),
     "early_decisions": (
-        "note",
-        "Decisions are taken before run()",
-        """In a constructor or in reset(), the rule decides, and no environment is asked. Take these
-        decisions at the beginning of run(), unless they should be the rule's.""",
+        "warning",
+        "{point} decides before run()",
+        """In a constructor or in reset(), the rule decides, and no environment is asked. Take the
+        decision at the beginning of run(), or call another function if its rule should
+        decide.""",
     ),
     "settings": (
         "warning",
@@ -236,6 +237,12 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
         "Rewards at {point} are always zero",
         """Random actions never earned a reward, and rare rewards are hard to learn from. See the
         reward_mapping.""",
+    ),
+    "history": (
+        "note",
+        "{point} decides before run(), while the model is made or reset",
+        """There, the rule decides, and no environment is asked. This is right for a history that no
+        agent should decide. Else take these decisions in run().""",
     ),
     "unseeded_reset": (
         "note",

@@ -17,40 +17,34 @@ from inspect import getclosurevars
 from types import CodeType, FrameType, FunctionType
 
 from ..core import Plan
+from ..errors import short_repr
 from ..hooks.hook import Hook, hook_of, unbind
 from ..hooks.places import all_classes
 from ..hooks.stacks import Args, Kwargs, outside_simulation
 from ..simulation import Model
-from .fingerprint import STATE, Difference, Fingerprint, differences, fingerprint
+from .fingerprint import STATE, Fingerprint, describe_differences, differences, fingerprint
 from .runs import Rule, Run
 
 
 class Watch(Run):
-    """A plain run that watches the rules. Names are those of decision points.
+    """A plain run that watches the rules.
 
     Attributes:
-        changes: For each name, the differences that one decision of the rule has made in the model,
-            in its arguments, and in the variables that it uses.
-        yielded: The first value that the generator or coroutine of each name has yielded.
-        returning: The names of generators and coroutines that have returned a value.
-        settings: For each name, the settings that differ from those before the main loop.
-        overriding: Classes whose functions override a decision point and were called.
+        found: The evidence of findings, by their names in ``FINDINGS`` and by decision function.
+        overriding: Classes whose functions override a decision function and were called.
         deciding: The classes of the objects that have made decisions, with their base classes.
     """
 
     def __init__(self, state_of: Callable[[Model], Model] | None, plan: Plan) -> None:
         super().__init__(state_of)
-        self.changes: dict[str, list[Difference]] = {}
-        self.yielded: dict[str, Model] = {}
-        self.returning: set[str] = set()
-        self.settings: dict[str, list[str]] = {}
+        self.found: dict[tuple[str, Hook], str] = {}
         self.overriding: set[type] = set()
         self.deciding: set[type] = set()
         self._settings_before: dict[str, object] = {}
         self._overrides = {
             code: kind for point in plan.active for code, kind in _overrides(point.hook, plan)
         }
-        self._looked: defaultdict[str, float] = defaultdict(float)  # seconds, by name
+        self._looked: defaultdict[Hook, float] = defaultdict(float)  # seconds
 
     def run_main_loop(self, simulation: Model) -> None:
         """Run the main loop, and note calls of overriding functions."""
@@ -69,15 +63,14 @@ class Watch(Run):
 
     def decide(self, hook: Hook, args: Args, kwargs: Kwargs) -> Model:
         """Let the rule decide, and compare the model before and after."""
-        name = hook.name
         for owner in args[:1]:
             self.deciding.update(type(owner).__mro__)
         before = self._settings_before
-        changed = [key for key, value in _settings().items() if value != before.get(key, value)]
+        changed = [name for name, value in _settings().items() if value != before.get(name, value)]
         if changed:
-            self.settings[name] = changed
+            self.found["settings", hook] = ", ".join(changed)
         # Looks are slow, so that their time is limited.
-        is_watched = self._looked[name] < 1.0 and name not in self.changes
+        is_watched = self._looked[hook] < 1.0 and ("changing_rule", hook) not in self.found
         begin = time.process_time()
         steps = len(self.calls)
         parts = self._look(hook, args) if is_watched else {}
@@ -88,24 +81,30 @@ class Watch(Run):
             # Lazy values that libraries store do not change a model.
             changes = [c for c in changes if STATE not in c.path and "cache" not in c.path]
             if changes:
-                self.changes[name] = changes
-        self._looked[name] += time.process_time() - begin
+                self.found["changing_rule", hook] = describe_differences(changes)
+        self._looked[hook] += time.process_time() - begin
         return value
 
     def follow(self, hook: Hook, rule: Rule) -> Rule:
-        """Note the first value that a rule yields, and whether it returns one.
+        """Note whether a rule yields, and whether it returns a value.
 
         An error that the model raises in the rule ends it, because the run's result is not used.
         """
-        sent = None
+        value = sent = None
+        finding = ""
         while True:
             try:
                 value = rule.send(sent)
             except StopIteration as stop:
-                if stop.value is not None:
-                    self.returning.add(hook.name)
+                is_plain = isinstance(value, (int, float, str, tuple))
+                if finding and stop.value is None and is_plain:
+                    finding = "vanishing"
+                if finding:
+                    self.found[finding, hook] = (
+                        f"the last value that it yields: {short_repr(value)}"
+                    )
                 return stop.value
-            self.yielded.setdefault(hook.name, value)
+            finding = "waiting_rule"
             sent = yield value
 
     def _look(self, hook: Hook, args: Args) -> Fingerprint:

@@ -257,7 +257,7 @@ class Check(Runner):
             with suppress(Exception):  # the simulation may have no clock
                 evidence += f", at the simulated time {run.simulation.time():g}"
             if run.is_stuck:
-                self.add("stuck", f"{evidence} ({place_of(error)})")
+                self.add("stuck", f"{evidence} ({place_of(error) or 'in another thread'})")
             elif not self.is_late:  # else the end of the check adds it
                 self.add("out_of_time", evidence)
         # The joint view may be unable to know all agents.

@@ -167,11 +167,12 @@ def test_labels_may_be_made_for_each_call():
         )
     )
     assert parse(env, "2 of 5.0") == 2
-    bad = env_of(replace(FILL, action_labels=lambda tank: ["one"]))
-    with pytest.raises(
-        DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"
-    ):
-        describe(bad)
+    for labels in (["one"], {1: "one", 2: "two", 3: "three"}):
+        bad = env_of(replace(FILL, action_labels=lambda tank, labels=labels: labels))
+        with pytest.raises(
+            DefinitionError, match=r"labels of .*Tank.fill for a call are .*, which are not texts"
+        ):
+            describe(bad)
 
 
 SPACES = {

@@ -17,6 +17,7 @@ from functools import partial
 from typing import Unpack
 
 from ..core import CheckOptions, Point, Points, is_seed
+from ..envs import VIEWS
 from ..envs.single import plan_of
 from ..errors import OptionValueError, short_repr
 from ..simulation import Model
@@ -61,9 +62,10 @@ def check_simulation(
     """Check a simulation before its environments are used.
 
     The checks compare plain runs with runs of ``RULE`` throughout in every view that fits; episodes
-    of the same seed in new and used environments and side by side; and observations with their
-    spaces. They run PettingZoo's and Gymnasium's own tests. Every exception of the model is a
-    finding. The global generators of Python and NumPy keep their states.
+    of the same seed in new and used environments, side by side, and in new processes with other
+    hash seeds; and observations with their spaces. They watch the rules, and run PettingZoo's and
+    Gymnasium's own tests. Every exception of the model is a finding. The global generators of
+    Python and NumPy keep their states.
 
     Args:
         simulation: A simulation (which is copied), its class, or a zero-argument factory.
@@ -72,9 +74,9 @@ def check_simulation(
         episodes: The number of episodes of random legal actions.
         max_steps: The number of decisions after which a run is cut, so that the check also ends for
             models that never end.
-        time_limit: The approximate limit for all checks, in seconds; a single run may take a
-            quarter of it. Running Python code is interrupted; waiting outside of Python (in a
-            sleep, for example) is not.
+        time_limit: The limit for all checks, in seconds; a single run may take a quarter of it.
+            Running Python code is interrupted, in the main thread also a sleep; calculations
+            outside of Python are not.
         fingerprint: A callable of the simulation after a run, whose results are compared: numbers,
             arrays, strings, or containers of these. None: the simulation's ``state()``, or else all
             its attributes.
@@ -144,11 +146,11 @@ def inspect_simulation(
             lambda simulation: None,
         )
         run = runner.run_plainly(seed)
-        views = tuple(runner.fitting_views())
+        refused = runner.refused_views()
     return Inspection(
         simulation=runner.plan.name,
         points=tuple(map(_describe, runner.plan.active)),
-        views=views,
+        views=tuple(view for view in VIEWS if view not in refused),
         calls=order_of(run.calls),
         counts=dict(Counter(run.calls)),
         ended=f"{len(run.calls)} decisions, then {_describe_end(run)}",

@@ -35,23 +35,61 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
     "raises": (
         "error",
         "The simulation raises {kind}",
-        """The error comes from the model, from one of its mappings, or from the environment, which
-        refuses what they return. Learning code tries every action that is in the action space
+        """No mapping has raised it. Learning code tries every action that is in the action space
         and not masked: if an action causes the error, narrow the space or exclude the action
         with action_mask_mapping. If only a later episode fails, reset() must restore more.""",
+    ),
+    "mapping_raises": (
+        "error",
+        "{source} raises {kind}",
+        """The model may be right: its mapping raises the error, or returns a value that the
+        environment refuses. An environment calls mappings at each decision, and once more at
+        an agent's end, where the model may have changed: let the mapping serve there, too.
+        Labels are texts for each part of the space, or for actions in it.""",
     ),
     "stuck": (
         "error",
         "The simulation neither ends nor asks for a decision",
         """An environment would wait forever. Look for an endless loop, for a loop that waits for
         an event that some actions never cause, and for an except that catches everything,
-        including SimulationExit. If the model is only slow, raise time_limit=.""",
+        including SimulationExit. If the simulated time stands still, events cause each other
+        without a delay. If the model is only slow, raise time_limit=.""",
     ),
     "no_decision": (
         "error",
         "The simulation never asks for a decision",
         """run() never calls {points}. Does it call an earlier reference instead of the attribute
         of a class or module?""",
+    ),
+    "silent_override": (
+        "error",
+        "{kind} overrides a decision point, and its objects are no agents",
+        """The model calls the overriding function, which is no decision point: its own code
+        decides, and no environment is asked. Decorate it with make_step, or add it to points,
+        too. If the subclass only extends the function, call super() in it. If its objects
+        should not be agents, give their function another name.""",
+    ),
+    "standing_clock": (
+        "error",
+        "The simulated time stands still while agents decide",
+        """The same agents decide again and again at one time, and the episode never ends. Look for
+        a loop that waits for a decision which changes nothing, and for events without a
+        delay. If the model is right, time() should tell these decisions apart.""",
+    ),
+    "backward_clock": (
+        "error",
+        "The simulated time goes back",
+        """Infos, discounts and planners use the time elapsed since the previous decision, which is
+        negative or no number here. Let time() return the model's own clock, which only grows in
+        an episode.""",
+    ),
+    "hash_seed": (
+        "error",
+        "The same seed does not give the same run in another process",
+        """Python hashes strings differently in each process. So the order of a set of strings, or
+        of objects whose hash uses strings, differs, and so does hash(). Sort the set before
+        you iterate over it, or use a dict, whose order is that of insertion. Only setting
+        PYTHONHASHSEED would hide this.""",
     ),
     "unrepeatable": (
         "error",
@@ -94,6 +132,13 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
         "{test} fails",
         """Learning libraries rely on the properties that it tests.""",
     ),
+    "not_finite": (
+        "error",
+        "Observations at {point} contain NaN or infinite numbers",
+        """One such number spoils all weights of a network. Look for a division by zero, the mean of
+        nothing, or a missing value in the observation_space_mapping, and return a number for
+        it.""",
+    ),
     "outside": (
         "error",
         "Observations at {point} lie outside their space",
@@ -113,6 +158,53 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
         """In an environment the simulation holds values that it does not hold in a plain run,
         though its decisions are the same. Keep such values outside the model; difference()
         computes changes since the last decision.""",
+    ),
+    "changing_rule": (
+        "warning",
+        "The rule of {point} changes the model by deciding",
+        """An action takes the place of the rule, so that the model changes under RULE and not under
+        actions. Let the function only choose, and its caller change the model. Or give the
+        definition apply= in place of action_space_mapping=: it gets the action and makes the
+        changes of the rule, too. If a change is harmless, as that of a log, leave it out by
+        fingerprint=.""",
+    ),
+    "waiting_rule": (
+        "warning",
+        "The rule of {point} takes time, an action takes none",
+        """The rule waits before it decides, and an action skips the wait. Wait outside of the
+        decision function, or give the definition apply= in place of action_space_mapping=:
+        apply may be a generator or coroutine function, which waits as the rule does and returns
+        the decision.""",
+    ),
+    "vanishing": (
+        "warning",
+        "The rule of {point} yields values and returns none",
+        """The decision of a generator function is the value that it returns. If the caller iterates
+        over decisions that it yields, it gets none under an action: make one call for each
+        decision, or return a list of them. If it yields delays, an action skips them: apply=
+        may be a generator function, which yields them, too.""",
+    ),
+    "early_decisions": (
+        "warning",
+        "{point} decides before run()",
+        """In a constructor or in reset(), the rule decides, and no environment is asked. Take the
+        decision at the beginning of run(), or call another function if its rule should
+        decide.""",
+    ),
+    "settings": (
+        "warning",
+        "{point} decides under settings that the model has changed",
+        """While an environment waits for an action, the model stays in its with block, and the
+        settings of the process hold for your training code, too: its warnings and output
+        vanish, its gradients, or its relative paths. Leave the block before the decision:
+        compute in the block, decide after it. Each thread has a grad mode of torch, so the
+        option driver="thread" separates that.""",
+    ),
+    "same_observations": (
+        "warning",
+        "Observations at {point} are always the same",
+        """Agents see nothing of the model. Does the observation_space_mapping read an old copy, or
+        an attribute that never changes?""",
     ),
     "warned": (
         "warning",
@@ -145,6 +237,12 @@ FINDINGS: Final[dict[str, tuple[Severity, str, str]]] = {
         "Rewards at {point} are always zero",
         """Random actions never earned a reward, and rare rewards are hard to learn from. See the
         reward_mapping.""",
+    ),
+    "history": (
+        "note",
+        "{point} decides before run(), while the model is made or reset",
+        """There, the rule decides, and no environment is asked. This is right for a history that no
+        agent should decide. Else take these decisions in run().""",
     ),
     "unseeded_reset": (
         "note",

@@ -10,6 +10,7 @@ import ctypes
 import io
 import os
 import random
+import signal
 import sys
 import threading
 import time
@@ -21,10 +22,10 @@ from collections.abc import (
     Iterable,
     Iterator,
 )
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
 from datetime import date, datetime
-from functools import cached_property, partial
+from functools import cached_property, partial, wraps
 from itertools import islice
 from textwrap import shorten
 from types import FrameType, coroutine
@@ -39,16 +40,18 @@ from ..core import (
     GlobalRandom,
     LoopExit,
     Plan,
+    Point,
+    Where,
     environment_context,
     global_states,
     preserve_generators,
 )
 from ..envs import VIEWS, SimulationAECEnv
 from ..envs.base import StepResult
-from ..errors import describe_error, error_notes
+from ..errors import describe_error, error_notes, error_text
 from ..hooks.handlers import Installation
 from ..hooks.hook import Hook
-from ..hooks.stacks import outside_simulation, stack_of
+from ..hooks.stacks import Args, Kwargs, outside_simulation, stack_of
 from ..simulation import (
     RULE,
     TRUNCATED,
@@ -64,28 +67,42 @@ _WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appe
 """Texts of the warnings that are findings."""
 
 
+Rule = Generator[Model, Model, Model]
+"""The rule of a generator or coroutine function, while it runs."""
+
+
 class LimitReached(LoopExit):
     """Ends a run that has reached its limit of decisions or of time."""
+
+
+def _raise_limit(number: int, frame: FrameType | None) -> NoReturn:
+    raise LimitReached
 
 
 def call_within(seconds: float, function: Callable[[], object]) -> None:
     """Call a function, and raise ``LimitReached`` in it after a time.
 
-    This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted
+    In the main thread, a signal interrupts a sleep, too. In other threads, a sleep is interrupted
     when it returns.
     """
     thread = threading.get_ident()
     over = threading.Event()
+    is_main = threading.current_thread() is threading.main_thread()
+    urgent = getattr(signal, "SIGURG", None) if is_main else None  # not on Windows
 
     def watch() -> None:
         pause = seconds
         while not over.wait(pause):
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(
-                ctypes.c_ulong(thread), ctypes.py_object(LimitReached)
-            )
+            if urgent is None:
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(
+                    ctypes.c_ulong(thread), ctypes.py_object(LimitReached)
+                )
+            else:
+                signal.pthread_kill(thread, urgent)
             pause = 0.5  # then again, because the model may swallow it
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
+    handler = None if urgent is None else signal.signal(urgent, _raise_limit)
     try:
         watcher.start()
         function()
@@ -98,6 +115,8 @@ def call_within(seconds: float, function: Callable[[], object]) -> None:
                 watcher.join()
                 for _ in range(10):
                     pass
+                if urgent is not None:
+                    signal.signal(urgent, handler or signal.SIG_DFL)
                 break
             except LimitReached:
                 continue
@@ -155,6 +174,8 @@ class Run:
         error: The exception that ended the run, unless the limit of decisions did.
         is_stuck: Whether the last step began long before that exception.
         draws: The global generators that the run has used, by name.
+        early: The places where a plain run called decision points before its main loop, by name.
+        times: The times of the simulation at the decisions of an episode, if it has a clock.
     """
 
     def __init__(self, state_of: Callable[[Model], Model] | None = None) -> None:
@@ -164,7 +185,7 @@ class Run:
             state_of: A function of the simulation whose results are compared. None: the ``state()``
                 of the simulation, or else all its attributes.
         """
-        self._state_of = state_of
+        self.state_of = state_of
         self.simulation: Model = None
         self.calls: list[str] = []
         self.parts: Fingerprint = {}
@@ -176,6 +197,8 @@ class Run:
         self.error: BaseException | None = None
         self.is_stuck = False
         self.draws: set[str] = set()
+        self.early: dict[str, str] = {}
+        self.times: list[float] = []
         self._step_began = time.monotonic()
 
     def play(
@@ -221,11 +244,11 @@ class Run:
         self,
         env: SimulationAECEnv,
         seed: int,
-        skipped: int = 0,
+        drawn: int = 1,
     ) -> Iterator[None]:
         """Play an episode with random legal actions, and yield before each step.
 
-        ``skipped`` random actions before each step are not used.
+        The last of ``drawn`` random actions is used at each step; without any, ``RULE``.
         """
         env.reset(seed=seed)  # which also seeds the spaces of the actions
         for name in env.agent_iter():
@@ -237,11 +260,25 @@ class Run:
             self.end = "truncated" if truncated else "terminated"
             action = None
             if not (terminated or truncated):
-                for _ in range(1 + skipped):
+                action = RULE
+                for _ in range(drawn):
                     action = env.action_space(name).sample(info.get(MASK))
                 self.actions.append(action)
+                if "time" in info:
+                    self.times.append(info["time"])
+                agent.describe(seed, Where.USER)  # which raises an error if labels do not fit
             yield
             env.step(action)
+
+    # -- plain runs -------------------------------------------------------------------------------
+
+    def decide(self, hook: Hook, args: Args, kwargs: Kwargs) -> Model:
+        """Let the rule decide in a plain run."""
+        return hook.function(*args, **kwargs)
+
+    def follow(self, hook: Hook, rule: Rule) -> Rule:
+        """Return the rule of a generator or coroutine function, as the run follows it."""
+        return rule
 
     def begin_step(self, name: str) -> str:
         """Record the call of a decision point or agent; return the name of its step."""
@@ -261,8 +298,8 @@ class Run:
         with outside_simulation():  # decision functions run their rule here
             simulation = self.simulation
             state = optional_method(simulation, "state")
-            if self._state_of is not None:
-                self.parts |= fingerprint("fingerprint", self._state_of(simulation))
+            if self.state_of is not None:
+                self.parts |= fingerprint("fingerprint", self.state_of(simulation))
             elif state is not None:
                 self.parts |= fingerprint("state()", state())
             else:
@@ -304,25 +341,26 @@ class Runner:
         plan = self.plan.amended(options)
         return VIEWS[view](plan)
 
-    def fitting_views(self) -> list[str]:
-        """Return the views that the plan allows."""
-        views = []
+    def refused_views(self) -> dict[str, str]:
+        """Return the reasons why the plan does not allow a view, by view."""
+        refused = {}
         for view in VIEWS:
-            # The view may refuse the plan, or reset the model, which may raise anything.
-            with suppress(Exception):
+            try:
                 self.make_environment(view).close()
-                views.append(view)
-        return views
+            # The view may refuse the plan, or reset the model, which may raise anything.
+            except Exception as error:
+                refused[view] = error_text(error)
+        return refused
 
     def call(self, function: Callable[[], object]) -> Run:
         """Call a function within the time limit."""
         return Run().play(function, self.seconds)
 
-    def run_plainly(self, seed: int, global_seed: int | None = None) -> Run:
+    def run_plainly(self, seed: int, global_seed: int | None = None, run: Run | None = None) -> Run:
         """Run the simulation's own loop, with the plan's handlers and generators.
 
-        Records the decisions of the rules. The global generators get the same seed, or
-        ``global_seed``.
+        Records the decisions of the rules, in a new ``run`` if none is given. The global generators
+        get the same seed, or ``global_seed``.
         """
 
         def start(run: Run) -> None:
@@ -338,14 +376,14 @@ class Runner:
             finally:
                 installation.uninstall()
 
-        return self.record_rules(start, seed if global_seed is None else global_seed)
+        return self.record_rules(start, seed if global_seed is None else global_seed, run)
 
-    def record_rules(self, start: Callable[[Run], None], seed: int) -> Run:
+    def record_rules(self, start: Callable[[Run], None], seed: int, run: Run | None = None) -> Run:
         """Play a run, and record the decisions of the rules.
 
         ``start`` plays it.
         """
-        run = Run(self.state_of)
+        run = run or Run(self.state_of)
         hooks = {point.hook for point in self.plan.points}
         for hook in hooks:
             hook.replace_rule(self._recording_rule(hook, run))
@@ -362,17 +400,20 @@ class Runner:
             stack = stack_of(getcurrent())
             # Calls in a reset or a mapping are no decisions.
             if not (run.in_main_loop if stack is None else stack.events):
+                if run.simulation is None:
+                    run.early[hook.name] = _innermost(traceback.extract_stack(), _PACKAGE)
                 return hook.function(*args, **kwargs)
             if len(run.calls) >= self.max_steps:
                 run.stop()
             step = run.begin_step(hook.name)
-            value = hook.function(*args, **kwargs)
+            value = run.decide(hook, args, kwargs)
             if hook.kind == "function":
                 return run.end_step(step, value)
-            return wait(step, value.__await__() if hook.kind == "coroutine" else value)
+            rule = value.__await__() if hook.kind == "coroutine" else value
+            return wait(step, run.follow(hook, rule))
 
         @coroutine
-        def wait(step: str, rule: Generator[Model, Model, Model]) -> Generator[Model, Model, Model]:
+        def wait(step: str, rule: Rule) -> Rule:
             return run.end_step(step, (yield from rule))
 
         return decide
@@ -382,7 +423,7 @@ class Runner:
         env: SimulationAECEnv,
         seed: int,
         *,
-        skipped: int = 0,
+        drawn: int = 1,
         most: int | None = None,
         beside: SimulationAECEnv | None = None,
     ) -> Run:
@@ -391,7 +432,7 @@ class Runner:
         Args:
             env: The environment.
             seed: The seed of the episode and its actions.
-            skipped: Another number gives other actions with the same seed.
+            drawn: Another number gives other actions with the same seed; 0 gives ``RULE``.
             most: The number of steps after which the episode is broken off.
             beside: Another environment, which is stepped in turns with this one.
         """
@@ -399,10 +440,31 @@ class Runner:
 
         def start() -> None:
             other = iter(()) if beside is None else Run().play_randomly(beside, seed + 1)
-            for _ in islice(run.play_randomly(env, seed, skipped), most):
+            for _ in islice(run.play_randomly(env, seed, drawn), most):
                 next(other, None)
 
         return run.play(start, self.seconds, seed)
+
+    def apply_waits(self, point: Point, seed: int) -> bool:
+        """Return whether actions at a point take time, because ``apply`` waits.
+
+        If it is not called in an episode of random actions, that is not known, and true.
+        """
+        apply = point.definition.apply
+        if apply is None:
+            return False
+        waits: set[bool] = set()
+
+        @wraps(apply)
+        def record(*args: Model, **kwargs: Model) -> Model:
+            result = apply(*args, **kwargs)
+            waits.add(hasattr(result, "send") or hasattr(result, "__await__"))
+            return result
+
+        plan = self.plan.redefined(point.hook, replace(point.definition, apply=record))
+        env = SimulationAECEnv(plan.amended({"max_steps": self.max_steps}))
+        self.run_randomly(env, seed)
+        return waits != {False}
 
     def sources_of_chance(self, seed: int) -> str:
         """Return where a plain run uses clocks, entropy and the global generators; or nothing."""

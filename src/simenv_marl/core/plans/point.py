@@ -308,7 +308,8 @@ class Point:
         if callable(labels):
             labels = self._calls[name](*args, **kwargs)
             # Labels of a Discrete may leave out the illegal actions of this call.
-            is_partial = isinstance(labels, Mapping) and isinstance(space, gym_spaces.Discrete)
+            is_partial = isinstance(space, gym_spaces.Discrete) and isinstance(labels, Mapping)
+            is_partial = is_partial and labels.keys() <= set(parts_of(space) or ())
             if not is_partial and not fit_labels(space, labels):
                 raise DefinitionError(
                     f"the labels of {self.hook.name} for a call are {short_repr(labels)}, which are"

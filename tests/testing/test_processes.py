@@ -1,0 +1,54 @@
+"""The check repeats a run in new processes, where sets of strings have another order."""
+
+import os
+import subprocess
+import sys
+import threading
+
+from simenv_marl.testing import check_simulation
+from tests.worlds import sets
+
+
+def checked(simulation, **changes):
+    return check_simulation(simulation, sets.points(simulation, **changes), episodes=2, seeds=[4])
+
+
+def test_runs_that_depend_on_the_hashes_of_strings_are_errors():
+    for model in (sets.Unordered, sets.Noted, sets.Hashed):
+        (seen,) = checked(model).of("error")
+        assert seen.title.endswith("not give the same run in another process")
+        assert "Sort the set" in seen.explanation
+        assert "seed 4" in seen.evidence
+
+
+def test_sets_that_are_sorted_and_values_of_a_process_are_sound():
+    report = checked(sets.Ordered)
+    assert not report.of("error")
+    assert any("four hash seeds" in line for line in report.checked)
+
+
+def test_a_model_that_cannot_be_pickled_is_left_out_with_the_reason():
+    lock = threading.Lock()
+    report = checked(sets.Walk, reward_mapping=lambda walk: walk.place + lock.locked())
+    assert report.ok
+    assert "runs with other hash seeds, because TypeError: cannot pickle" in str(report.checked)
+
+
+def test_a_script_without_a_main_guard_can_be_checked(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from tests.testing.test_processes import checked, sets\n"
+        "class Unordered(sets.Walk):\n"
+        "    names = {*sets.NAMES}\n"
+        "print(checked(Unordered))\n"
+    )
+    paths = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.count("What was checked") == 1, done.stderr
+    assert "another process" in done.stdout

@@ -14,6 +14,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 
 from ..core import (
+    Episode,
     EpisodeOptions,
     Mode,
     Plan,
@@ -199,9 +200,9 @@ def _play(
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)
 
-    def finish(place: int, simulation: Model) -> None:
+    def finish(place: int, episode: Episode) -> None:
         if collect is not None:
-            collected[place] = collect(simulation)
+            collected[place] = collect(episode.simulation)
         bar.update()
 
     seeds = [seed for _, seed in episodes]

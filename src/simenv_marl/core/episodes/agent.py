@@ -507,8 +507,6 @@ class Agent:
         """Set the reward to 0.0, and the info to one without an observation. The last one stays."""
         self.reward = 0.0
         self.present = False
-        if self.observation is not None:  # users may have changed the one that they got
-            self.observation = duplicate(self.observation)
         if self.clock is None:
             self.info = {}
         else:

@@ -386,11 +386,12 @@ class Episode(EpisodeState):
                 return WAIT
         else:
             self.consulted = agent
+            observation = duplicate(agent.observation)  # which the policy may change
             try:
                 if isinstance(policy, EpisodePolicy):
-                    action = policy.answer(self, agent, agent.observation, agent.info)
+                    action = policy.answer(self, agent, observation, agent.info)
                 else:
-                    action = policy(agent.observation, agent.info)
+                    action = policy(observation, agent.info)
             finally:
                 self.consulted = None
         self.record(action)

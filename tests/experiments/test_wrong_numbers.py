@@ -6,7 +6,8 @@ import warnings
 import numpy as np
 import pytest
 
-from simenv_marl import evaluate, simulate
+from simenv_marl import RULE, evaluate, simulate
+from simenv_marl.data import collect_episodes
 from simenv_marl.experiments import run_experiment
 from tests.worlds.models import Script, decision, define
 
@@ -201,3 +202,14 @@ def test_the_warning_itself_comes_once() -> None:
         simulate(Fresh, points=BET, seed=1)
         fates(Fresh, BET)
     assert len([one for one in caught if "global generator" in str(one.message)]) == 1
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_trajectories_tell_which_episodes_are_wrong(workers) -> None:
+    policies = {"gambler": RULE}
+    for _ in range(2):
+        found = collect_episodes(Casino, policies, seeds=SEEDS, points=BET, workers=workers)
+        assert all("global_rng=True" in error for error in found["gambler"].errors)
+        assert len(found["gambler"].errors) == len(SEEDS)
+    fine = collect_episodes(Casino, policies, seeds=SEEDS, points=BET, global_rng=True)
+    assert fine["gambler"].errors == ("", "", "")

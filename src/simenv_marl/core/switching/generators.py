@@ -80,12 +80,14 @@ def draws_check(
         is_known = _CHECKED.setdefault(kind, False)
         after = global_states()
         names = [name for name, state in after.items() if state != states[name]]
+        if not names:
+            return ""
         is_alone = all(
             thread is current_thread() or thread.name == SIMULATION
             for thread in enumerate_threads()
         )
         is_idle = not in_thread and _time_of_other_threads() - time_before < _SHORT
-        if not names or not (is_alone or is_idle or is_known):
+        if not (is_alone or is_idle or is_known):
             return ""
         problem = (
             f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which"
@@ -105,6 +107,11 @@ def _has_drawn(before: Model, after: Model) -> bool:
     """Return whether draws alone lead from one state to another: the generator was not seeded."""
     if isinstance(after, str):  # of a generator of the user
         return True
+    if len(after) == 2:  # of NumPy
+        before, after = (
+            (3, (*np.frombuffer(key, np.uint32).tolist(), place), None)
+            for key, place in (before, after)
+        )
     generator = random.Random()
     generator.setstate(before)
     for _ in range(_MOST_REFILLS):
@@ -122,9 +129,8 @@ def _time_of_other_threads() -> int:
 def global_states() -> dict[str, object]:
     """Return values that change when Python's or NumPy's global generator draws a number."""
     state = LEGACY.get_bit_generator().state["state"]
-    of_numpy: object = repr(state)
-    if "key" in state:  # the same algorithm as Python's
-        of_numpy = (3, (*state["key"].tolist(), state["pos"]), None)
+    is_mersenne = "key" in state  # as Python's
+    of_numpy = (state["key"].tobytes(), state["pos"]) if is_mersenne else repr(state)
     return {"random": random.getstate(), "numpy.random": of_numpy}
 
 

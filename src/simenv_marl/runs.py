@@ -5,6 +5,7 @@ from itertools import chain
 from typing import Any, Unpack
 
 from .core import (
+    Episode,
     EpisodeOptions,
     Mode,
     Plan,
@@ -162,7 +163,8 @@ def _simulate(
     """Simulate some of the seeds, in this process."""
     results: list[Model] = [None] * len(seeds)
 
-    def finish(place: int, simulation: Model) -> None:
+    def finish(place: int, episode: Episode) -> None:
+        simulation = episode.simulation
         results[place] = simulation if collect is None else collect(simulation)
         bar.update()
 

@@ -1,14 +1,17 @@
 """Spaces: observations are cast to them, and actions and masks are checked against them."""
 
 import copy
+from collections import deque
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 
+from simenv_marl import single_env
 from simenv_marl.core.values.actions import ILLEGAL, action_check, mask_allows, mask_cast, open_mask
 from simenv_marl.core.values.spaces import blank, duplicate, observation_cast, same
-from simenv_marl.errors import MaskError, ObservationError
+from simenv_marl.errors import InvalidActionError, MaskError, ObservationError
+from tests.worlds.models import calling, decision
 
 BOX = spaces.Box(-1.0, 3.0, (2,), np.float32)
 BYTES = spaces.Box(0, 255, (2,), np.uint8)
@@ -17,6 +20,12 @@ DIALS = spaces.MultiDiscrete([2, 3], start=[0, 4])
 BITS = spaces.MultiBinary(3)
 TREE = spaces.Dict({"box": BOX, "pair": spaces.Tuple((DIAL, spaces.Dict({"bits": BITS})))})
 WORDS = spaces.Text(5)
+SWITCHES = spaces.Box(0, 1, (2,), bool)
+ROW = spaces.Sequence(BOX)
+STACK = spaces.Sequence(BOX, stack=True)
+EITHER = spaces.OneOf((DIAL, BOX, SWITCHES))
+NET = spaces.Graph(BOX, spaces.Discrete(4))
+DEEP = spaces.Dict({"row": spaces.Sequence(spaces.Tuple((EITHER, ROW)))})
 
 
 def assert_alike(one, other):
@@ -39,6 +48,26 @@ def assert_alike(one, other):
             TREE,
             {"pair": [6.0, {"bits": [True, False, False]}], "box": [1, 2]},
             {"box": np.float32([1, 2]), "pair": (np.int64(6), {"bits": np.int8([1, 0, 0])})},
+        ),
+        (SWITCHES, [True, 0.0], np.array([True, False])),
+        (ROW, [], ()),
+        (ROW, deque([[1, 2], np.array([3.0, 9.0])]), (np.float32([1, 2]), np.float32([3, 9]))),
+        (STACK, [[1, 2], (3, 4)], np.float32([[1, 2], [3, 4]])),
+        (STACK, np.ones((3, 2)), np.ones((3, 2), np.float32)),
+        (EITHER, [1, [1, 2]], (np.int64(1), np.float32([1, 2]))),
+        (EITHER, (np.int64(2), [1, 0]), (np.int64(2), np.array([True, False]))),
+        (NET, ([[1, 2]], None, None), spaces.GraphInstance(np.float32([[1, 2]]), None, None)),
+        (
+            NET,
+            ([[1, 2], [3, 9]], [3.0, 0], [[0, 1], [1, 1]]),
+            spaces.GraphInstance(
+                np.float32([[1, 2], [3, 9]]), np.array([3, 0]), np.array([[0, 1], [1, 1]])
+            ),
+        ),
+        (
+            DEEP,
+            {"row": [((0, 7.0), [[1, 2]])]},
+            {"row": (((np.int64(0), np.int64(7)), (np.float32([1, 2]),)),)},
         ),
     ],
     ids=str,
@@ -64,6 +93,20 @@ def test_observations_are_cast(space, value, expected):
         (TREE, {"box": [1, 2], "pair": [6]}, "2 parts"),
         (TREE, {"box": [1, 2], "pair": {0: 6, 1: 7}}, "2 parts"),
         (WORDS, "too many words", "not in"),
+        (SWITCHES, [0.5, 1], "numbers but 0 and 1"),
+        (TREE, {"box": [1, 2], "pair": [6, {"bits": [1]}]}, r"'pair'.*'bits'.*shape \(1,\)"),
+        (ROW, [[1, 2], [3, 4, 5]], r"in the element 1: .* shape \(3,\)"),
+        (ROW, 3, "must have exactly the parts"),
+        (spaces.Sequence(WORDS), "abc", "must have exactly the parts"),
+        (EITHER, (3, [1, 2]), "must have exactly the parts"),
+        (EITHER, (-1, [1, 0]), "must have exactly the parts"),
+        (EITHER, (0, 6.5), "in the element 0: .* must be an integer"),
+        (NET, ([[1, 2, 3]], None, None), "in the element 'nodes': .*shape"),
+        (NET, ([[1, 2]], [1], [[0, 1]]), "pairs of the numbers of nodes"),
+        (NET, ([[1, 2]], [1], [[0]]), "in the element 'edge_links': .*shape"),
+        (NET, ([[1, 2]], ["x"], [[0, 0]]), "in the element 'edges': .*not numeric"),
+        (NET, ([[1, 2]], None, [[0, 0]]), "pairs of the numbers of nodes"),
+        (DEEP, {"row": [((1, [0, 1]), [[1]])]}, "'row'.* 0: .* 1: .* 0: .*shape"),
     ],
     ids=str,
 )
@@ -232,6 +275,85 @@ def test_an_action_with_an_illegal_part_is_illegal(change, clips):
     check = action_check(TREE, clips=clips)
     assert check(action) is not ILLEGAL
     assert check({**action, **change}) is ILLEGAL
+
+
+@pytest.mark.parametrize(
+    ("space", "action", "expected"),
+    [
+        (SWITCHES, [True, False], np.array([True, False])),
+        (SWITCHES, np.array([1, 0]), np.array([True, False])),
+        (ROW, [[1, 2], np.array([3.0, 0.0])], (np.float32([1, 2]), np.float32([3, 0]))),
+        (STACK, [[1, 2]], np.float32([[1, 2]])),
+        (EITHER, [0, np.int8(6)], (np.int64(0), 6)),
+        (EITHER, (2, [1, 0]), (np.int64(2), np.array([True, False]))),
+        (
+            NET,
+            ([[1, 2]], [3], [[0, 0]]),
+            spaces.GraphInstance(np.float32([[1, 2]]), np.array([3]), np.array([[0, 0]])),
+        ),
+        (
+            DEEP,
+            {"row": [((0, 7), [[1, 2]])]},
+            {"row": (((np.int64(0), 7), (np.float32([1, 2]),)),)},
+        ),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("clips", [False, True])
+def test_items_of_actions_are_checked_like_actions(space, action, expected, clips):
+    assert_alike(action_check(space, clips=clips)(action), expected)
+
+
+@pytest.mark.parametrize(
+    ("space", "action", "match"),
+    [
+        (SWITCHES, [2, 0], r"\[2, 0\] is not in Box"),
+        (TREE, {"box": [0.5, np.nan], "pair": (6, {"bits": np.int8([0] * 3)})}, "'box': .* Box"),
+        (ROW, [[1, 2], [1, 4]], r"in the element 1: \[1, 4\] is not in Box"),
+        (STACK, [[1, 4]], r"\[\[1, 4\]\] is not in Box"),
+        (EITHER, (0, 9), "in the element 0: 9 is not in Discrete"),
+        (EITHER, (7, 9), "is not in OneOf"),
+        (NET, ([[1, 2]], [3], [[0, 1]]), "in the element 'edge_links'"),
+        (DEEP, {"row": [((0, 7), [[1, 2], "x"])]}, "'row': .* 0: .* 1: .* 1: 'x' is not in Box"),
+    ],
+    ids=str,
+)
+def test_refused_actions_name_the_illegal_element(space, action, match):
+    assert action_check(space)(action) is ILLEGAL
+    with pytest.raises(InvalidActionError, match=match):
+        action_check(space, raises=True)(action)
+    env = single_env(calling(decide := decision(agent="a", action_space=space)), decide)
+    env.reset()
+    with pytest.raises(InvalidActionError, match=match if "element" in match else "action space"):
+        env.step(action)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        SWITCHES,
+        spaces.Box(0, 1, (1,), bool),
+        spaces.Box(0, 1, (), bool),
+        ROW,
+        STACK,
+        EITHER,
+        NET,
+        DEEP,
+        spaces.Graph(spaces.Dict(a=DIAL), spaces.Tuple((BOX, SWITCHES))),
+        spaces.Sequence(spaces.Dict(a=BOX, b=DIAL), stack=True),
+        spaces.Sequence(WORDS),
+    ],
+    ids=str,
+)
+def test_samples_are_legal_actions_and_observations(space):
+    space.seed(1)
+    for _ in range(20):
+        sample = space.sample()
+        for convert in (observation_cast(space), action_check(space)):
+            found = convert(sample)
+            assert same(found, sample)
+            assert space.contains(found)
+    assert observation_cast(space)(blank(space)) in space
 
 
 def test_other_spaces_are_asked_themselves_and_actions_are_copied():

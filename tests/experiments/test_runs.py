@@ -464,9 +464,10 @@ def visits(days=2):
     """Two beings decide each day, and a late one on the fifth day alone, and not with seed 0."""
 
     def main(simulation):
+        simulation.beings = list(map(Being, range(5)))
         for day in range(days):
             for number in (0, 1, *((4,) if day == 4 and simulation.seed else ())):
-                Being(number).act()
+                simulation.beings[number].act()
 
     return Script(main)
 

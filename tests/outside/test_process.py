@@ -373,3 +373,65 @@ def test_options_of_a_simulation_that_are_none_are_refused():
                 {"reservoir.inflow": replace(INFLOW, reward_mapping=lambda call: call.depth)}
             )
         ).reset()
+
+
+TANKS = """
+import json, os
+reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
+commands = os.fdopen(reading)
+
+def send(frame):
+    os.write(writing, json.dumps(frame).encode() + b"\\n")
+
+send({"hello": 1, "points": ["tank", "other"], "can": ["expect"]})
+for line in commands:
+    if "start" not in json.loads(line):
+        continue
+    for frame in FIRST:
+        send(frame)
+    for number in (1, 2, 3):
+        send({"decide": number, "point": "tank", "entity": "a", "time": 0.5 * number, "args": {}})
+        if "stop" in json.loads(commands.readline()):
+            break
+    else:
+        send({"end": {}})
+"""
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        [{"expect": [{"point": "tank", "entity": "b", "args": {}}]}],
+        [{"expect": [{"point": "tank", "entity": "b"}]}, {"remove": "b", "point": "tank"}],
+        [{"update": "a", "point": "tank", "args": {}}, {"update": "a", "point": "other"}],
+        [{"expect": []}],
+        [{"expect": [{"point": "tank", "entity": "a", "time": 0.25}]}],
+        [],
+    ],
+    ids=str,
+)
+def test_an_episode_has_its_clock_whatever_its_first_frame_is(first):
+    seen = []
+
+    def observe(call):
+        seen.append((call.entity, call.time))
+        return [0.0]
+
+    definition = make_step(
+        observation_space=spaces.Box(-1, 1, (1,), np.float64),
+        observation_space_mapping=observe,
+        action_space=spaces.Discrete(2),
+        action_space_mapping=int,
+        reward_mapping=lambda call: 1.0,
+        agent=lambda call: call.entity,
+    )
+    source = f"FIRST = {first!r}{TANKS}"
+    simulation = ProcessSimulation([sys.executable, "-c", source], {"tank": definition})
+    env = single_env(simulation, agent="a", discount_rate=1.0)
+    for _ in range(2):
+        infos = [env.reset(seed=1)[1], *(env.step(0)[-1] for _ in range(3))]
+        assert [info["time"] for info in infos] == [0.5, 1.0, 1.5, 1.5]
+        assert [info["elapsed"] for info in infos] == [0.0, 0.5, 0.5, 0.0]
+        assert infos[1]["discount"] == pytest.approx(np.exp(-0.5))
+    assert set(seen) >= {("a", 0.5), ("a", 1.0), ("a", 1.5)}
+    env.close()

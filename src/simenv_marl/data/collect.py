@@ -14,6 +14,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 
 from ..core import (
+    Episode,
     EpisodeOptions,
     Mode,
     Plan,
@@ -130,9 +131,10 @@ def collect_episodes(
         parts = spread(_play, arguments, list(enumerate(seed_list)), workers, batch_size, bar)
     collected = None
     if collect is not None:
-        collected = tuple(chain.from_iterable(values for _, values in parts))
+        collected = tuple(chain.from_iterable(values for _, values, _ in parts))
+    errors = tuple(chain.from_iterable(texts for *_, texts in parts))
     return {
-        key: combine([records[place] for records, _ in parts], tuple(seed_list), collected)
+        key: combine([records[place] for records, *_ in parts], tuple(seed_list), collected, errors)
         for place, key in enumerate(policies)
     }
 
@@ -190,23 +192,25 @@ def _play(
     concurrency: int,
     episodes: list[tuple[int, int]],
     bar: Any,
-) -> tuple[list[Records], list[Any]]:
+) -> tuple[list[Records], list[Any], list[str]]:
     """Play episodes, given as pairs of number and seed.
 
-    Return the records of each policy, and the result of ``collect`` for each episode.
+    Return the records of each policy, and the result of ``collect`` and the error of each episode.
     """
     plan = make_plan()
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)
+    errors = [""] * len(episodes)
 
-    def finish(place: int, simulation: Model) -> None:
+    def finish(place: int, episode: Episode) -> None:
+        errors[place] = episode.fault
         if collect is not None:
-            collected[place] = collect(simulation)
+            collected[place] = collect(episode.simulation)
         bar.update()
 
     seeds = [seed for _, seed in episodes]
     BatchRun(plan, seeds, batch_size, finish, recorder, concurrency).run()
-    return recorder.records(plan, keys), collected
+    return recorder.records(plan, keys), collected, errors
 
 
 # -- mixtures -------------------------------------------------------------------------------------

@@ -116,6 +116,8 @@ class Trajectories:
             vary with the call.
         collected: The result of ``collect`` for each episode's simulation, in the order of the
             seeds. None where there was no ``collect``.
+        errors: For each seed, the reason why the numbers of its episode are wrong, as
+            ``run_experiment`` tells it. Empty where none is known.
     """
 
     _: KW_ONLY
@@ -143,6 +145,7 @@ class Trajectories:
     action_space: spaces.Space[Any] | None = None
     action_labels: Sequence[str] | Mapping[Any, str] | None = None
     collected: tuple[Any, ...] | None = None
+    errors: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return N, the number of decisions."""
@@ -208,10 +211,11 @@ def combine(
     parts: Sequence[Records],
     seeds: tuple[int, ...],
     collected: tuple[Any, ...] | None = None,
+    errors: tuple[str, ...] = (),
 ) -> Trajectories:
     """Combine the records of one policy in consecutive parts of the episodes.
 
-    ``seeds`` and ``collected`` have an item for each episode of all parts.
+    ``seeds``, ``collected`` and ``errors`` have an item for each episode of all parts.
     """
     nonempty = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
     _check_extras([part.decisions["extras"] for part in nonempty])
@@ -234,6 +238,7 @@ def combine(
         seeds=seeds,
         names=tuple(codes),
         collected=collected,
+        errors=errors,
     )
 
 

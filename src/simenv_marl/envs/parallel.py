@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TypeAlias
 
+from numpy import ndarray
 from pettingzoo import ParallelEnv
 
 from ..core import (
@@ -11,6 +12,7 @@ from ..core import (
     Info,
     Observation,
     Round,
+    duplicate,
 )
 from ..errors import warn_user
 from ..simulation import Sentinel
@@ -128,7 +130,12 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Observation, Action]):
         infos = {}
         for name, agent in agents.items():
             observation = agent.observation
-            observations[name] = agent.point.blank() if observation is None else observation
+            if observation is None:
+                observations[name] = agent.point.blank()
+            elif type(observation) is ndarray:  # spares it a call
+                observations[name] = observation.copy()
+            else:
+                observations[name] = duplicate(observation)
             rewards[name] = agent.reward
             info = agent.info
             infos[name] = info

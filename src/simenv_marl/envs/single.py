@@ -12,6 +12,7 @@ from typing import Any, NoReturn, Self
 
 import numpy as np
 from gymnasium import spaces
+from numpy import ndarray
 from numpy.typing import NDArray
 
 from ..core import (
@@ -24,6 +25,7 @@ from ..core import (
     Plan,
     Points,
     Space,
+    duplicate,
     make_plan,
 )
 from ..errors import CopyError, ReentrancyError, ViewError
@@ -118,7 +120,7 @@ class SimulationEnv(OneAgentView):
         name = self._agent_name
         agent = episode.agents.get(name) or episode.ended[name]
         self.own_agent = agent
-        return agent.observation, agent.info
+        return duplicate(agent.observation), agent.info
 
     def _clear(self) -> None:
         if hasattr(self, "own_agent"):
@@ -143,8 +145,9 @@ class SimulationEnv(OneAgentView):
         terminated = truncated = False
         if episode.pending is None:
             terminated, truncated = self.read_end(episode)
+        seen = agent.observation  # a copy is returned, because users may change it
         return (
-            agent.observation,
+            seen.copy() if type(seen) is ndarray else duplicate(seen),
             agent.reward,
             terminated,
             truncated,

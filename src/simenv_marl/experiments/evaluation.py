@@ -26,7 +26,7 @@ from .runner import (
     TEAM,
     Contenders,
     Metrics,
-    Outcome,
+    Result,
     Row,
     Runner,
     Team,
@@ -62,7 +62,8 @@ class Evaluation:
             ``return`` (the undiscounted sum of rewards), ``length`` (the number of decisions; for
             the team, of all agents) and the metrics, which are the same in all rows of an episode.
             Where a contender has a ``FallbackPolicy``, ``fallbacks`` is the number of decisions
-            that a fallback answered.
+            that a fallback answered. Where the numbers of a run are known to be wrong, there are
+            the columns ``status`` and ``error``, as ``run_experiment`` has them.
         baseline: The contender that all others are compared with, or None.
         confidence: The confidence level of the intervals.
 
@@ -85,6 +86,8 @@ class Evaluation:
         """Return the team's values: one row for each seed, one column for each contender."""
         check_metric(metric, self.frame.columns)
         team = self.frame[self.frame["agent"] == TEAM]
+        if "status" in team:
+            team = team.assign(**{metric: team[metric].where(team["status"] == "ok")})
         table = team.pivot(index="seed", columns="contender", values=metric)
         return table.loc[team["seed"].unique(), team["contender"].unique()]
 
@@ -338,13 +341,17 @@ def evaluate(
                 *spread(_run, (simulation, runner), runs, workers, runner.batch_size, bar)
             )
             rows.sort(key=lambda row: order[row["contender"], row["seed"]])
-            evaluation = Evaluation(make_table(runner.columns, rows), baseline, float(confidence))
+            columns = runner.columns
+            if any(row["status"] == "error" for row in rows):
+                columns += STATUS_COLUMNS
+            evaluation = Evaluation(make_table(columns, rows), baseline, float(confidence))
             if width is not None and evaluation._widest() <= width:
                 break
     for name, plan in plans.items():
         frame = evaluation.frame
         present = set(frame["agent"][frame["contender"] == name]) - {TEAM}
-        check_agents(name, runner.undeclared_agents(plan, name), sorted(present))
+        if present or "status" not in frame:
+            check_agents(name, runner.undeclared_agents(plan, name), sorted(present))
     return evaluation
 
 
@@ -369,8 +376,8 @@ def _run(
     """Run pairs of contender and seed."""
     rows: list[Row] = []
 
-    def report(name: str, seed: int, outcome: Outcome) -> None:
-        rows.extend(runner.rows(name, seed, outcome))
+    def report(name: str, seed: int, result: Result) -> None:
+        rows.extend(runner.rows(name, seed, result))
         bar.update()
 
     with reuse_resources():

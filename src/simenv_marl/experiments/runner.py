@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
+from math import nan
 from types import NoneType
 from typing import TYPE_CHECKING, Any, SupportsFloat
 
@@ -73,6 +74,9 @@ class Outcome:
     agents: dict[str, dict[str, float]]
     metrics: dict[str, Value]
 
+
+Result = Outcome | str
+"""The result of a run. A string tells the error of a failed run, or why its numbers are wrong."""
 
 Team = Callable[["Series[float]"], SupportsFloat]
 """A callable that combines the returns of agents into the team's value."""
@@ -194,24 +198,26 @@ class Runner:
         plan: Plan,
         contender: str,
         seeds: Sequence[int],
-        report: Callable[[int, Outcome], None],
+        report: Callable[[int, Result], None],
     ) -> None:
         """Run one episode for each seed.
 
-        ``report`` gets the seed and the results after the simulation is closed.
+        ``report`` gets the seed and the result after the simulation is closed.
         """
         tally = Tally()
 
-        def finish(place: int, simulation: Model) -> Callable[[], None]:
+        def finish(place: int, episode: Episode) -> Callable[[], None]:
             seed = seeds[place]
             outcome = tally.outcomes.pop(seed)
+            if episode.fault:
+                return partial(report, seed, f"the numbers are wrong: {episode.fault}")
             if TEAM in outcome.agents:
                 raise AgentError(
                     f"an agent is called {TEAM!r}, as is the row of all agents together; rename the"
                     " agent"
                 )
             for name, metric in self.metrics.items():
-                value = metric(simulation)
+                value = metric(episode.simulation)
                 outcome.metrics[name] = plain_value(f"the metric {name!r}", value)
             return partial(report, seed, outcome)
 
@@ -234,12 +240,19 @@ class Runner:
         self,
         contender: str,
         seed: int,
-        outcome: Outcome,
+        result: Result,
     ) -> list[Row]:
-        """Return a row of the table for each agent, and one for the team."""
+        """Return a row of the table for each agent, and one for the team.
+
+        A run with an error has only the team's row.
+        """
         from pandas import Series
 
-        agents = outcome.agents
+        run: Row = {"contender": contender, "seed": seed, "status": "ok"}
+        if isinstance(result, str):
+            failed: Row = {"agent": TEAM, "return": nan, "length": 0}
+            return [{**run, **failed, "status": "error", "error": result}]
+        agents = result.agents
         total: dict[str, Any] = {
             name: sum(own[name] for own in agents.values())
             for name in ("return", "length", FALLBACKS)
@@ -259,7 +272,7 @@ class Runner:
             raise OptionValueError(
                 f"team must return a number, not {short_repr(total['return'])}"
             ) from None
-        run = {"contender": contender, "seed": seed, **outcome.metrics}
+        run |= result.metrics
         return [{**run, "agent": name, **own} for name, own in {**agents, TEAM: total}.items()]
 
 

@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from itertools import groupby, product, starmap
-from math import nan
 from pathlib import Path
 from time import time_ns
 from typing import TYPE_CHECKING, Any, Unpack
@@ -43,10 +42,10 @@ from ..simulation import Model
 from .runner import (
     RESERVED,
     STATUS_COLUMNS,
-    TEAM,
     Contenders,
     Metrics,
     Outcome,
+    Result,
     Row,
     Runner,
     Team,
@@ -59,7 +58,6 @@ from .runner import (
 from .store import (
     Entry,
     Provenance,
-    Result,
     Run,
     Store,
     append,
@@ -126,7 +124,8 @@ def run_experiment(
         One row for each agent of each run, and one for the team (``agent`` is ``"team"``), in the
         order of the design, the contenders and the seeds. The columns: the factors, ``contender``,
         ``seed``, ``agent``, ``return``, ``length``, the metrics, ``status`` (``"ok"`` or
-        ``"error"``; a failed run has only the team's row) and ``error``.
+        ``"error"``; a run that failed, or whose numbers are known to be wrong, has only the team's
+        row) and ``error``.
 
     Raises:
         OptionValueError: An argument has an invalid value, or the store belongs to another
@@ -412,14 +411,10 @@ def _make_frame(
     rows: list[Row] = []
     for (place, key), contender, seed in product(enumerate(keys), runner.contenders, seeds):
         result = results.get(Run(key, contender, seed), "its result is no longer stored")
-        if isinstance(result, Outcome):
-            try:
-                rows += [{**row, "status": "ok"} for row in runner.rows(contender, seed, result)]
-            except Exception as error:  # raised by team=, which is called for stored runs, too
-                result = describe_error(error)
-        if isinstance(result, str):
-            run: Row = {"contender": contender, "seed": seed, "agent": TEAM, "return": nan}
-            rows.append({**run, "length": 0, "status": "error", "error": result})
+        try:
+            rows += runner.rows(contender, seed, result)
+        except Exception as error:  # raised by team=, which is called for stored runs, too
+            rows += runner.rows(contender, seed, describe_error(error))
         places += [place] * (len(rows) - len(places))
     factors = table.iloc[places].reset_index(drop=True)
     return factors.join(make_table((*runner.columns, *STATUS_COLUMNS), rows))

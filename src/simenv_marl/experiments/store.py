@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from uuid import getnode, uuid4
 
 from ..errors import LONGEST, OptionValueError, StoreError, short_repr, warn_user
-from .runner import Outcome
+from .runner import Outcome, Result
 
 VERSION = 1
 HEADER = "experiment.json"
@@ -39,9 +39,6 @@ VARYING = re.compile(r" at 0x[0-9a-fA-F]+|\w+\.<locals>\.")
 
 These are addresses in memory, and functions around classes, whose names workers lose.
 """
-
-Result = Outcome | str
-"""The result of a run. A string describes the error of a run that failed."""
 
 Provenance = Mapping[str, Any]
 

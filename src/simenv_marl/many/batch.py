@@ -47,7 +47,7 @@ from ..core import Answers as PendingAnswers
 from ..decision import DecisionPoint
 from ..errors import InvalidActionError, annotate, listed, name_of, short_repr
 from ..hooks.stacks import EVALUATING, outside_simulation
-from ..simulation import RULE, Action, Model, Observation, positional
+from ..simulation import RULE, Action, Observation, positional
 
 Answers = tuple[list[Action], Mapping[str, Any]]
 """The actions of a policy for many decisions, and its extras: arrays with a row for each."""
@@ -295,8 +295,8 @@ class BatchRun:
         plan: The plan, with a ``PolicyKey`` for each policy.
         seeds: The seeds.
         size: The largest number of simulations that run together.
-        finish: Called with the index of a seed and its simulation when that has ended. If it
-            returns a callable, that is called after the simulation is closed.
+        finish: Called with the index of a seed and its episode when that has ended. If it returns
+            a callable, that is called after the simulation is closed.
         watcher: Observes the episodes. None: no observer.
         concurrency: The number of decisions that wait together for policies that are awaited.
     """
@@ -304,7 +304,7 @@ class BatchRun:
     plan: Plan
     seeds: Sequence[int]
     size: int
-    finish: Callable[[int, Model], Callable[[], None] | None]
+    finish: Callable[[int, Episode], Callable[[], None] | None]
     watcher: Watcher | None = None
     concurrency: int = 1
 
@@ -345,7 +345,8 @@ class BatchRun:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
             self._sessions[place] = session
-            self._queue(place, session.start(seed, None))
+            beside = None if self.watcher is None else self.size > 1
+            self._queue(place, session.start(seed, None, beside=beside))
 
     def _proceed(self) -> None:
         """Have decisions answered, and run their simulations to their next decisions."""
@@ -371,7 +372,7 @@ class BatchRun:
             if self.watcher is not None:
                 self.watcher.pay(episode)
             if episode.pending is None:
-                self._end(place)
+                self._end(place, episode)
                 return
             agent, key = _pending(episode)
             if not key.batch_policy.alone:
@@ -421,11 +422,11 @@ class BatchRun:
             self.watcher.record(group, [place], [episode], [agent.observation], answers)
         episode.step(action)
 
-    def _end(self, place: int) -> None:
+    def _end(self, place: int, episode: Episode) -> None:
         session = self._sessions[place]
         session.end()  # it may have been truncated
         try:
-            after_close = self.finish(place, session.simulation)
+            after_close = self.finish(place, episode)
             session.close()
             if after_close is not None:
                 after_close()

@@ -26,6 +26,7 @@ from ..core import (
     Where,
     action_check,
     checked_actions,
+    duplicate,
     is_planner,
     pending_view,
     policy_for,
@@ -217,7 +218,7 @@ class Player:
         agent = self.episode.agents.get(name, self.agent)
         if agent.observation is None:
             return agent.point.blank(), agent.info
-        return agent.observation, agent.info
+        return duplicate(agent.observation), agent.info
 
     # -- through wrappers -------------------------------------------------------------------------
 

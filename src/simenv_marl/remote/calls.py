@@ -4,6 +4,7 @@
 ``decision_function`` makes. Their argument, which mappings receive, is a ``RemoteCall``.
 """
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from functools import cache
 from types import CodeType, FunctionType
@@ -126,15 +127,20 @@ class RemoteEpisode:
     """
 
     def __init__(self, child: Child, points: Collection[str], start: bytes) -> None:
-        """Begin an episode in a process with a line.
+        """Begin an episode in a process with a line, and read its frames up to the first call.
 
-        The process decides itself at points other than these.
+        The process decides itself at points other than these. The frames before the first call may
+        have no time, but whoever asks after the reset must learn whether there is one.
         """
         self._child = child
         self._points = points
         self._calls: dict[tuple[str, Entity], RemoteCall] = {}
         self._expected_calls: dict[RemoteCall, None] = {}
-        self._first_frame = child.begin(start)
+        frame = child.begin(start)
+        self._frames = deque([(frame, child.time)])
+        while not frame.keys() & {"decide", "end"}:
+            frame = child.next_frame()
+            self._frames.append((frame, child.time))
         self.time = child.time
         self.has_run = False
 
@@ -146,23 +152,27 @@ class RemoteEpisode:
             SimulationError: A handler or ``apply`` has replaced a decision of the rule.
         """
         self.has_run = True
-        frame = self._first_frame
-        while "end" not in frame:
-            self.time = self._child.time
+        child = self._child
+        while True:
+            frame, time = (
+                self._frames.popleft() if self._frames else (child.next_frame(), child.time)
+            )
+            if "end" in frame:
+                end: Frame = frame["end"]
+                return end
+            if time is not None:
+                self.time = time
             for item in frame.get("expect", [frame]):
                 if item["point"] in self._points:
-                    self._handle(item)
+                    self._handle(item, time)
                 elif "decide" in item:
-                    self._child.decide_by_rule()
-            frame = self._child.next_frame()
-        end: Frame = frame["end"]
-        return end
+                    child.decide_by_rule()
 
     def expected_calls(self, point: str) -> list[tuple[RemoteCall]]:
         """Return the calls of a point that the process has announced and has not made yet."""
         return [(call,) for call in self._expected_calls if call.point == point]
 
-    def _handle(self, frame: Frame) -> None:
+    def _handle(self, frame: Frame, time: float | None) -> None:
         """Handle a frame of an entity at a point, or an item of an "expect"."""
         key = frame["point"], frame["entity"]
         call = self._calls.get(key)
@@ -175,7 +185,7 @@ class RemoteEpisode:
             del self._calls[key]
             removal_function(call.point)(call)
             return
-        call._update(frame.get("args") or {}, self._child.time)
+        call._update(frame.get("args") or {}, time)
         if "decide" in frame:
             self._expected_calls.pop(call, None)
             self._decide(call)

@@ -58,11 +58,11 @@ class DecisionHandler(AnyHandler, Protocol):
     def point(self) -> Point:
         """The decision point."""
 
-    def warn_of_several(self, agent: str) -> None:
-        """Warn once that several objects decide under the name of one agent."""
+    def warn_of_several(self, agent: str) -> str:
+        """Warn once that several objects decide under the name of one agent. Return the text."""
 
-    def warn_of_gone(self, gone: set[int | str], effect: str) -> None:
-        """Warn once that the model has freed arguments that mappings take."""
+    def warn_of_gone(self, gone: set[int | str], effect: str) -> str:
+        """Warn once that the model has freed arguments that mappings take. Return the text."""
 
 
 class RunningEpisode(Protocol):
@@ -129,12 +129,13 @@ class Agent:
         answered_at: The time of the latest answered decision.
         now: The time of the latest decision.
         fallbacks: The number of its decisions that a fallback has answered.
+        fault: Why its rewards are wrong. Empty as far as is known.
     """
 
     __slots__ = (
         "_applying", "_carried", "_has_rule_action", "_is_quick", "answered", "answered_at",
-        "arguments", "asked", "choices", "clock", "decided", "delegated", "ended",
-        "fallbacks", "handler", "info", "mask", "memory", "name", "now", "observation", "offered",
+        "arguments", "asked", "choices", "clock", "decided", "delegated", "ended", "fallbacks",
+        "fault", "handler", "info", "mask", "memory", "name", "now", "observation", "offered",
         "plugins", "point", "policy", "present", "reward", "rule_action",
     )  # fmt: skip
 
@@ -174,6 +175,7 @@ class Agent:
         self.answered_at: float | None = None
         self.now: float | None = None
         self.fallbacks = 0
+        self.fault = ""
         self._applying = 0
 
     # -- decisions --------------------------------------------------------------------------------
@@ -331,7 +333,7 @@ class Agent:
         if point.expects_one and args:
             before = arguments.first()
             if before is not None and before is not args[0]:
-                self.handler.warn_of_several(self.name)
+                self.fault = self.handler.warn_of_several(self.name)
         arguments.store(args, kwargs)
         if point.agent is None and args:
             episode.note_entity(self, args[0])
@@ -465,7 +467,7 @@ class Agent:
             self.clear_observation()
         self.reward = 0.0
         if reward and not pays and self.decided:
-            self.handler.warn_of_gone(gone, "the reward is 0.0")
+            self.fault = self.handler.warn_of_gone(gone, "the reward is 0.0")
         elif not observes and self.decided:
             self.handler.warn_of_gone(gone, "the last observation stays")
         if pays or observes:
@@ -512,8 +514,6 @@ class Agent:
         """Set the reward to 0.0, and the info to one without an observation. The last one stays."""
         self.reward = 0.0
         self.present = False
-        if self.observation is not None:  # users may have changed the one that they got
-            self.observation = duplicate(self.observation)
         if self.clock is None:
             self.info = {}
         else:

@@ -147,17 +147,15 @@ class Episode(EpisodeState):
 
     # -- steps ------------------------------------------------------------------------------------
 
-    def begin(self, events: list[Event], at_first_event: Callable[[], None] | None) -> None:
-        """Go on from the simulation's first event to its first decision, in its context.
-
-        Call a function before.
+    def begin(self, events: list[Event], find_fault: Callable[[], str] | None) -> None:
+        """Go on from the simulation's first event, and a look for a fault, to its first decision.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
         """
         try:
-            if at_first_event is not None:
-                at_first_event()
+            if find_fault is not None:
+                self._fault = find_fault()
             self.receive(events)
             is_over = self.outcome is not RUNNING
             if not is_over and self.consulted is None and self.agents:
@@ -387,11 +385,12 @@ class Episode(EpisodeState):
                 return WAIT
         else:
             self.consulted = agent
+            observation = duplicate(agent.observation)  # which the policy may change
             try:
                 if isinstance(policy, EpisodePolicy):
-                    action = policy.answer(self, agent, agent.observation, agent.info)
+                    action = policy.answer(self, agent, observation, agent.info)
                 else:
-                    action = policy(agent.observation, agent.info)
+                    action = policy(observation, agent.info)
             finally:
                 self.consulted = None
         self.record(action)
@@ -681,7 +680,8 @@ class Episode(EpisodeState):
         finally:
             self.outcome = Outcome.STOPPED if before is RUNNING else before
         if self.driver.given_up is not None:
-            warn_user(f"{type(self.simulation).__name__} {self.driver.given_up}.", ResourceWarning)
+            self._fault = f"{type(self.simulation).__name__} {self.driver.given_up}."
+            warn_user(self._fault, ResourceWarning)
         return problems
 
 

@@ -35,7 +35,7 @@ class PointHandler:
     def __init__(self, point: Point) -> None:
         self.point = point
         self.report: AnyHandler | None = RuleHandler(point) if point.reports_rule else None
-        self._warnings: set[str] = set()
+        self._warnings: dict[str, str] = {}
 
     reports_itself = False
 
@@ -60,32 +60,34 @@ class PointHandler:
             agent = episode.agent_for(self, name)
         return agent.handle(episode, args, kwargs)
 
-    def warn_of_several(self, agent: str) -> None:
-        """Warn once that several objects decide under the name of one agent."""
+    def warn_of_several(self, agent: str) -> str:
+        """Warn once that several objects decide under the name of one agent. Return the text."""
         if "several" not in self._warnings:
-            self._warnings.add("several")
-            warn_user(
+            self._warnings["several"] = problem = (
                 f"several objects decide at {self.point.hook.name} as one agent, {agent!r}: their"
                 " rewards and differences mix. Set agent= of its make_step to a callable that names"
                 " an agent for each object, or to a string if one agent is meant"
             )
+            warn_user(problem)
+        return self._warnings["several"]
 
-    def warn_of_gone(self, gone: set[int | str], effect: str) -> None:
-        """Warn once that the model has freed arguments that mappings take."""
-        if "gone" in self._warnings:
-            return
-        self._warnings.add("gone")
+    def warn_of_gone(self, gone: set[int | str], effect: str) -> str:
+        """Warn once that the model has freed arguments that mappings take. Return the text."""
         signature = self.point.hook.signature
         parameters = ["the item"] * (self.point.split is not None)
         parameters += [] if signature is None else signature.parameters
         known: dict[int | str, str] = dict(enumerate(parameters))
         names = sorted(known.get(argument, f"argument {argument}") for argument in gone)
-        warn_user(
+        problem = (
             f"the model has freed {', '.join(names)} of the latest call of"
             f" {self.point.hook.name}, which its mappings take, so {effect} where an agent has"
             " ended or a round has returned. Name the function that removes it in removed_by=, let"
             " the mapping take _simulation instead, or keep the object in the simulation"
         )
+        if "gone" not in self._warnings:
+            self._warnings["gone"] = problem
+            warn_user(problem)
+        return problem
 
 
 class RemovalHandler(Observer):

@@ -130,8 +130,17 @@ class Session(BaseSession):
         *,
         in_rounds: bool = False,
         replay: Replay | None = None,
+        beside: bool | None = None,
     ) -> Episode:
-        """Begin another episode: see ``BaseSession``. ``replay`` repeats one of another session."""
+        """Begin another episode: see ``BaseSession``.
+
+        Args:
+            seed: The seed.
+            options: The options of the reset.
+            in_rounds: Whether all agents are updated when a step returns.
+            replay: Repeats an episode of another session.
+            beside: As ``draws_check`` takes it.
+        """
         if not self._is_suspended():
             self._driver = self._driver.ready()
         driver = self._driver
@@ -147,7 +156,7 @@ class Session(BaseSession):
                 self.options = options
                 self.seed = self.seed_for(seed)
                 self._enter_ready_driver(driver)
-                return self._begin(self.seed, in_rounds, replay)
+                return self._begin(self.seed, in_rounds, replay, beside)
             finally:
                 self._state = State.NEW if self.episode is None else State.OVER
 
@@ -171,12 +180,15 @@ class Session(BaseSession):
             self._make_simulation()
             driver.renew()
 
-    def _begin(self, seed: int, in_rounds: bool, replay: Replay | None) -> Episode:
+    def _begin(
+        self, seed: int, in_rounds: bool, replay: Replay | None, beside: bool | None
+    ) -> Episode:
         """Reset the simulation, and run it to its first decision."""
         driver = self._driver
         check = None  # warns of draws from the global generators
         if self._rng is None:
-            check = draws_check(self._simulation, in_thread=self.lock is not None)
+            in_thread = self.lock is not None
+            check = draws_check(self._simulation, in_thread=in_thread, beside=beside)
         else:
             self._rng.begin(seed)
         try:

@@ -140,8 +140,8 @@ class EpisodeState:
     """
 
     __slots__ = (
-        "agents", "clock", "consulted", "ended", "just_ended", "others", "outcome", "pending",
-        "plan", "round", "seed", "skips", "turns", "unreported_end", "where",
+        "_fault", "agents", "clock", "consulted", "ended", "just_ended", "others", "outcome",
+        "pending", "plan", "round", "seed", "skips", "turns", "unreported_end", "where",
     )  # fmt: skip
 
     def __init__(
@@ -162,6 +162,7 @@ class EpisodeState:
         self.outcome = RUNNING
         self.unreported_end = False
         self.turns = 0
+        self._fault = ""
 
     @property
     def state(self) -> State:
@@ -184,6 +185,12 @@ class EpisodeState:
     def truncated(self) -> bool:
         """Whether the episode has reached a limit of time."""
         return self.outcome is TRUNCATED
+
+    @property
+    def fault(self) -> str:
+        """Why its results are wrong. Empty as far as is known."""
+        faults = [agent.fault for agent in (*self.ended.values(), *self.agents.values())]
+        return self._fault or max(faults, default="")
 
     @property
     def in_rounds(self) -> bool:

@@ -348,10 +348,17 @@ class Point:
                 " by async def, or give it an attribute waits = True"
             )
         if legal is ILLEGAL:
-            raise InvalidActionError(
+            problem = (
                 f"the action {short_repr(action)} of {agent!r} is not in its action space"
                 f" {short_repr(space)}"
             )
+            try:
+                for clips in (True, False):  # parts that can be clipped are named last
+                    actions.action_check(space, clips=clips, raises=True)(action)
+            except InvalidActionError as error:
+                if error.__cause__ is not None:  # an element of it is illegal
+                    problem += f": {error}"
+            raise InvalidActionError(problem)
         if mask is not None and not actions.mask_allows(space, mask, legal):
             raise InvalidActionError(
                 f"the action {short_repr(action)} of {agent!r} is masked; its mask is"

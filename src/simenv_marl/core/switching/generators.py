@@ -12,7 +12,7 @@ from threading import enumerate as enumerate_threads
 from time import process_time_ns, thread_time_ns
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, Final
-from weakref import WeakSet
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.random import (
@@ -44,8 +44,8 @@ def is_seed(value: object) -> bool:
 
 # -- simulations that draw from the generators of the process --------------------------------------
 
-_CHECKED: Final[WeakSet[type]] = WeakSet()
-"""The classes of simulations that were checked."""
+_CHECKED: Final[WeakKeyDictionary[type, bool]] = WeakKeyDictionary()
+"""The classes of simulations that were checked, and whether they draw."""
 
 _SHORT: Final = 100_000
 """A time in nanoseconds.
@@ -53,39 +53,73 @@ _SHORT: Final = 100_000
 Another thread that wakes up and draws runs for longer; the clocks differ by less.
 """
 
+_MOST_REFILLS: Final = 200
+"""How many times 624 draws are tried to find out whether a generator was seeded."""
 
-def draws_check(simulation: Model, *, in_thread: bool) -> Callable[[], None] | None:
+
+def draws_check(
+    simulation: Model, *, in_thread: bool, beside: bool | None
+) -> Callable[[], str] | None:
     """Begin to check whether a simulation draws from the global generators.
 
     Args:
         simulation: The simulation, before it runs.
         in_thread: Whether it runs in a thread beside which threads of the user may run.
+        beside: Whether others run beside it. None: one check of its class is enough.
 
     Returns:
-        The function that ends the check, and warns. None if its class was checked before.
+        The function that ends the check, warns once for each class, and returns why the results
+        will be wrong, or "". None without a check.
     """
     kind = type(simulation)
-    if kind in _CHECKED:
+    if beside is None and kind in _CHECKED:
         return None
     states = global_states()
     time_before = _time_of_other_threads()
 
-    def warn_of_draws() -> None:
-        _CHECKED.add(kind)
-        names = [name for name, state in global_states().items() if state != states[name]]
+    def warn_of_draws() -> str:
+        is_known = _CHECKED.setdefault(kind, False)
+        after = global_states()
+        names = [name for name, state in after.items() if state != states[name]]
+        if not names:
+            return ""
         is_alone = all(
             thread is current_thread() or thread.name == SIMULATION
             for thread in enumerate_threads()
         )
         is_idle = not in_thread and _time_of_other_threads() - time_before < _SHORT
-        if names and (is_alone or is_idle):
-            warn_user(
-                f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which"
-                " all code in the process shares: its environments influence each other, and a"
-                " seed does not repeat an episode. Make them with global_rng=True"
-            )
+        if not (is_alone or is_idle or is_known):
+            return ""
+        problem = (
+            f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which"
+            " all code in the process shares: its environments influence each other, and a"
+            " seed does not repeat an episode. Make them with global_rng=True"
+        )
+        if not is_known:
+            _CHECKED[kind] = True
+            warn_user(problem)
+        is_wrong = beside or any(_has_drawn(states[name], after[name]) for name in names)
+        return problem if is_wrong else ""
 
     return warn_of_draws
+
+
+def _has_drawn(before: Model, after: Model) -> bool:
+    """Return whether draws alone lead from one state to another: the generator was not seeded."""
+    if isinstance(after, str):  # of a generator of the user
+        return True
+    if len(after) == 2:  # of NumPy
+        before, after = (
+            (3, (*np.frombuffer(key, np.uint32).tolist(), place), None)
+            for key, place in (before, after)
+        )
+    generator = random.Random()
+    generator.setstate(before)
+    for _ in range(_MOST_REFILLS):
+        if generator.getstate()[1][:-1] == after[1][:-1]:
+            return True
+        generator.getrandbits(32 * 624)
+    return False
 
 
 def _time_of_other_threads() -> int:
@@ -95,7 +129,10 @@ def _time_of_other_threads() -> int:
 
 def global_states() -> dict[str, object]:
     """Return values that change when Python's or NumPy's global generator draws a number."""
-    return {"random": random.getstate(), "numpy.random": repr(LEGACY.get_bit_generator().state)}
+    state = LEGACY.get_bit_generator().state["state"]
+    is_mersenne = "key" in state  # as Python's
+    of_numpy = (state["key"].tobytes(), state["pos"]) if is_mersenne else repr(state)
+    return {"random": random.getstate(), "numpy.random": of_numpy}
 
 
 # -- other futures --------------------------------------------------------------------------------

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from operator import le
-from typing import Final
+from typing import Final, NoReturn
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, OneOf, Sequence, Tuple
 from numpy import ndarray
 from numpy.typing import ArrayLike, NDArray
 
-from ...errors import MaskError, short_repr
+from ...errors import InvalidActionError, MaskError, short_repr
 from ...simulation import Action
 from .spaces import ILLEGAL as ILLEGAL
-from .spaces import Array, Space, by_parts, duplicate
+from .spaces import Array, ArraySpace, Space, by_parts, duplicate
 
 Check = Callable[[Action], Action]
 """Takes an action. Returns it in the form that its mapping receives, or ``ILLEGAL``."""
@@ -35,31 +35,45 @@ _SMALL = 16  # up to this many elements, comparing Python floats is faster than 
 # -- checks ----------------------------------------------------------------------------------------
 
 
-def action_check(space: Space, *, clips: bool = False) -> Check:
+def action_check(space: Space, *, clips: bool = False, raises: bool = False) -> Check:
     """Make the function that checks actions against a space.
 
     The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action
     of a ``Discrete``, and a scalar for a one-element ``Box`` unchanged. All other actions are
     copied, for a ``Box`` in its dtype. If it ``clips``, it clips the parts of actions that belong
-    to a ``Box``.
+    to a ``Box``. If it ``raises``, an ``InvalidActionError`` names the illegal element instead.
     """
+
+    def refuse(action: Action) -> NoReturn:
+        raise InvalidActionError(f"{short_repr(action)} is not in {short_repr(space)}")
+
+    def duplicate_legal(action: Action) -> Action:
+        if not space.contains(action):
+            return ILLEGAL
+        is_list = isinstance(action, list) and isinstance(space, ArraySpace)
+        return np.array(action, space.dtype) if is_list else duplicate(action)
+
+    check: Check = duplicate_legal
     match space:
         case Discrete():
-            return _discrete_check(space)
+            check = _discrete_check(space)
         case Box():
-            return _box_check(space, clips)
-        case Dict() | Tuple():
-            return by_parts(space, partial(action_check, clips=clips), lambda action: ILLEGAL)
+            check = _box_check(space, clips)
+        case Dict() | Tuple() | Sequence() | OneOf() | Graph():
+            check = by_parts(space, partial(action_check, clips=clips, raises=True), refuse)
+            if raises:
+                return check
+    if not raises and isinstance(space, (Box, Discrete)):
+        return check
 
-    def check(action: Action) -> Action:
+    def call(action: Action) -> Action:
         try:
-            if space.contains(action):
-                return duplicate(action)
+            legal = check(action)
         except Exception:  # some spaces raise for a value outside
-            pass
-        return ILLEGAL
+            legal = ILLEGAL
+        return refuse(action) if raises and legal is ILLEGAL else legal
 
-    return check
+    return call
 
 
 def _discrete_check(space: Discrete) -> Check:
@@ -88,11 +102,11 @@ def _box_check(space: Box, clips: bool) -> Check:
     lows = space.low.ravel().tolist()
     highs = space.high.ravel().tolist()
     is_scalar = len(lows) == 1
-    is_integer = dtype.kind in "iu"
+    is_integer = dtype.kind in "biu"  # bools are compared before the cast, too
     takes_float = is_scalar and not is_integer
     low, *_ = lows or [0.0]
     high, *_ = highs or [0.0]
-    kinds = "iu" if is_integer else "iuf"
+    kinds = {"b": "biu", "f": "iuf"}.get(dtype.kind, "iu")
 
     def is_legal(array: Array) -> bool:
         if len(lows) > _SMALL:

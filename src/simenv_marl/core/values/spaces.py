@@ -9,16 +9,29 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from functools import partial
 from sys import getrefcount
 from typing import Any, Final, NoReturn, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from gymnasium.spaces import (
+    Box,
+    Dict,
+    Discrete,
+    Graph,
+    GraphInstance,
+    MultiBinary,
+    MultiDiscrete,
+    OneOf,
+    Sequence,
+    Tuple,
+)
+from gymnasium.vector.utils import batch_space
 from numpy import ndarray
 from numpy.typing import NDArray
 
-from ...errors import ObservationError, short_repr
+from ...errors import InvalidActionError, ObservationError, short_repr
 from ...simulation import Observation, Sentinel
 
 ILLEGAL: Final = Sentinel("ILLEGAL")
@@ -31,6 +44,8 @@ Space: TypeAlias = spaces.Space[Any]
 
 CompoundSpace = Dict | Tuple[Any]
 """Spaces whose elements have parts."""
+
+_REFUSALS: Final = (ObservationError, InvalidActionError)
 
 Array: TypeAlias = NDArray[Any]
 
@@ -51,7 +66,7 @@ def observation_cast(space: Space) -> Cast:
             return _array_cast(space)
         case Discrete():
             return _discrete_cast(space)
-        case Dict() | Tuple():
+        case Dict() | Tuple() | Sequence() | OneOf() | Graph():
             return _parts_cast(space)
 
     def cast(value: Observation) -> Observation:
@@ -122,6 +137,8 @@ def _convert(value: Observation, space: ArraySpace) -> Array:
         raise ObservationError(
             f"the observation {short_repr(value)} has dtype {array.dtype}, which is not numeric"
         )
+    if dtype.kind == "b" and not np.isin(array, (0, 1)).all():
+        raise ObservationError(f"the observation {short_repr(value)} has numbers but 0 and 1")
     if dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, dtype):
         limits = np.iinfo(dtype)
         if not (array.min() >= limits.min and array.max() <= limits.max):  # also for NaN
@@ -157,31 +174,32 @@ def parts_of(space: CompoundSpace) -> dict[Any, Space]:
 
 
 def by_parts(
-    space: CompoundSpace,
+    space: Space,
     make: Callable[[Space], Cast],
-    refuse: Callable[[Observation], Observation],
+    refuse: Callable[[Observation], NoReturn],
 ) -> Cast:
     """Make the function that calls a function for each part of a value, and joins the results.
 
     Args:
-        space: The space of the values.
-        make: Makes the function for the space of a part. If that returns ``ILLEGAL``, the result is
-            ``ILLEGAL``.
+        space: The space of the values: a ``Dict``, ``Tuple``, ``Sequence``, ``OneOf`` or ``Graph``.
+        make: Makes the function for the space of a part. Its error is raised with the part's name.
         refuse: Called with a value that does not have these parts.
     """
+    if not isinstance(space, (Dict, Tuple)):
+        return partial(_convert_items, space, make, refuse)
     is_tuple = isinstance(space, Tuple)
     functions = {key: make(part) for key, part in parts_of(space).items()}
 
     def call(value: Observation) -> Observation:
+        key = None
         try:
             if len(value) == len(functions) and (not is_tuple or isinstance(value, (tuple, list))):
                 parts = {}
                 for key, function in functions.items():
-                    part = function(value[key])
-                    if part is ILLEGAL:
-                        return ILLEGAL
-                    parts[key] = part
+                    parts[key] = function(value[key])
                 return tuple(parts.values()) if is_tuple else parts
+        except _REFUSALS as error:
+            raise type(error)(f"in the element {key!r}: {error}") from error
         except (TypeError, LookupError):
             pass
         return refuse(value)
@@ -189,10 +207,67 @@ def by_parts(
     return call
 
 
-def _parts_cast(space: CompoundSpace) -> Cast:
+def _convert_items(
+    space: Space,
+    make: Callable[[Space], Cast],
+    refuse: Callable[[Observation], Observation],
+    value: Observation,
+) -> Observation:
+    """Do as a function of ``by_parts`` does, for elements with other parts each time."""
+    part: Any
+
+    def convert(key: object, part: Space, item: Observation) -> Observation:
+        try:
+            return make(part)(item)
+        except _REFUSALS as error:
+            raise type(error)(f"in the element {key!r}: {error}") from error
+
+    try:
+        match space:
+            case OneOf(spaces=options):
+                key, item = value
+                return np.int64(key), convert(key, dict(enumerate(options))[key], item)
+            case Sequence(feature_space=part, stack=True):
+                return make(batch_space(part, _size(part, value)))(value)
+            case Sequence(feature_space=part) if not isinstance(value, (str, Mapping)):
+                return tuple([convert(key, part, item) for key, item in enumerate(value)])
+            case Graph(node_space=part):
+                nodes, edges, links = value
+                number = _size(part, nodes)
+                nodes = convert("nodes", batch_space(part, number), nodes)
+                if edges is None and links is None:
+                    return GraphInstance(nodes, None, None)
+                part = space.edge_space
+                size = _size(part, edges)
+                edges = convert("edges", batch_space(part, size), edges)
+                ends: Space = Box(0, number - 1, (size, 2), np.int64)
+                links = convert("edge_links", ends, links)
+                if ends.contains(links):
+                    return GraphInstance(nodes, edges, links)
+    except _REFUSALS:
+        raise
+    except (TypeError, ValueError, LookupError, AssertionError):
+        pass
+    return refuse(value)
+
+
+def _size(space: Space, stack: Observation) -> int:
+    """Return the number of elements of a space in a stack."""
+    while isinstance(space, (Dict, Tuple)):
+        key, space = next(iter(parts_of(space).items()))
+        stack = stack[key]
+    return len(stack)
+
+
+def _parts_cast(space: Space) -> Cast:
     def refuse(value: Observation) -> NoReturn:
-        names = list(parts_of(space))
-        expected = f"keys {names}" if isinstance(space, Dict) else f"{len(names)} parts"
+        expected = "parts"
+        match space:
+            case Dict() | Tuple():
+                names = list(parts_of(space))
+                expected = f"keys {names}" if isinstance(space, Dict) else f"{len(names)} parts"
+            case Graph():
+                expected = "nodes, edges, and edge_links, pairs of the numbers of nodes,"
         raise ObservationError(
             f"the observation {short_repr(value)} must have exactly the {expected} of"
             f" {short_repr(space)}"

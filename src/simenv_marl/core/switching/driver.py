@@ -330,6 +330,8 @@ class Driver(ABC):
 
         def decide(args: Args, kwargs: Kwargs) -> Model:
             if type(exception()) is GeneratorExit:  # see ``interceptor``
+                if self._exiting:
+                    raise make_exit()
                 return rule(*args, **kwargs)
             bound = args
             named = kwargs

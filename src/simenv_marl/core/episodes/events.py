@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -65,7 +65,7 @@ class PointHandler:
             warn_user(
                 f"several objects decide at {self.point.hook.name} as one agent, {agent!r}: their"
                 " rewards and differences mix. Set agent= of its make_step to a callable that names"
-                " an agent for each object, or to a string if one agent is meant"
+                " each object differently, or to a string if one agent is meant"
             )
 
     def warn_of_gone(self, gone: set[int | str], effect: str) -> None:
@@ -92,8 +92,11 @@ class RemovalHandler:
     deliver = None
     report = None
 
-    def __init__(self) -> None:
+    def __init__(self, hook: Hook, roster: Collection[str]) -> None:
+        self._hook = hook
         self._removals: list[tuple[PointHandler | None, Namer]] = []
+        self._roster = roster
+        self._has_warned = False
 
     def add(self, handler: PointHandler | None, remover: Remover) -> None:
         """Let calls end agents of a point. None: any agents."""
@@ -109,12 +112,22 @@ class RemovalHandler:
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Give the agents their last rewards and observations; then let the function run."""
+        episode.called.add(self._hook)
         # All names come first, because the end of an agent may change them.
         named = [(handler, name(episode, args, kwargs)) for handler, name in self._removals]
         for handler, name in named:
             agent = episode.agents.get(name)
             if agent is not None and handler in (None, agent.handler):
                 episode.end_agent(agent)
+            elif handler is None and name is not None and not self._has_warned:
+                known = [*episode.agents, *episode.others, *episode.ended]
+                if name in known or name in self._roster:
+                    continue
+                self._has_warned = True
+                warn_user(
+                    f"end_agent({short_repr(name)}) has no effect, because no agent has had this"
+                    f" name in the episode; these have: {listed(known)}"
+                )
         return RULE
 
 
@@ -249,7 +262,7 @@ def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:
             by_hook[handler.point.hook] = SplitHandler(handler)
     removals: dict[Hook, RemovalHandler] = {}
     for remover in plan.removers:
-        removal = removals.setdefault(remover.hook, RemovalHandler())
+        removal = removals.setdefault(remover.hook, RemovalHandler(remover.hook, plan.roster))
         removal.add(None if remover.point is None else by_point[remover.point], remover)
     by_hook.update(removals)
     for point, hooks in plan.overrides.items():

@@ -142,3 +142,15 @@ def test_messages_hint_at_the_name_that_was_meant(wrong, hint):
     env.reset(seed=1)
     with pytest.raises(simenv_marl.SimEnvError, match=f"did you mean {hint}"):
         wrong(env)
+
+
+def test_a_name_of_a_room_is_told_by_imports_and_attributes():
+    expected = "pad_agents is in simenv_marl.envs: from simenv_marl.envs import pad_agents"
+    with pytest.raises(AttributeError, match=expected):
+        print(simenv_marl.pad_agents)
+    assert not hasattr(simenv_marl, "pad_agents")
+    with pytest.raises(ImportError, match=expected):
+        exec("from simenv_marl import pad_agents")
+    with pytest.raises(ImportError, match="cannot import name 'nothing'"):
+        exec("from simenv_marl import nothing")
+    exec("from simenv_marl import envs, plugins, registration")

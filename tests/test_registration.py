@@ -270,3 +270,15 @@ def test_pictures_for_people_are_made_of_arrays(register, monkeypatch):
     env.reset(seed=1)
     env.step(env.action_space.sample())
     assert shown == [(8, 8, 3)] * 2
+
+
+@pytest.mark.parametrize("name", ["two_words", "two-words"])
+def test_ids_are_found_in_both_spellings_where_a_name_has_underscores(register, name):
+    """PettingZoo lists ``coop_v0`` as ``coop-v0``."""
+    ids = register(Voyage, name=name)
+    assert ids[-1] == f"{name}/coop_v0"
+    for identity in ids[:-1]:
+        assert identity in gymnasium.registry
+    for kind in ("aec", "parallel"):
+        for identity in (f"{name}/coop_v0", f"{name}/coop-v0"):
+            assert pettingzoo.make(kind, identity).possible_agents

@@ -33,6 +33,7 @@ All other names are in rooms, which are imported when they are first used:
 decision through the package.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -94,7 +95,10 @@ def __getattr__(name: str) -> Any:
     if not name.startswith("_"):
         for room in ROOMS:
             if name in getattr(import_module(f".{room}", __name__), "__all__", ()):
-                raise AttributeError(
+                error: type[Exception] = AttributeError
+                if sys._getframe(1).f_code.co_name == "_handle_fromlist":
+                    error = ImportError  # else Python's own error would not name the room
+                raise error(
                     f"{name} is in simenv_marl.{room}: from simenv_marl.{room} import {name}"
                 )
     raise AttributeError(f"module 'simenv_marl' has no attribute {name!r}")

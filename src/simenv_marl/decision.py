@@ -64,7 +64,7 @@ class Definition:
     rule_action_mapping: Mapped | Mapping[Any, Any] | None
     agent: str | Mapped | None
     action_mask_mapping: Mapped | None
-    removed_by: Mapping[str, Mapped | None]
+    removed_by: Mapping[str | Function, Mapped | None]
     goal_space: Space | None
     achieved_goal_mapping: Mapped | None
     desired_goal_mapping: Mapped | None
@@ -84,14 +84,15 @@ class Definition:
         if decisions is not None:
             object.__setattr__(self, "action_space_mapping", dict(decisions).__getitem__)
         names: Any = self.removed_by
-        if isinstance(names, str):
+        if isinstance(names, str) or callable(names):
             names = [names]
         removed_by = dict(names if isinstance(names, Mapping) else dict.fromkeys(names))
         for name, agent in removed_by.items():
-            if not isinstance(name, str) or not (agent is None or callable(agent)):
+            is_function = isinstance(name, str) or callable(name)
+            if not is_function or not (agent is None or callable(agent)):
                 raise DefinitionError(
-                    "make_step: removed_by must be a dict from dotted names to callables, not"
-                    f" {short_repr(name)}: {short_repr(agent)}"
+                    "make_step: removed_by must be a dict from dotted names or functions to"
+                    f" callables, not {short_repr(name)}: {short_repr(agent)}"
                 )
         object.__setattr__(self, "removed_by", removed_by)
 
@@ -129,7 +130,9 @@ def make_step(
     rule_action_mapping: Mapped | Mapping[Any, Any] | None = None,
     agent: str | Mapped | None = None,
     action_mask_mapping: Mapped | None = None,
-    removed_by: str | Iterable[str] | Mapping[str, Mapped | None] = (),
+    removed_by: (
+        str | Function | Iterable[str | Function] | Mapping[str | Function, Mapped | None]
+    ) = (),
     goal_space: Space | None = None,
     achieved_goal_mapping: Mapped | None = None,
     desired_goal_mapping: Mapped | None = None,
@@ -183,10 +186,10 @@ def make_step(
             a number, such as ``choosewateramount_0``.
         action_mask_mapping: A callable of the call's arguments that returns the action mask of a
             ``Discrete`` or ``MultiDiscrete``: 1 for each legal action, 0 for others.
-        removed_by: The functions of the model whose calls end an agent's episode: a dotted name,
-            several, or a dict from dotted name to a callable of that call's arguments that returns
-            the agent's name. Without a callable, it is the agent that ``agent`` names for the
-            call's first argument, or that it named for it last.
+        removed_by: The functions of the model whose calls end an agent's episode: a function or
+            its dotted name, several, or a dict from these to a callable of that call's arguments
+            that returns the agent's name. Without a callable, it is the agent that ``agent`` names
+            for the call's first argument, or that it named for it last.
         goal_space: The space of goals. With it and the next three arguments, the single view is
             goal-based.
         achieved_goal_mapping: A callable like ``observation_space_mapping`` that returns the

@@ -88,6 +88,7 @@ def test_spaces_of_all_possible_agents_are_dicts(make):
     assert not hasattr(without, "possible_agents")
 
 
+@pytest.mark.filterwarnings("ignore:several objects decide")
 def test_entities_of_one_name_are_one_agent_even_if_it_is_empty():
     """The name is the agent: a model may replace the object behind it."""
     named = beings(agent=lambda being: "")
@@ -554,6 +555,7 @@ def ending(program):
 BY_NAME = beings(removed_by=())
 
 
+@pytest.mark.filterwarnings("ignore:end_agent.'being_7'. has no effect")
 def test_an_agent_that_is_ended_is_rewarded_and_observed_for_the_last_time_and_leaves():
     program = (
         "0 acts, 1 acts, 2 acts, 1 health 2, 1 ends, 7 ends, 1 health 9, 0 acts, 1 ends, 2 acts"

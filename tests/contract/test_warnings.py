@@ -1,5 +1,6 @@
 """Warnings at run time: shared generators, agents that never come, rounds that stand still."""
 
+import pickle
 import random
 import sys
 import threading
@@ -7,10 +8,20 @@ import time
 import warnings
 from functools import partial
 
+import cloudpickle
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, aec_env, parallel_env, simulate, simulate_many, single_env, vector_env
+from simenv_marl import (
+    RULE,
+    SimulationInterface,
+    aec_env,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
 from simenv_marl.core.switching import generators as rng
 from simenv_marl.errors import UnknownPointError
 from tests.worlds.models import calling, decision, define, script
@@ -317,3 +328,105 @@ def test_an_override_may_run_in_a_thread_of_the_model(heard) -> None:
     env.reset()
     env.step(4)
     assert env.unwrapped.simulation.log == ["deaf", 4]
+
+
+# -- names of agents, and functions that end them -------------------------------------------------
+
+
+class Ant(SimulationInterface):
+    """Two ants decide; one may die, and the names of agents that end are given."""
+
+    ending = ()
+    dies = False
+
+    def reset(self):
+        self.ants = [Worker(0), Worker(1)]
+
+    def run(self):
+        for ant in self.ants:
+            ant.work()
+        for name in self.ending:
+            self.end_agent(name)
+        if self.dies:
+            self.ants[1].die()
+        self.ants[0].work()
+
+
+class Worker:
+    def __init__(self, number):
+        self.number = number
+
+    def work(self):
+        return "rule"
+
+    def die(self):
+        pass
+
+    def starve(self):
+        pass
+
+
+def colony(**changes):
+    given = {"agent": lambda ant: f"ant_{ant.number}", **changes}
+    return {f"{__name__}.Worker.work": define(**given)}
+
+
+def test_an_end_of_an_agent_that_never_was_is_warned_of_once(heard) -> None:
+    for ending, expected in [(["ant_1"], 0), (["ant_1", "ant_1", None], 0), (["ant_7", "bee"], 1)]:
+        env = aec_env(type("Own", (Ant,), {"ending": ending}), colony())
+        play_in_turns(env, 1)
+        play_in_turns(env, 1)
+        texts = heard("has no effect, because no agent has had this name")
+        assert len(texts) == expected
+    assert "end_agent('ant_7')" in texts[0]
+    assert "these have: ant_0, ant_1" in texts[0]
+
+
+def test_declared_agents_may_end_before_they_decide(heard) -> None:
+    env = aec_env(
+        type("Own", (Ant,), {"ending": ["ant_2"]}),
+        colony(),
+        possible_agents=["ant_0", "ant_1", "ant_2"],
+    )
+    play_in_turns(env, 1)
+    assert not heard("has no effect")
+
+
+def test_two_objects_under_one_name_of_a_callable_are_warned_of_once(heard) -> None:
+    env = aec_env(Ant, colony(agent=lambda ant: "ant"))
+    play_in_turns(env, 1)
+    play_in_turns(env, 1)
+    (text,) = heard("several objects decide at")
+    assert "'ant'" in text
+    play_in_turns(aec_env(Ant, colony()), 1)
+    play_in_turns(aec_env(type("Own", (Ant,), {"dies": True}), colony()), 1)
+    assert len(heard("several objects decide at")) == 1
+
+
+@pytest.mark.parametrize("key", [Worker.die, f"{__name__}.Worker.die"])
+@pytest.mark.parametrize("form", [lambda key: key, lambda key: [key], lambda key: {key: None}])
+def test_functions_that_end_agents_are_named_as_points_are(key, form, heard) -> None:
+    dying = type("Own", (Ant,), {"dies": True})
+    env = aec_env(dying, colony(removed_by=form(key)))
+    for _ in range(2):
+        turns = play_in_turns(env, 1)
+        assert [turn.agent for turn in turns if turn.terminated] == ["ant_1", "ant_0"]
+        assert [turn.agent for turn in turns] == ["ant_0", "ant_1", "ant_1", "ant_0", "ant_0"]
+    assert not heard("removed_by= of")
+    copied = pickle.loads(cloudpickle.dumps(env))
+    assert len(play_in_turns(copied, 1)) == 5
+
+
+def test_a_function_of_removed_by_that_is_never_called_is_warned_of_once(heard) -> None:
+    starves = f"{__name__}.Worker.starve"
+    env = aec_env(Ant, colony(removed_by=starves))
+    env.reset()
+    env.close()
+    assert not heard("removed_by= of")
+    play_in_turns(env, 1)
+    play_in_turns(env, 1)
+    (text,) = heard("removed_by= of")
+    assert f"removed_by= of {__name__}.Worker.work names {starves}, which the model did not" in text
+    dying = type("Own", (Ant,), {"dies": True})
+    play_in_turns(aec_env(dying, colony(removed_by=[starves, Worker.die])), 1)
+    assert len(heard("removed_by= of")) == 1

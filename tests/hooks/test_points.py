@@ -401,6 +401,28 @@ def test_what_is_defined_in_a_notebook_goes_to_other_processes_by_value(monkeypa
     assert unpack(parcel).value == 3
 
 
+# -- dicts from functions -------------------------------------------------------------------------
+
+
+def test_dicts_from_functions_work_while_environments_live():
+    """The class then has a wrapper, which is another key of the same point."""
+    points = {Trader.bid: define(agent="old")}
+    env = aec_env(calling(lambda: Trader().bid("tea")), points)
+    env.reset()
+    assert Trader.bid not in points
+    changed = points | {Trader.bid: define(agent="new")}
+    for given, agent in [(points, "old"), (changed, "new"), (changed, "new")]:
+        other = aec_env(calling(lambda: Trader().bid("tea")), given)
+        other.reset()
+        assert other.agents == [agent]
+        env.close()
+    assert simulate(env.unwrapped.simulation, {Trader.bid: lambda _: 4}, points=changed).log == [4]
+    with pytest.raises(UnknownPointError, match="was named twice"):
+        aec_env(calling(Trader), {BID: define(), Trader.bid: define()})
+    with pytest.raises(UnknownPointError, match="was named twice"):
+        aec_env(calling(Trader), [Home.heat, Home.heat])
+
+
 # -- quick rewards --------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from greenlet import getcurrent
 
 from ...errors import AgentError, MaskError, RewardError, short_repr
+from ...hooks.hook import Hook
 from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
 from ...simulation import RULE, Action, Model, Observation
@@ -71,6 +72,8 @@ class RunningEpisode(Protocol):
     is_plain: bool
     agents: dict[str, Agent]
     others: dict[str, Agent]
+    ended: dict[str, Agent]
+    called: set[Hook]
 
     def decide(self, agent: Agent, args: Args, kwargs: Kwargs) -> Model:
         """Handle a decision where more than an update is due."""

@@ -86,6 +86,7 @@ class Episode(EpisodeState):
         simulation: The simulation.
         driver: The driver of its stack.
         latest: The agent that decided last, for the notes of errors.
+        called: The functions that end agents and were called.
         running: Whether the simulation's ``run`` has not ended yet.
         is_plain: Whether a decision of the user's agents is just updated, and waits.
         tape: The answers of the user and of policies, in order. If it is full, later ones are lost.
@@ -94,7 +95,7 @@ class Episode(EpisodeState):
 
     __slots__ = (
         "_context", "_entities", "_expected_calls", "_failed_in_model", "_handlers",
-        "_most_steps", "_plugins", "_split", "_tape_size", "driver", "is_plain", "latest",
+        "_most_steps", "_plugins", "_split", "_tape_size", "called", "driver", "is_plain", "latest",
         "replay", "running", "session", "simulation", "tape",
     )  # fmt: skip
 
@@ -120,6 +121,7 @@ class Episode(EpisodeState):
         self._handlers = session.handlers
         self._plugins = plan.plugins
         self.latest: Agent | None = None
+        self.called: set[Hook] = set()
         self.running = True
         self._failed_in_model = False
         self._entities: dict[tuple[DecisionHandler, int], Agent] = {}  # by the id of the entity
@@ -597,8 +599,8 @@ class Episode(EpisodeState):
             agent.conclude()
         self.outcome = Outcome.TRUNCATED if truncated else Outcome.TERMINATED
         session = self.session()
-        if session is not None and self.plan.named_agents:
-            session.unmatched_names.check(self)
+        if session is not None and (self.plan.named_agents or self.plan.removers):
+            session.unmatched_names.check(self, None if self.running else self.called)
 
     # -- errors, and the end by a close -----------------------------------------------------------
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -66,7 +66,7 @@ class PointHandler:
             self._warnings["several"] = problem = (
                 f"several objects decide at {self.point.hook.name} as one agent, {agent!r}: their"
                 " rewards and differences mix. Set agent= of its make_step to a callable that names"
-                " an agent for each object, or to a string if one agent is meant"
+                " each object differently, or to a string if one agent is meant"
             )
             warn_user(problem)
         return self._warnings["several"]
@@ -93,10 +93,13 @@ class PointHandler:
 class RemovalHandler(Observer):
     """Handles calls that end agents. It changes nothing in the simulation: the function runs."""
 
-    def __init__(self, last: AnyHandler | None) -> None:
-        """Handle calls of a function. ``last`` handles their ends."""
+    def __init__(self, hook: Hook, roster: Collection[str], last: AnyHandler | None) -> None:
+        """Handle calls of a hook. ``last`` handles their ends."""
+        self._hook = hook
         self._last = last
         self._removals: list[tuple[PointHandler | None, Namer]] = []
+        self._roster = roster
+        self._has_warned = False
 
     @property
     def report(self) -> AnyHandler | None:
@@ -117,12 +120,22 @@ class RemovalHandler(Observer):
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Give the agents their last rewards and observations; then let the function run."""
+        episode.called.add(self._hook)
         # All names come first, because the end of an agent may change them.
         named = [(handler, name(episode, args, kwargs)) for handler, name in self._removals]
         for handler, name in named:
             agent = episode.agents.get(name)
             if agent is not None and handler in (None, agent.handler):
                 episode.end_agent(agent)
+            elif handler is None and name is not None and not self._has_warned:
+                known = [*episode.agents, *episode.others, *episode.ended]
+                if name in known or name in self._roster:
+                    continue
+                self._has_warned = True
+                warn_user(
+                    f"end_agent({short_repr(name)}) has no effect, because no agent has had this"
+                    f" name in the episode; these have: {listed(known)}"
+                )
         return RULE
 
 
@@ -262,7 +275,7 @@ def _make_handlers(plan: Plan, simulation: Model = None) -> Handlers:
     removals: dict[Hook, RemovalHandler] = {}
     last = LastHandler() if plan.complete and plan.options.max_steps else None
     for remover in plan.removers:
-        removal = removals.setdefault(remover.hook, RemovalHandler(last))
+        removal = removals.setdefault(remover.hook, RemovalHandler(remover.hook, plan.roster, last))
         removal.add(None if remover.point is None else by_point[remover.point], remover)
     by_hook.update(removals)
     for point, hooks in plan.overrides.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import Enum
 from threading import current_thread
 from typing import TYPE_CHECKING, Final
@@ -20,6 +20,7 @@ from ...errors import (
     short_repr,
     warn_user,
 )
+from ...hooks.hook import Hook
 from ...simulation import RULE, Action
 from ..plans.plan import Plan
 from ..plans.policies import Where
@@ -93,15 +94,17 @@ class State(Enum):
 
 
 class UnmatchedNames:
-    """The agents that options name and no episode of an environment has had yet."""
+    """The agents and functions that are named, and that no episode has had or called yet."""
 
     def __init__(self, names: frozenset[str]) -> None:
         self._names = set(names)
+        self._points: set[Hook] = set()  # whose removers were checked
 
-    def check(self, episode: EpisodeState) -> None:
-        """Warn once of each name that does not appear in an episode that has ended."""
-        if not self._names:
-            return
+    def check(self, episode: EpisodeState, called: Collection[Hook] | None) -> None:
+        """Warn once of names that options and ``removed_by=`` have in vain, at an episode's end.
+
+        ``called``: the functions that end agents and were called. None if the model has not ended.
+        """
         present = [
             name
             for name, agent in episode.agents.items()
@@ -115,6 +118,24 @@ class UnmatchedNames:
                 "policies= or possible_agents= name agents that did not appear in the episode:"
                 f" {listed(sorted(absent))}; these did: {listed(present)}"
             )
+        if called is not None:
+            self._check_removers(episode, called)
+
+    def _check_removers(self, episode: EpisodeState, called: Collection[Hook]) -> None:
+        agents = [*episode.agents.values(), *episode.others.values(), *episode.ended.values()]
+        decided = {agent.point.hook for agent in agents if agent.answered}
+        for point in episode.plan.points:
+            hooks = {each.hook for each in episode.plan.removers if each.point is point}
+            if point.hook not in decided or not hooks or point.hook in self._points:
+                continue
+            self._points.add(point.hook)
+            if hooks.isdisjoint(called):
+                names = sorted(hook.name for hook in hooks)
+                warn_user(
+                    f"removed_by= of {point.hook.name} names {listed(names)}, which the model did"
+                    " not call in an episode in which its agents decided. If agents were removed,"
+                    " name the function that the model calls"
+                )
 
 
 class EpisodeState:

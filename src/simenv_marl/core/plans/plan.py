@@ -152,7 +152,7 @@ class Remover(NamedTuple):
 
     hook: Hook
     point: Point | None
-    name: str
+    name: str | Callable[..., Model]
     owner: type | None
 
 
@@ -537,8 +537,8 @@ def _removers(points: Collection[Point], subject: Subject) -> tuple[Remover, ...
             hook = locate(name, subject.own)
             if hook in decisions:
                 raise DefinitionError(
-                    f"{name} is a decision point, so removed_by= cannot name it as a function that"
-                    " ends an agent"
+                    f"{hook.name} is a decision point, so removed_by= cannot name it as a function"
+                    " that ends an agent"
                 )
             found.append(Remover(hook, point, name, owner_class(point.hook)))
     if points and subject.ends_agents:

@@ -84,7 +84,7 @@ class Point:
             takes, or ``ILLEGAL``.
         applies: Whether an ``apply`` gets the action, on the simulation's side.
         reports_rule: Whether the decisions of the rule are reported.
-        expects_one: Whether one object makes all decisions, because the definition names no agents.
+        expects_one: Whether one object makes all decisions of an agent.
         gives_answers: Whether a callable asks for the answers to the items before.
         needs_simulation: Whether a callable asks for the simulation.
         name_agent: A callable of the call's arguments that names the agent, if ``agent`` is None.
@@ -148,7 +148,8 @@ class Point:
         is_invertible = definition.choices is not None or inverse(definition) is not None
         informs = definition.rule_action_mapping is not None
         self.reports_rule = informs or (records and is_invertible)
-        self.expects_one = definition.agent is None and hook.bound
+        names_one = not isinstance(definition.agent, str) and definition.split is None
+        self.expects_one = names_one and hook.bound
         callables = (*vars(definition).values(), *definition.removed_by.values())
         self.needs_simulation = any(asks_for(part, "_simulation") for part in callables)
         asks_for_answers = any(asks_for(part, "_answers") for part in callables)

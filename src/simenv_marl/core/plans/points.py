@@ -137,9 +137,15 @@ def find_points(
         points = [points]
     pairs = points.items() if isinstance(points, Mapping) else [(key, None) for key in points]
     found: dict[DecisionPoint, Definition] = {}
+    keys: dict[DecisionPoint, Key] = {}
     for key, given in pairs:
         point, definition = find_point(key, given, own=own)
-        if point in found:
+        earlier = keys.setdefault(point, key)
+        # The class has a wrapper of a function that is a key already, while an environment lives.
+        is_wrapper = (
+            earlier is not key and not isinstance(key, str) and not isinstance(earlier, str)
+        )
+        if point in found and not is_wrapper:
             raise UnknownPointError(f"the decision point {point.name} was named twice")
         found[point] = definition
     if not found and not empty:

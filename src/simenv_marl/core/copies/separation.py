@@ -27,7 +27,7 @@ from ...errors import BranchError
 from ..episodes.episode import Episode
 from ..switching.awaiting import LOOPS
 from ..switching.opened import new_epolls
-from .forks import CAN_FORK, exhausted
+from .forks import CAN_FORK, limited
 
 if CAN_FORK:
     import fcntl
@@ -100,22 +100,18 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
         )
     if others:
         return None
-    try:
+    with limited():
         files = _open_files()
-    except OSError as error:
-        raise exhausted(error) from error
     return partial(_separate, random.getstate(), files, loops)
 
 
 def _separate(python: tuple[Any, ...], files: list[list[_Opening]], loops: list[Loop]) -> None:
     """In a fork, restore Python's generator, reopen files, and separate loops."""
     random.setstate(python)  # Python reseeds it after a fork
-    try:
+    with limited():
         for openings in files:
             with suppress(FileNotFoundError):  # the garbage collector has closed it since
                 _reopen(openings)
-    except OSError as error:
-        raise exhausted(error) from error
     for loop in loops:
         _separate_loop(loop)
     torch = sys.modules.get("torch")

@@ -26,7 +26,7 @@ from typing import Any, Final, Protocol
 from ...errors import BranchError
 from ..episodes.episode import Episode
 from ..switching.awaiting import LOOPS
-from ..switching.opened import new_epolls
+from ..switching.opened import SHARED_BEFORE, new_epolls, shared_memory
 from .forks import CAN_FORK, limited
 
 if CAN_FORK:
@@ -93,6 +93,7 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
             if hasattr(part, "fileno"):
                 held.pop(part.fileno(), None)
     others += [f"{name} (descriptor {number})" for number, name in sorted(held.items())]
+    others += [f"shared memory ({path})" for _, path in shared_memory() - SHARED_BEFORE]
     if others and method == "fork":
         raise BranchError(
             f"a forked process cannot continue with {', '.join(others)} that the simulation has"

@@ -5,6 +5,8 @@ That branches do what the environment would have done is asserted beside the sam
 """
 
 import asyncio
+import mmap
+import multiprocessing
 import os
 import random
 import select
@@ -12,11 +14,13 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import types
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +41,7 @@ from simenv_marl.errors import (
     WorkerError,
 )
 from tests.core.test_global_rng import world
-from tests.processes import ROOT, gone
+from tests.processes import ROOT, gone, run_code
 from tests.worlds import exactness, filing
 from tests.worlds.models import define, notes
 from tests.worlds.trips import POINTS, Lucky, Trip, future, move, trip
@@ -357,6 +361,40 @@ def a_thread(model):
     thread.join()
 
 
+@contextmanager
+def anonymous_memory(model):
+    with mmap.mmap(-1, 100) as memory:
+        yield memory
+
+
+@contextmanager
+def shared_memory(model):
+    memory = SharedMemory(create=True, size=100)
+    yield memory
+    memory.close()
+    memory.unlink()
+
+
+def mapped(mode):
+    @contextmanager
+    def a_memmap(model):
+        with tempfile.TemporaryFile() as file:
+            file.write(bytes(80))
+            file.flush()
+            memory = np.memmap(file, float, mode, shape=10)
+            yield
+            del memory
+
+    return a_memmap
+
+
+@contextmanager
+def a_semaphore(model):
+    semaphore = multiprocessing.Semaphore()
+    yield
+    del semaphore
+
+
 def held_by(model):
     """An environment of a model that decides while it holds something."""
     env = single_env(model, filing.choose)
@@ -365,7 +403,16 @@ def held_by(model):
 
 
 @pytest.mark.parametrize(
-    ("held", "name"), [(a_socket, "a socket"), (a_child, "a child process"), (a_thread, "a thread")]
+    ("held", "name"),
+    [
+        (a_socket, "a socket"),
+        (a_child, "a child process"),
+        (a_thread, "a thread"),
+        (anonymous_memory, r"shared memory \(/dev/zero"),
+        (shared_memory, r"shared memory \(/dev/shm/"),
+        (mapped("w+"), r"shared memory \(/tmp/"),
+        (mapped("r+"), r"shared memory \(/tmp/"),
+    ],
 )
 def test_what_cannot_be_forked_is_replayed_or_named(held, name):
     env = held_by(type("Model", (Holding,), {"open": held}))
@@ -379,6 +426,24 @@ def test_what_cannot_be_forked_is_replayed_or_named(held, name):
     for each in (deeper, twin, env):  # to its end, or its thread stays
         found.append(filing.left(each))
     assert found == [found[0]] * 5
+
+
+@pytest.mark.parametrize("held", [mapped("r"), mapped("c"), a_semaphore])
+def test_memory_that_no_process_can_change_is_forked(held):
+    env = held_by(type("Model", (Holding,), {"open": held}))
+    assert branch(env, filing.left, 1, method="fork") == [filing.left(env)]
+
+
+def test_memory_that_was_shared_before_the_import_does_not_count():
+    code = """
+import mmap
+memory = mmap.mmap(-1, 100)
+from simenv_marl import branch
+from tests.worlds.trips import trip
+env = trip()
+print(branch(env, lambda env, number: number, 1, method="fork"))
+"""
+    assert run_code(code) == "[0]\n"
 
 
 def test_resources_of_the_user_do_not_keep_a_branch_from_forking():

@@ -1,7 +1,9 @@
 """Clones: their behaviour, their isolation and their ends; and that branches behave like clones."""
 
+import ctypes
 import errno
 import gc
+import inspect
 import os
 import random
 import resource
@@ -9,16 +11,19 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 
-from simenv_marl import branch, clone
+from simenv_marl import branch, clone, joint_env, single_env, vector_env
 from simenv_marl.core.copies.forks import Fork
 from simenv_marl.errors import (
     BranchError,
@@ -29,11 +34,12 @@ from simenv_marl.errors import (
     WrongThreadError,
 )
 from tests.core.test_global_rng import world
-from tests.processes import ROOT, alone, descriptors, gone
+from tests.processes import ROOT, alone, descriptors, gone, runs
 from tests.test_branch import METHODS, ahead, children
-from tests.worlds.counters import FORKS
+from tests.worlds.counters import FORK, FORKS, POINT, Counter
+from tests.worlds.duels import Duel, points
 from tests.worlds.models import notes
-from tests.worlds.trips import VIEWS, Free, Lucky, Trip, future, move, outcome, trip
+from tests.worlds.trips import POINTS, VIEWS, Free, Lucky, Trip, future, move, outcome, trip
 
 LUCKY = {"simulation": Lucky, "global_rng": True}
 OPTIONS = {
@@ -87,6 +93,29 @@ def test_a_replayed_clone_leaves_the_generators_of_its_user_alone():
     env, before = trip(simulation=Drawing), world()
     clone(env, method="replay")
     assert world() == before
+
+
+def test_clones_of_stepped_clones_show_acts_and_times_of_the_original():
+    class Short(Duel):
+        ceiling = 2.5  # where the one on the left retires
+
+    env = joint_env(Short, points(), discount_rate=0.1)
+    env.reset(seed=5)
+    twin = clone(env, method="fork")
+    action = {"left": 1, "right": 0}
+    assert repr(env.step(action)) == repr(twin.step(action))
+    twins = [twin, clone(twin, method="fork"), clone(twin, method="replay")]
+    twins.append(clone(twins[1], method="replay"))
+    acts = []
+    over = False
+    while not over:
+        told = env.step(action)
+        over = told[2]
+        acts.append(told[4]["acted"]["left"])
+        for each in twins:
+            assert repr(each.step(action)) == repr(told)
+    assert acts[-1] is False
+    assert {"elapsed", "discount"} < {*told[4]}
 
 
 @METHODS
@@ -241,12 +270,12 @@ def test_an_interrupt_while_a_clone_is_made_leaves_no_process():
     signal.setitimer(signal.ITIMER_REAL, 0.1)
     try:
         with pytest.raises(KeyboardInterrupt):
-            Fork.begin(lambda connection: time.sleep(600), 600.0).start()
+            Fork.begin(None, lambda: time.sleep(600), 600.0).start()
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, handler)
     with pytest.raises(BranchError, match="died"):
-        Fork.begin(lambda connection: None, 600.0).start()
+        Fork.begin(None, lambda: os._exit(0), 600.0).start()
     assert children() - before == set()  # those of earlier tests may end meanwhile
 
 
@@ -464,3 +493,297 @@ def lean():
 @pytest.mark.parametrize("function", [crowd, starve, lean])
 def test_clones_take_one_descriptor_each_and_leave_none(function):
     alone(function)
+
+
+# -- memory ---------------------------------------------------------------------------------------
+
+
+class Cyclic:
+    """Only the collector frees it."""
+
+    def __init__(self):
+        self.me = self
+
+
+def test_forks_free_what_their_original_frees():
+    env = trip()
+    model = env.simulation
+    model.alive = [Cyclic(), Cyclic()]
+    model.known = weakref.WeakSet([*model.alive, Cyclic()])  # one is garbage at the fork
+
+    def count(env, *_):
+        env.simulation.alive.pop()
+        gc.collect()
+        return len(env.simulation.known)
+
+    twin = clone(env, method="fork")
+    deeper = clone(twin, method="fork")
+    found = [twin.call(count), deeper.call(count), *branch(env, count, 1, method="fork")]
+    assert found == [count(env)] * 3 == [1] * 3
+
+
+def test_a_closed_link_of_a_chain_of_clones_is_freed():
+    twin = clone(trip(), method="fork")
+    depth = twin.call(lambda env: len(inspect.stack()))
+    links = []
+    for _ in range(300):
+        links.append((weakref.ref(twin.unwrapped), weakref.ref(twin.unwrapped.session._fork)))
+        deeper = clone(twin, method="fork")
+        twin.close()
+        twin = deeper
+    gc.collect()
+    assert not [link for pair in links for link in pair if link() is not None]
+    assert twin.call(lambda env: len(inspect.stack())) == depth
+    assert future(twin) == future(trip())
+
+
+# -- errors ---------------------------------------------------------------------------------------
+
+
+class Broken(Trip):
+    """Whatever is asked of it after an error of the model fails, too."""
+
+    broken = None
+
+    def luck(self):
+        self.broken = KeyError("the model is broken")
+        raise ZeroDivisionError("in the model")
+
+    def time(self):
+        if self.broken is not None:
+            raise self.broken
+        return 0.0
+
+    def state(self):
+        return [self.place, (None if self.broken is None else 1 / 0) or self.day]
+
+
+@METHODS
+@pytest.mark.parametrize("view", ["single", "aec", "parallel", "joint"])
+def test_the_models_error_comes_before_those_that_follow_from_it(view, method):
+    twin = clone(trip(view, Broken, taken=0), method=method)
+    with pytest.raises(ZeroDivisionError, match="in the model"):
+        all(True for _ in iter(lambda: move(twin), None))
+    with pytest.raises(EpisodeOverError):
+        move(twin)
+
+
+class Bad:
+    """An object that can be pickled, but not unpickled."""
+
+    def __init__(self, number=0):
+        pass
+
+    def __reduce__(self):
+        return int, ("no number",)
+
+
+def unsendable():
+    return {"generator": (step for step in ()), "broken": Bad(), "lock": threading.Lock()}
+
+
+@pytest.mark.parametrize("kind", unsendable())
+def test_an_info_that_cannot_be_sent_is_named_and_hides_no_error(kind):
+    def leave(env, fails):
+        env.episode.pending.info["more"] = unsendable()[kind]
+        if fails:
+            raise ZeroDivisionError
+
+    env = trip()
+    twin = clone(env, method="fork")
+    with pytest.raises(ZeroDivisionError):
+        twin.call(leave, True)
+    twin = clone(env, method="fork")
+    with pytest.raises(BranchError, match=r"cannot be sent.*replay"):
+        twin.call(leave, False)
+    with pytest.raises(EpisodeOverError):
+        twin.step(1)
+    twin.reset(seed=3)
+    assert move(twin) == move(trip(taken=0))
+    leave(env, False)
+    with pytest.raises(BranchError, match=r"cannot be sent.*replay"):
+        clone(env, method="fork")
+
+
+@METHODS
+@pytest.mark.parametrize("view", ["single", "aec", "parallel", "joint"])
+@pytest.mark.parametrize("kind", unsendable())
+def test_actions_that_cannot_be_sent_are_invalid(kind, view, method):
+    env = trip(view)
+    twin = clone(env, method=method)
+    bad = action = unsendable()[kind]
+    if view in ("parallel", "joint"):
+        action = {"walker_0": bad, "guide_0": 0}
+    for each in (env, twin):
+        with pytest.raises(InvalidActionError):
+            each.step(action)
+    assert future(twin) == future(env)
+
+
+# -- ends -----------------------------------------------------------------------------------------
+
+
+def test_the_end_of_a_process_is_never_told_as_success():
+    twin = clone(trip(), method="fork")
+    with pytest.raises(BranchError, match=r"has died, because .*os\._exit\(0\)"):
+        twin.call(lambda env: os._exit(0))
+    twin = clone(trip(), method="fork")
+    with pytest.raises(BranchError, match=r"has died, (because|killed)"):
+        twin.call(lambda env: os.closerange(3, 1000))
+    with pytest.raises(BranchError, match="branch 0 has died without a result, because"):
+        branch(trip(), lambda env, number: os._exit(0), method="fork")
+    twin = clone(trip(), method="fork")
+    number = number_of(twin)
+    os.kill(number, signal.SIGKILL)
+    os.waitpid(number, 0)  # as handlers of SIGCHLD may do
+    with pytest.raises(BranchError, match="its process has ended"):
+        twin.step(1)
+
+
+def reap(order):
+    prctl = ctypes.CDLL(None).prctl
+    assert prctl(36, 1, 0, 0, 0) == 0  # PR_SET_CHILD_SUBREAPER: as the first of a container
+    twins = [clone(trip(), method="fork")]
+    for _ in range(3):
+        twins.append(clone(twins[-1], method="fork"))
+    for place in map(int, order):
+        twins[place].close()
+    assert children() == set()
+
+
+@pytest.mark.parametrize("order", ["0123", "3210", "1032", "0213"])
+def test_closed_clones_leave_no_zombie_to_a_first_process(order):
+    alone(reap, order)
+
+
+@pytest.mark.parametrize("at", ["waitpid", "kill"])
+def test_a_second_close_ends_what_an_interrupted_one_has_left(at, monkeypatch):
+    twin = clone(trip(), method="fork")
+    number = number_of(twin)
+
+    def interrupt(*_):
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, at, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        twin.close()
+    assert runs(number)
+    twin.close()
+    assert not runs(number)
+
+
+SIGNALS = [signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1]
+
+
+def handled(place):
+    def note(number, frame):
+        with open(place, "a", encoding="utf-8") as file:
+            file.write(f"{os.getpid()}\n")
+
+    os.setpgid(0, 0)
+    for number in SIGNALS:
+        signal.signal(number, note)
+    env = trip()
+    twin = clone(env, method="fork")
+    deeper = clone(twin, method="fork")
+    envs = vector_env(Counter, POINT, num_envs=2, workers=2, context=FORK)
+    envs.reset(seed=0)
+
+    def wait(env, number):
+        time.sleep(0.5)  # the parent sends the signals meanwhile
+        return number
+
+    timer = threading.Timer(0.2, lambda: [os.killpg(0, number) for number in SIGNALS[1:]])
+    timer.start()
+    assert branch(env, wait, 2, method="fork") == [0, 1]
+    envs.step(envs.action_space.sample())
+    os.kill(number_of(twin), signal.SIGTERM)
+    assert future(twin) == future(deeper) == future(env)
+    envs.close()
+    assert {*Path(place).read_text(encoding="utf-8").split()} == {str(os.getpid())}
+
+
+def test_the_users_signal_handlers_run_in_the_users_process_alone(tmp_path):
+    alone(handled, str(tmp_path / "signals"))
+
+
+# -- locks ----------------------------------------------------------------------------------------
+
+
+HELD = threading.Lock()
+
+
+def hold(env, number=0):
+    HELD.acquire()
+
+
+def test_a_fork_that_waits_for_a_lock_for_ever_says_so():
+    HELD.acquire()  # as by a thread that is not in the fork
+    env = trip()
+    began = time.monotonic()
+    twin = clone(env, method="fork")
+    deeper = clone(twin, method="fork")
+    patient = clone(env, method="fork")
+
+    with ThreadPoolExecutor(1) as pool:
+        waits = pool.submit(patient.call, lambda env: threading.Event().wait(8))
+        for use in (
+            lambda: twin.call(hold),
+            lambda: deeper.call(hold),
+            lambda: branch(env, hold, 2, method="fork"),
+        ):
+            with pytest.raises(BranchError, match=r"locks.*OpenMP.*replay.*one thread"):
+                use()
+        assert time.monotonic() - began < 30
+        assert waits.result() is False  # it waits with a limit of time
+    HELD.release()
+
+
+class Slow(type):
+    """Whoever changes its classes, as environments do, takes a while."""
+
+    begun = threading.Event()
+
+    def __setattr__(cls, name, value):
+        cls.begun.set()
+        time.sleep(0.3)
+        super().__setattr__(name, value)
+
+
+def make_slowly():
+    class Model(Trip, metaclass=Slow):
+        def walk(self):
+            return 1
+
+    Slow.begun.clear()
+    single_env(Model, {Model.walk: POINTS["tests.worlds.trips.Trip.walk"]}).close()
+
+
+def by_hand(env):
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        make_slowly()
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@FORKS
+@pytest.mark.parametrize(
+    "forked",
+    [
+        by_hand,
+        lambda env: clone(env, method="fork", time_limit=20).call(lambda env: not make_slowly()),
+        lambda env: branch(env, lambda env, _: not make_slowly(), method="fork", time_limit=20)[0],
+    ],
+)
+def test_a_fork_while_another_thread_makes_an_environment_does_not_hang(forked):
+    env = trip()
+    make_slowly()
+    with ThreadPoolExecutor(1) as pool:
+        Slow.begun.clear()
+        made = pool.submit(make_slowly)
+        assert Slow.begun.wait(20)
+        assert forked(env)
+        made.result()

@@ -187,6 +187,24 @@ def test_errors_while_closing_surface_and_the_workers_end():
     assert envs.closed
 
 
+def test_a_second_close_ends_workers_that_an_interrupted_one_has_left(monkeypatch):
+    envs = begun(workers(Failing))
+    there = processes_of(envs)
+
+    def interrupt(*_):
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(multiprocessing.process.BaseProcess, "join", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        envs.close()
+    assert not envs.closed
+    envs.close()
+    assert envs.closed
+    assert not multiprocessing.active_children()
+    assert all(map(gone, there))
+
+
 def test_workers_of_an_environment_that_is_dropped_finish_and_end(tmp_path):
     def finish(path: Path) -> None:
         time.sleep(0.3)

@@ -427,6 +427,45 @@ def test_agents_that_end_before_the_depth():
     assert not np.isnan(told.means).any()
 
 
+def rule_to_the_end(env):
+    """Play a clone to its end by the rule."""
+    over = False
+    while not over:
+        told = env.step(RULE)
+        over = not env.agents if hasattr(env, "agents") else told[2] or told[3]
+
+
+def far_sighted(observation, *, _environment):
+    clone(_environment).unwrapped.call(rule_to_the_end)
+    return 1
+
+
+@pytest.mark.filterwarnings("ignore:.* cannot draw new random numbers")
+@pytest.mark.parametrize("policy", [TreeSearchPolicy(depth=5, futures=8), far_sighted])
+def test_policies_plan_and_play_clones_up_to_the_end(policy, monkeypatch):
+    monkeypatch.setattr(tree, "perf_counter", partial(next, count(0, 0)))  # forks cost nothing
+
+    class Short(Unseeded):
+        turns = 3
+
+    policies = {"right": policy}
+    simulate(Short, policies, points=tame(), seed=1)
+    aec = begun(aec_env(Short, tame(), policies=policies))
+    rule_to_the_end(aec)
+    parallel = begun(parallel_env(Short, tame(), policies=policies))
+    while parallel.agents:
+        parallel.step({"left": 1})
+    rule_to_the_end(begun(joint_env(Short, tame(), policies=policies)))
+    single = begun(single_env(Short, tame(), agent="left"))
+    over = False
+    while not over:
+        if policy is far_sighted:
+            action = policy(None, _environment=single)
+        else:
+            action = policy.choose(single).best
+        over = any(single.step(action)[2:4])
+
+
 def test_candidates_meet_the_same_futures():
     env = made("single")
     table = TreeSearchPolicy([1, 1], depth=1, futures=6).choose(env).returns

@@ -144,10 +144,14 @@ def _refuse_after_fork() -> None:
 
     The environment's user is in the other process.
     """
+    LOCK.release()
     driver = stack_of(getcurrent())
     if driver is not None:
         driver.refuse_all()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_refuse_after_fork)
+    # A fork waits for the changes of other threads, because nobody would complete them there.
+    os.register_at_fork(
+        before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=_refuse_after_fork
+    )

@@ -197,7 +197,7 @@ def _serve(connection: Connection, other_end: Connection | None, recipe: bytes) 
         other_end: The user's end, if a fork has copied it.
         recipe: The packed function that makes the object, and its arguments.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # because the user's process handles an interrupt
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # because multiprocessing ends workers by it
     if other_end is not None:
         other_end.close()
     served: list[Any] = []
@@ -260,10 +260,11 @@ class _Worker(Peer):
         """End the process, by force if it does not end within some seconds."""
         self.connection.close()
         process = self._process
-        process.join(seconds)
-        process.kill()  # which does nothing if it has ended
-        process.join()
-        process.close()
+        with suppress(ValueError):  # it was closed before an interrupt
+            process.join(seconds)
+            process.kill()  # which does nothing if it has ended
+            process.join()
+            process.close()
 
 
 class WorkerPool:
@@ -275,10 +276,7 @@ class WorkerPool:
     Attributes:
         failed: Whether an error has left the simulations at different steps, so that all of them
             need a reset.
-        idle: True: no simulation runs in this process.
     """
-
-    idle = True
 
     def __init__(
         self,
@@ -326,6 +324,11 @@ class WorkerPool:
         self._is_broken = True  # a worker is dead, or owes an answer because of an interrupt
         self.failed = False
         self._start()
+
+    @property
+    def idle(self) -> bool:
+        """Whether this process has no workers."""
+        return not self._workers
 
     def _start(self) -> None:
         """Start all workers, and have them make their objects."""
@@ -427,15 +430,14 @@ class WorkerPool:
     def abandon(self) -> None:
         """End the workers. A finalizer may call this; it raises no errors."""
         if os.getpid() != self._home:
-            return  # because this process is a fork, and its parent has the workers
-        workers = self._workers
-        self._workers = []
-        for worker in workers:
+            self._workers = []  # because this process is a fork, and its parent has the workers
+        for worker in self._workers:
             with suppress(OSError):
                 worker.connection.send_bytes(b"")  # asks it to end
         deadline = monotonic() + SECONDS_TO_CLOSE
-        for worker in workers:
-            worker.stop(max(deadline - monotonic(), 0.0))
+        while self._workers:  # a second call, after an interrupt, stops those that are left
+            self._workers[-1].stop(max(deadline - monotonic(), 0.0))
+            self._workers.pop()
 
 
 def _share_of(argument: Any, part: range) -> Any:

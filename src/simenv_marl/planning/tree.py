@@ -188,6 +188,8 @@ class Checkpoints:
         """Make a rollout, and a checkpoint after its candidates."""
         lengths = [length for length in range(len(node)) if node[:length] in self._checkpoints]
         nearest, begun = self._checkpoints[node[: lengths[-1]]]
+        if begun.over:  # further candidates are never taken
+            return begun
         function = self._search.trying([(node, 0)])
         limit = self._search.policy.time_limit
         with self._lock:

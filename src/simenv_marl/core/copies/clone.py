@@ -14,10 +14,10 @@ import copy
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from contextvars import ContextVar
 from functools import partial
 from itertools import islice
-from math import inf
 from multiprocessing.connection import Connection, wait
 from typing import Any, Final, TypeVar
 
@@ -39,9 +39,9 @@ from ..plans.policies import Where
 from ..switching.context import preserve_generators
 from ..switching.generators import PROCESS, is_seed, seed_globals
 from ..switching.resources import reuse_resources
-from .forks import CAN_FORK, Fork
+from .forks import CAN_FORK, PATIENCE, STUCK, Fork
 from .packing import pack_plainly, unpack, unpack_outcome
-from .peer import PeerLostError, serve
+from .peer import PeerLostError
 from .remote import Host, RemoteSession
 from .separation import separator_of
 
@@ -103,7 +103,8 @@ def clone(
     else:
         separate = separator_of(original.episode, method)
         if separate is not None:
-            fork = Fork.begin(partial(Host.serve, view, separate), time_limit)
+            host = Host(view)
+            fork = Fork.begin(host, partial(host.begin, separate), time_limit)
     session = Session(original.plan) if fork is None else RemoteSession(original, fork)
     try:
         if isinstance(session, Session):
@@ -282,25 +283,26 @@ def _call_in_forks(
     running: dict[Connection, tuple[int, Fork, float]] = {}  # with the number and the deadline
     cores = len(os.sched_getaffinity(0))
     numbers = iter(range(n))
-    try:
+    with ExitStack() as forks:  # an interrupt may end the end of one of them
         while len(results) < n:
             for number in islice(numbers, cores - len(running)):
                 first = partial(_call_and_pack, separate, function, number)
-                fork = Fork.begin(partial(serve, served=None, first=first), time_limit)
+                fork = Fork.begin(None, first, time_limit)
+                forks.callback(fork.end, "")
                 running[fork.connection] = number, fork, time.monotonic() + time_limit
             oldest, _, deadline = next(iter(running.values()))
-            left = None if deadline == inf else max(deadline - time.monotonic(), 0.0)
-            ready = wait(list(running), left)
+            ready = wait(list(running), min(max(deadline - time.monotonic(), 0.0), PATIENCE))
             if not ready:
-                raise BranchError(
-                    f"branch {oldest} was stopped: it took longer than {time_limit} s"
-                )
+                for number, fork, _ in running.values():
+                    if fork.is_stuck():
+                        raise BranchError(f"branch {number} is gone: {STUCK}")
+                if time.monotonic() >= deadline:
+                    raise BranchError(
+                        f"branch {oldest} was stopped: it took longer than {time_limit} s"
+                    )
             for connection in [connection for connection in running if connection in ready]:
                 number, fork, _ = running.pop(connection)
                 results[number] = _result_of(number, fork)
-    finally:
-        for _, fork, _ in running.values():
-            fork.end("")
     return [results[number] for number in range(n)]
 
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import _signal  # type: ignore[import-not-found]  # without the enums of signal, which forks copy
-import gc
 import os
+import re
 import select
 import socket
 import sys
+import traceback
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from errno import EMFILE
+from functools import partial
+from math import inf
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Final, TypeVar
 
 from ...errors import BranchError, annotate
 from ...simulation import Model
 from ..switching.context import ExclusiveLock
 from .packing import unpack_outcome
-from .peer import Peer, PeerLostError, flush, pack_request, receive
+from .peer import Peer, PeerLostError, flush, pack_request, receive, serve
 
 CAN_FORK: Final = sys.platform == "linux"
 """Whether processes can be forked: elsewhere, nothing ends a busy one with its user's process."""
@@ -45,12 +50,12 @@ class _Process:
 
     Attributes:
         lives: The read ends of the lives of the processes above this one.
-        connection: The connection to the process that uses this one.
+        user: The connection to the process that uses this one. -1 if this is the first process.
         life: The read end and the write end of this process's own life, once it has forked.
     """
 
     lives: tuple[int, ...] = ()
-    connection: Connection | None = None
+    user: int = -1
     life: tuple[int, int] | None = None
 
     def own_life(self) -> int:
@@ -60,11 +65,11 @@ class _Process:
         return self.life[0]
 
     def leave(self) -> None:
-        """In a fork, close the descriptors that keep the other end from being closed."""
+        """In a fork, close what keeps the other end from being closed."""
         if self.life is not None:
             os.close(self.life[1])
-        if self.connection is not None:
-            self.connection.close()
+        if self.user >= 0:  # its object remains open, because a clone's fork connects it anew
+            os.dup2(self.lives[0], self.user, inheritable=False)
 
 
 _this = _Process()
@@ -81,15 +86,13 @@ if CAN_FORK:
     os.register_at_fork(after_in_child=_begin_process)
 
 
-def _begin_fork(lives: tuple[int, ...], connection: Connection) -> None:
-    """In a fork of this module, end with the lives, and leave interrupts to the user."""
+def _begin_fork(lives: tuple[int, ...], user: int, first: Callable[[], Result]) -> Result:
+    """In a fork of this module, end with the lives, and call a function."""
     global _this
-    gc.freeze()  # the collector would write to the memory that is shared, and so copy it
-    _this = _Process(lives, connection)
+    _this = _Process(lives, user)
     for life in lives:
         _end_with(life)
-    _signal.signal(_signal.SIGINT, _signal.SIG_IGN)
-    _signal.set_wakeup_fd(-1)
+    return first()
 
 
 def _end_with(descriptor: int) -> None:
@@ -108,6 +111,19 @@ def _end_with(descriptor: int) -> None:
 
 # -- forks ----------------------------------------------------------------------------------------
 
+_FOREVER: Final = re.compile(r"futex\w+ \w+ 0x\w*[89a-f]\w \w+ 0x0 ")
+"""A wait without a time limit for private memory (a futex), which only its process can end."""
+
+PATIENCE: Final = 2.0
+"""After so many seconds without a response, look whether the process can still respond."""
+
+STUCK: Final = (
+    "it was ended, because all its threads waited for locks that nobody releases: a thread that is"
+    " not in the fork held one, or a library cannot be used in forks, such as OpenMP in"
+    ' scikit-learn, LightGBM and faiss; use method="replay", or have the library use one thread'
+    " (OMP_NUM_THREADS=1)"
+)
+
 
 class Fork(Peer):
     """A forked process. It serves an object.
@@ -122,7 +138,7 @@ class Fork(Peer):
         process: int,
         connection: Connection,
         limit: float,
-        reap: Callable[[], object] | None = None,
+        parent: Fork | None = None,
     ) -> None:
         """Take over a process.
 
@@ -130,26 +146,45 @@ class Fork(Peer):
             process: Its number.
             connection: The connection to it.
             limit: The time that an answer may take, in seconds.
-            reap: Lets its parent wait for its end. None: this process is its parent.
+            parent: Its parent, which must wait for its end. None: this process.
         """
         super().__init__(connection)
         self.lock = ExclusiveLock()
         self.process = process
         self._limit = limit
-        self._reap = reap
+        # Weak, because a clone may be the last of a long chain.
+        self._parent = None if parent is None else weakref.ref(parent)
         self._owner = os.getpid()
         self._gone: str | None = None
+        self._waits: list[str] = []
 
     @classmethod
-    def begin(cls, main: Callable[[Connection], None], limit: float) -> Fork:
-        """Fork this process: see ``fork``. The new process ends with this one.
+    def begin(cls, served: object, first: Callable[[], object], limit: float) -> Fork:
+        """Fork a process that serves an object, and ends with this one.
+
+        Args:
+            served: The object.
+            first: Called in the new process. Its result, or its error, is the first response.
+            limit: The time that an answer may take, in seconds.
 
         Raises:
             BranchError: There are no more descriptors or processes. Nothing is left behind.
         """
         here, there = pipe()
         with there:
-            process = fork(main, there, here)
+            with limited():
+                lives = *_this.lives, _this.own_life()
+            process = _fork()
+            if process == 0:
+                code = 1
+                try:
+                    here.close()
+                    serve(there, served, partial(_begin_fork, lives, there.fileno(), first))
+                    code = 0
+                except BaseException:
+                    traceback.print_exc()
+                finally:
+                    os._exit(code)  # without any of the parent's exit handlers
         return cls(process, here, limit)
 
     @property
@@ -179,6 +214,23 @@ class Fork(Peer):
         result: Result = result_of(response)
         return result
 
+    def receive(self, seconds: float = inf) -> bytes:
+        """Wait for a response: see ``Peer.receive``. End the process if none can come."""
+        while seconds > PATIENCE:
+            with suppress(TimeoutError):
+                return super().receive(PATIENCE)
+            if self.is_stuck():
+                self.end(f"{STUCK}; ")
+                raise self.lost()
+            seconds -= PATIENCE
+        return super().receive(seconds)
+
+    def is_stuck(self) -> bool:
+        """Return whether all threads wait for locks, and did so at the previous call."""
+        before = self._waits
+        self._waits = _waits_of(self.process)
+        return before == self._waits != []
+
     @contextmanager
     def watch(self) -> Iterator[None]:
         """Send a request and wait for the response inside.
@@ -204,59 +256,90 @@ class Fork(Peer):
             raise BranchError(f"the clone is gone: {self.gone}")
 
     def end(self, why: str) -> None:
-        """End the process, for a reason. In a fork of this process, only forget it."""
-        if self._gone is not None:
+        """End the process, for a reason. In a fork of this process, only forget it.
+
+        After an interrupt, call this again.
+        """
+        if self._gone is None:
+            self._gone = why  # an interrupt may come before the rest
+        if self.connection.closed:
             return
-        self._gone = why  # an interrupt may come before the rest
         if self._owner == os.getpid():
             self._gone += self._kill()
         self.connection.close()
 
     def _kill(self) -> str:
         """Kill the process; return how it has ended."""
-        # If it has closed its connection, its number may be another process's.
-        if self._reap is None or receive(self.connection, 0) != b"":
-            with suppress(ProcessLookupError):
-                os.kill(self.process, _signal.SIGKILL)
-        if self._reap is not None:
-            with suppress(Exception):  # the parent may be gone, or busy; then it waits later
-                self._reap()
+        if self._parent is not None:
+            self._kill_foreign(self._parent())
             return "its process has ended"
-        code = 0
-        with suppress(ChildProcessError):  # the user has waited for it
-            code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
+        try:
+            status = os.waitpid(self.process, os.WNOHANG)
+            if status[0] == 0:
+                os.kill(self.process, _signal.SIGKILL)
+                status = os.waitpid(self.process, 0)
+        except ChildProcessError:  # the user has waited for it
+            return "its process has ended"
+        code = os.waitstatus_to_exitcode(status[1])
+        if code == 0:
+            return "because code in it has called os._exit(0), or closed all descriptors"
         return f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
 
+    def _kill_foreign(self, parent: Fork | None) -> None:
+        """Kill a process that another fork has forked, and have that wait for it."""
+        options = os.WNOHANG
+        # If it has closed its connection, its number may be another process's.
+        if receive(self.connection, 0) != b"":
+            options = 0
+            with suppress(ProcessLookupError):
+                os.kill(self.process, _signal.SIGKILL)
+        if parent is not None and not parent.lock.held:
+            with suppress(Exception):  # it may be busy, or gone
+                parent.request(_wait_for, self.process)
+                return
+        _wait_for(None, self.process, options)
 
-def fork(
-    main: Callable[[Connection], None], connection: Connection, other: Connection | None
-) -> int:
-    """Fork a process that runs a function with a connection, and then ends. Return its number.
+
+def _wait_for(served: object, process: int, options: int = 0) -> None:
+    """Wait for the end of a process that was killed, if it is a child of this one.
+
+    A process whose parent has ended gets another one: the first process of a container.
+    """
+    with suppress(ChildProcessError):
+        os.waitpid(process, options)
+
+
+def _waits_of(process: int) -> list[str]:
+    """Return where the threads of a process wait. An empty list if one of them may go on."""
+    with suppress(OSError):  # it has ended, or the system hides it
+        waits = [
+            "".join((task / name).read_text() for name in ("wchan", "syscall", "status"))
+            for task in Path(f"/proc/{process}/task").iterdir()
+        ]
+        if all(map(_FOREVER.match, waits)):
+            return waits  # with the status, which counts how often they have run
+    return []
+
+
+def fork(connection: Connection, first: Callable[[], Result]) -> int | Result:
+    """Fork this fork. Return the number of the new process; there, the result of a function.
 
     Args:
-        main: The function, which must ``serve`` something.
-        connection: The connection.
-        other: The other end, if this process uses the new one. Then the new process ends with this
-            one, otherwise with the processes above this one.
+        connection: The connection to the new process, in place of the one to this process.
+        first: The function.
     """
+    this = _this
+    process = _fork()
+    if process != 0:
+        return process
+    os.dup2(connection.fileno(), this.user, inheritable=False)
+    return _begin_fork(this.lives, this.user, first)
+
+
+def _fork() -> int:
     flush()  # else both processes would write the buffered output
-    lives = _this.lives
-    try:
-        if other is not None:
-            lives = *lives, _this.own_life()
-        with warnings.catch_warnings(action="ignore"):  # of locks that other threads hold
-            process = os.fork()
-    except OSError as error:
-        raise exhausted(error) from error
-    if process == 0:
-        try:
-            if other is not None:
-                other.close()
-            _begin_fork(lives, connection)
-            main(connection)
-        finally:
-            os._exit(0)  # without any of the parent's exit handlers
-    return process
+    with limited(), warnings.catch_warnings(action="ignore"):  # of locks that other threads hold
+        return os.fork()
 
 
 # -- connections ----------------------------------------------------------------------------------
@@ -264,31 +347,30 @@ def fork(
 
 def pipe() -> tuple[Connection, Connection]:
     """Return two connected ends. Raise a ``BranchError`` if there are no more descriptors."""
-    try:
+    with limited():
         return Pipe()
-    except OSError as error:
-        raise exhausted(error) from error
 
 
-def _as_socket(connection: Connection) -> socket.socket:
-    """Return the socket that a connection is."""
-    same = socket.socket(fileno=os.dup(connection.fileno()))
+def _as_socket(descriptor: int) -> socket.socket:
+    """Return the socket of a connection."""
+    same = socket.socket(fileno=os.dup(descriptor))
     same.setblocking(True)  # because users may set a default time limit of sockets
     return same
 
 
 def send_connection(through: Connection, connection: Connection) -> None:
     """Send a connection through another one."""
-    with _as_socket(through) as same:
+    with _as_socket(through.fileno()) as same:
         socket.send_fds(same, [b"."], [connection.fileno()])
 
 
-def receive_connection(through: Connection) -> Connection:
-    """Receive a connection. Raise a ``BranchError`` if there are no more descriptors."""
-    with _as_socket(through) as same:
+def receive_connection() -> Connection:
+    """In a fork, receive a connection. Raise a ``BranchError`` if there are no more descriptors."""
+    with _as_socket(_this.user) as same:
         descriptors = socket.recv_fds(same, 1, 1)[1]
-    if not descriptors:
-        raise exhausted(OSError(EMFILE, os.strerror(EMFILE)))
+    with limited():
+        if not descriptors:
+            raise OSError(EMFILE, os.strerror(EMFILE))
     return Connection(descriptors[0])
 
 
@@ -302,6 +384,10 @@ def result_of(response: bytes) -> Model:
     raise error
 
 
-def exhausted(error: OSError) -> BranchError:
-    """Make the error that says that there are no more descriptors or processes."""
-    return BranchError(f"no process can be forked: {error}; close some clones")
+@contextmanager
+def limited() -> Iterator[None]:
+    """Explain the error that there are no more descriptors or processes."""
+    try:
+        yield
+    except OSError as error:
+        raise BranchError(f"no process can be forked: {error}; close some clones") from error

@@ -5,6 +5,7 @@ A process ``serve``s an object, whose methods its user calls by a ``Peer``. Each
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]  # without the enums of signal, which forks copy
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -65,6 +66,7 @@ def serve(connection: Connection, served: object, first: Callable[[], object]) -
 
     The first response comes without a request: the result of a function.
     """
+    _leave_signals()
 
     def call(request: bytes) -> Model:
         method, args = unpack(request)
@@ -79,6 +81,16 @@ def serve(connection: Connection, served: object, first: Callable[[], object]) -
             if not request:
                 return
             response = pack_outcome(call, request)
+
+
+def _leave_signals() -> None:
+    """Leave interrupts, and the signals that the user handles, to the user's process."""
+    _signal.signal(_signal.SIGINT, _signal.SIG_IGN)
+    _signal.set_wakeup_fd(-1)
+    for number in range(1, _signal.NSIG):
+        if callable(_signal.getsignal(number)):
+            # Not SIG_IGN, because child processes of the model would inherit that.
+            _signal.signal(number, lambda *_: None)
 
 
 def receive(connection: Connection, seconds: float = inf) -> bytes | None:

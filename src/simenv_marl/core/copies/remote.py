@@ -6,14 +6,20 @@ The session asks the host, whose responses report the episode. The session mirro
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Callable
 from functools import partial
-from multiprocessing.connection import Connection
 from operator import attrgetter
 from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
-from ...errors import BranchError, ClosedError, SimEnvError, short_repr, warn_user
+from ...errors import (
+    BranchError,
+    ClosedError,
+    InvalidActionError,
+    SimEnvError,
+    describe_error,
+    short_repr,
+    warn_user,
+)
 from ...simulation import Action, Model
 from ..episodes.agent import Agent, Clock
 from ..episodes.base import BaseSession, Recording, ResetOptions, Snapshot
@@ -25,8 +31,8 @@ from ..episodes.state import EpisodeState, Outcome, State
 from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals
 from .forks import Fork, fork, pipe, receive_connection, result_of, send_connection
-from .packing import pack_outcome
-from .peer import pack_request, serve
+from .packing import pack_outcome, pack_plainly, unpack
+from .peer import pack_request
 from .separation import separator_of
 
 Result = TypeVar("Result")
@@ -104,7 +110,15 @@ class Mirror(EpisodeState):
 
     def step(self, action: Action) -> None:
         """Take a step in the clone's process."""
-        self._session.move(Host.step, action)
+        try:
+            packed = pack_plainly(action)
+            unpack(packed)  # not everything that can be pickled can be unpickled
+        except Exception as error:
+            raise InvalidActionError(
+                f"the action {short_repr(action)} cannot be sent to the process of the clone"
+                f" ({describe_error(error)})"
+            ) from error
+        self._session.move(Host.step, packed)
 
 
 # -- the clone's process ---------------------------------------------------------------------------
@@ -134,26 +148,17 @@ class HostedView(Protocol):
 class Host:
     """The environment in the process of a clone. Its methods answer requests."""
 
-    def __init__(self, view: HostedView, connection: Connection) -> None:
+    def __init__(self, view: HostedView) -> None:
         self._view = view
-        self._connection = connection
         self._reported: Episode | None = None  # all its agents were reported
 
-    @classmethod
-    def serve(cls, view: HostedView, separate: Callable[[], None], connection: Connection) -> None:
-        """In a fork, separate it from its parent, and answer requests.
-
-        The first response is a report.
-        """
-        host = cls(view, connection)
-        serve(connection, host, partial(host.begin, separate))
-
-    def begin(self, separate: Callable[[], None]) -> Report | None:
-        """Leave the parent. Let the view of a planner wait for its agent only."""
+    def begin(self, separate: Callable[[], None]) -> bytes:
+        """In a fork, leave the parent. Let the view of a planner wait for its agent only."""
         separate()
+        self._reported = None
         self._view.session.leave_parent()
         self._view.begin_branch()
-        return self._report()
+        return pack_outcome(self._report)
 
     def _report(self) -> Report | None:
         """Report the episode. None if there is none."""
@@ -186,13 +191,13 @@ class Host:
 
     # -- requests that move the simulation: ``move`` calls them ------------------------------------
 
-    def move(self, method: Callable[..., object], *args: object) -> tuple[bytes, Report | None]:
-        """Call another method. Return the packed outcome and, also after an error, a report."""
-        return pack_outcome(method, self, *args), self._report()
+    def move(self, method: Callable[..., object], *args: object) -> tuple[bytes, bytes]:
+        """Call another method. Return the outcomes of it and, also after an error, of a report."""
+        return pack_outcome(method, self, *args), pack_outcome(self._report)
 
-    def step(self, action: Action) -> None:
-        """Take a step."""
-        self._view.episode.step(action)
+    def step(self, packed: bytes) -> None:
+        """Take a step with an action."""
+        self._view.episode.step(unpack(packed))
 
     def start(self, seed: int, options: ResetOptions, in_rounds: bool) -> None:
         """Begin another episode."""
@@ -226,20 +231,17 @@ class Host:
         seed_globals(seed, PROCESS)
         self._view.session.reseed(seed)
 
-    def fork(self, method: str | None) -> int | None:
+    def fork(self, method: str | None) -> int | bytes | None:
         """Fork this process, with a connection that follows the request.
 
-        Return the number of the new process. None if the episode is replayed.
+        Return the number of the new process. None if the episode is replayed. The new process
+        continues here: it responds to the request by its first response.
         """
-        with receive_connection(self._connection) as connection:
+        with receive_connection() as connection:
             separate = separator_of(self._view.episode, method)
             if separate is None:
                 return None
-            return fork(partial(Host.serve, self._view, separate), connection, None)
-
-    def reap(self, process: int) -> None:
-        """Wait for the end of a fork that was killed."""
-        os.waitpid(process, 0)
+            return fork(connection, partial(self.begin, separate))
 
 
 # -- the user's process ---------------------------------------------------------------------------
@@ -261,7 +263,8 @@ class RemoteSession(BaseSession):
         self.episode = None
         self._fork = fork
         self._is_renewed = False  # whether there may be another episode than at first
-        self._mirror(fork.start())
+        with fork.watch():  # an error ends the process
+            self._mirror(fork.start())
 
     @property
     def simulation(self) -> Model:
@@ -276,12 +279,26 @@ class RemoteSession(BaseSession):
 
     def move(self, method: Callable[..., Result], *args: object) -> Result:
         """Call a method that moves the simulation, and mirror the episode afterwards."""
-        outcome, report = self._fork.request(Host.move, method, *args)
-        self._mirror(report)
+        outcome, reported = self._fork.request(Host.move, method, *args)
+        try:
+            self._mirror(reported)
+        except BranchError:
+            result_of(outcome)  # the model's error comes first
+            raise
         result: Result = result_of(outcome)
         return result
 
-    def _mirror(self, report: Report | None) -> None:
+    def _mirror(self, reported: bytes) -> None:
+        """Mirror the outcome of a report."""
+        try:
+            report: Report | None = result_of(reported)
+        except Exception as error:
+            self.episode = None
+            self._state = State.OVER
+            raise BranchError(
+                "an observation, info or mask cannot be sent from the process of the clone"
+                f' ({describe_error(error)}); use method="replay"'
+            ) from error
         if report is None:
             self.episode = None
         elif self.episode is None or report.is_whole:
@@ -301,7 +318,7 @@ class RemoteSession(BaseSession):
         process: int | None = result_of(response)
         if process is None:
             return None
-        return Fork(process, here, time_limit, partial(self._fork.request, Host.reap, process))
+        return Fork(process, here, time_limit, self._fork)
 
     def refusal(self) -> SimEnvError:
         """Make the error that says why no action can be taken now."""
@@ -370,7 +387,7 @@ class RemoteSession(BaseSession):
     @property
     def idle(self) -> bool:
         """Whether the process has ended."""
-        return self._fork.gone is not None
+        return self._fork.connection.closed
 
     def close(self) -> None:
         """End the process. Unwind and close the simulation there if it was reset there."""

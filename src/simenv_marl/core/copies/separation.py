@@ -26,8 +26,8 @@ from typing import Any, Final, Protocol
 from ...errors import BranchError
 from ..episodes.episode import Episode
 from ..switching.awaiting import LOOPS
-from ..switching.opened import new_epolls
-from .forks import CAN_FORK, exhausted
+from ..switching.opened import SHARED_BEFORE, new_epolls, shared_memory
+from .forks import CAN_FORK, limited
 
 if CAN_FORK:
     import fcntl
@@ -93,6 +93,7 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
             if hasattr(part, "fileno"):
                 held.pop(part.fileno(), None)
     others += [f"{name} (descriptor {number})" for number, name in sorted(held.items())]
+    others += [f"shared memory ({path})" for _, path in shared_memory() - SHARED_BEFORE]
     if others and method == "fork":
         raise BranchError(
             f"a forked process cannot continue with {', '.join(others)} that the simulation has"
@@ -100,22 +101,18 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
         )
     if others:
         return None
-    try:
+    with limited():
         files = _open_files()
-    except OSError as error:
-        raise exhausted(error) from error
     return partial(_separate, random.getstate(), files, loops)
 
 
 def _separate(python: tuple[Any, ...], files: list[list[_Opening]], loops: list[Loop]) -> None:
     """In a fork, restore Python's generator, reopen files, and separate loops."""
     random.setstate(python)  # Python reseeds it after a fork
-    try:
+    with limited():
         for openings in files:
             with suppress(FileNotFoundError):  # the garbage collector has closed it since
                 _reopen(openings)
-    except OSError as error:
-        raise exhausted(error) from error
     for loop in loops:
         _separate_loop(loop)
     torch = sys.modules.get("torch")

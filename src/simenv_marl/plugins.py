@@ -37,7 +37,6 @@ from .hooks.hook import Hook, hook_of, hooks, rebind
 from .hooks.places import (
     decorate,
     find_hook,
-    is_importable,
     split_binding,
     target_of,
 )
@@ -346,8 +345,8 @@ class Plugins:
             for entry in entries:
                 handler = _make_handler(entry, named, self)
                 self.handlers.append(handler)
-                importable = is_importable(handler.target.name)
-                self.portable.append(_entry(handler) if importable else entry)
+                is_found = "<" not in handler.target.name  # by its name, in any process
+                self.portable.append(_entry(handler) if is_found else entry)
         self.entries = [_entry(handler) for handler in self.handlers]
         self.hooks = {handler.target for handler in self.handlers}
 

@@ -105,6 +105,10 @@ class UnmatchedNames:
 
         ``called``: the functions that end agents and were called. None if the model has not ended.
         """
+        if called is not None:
+            self._check_removers(episode, called)
+        if not self._names:
+            return
         present = [
             name
             for name, agent in episode.agents.items()
@@ -118,15 +122,14 @@ class UnmatchedNames:
                 "policies= or possible_agents= name agents that did not appear in the episode:"
                 f" {listed(sorted(absent))}; these did: {listed(present)}"
             )
-        if called is not None:
-            self._check_removers(episode, called)
 
     def _check_removers(self, episode: EpisodeState, called: Collection[Hook]) -> None:
-        agents = [*episode.agents.values(), *episode.others.values(), *episode.ended.values()]
-        decided = {agent.point.hook for agent in agents if agent.answered}
         for point in episode.plan.points:
             hooks = {each.hook for each in episode.plan.removers if each.point is point}
-            if point.hook not in decided or not hooks or point.hook in self._points:
+            if not hooks or point.hook in self._points:
+                continue
+            agents = [*episode.agents.values(), *episode.others.values(), *episode.ended.values()]
+            if not any(agent.answered and agent.point.hook is point.hook for agent in agents):
                 continue
             self._points.add(point.hook)
             if hooks.isdisjoint(called):

@@ -37,7 +37,6 @@ from ...hooks.places import (
     all_classes,
     find_hook,
     hook_at,
-    is_importable,
     raw_attribute,
     resolve,
 )
@@ -322,4 +321,4 @@ def portable(key: Model, name: str | None = None) -> Model:
     if hasattr(function, BY_NAME):
         return getattr(function, BY_NAME)
     name = name or f"{function.__module__}.{function.__qualname__}"
-    return name if is_importable(name) else function
+    return function if "<" in name else name

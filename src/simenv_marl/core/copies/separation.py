@@ -94,6 +94,9 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
                 held.pop(part.fileno(), None)
     others += [f"{name} (descriptor {number})" for number, name in sorted(held.items())]
     others += [f"shared memory ({path})" for _, path in shared_memory() - SHARED_BEFORE]
+    monkey = sys.modules.get("gevent.monkey")
+    if monkey is not None and monkey.is_module_patched("select"):
+        others.append("the hub of gevent.monkey")
     if others and method == "fork":
         raise BranchError(
             f"a forked process cannot continue with {', '.join(others)} that the simulation has"

@@ -333,7 +333,8 @@ class Holding:
         self.chance, self.log = random.Random(seed), []
 
     def run(self):
-        with self.open():
+        opened = self.open()
+        with opened:
             for _ in range(6):
                 self.log.append((filing.choose(), self.chance.random()))
 
@@ -448,7 +449,7 @@ print(branch(env, lambda env, number: number, 1, method="fork"))
 
 def test_resources_of_the_user_do_not_keep_a_branch_from_forking():
     env, (one, other) = trip(), socket.socketpair()
-    with one, other, subprocess.Popen(["cat"], stdin=subprocess.PIPE):
+    with one, other, mmap.mmap(-1, 100), subprocess.Popen(["cat"], stdin=subprocess.PIPE):
         assert branch(env, lambda twin, number: os.getpid(), method="fork") != [os.getpid()]
 
 

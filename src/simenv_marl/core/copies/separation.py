@@ -18,10 +18,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from mmap import mmap
 from selectors import BaseSelector
 from subprocess import Popen
 from threading import Thread
+from types import FunctionType, ModuleType
 from typing import Any, Final, Protocol
+
+import numpy as np
 
 from ...errors import BranchError
 from ..episodes.episode import Episode
@@ -56,6 +60,25 @@ class _Opening:
     flags: int
     offset: int
     descriptors: list[int]
+
+
+def _maps_memory(episode: Episode) -> bool:
+    """Return whether the simulation, its module or its frames hold an ``mmap``."""
+    simulation = episode.simulation
+    module = sys.modules.get(type(simulation).__module__)
+    queue = [simulation, {} if module is None else vars(module), *episode.driver.variables()]
+    known: set[int] = set()
+    while queue:
+        thing = queue.pop()
+        if isinstance(thing, mmap):
+            return True
+        if id(thing) in known or isinstance(thing, (type, ModuleType, FunctionType)):
+            continue  # these lead to the whole process
+        known.add(id(thing))
+        queue += gc.get_referents(thing)
+        if isinstance(thing, np.ndarray):
+            queue.append(thing.base)
+    return False
 
 
 def separator_of(episode: Episode | None, method: str | None) -> Callable[[], None] | None:
@@ -93,7 +116,9 @@ def separator_of(episode: Episode | None, method: str | None) -> Callable[[], No
             if hasattr(part, "fileno"):
                 held.pop(part.fileno(), None)
     others += [f"{name} (descriptor {number})" for number, name in sorted(held.items())]
-    others += [f"shared memory ({path})" for _, path in shared_memory() - SHARED_BEFORE]
+    shared = shared_memory() - SHARED_BEFORE
+    if shared and _maps_memory(episode):
+        others += [f"shared memory ({path})" for _, path in shared]
     monkey = sys.modules.get("gevent.monkey")
     if monkey is not None and monkey.is_module_patched("select"):
         others.append("the hub of gevent.monkey")

@@ -13,7 +13,7 @@ hook gets an interceptor, which sends an event and carries out the reply.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextvars import Context, copy_context
 from functools import partial
 from sys import exception, modules
@@ -238,6 +238,13 @@ class Driver(ABC):
         self._refused = None
         self._outcome = []
         self._context = copy_context()
+
+    def variables(self) -> Iterator[dict[str, Model]]:
+        """Yield the variables of each frame of the suspended simulation."""
+        frame = None if self._stack is None else self._stack.gr_frame
+        while frame is not None:
+            yield frame.f_locals
+            frame = frame.f_back
 
     @property
     def reachable(self) -> bool:

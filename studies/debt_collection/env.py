@@ -95,7 +95,7 @@ def profit_of_case(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> fl
     return (debtor.collected - debtor.spent) / 100_00
 
 
-def profit(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> float:
+def profit(agency: Agency) -> float:
     """The agency's profit, in hundreds of dollars."""
     return agency.profit / 100_00
 

@@ -42,7 +42,7 @@ Cast = Callable[[Observation], Observation]
 
 Space: TypeAlias = spaces.Space[Any]
 
-CompoundSpace = Dict | Tuple[Any]
+CompoundSpace: TypeAlias = "Dict | Tuple[Any]"
 """Spaces whose elements have parts."""
 
 _REFUSALS: Final = (ObservationError, InvalidActionError)

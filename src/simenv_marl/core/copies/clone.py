@@ -40,7 +40,7 @@ from ..switching.context import preserve_generators
 from ..switching.generators import PROCESS, is_seed, seed_globals
 from ..switching.resources import reuse_resources
 from .forks import CAN_FORK, PATIENCE, STUCK, Fork
-from .packing import pack_plainly, unpack, unpack_outcome
+from .packing import pack_checked, unpack, unpack_outcome
 from .peer import PeerLostError
 from .remote import Host, RemoteSession
 from .separation import separator_of
@@ -313,13 +313,11 @@ def _call_and_pack(
     separate()
     result = function(number)
     try:
-        packed = pack_plainly(result)
-        unpack(packed)  # not everything that can be pickled can be unpickled
+        return pack_checked(result)
     except Exception as error:
         raise BranchError(
             f"it returned a value that cannot be pickled ({describe_error(error)})"
         ) from error
-    return packed
 
 
 def _result_of(number: int, fork: Fork) -> Any:

@@ -49,6 +49,13 @@ unpack: Final = pickle.loads
 """Unpickles an object that ``pack`` or ``pack_plainly`` has pickled."""
 
 
+def pack_checked(thing: object) -> bytes:
+    """Pickle an object as ``pack_plainly`` does. Raise an error if it cannot be unpickled."""
+    packed = pack_plainly(thing)
+    unpack(packed)
+    return packed
+
+
 def pack_outcome(function: Callable[..., object], *args: object) -> bytes:
     """Call a function, and pack its result, or the error that it raises."""
     try:

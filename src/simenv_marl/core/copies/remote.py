@@ -31,7 +31,7 @@ from ..episodes.state import EpisodeState, Outcome, State
 from ..plans.policies import Where
 from ..switching.generators import PROCESS, seed_globals
 from .forks import Fork, fork, pipe, receive_connection, result_of, send_connection
-from .packing import pack_outcome, pack_plainly, unpack
+from .packing import pack_checked, pack_outcome, unpack
 from .peer import pack_request
 from .separation import separator_of
 
@@ -111,8 +111,7 @@ class Mirror(EpisodeState):
     def step(self, action: Action) -> None:
         """Take a step in the clone's process."""
         try:
-            packed = pack_plainly(action)
-            unpack(packed)  # not everything that can be pickled can be unpickled
+            packed = pack_checked(action)
         except Exception as error:
             raise InvalidActionError(
                 f"the action {short_repr(action)} cannot be sent to the process of the clone"

@@ -58,6 +58,7 @@ from .switching.generators import (
 )
 from .switching.resources import acquire, release, reuse_resources
 from .values.actions import ILLEGAL, MASK, Mask, action_check
+from .values.common import ActionCode, Encode, common_actions, common_observations
 from .values.spaces import blank, duplicate, observation_cast, same
 from .values.stacking import Stacker, joined, split_batch, stack_masks, stacker, taken
 
@@ -78,8 +79,8 @@ __all__ = [  # noqa: RUF022 - by subject
     "pack_request", "pending_view", "portable", "release", "reuse_resources", "serve", "unpack",
     "unpack_outcome",
     # Values.
-    "ILLEGAL", "MASK", "action_check", "as_json", "blank", "duplicate",
-    "explain_arguments", "joined", "observation_cast", "same", "source_name",
+    "ILLEGAL", "MASK", "ActionCode", "Encode", "action_check", "as_json", "blank", "common_actions",
+    "common_observations", "duplicate", "explain_arguments", "joined", "observation_cast", "same", "source_name",
     "split_batch", "stack_masks", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",

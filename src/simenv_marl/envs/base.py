@@ -26,6 +26,7 @@ from ..core import (
     BaseSession,
     EpisodeState,
     Info,
+    Mask,
     Model,
     Observation,
     Plan,
@@ -57,7 +58,7 @@ ResetOptions: TypeAlias = dict[str, Any] | None
 StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
 """Observation, reward, terminated, truncated, info."""
 
-_NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session"))
+_NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session", "turn"))
 """The attributes that each view makes for itself."""
 
 
@@ -69,16 +70,17 @@ class View:
         method            is called                                 is filled by
         ------            ---------                                 ------------
         adapt             with the plan, before the session         several agents, single, planner
-        set_up            when a view is made or cloned, and when   single, joint, planner
+        set_up            when a view is made or cloned, and when   one agent, planner
                           another process may have reset it
-        _original_spaces  when an agent's spaces are first read     View, joint
-        spaces_of         when a vector environment is made         single, joint
+        _original_spaces  when an agent's spaces are first read     View, joint, turn
+        spaces_of         when a vector environment is made         one agent
         reset             by the user                               all
-        begin             at the first decision of a reset          AEC, parallel, single, joint
+        begin             at the first decision of a reset          all but the planner
         step              by the user                               all
-        read_all,         by vector environments, in place of step  single, joint
+        read_all,         by vector environments, in place of step  one agent
         read_end, validate
-        _clear            when an episode ends                      AEC, parallel, single
+        masks             by ``action_masks``                       one agent
+        _clear            when an episode ends                      AEC, parallel, single, turn
         check_pending     before a branch or a clone is made        View, planner
         begin_branch      in a new branch or clone                  planner
 
@@ -134,9 +136,9 @@ class View:
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
-        for option, view in (("flatten", "joint"), ("agent", "single")):
+        for option, views in (("flatten", "joint and turn views"), ("agent", "single view")):
             if getattr(plan.options, option) and option != cls._option:
-                raise UnknownOptionError(f"{option} is an option of the {view} view only")
+                raise UnknownOptionError(f"{option} is an option of the {views} only")
         return plan
 
     @classmethod
@@ -538,6 +540,13 @@ class OneAgentView(View, gym.Env[Any, Any]):
         """
         return self._start(seed, options, self.begin)
 
+    def masks(self) -> list[Mask]:
+        """Return the masks of the actions that are legal now, one for each agent."""
+        return [
+            agent.point.open_mask() if agent.mask is None else agent.mask
+            for agent in self.known_agents()
+        ]
+
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the mask of the legal actions, as ``MaskablePPO`` of sb3-contrib expects it.
 
@@ -558,7 +567,6 @@ class OneAgentView(View, gym.Env[Any, Any]):
                 " MultiDiscrete with flatten=True"
             )
         parts: list[Any] = []
-        for agent in self.known_agents():
-            mask = agent.point.open_mask() if agent.mask is None else agent.mask
+        for mask in self.masks():
             parts += mask if isinstance(mask, tuple) else (mask,)
         return np.concatenate(parts).astype(np.bool_)

@@ -41,6 +41,7 @@ Result = TypeVar("Result")
 
 FIELDS: Final = (
     "observation", "reward", "info", "mask", "decided", "ended", "present", "answered", "delegated",
+    "noted_action",
 )  # fmt: skip
 """The fields of an agent that views read."""
 
@@ -150,6 +151,7 @@ class Host:
     def __init__(self, view: HostedView) -> None:
         self._view = view
         self._reported: Episode | None = None  # all its agents were reported
+        self._latest: Agent | None = None  # was pending at the latest report
 
     def begin(self, separate: Callable[[], None]) -> bytes:
         """In a fork, leave the parent. Let the view of a planner wait for its agent only."""
@@ -173,6 +175,9 @@ class Host:
             agents += episode.agents.values()
         elif pending is not None:
             agents.append(pending)
+            if self._latest is not None and self._latest.noted_action is not None:
+                agents.append(self._latest)  # because the turn view reads the rule's action
+        self._latest = pending
         self._reported = episode
         if not episode.in_rounds:
             episode.take_ended()  # because the view in the other process reports them

@@ -124,6 +124,7 @@ class Agent:
         choices: The choices of the pending decision. None without ``choices=``.
         offered: The choices of the latest decision, held weakly, until the rule has chosen.
         rule_action: The action that corresponds to the rule's latest decision. None if unknown.
+        noted_action: The same until an info contains it. None where infos do not.
         decided: Whether the reward mapping was called in this episode. Its first value is dropped.
         ended: Whether its episode has ended before the simulation's.
         present: Whether the latest info comes from an observation.
@@ -136,9 +137,9 @@ class Agent:
     """
 
     __slots__ = (
-        "_applying", "_carried", "_has_rule_action", "_is_quick", "answered", "answered_at",
+        "_applying", "_carried", "_is_quick", "answered", "answered_at",
         "arguments", "asked", "choices", "clock", "decided", "delegated", "ended", "fallbacks",
-        "fault", "handler", "info", "mask", "memory", "name", "now", "observation", "offered",
+        "fault", "handler", "info", "mask", "memory", "name", "noted_action", "now", "observation", "offered",
         "plugins", "point", "policy", "present", "reward", "rule_action",
     )  # fmt: skip
 
@@ -168,7 +169,7 @@ class Agent:
         self.choices: list[Model] | None = None
         self.offered: list[Model] | None = None
         self.rule_action: Action = None
-        self._has_rule_action = False  # which the next info contains
+        self.noted_action: Action = None
         self.decided = False
         self._is_quick = False  # an update needs no more than an observation and a reward
         self.ended = False
@@ -400,9 +401,9 @@ class Agent:
         mask = self.mask
         if mask is not None:
             self.info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
-        if self._has_rule_action:
-            self.info["rule_action"] = self.rule_action
-            self._has_rule_action = False
+        if self.noted_action is not None:
+            self.info["rule_action"] = self.noted_action
+            self.noted_action = None
         if point.masked_parts and mask is not None:
             self.observation = point.observe(args, kwargs, mask)
         else:
@@ -505,7 +506,7 @@ class Agent:
     def note_rule_action(self, action: Action, informs: bool) -> None:
         """Note the action that corresponds to the rule's decision."""
         self.rule_action = action
-        self._has_rule_action = informs
+        self.noted_action = action if informs else None
         self.offered = None
 
     def take_rule_action(self) -> Action:

@@ -1,0 +1,293 @@
+"""The turn view: a Gymnasium environment in which one learner takes each decision as it arises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import exp
+from typing import NamedTuple, Self
+
+import numpy as np
+from gymnasium import spaces
+from numpy import ndarray
+
+from ..core import (
+    MASK,
+    Action,
+    ActionCode,
+    Agent,
+    Encode,
+    EpisodeState,
+    Info,
+    Mask,
+    Observation,
+    Plan,
+    Space,
+    common_actions,
+    common_observations,
+    duplicate,
+)
+from ..errors import ViewError, short_repr
+from ..simulation import RULE
+from .base import OneAgentView, StepResult
+
+RULE_ACTION = "rule_action"
+"""The key of the rule's action in infos."""
+
+
+class Seat(NamedTuple):
+    """The decision point of some agents, as the learner sees it.
+
+    Attributes:
+        kind: The number of the point.
+        encode: Encodes an observation of theirs. None: their space is the common one.
+        code: Translates between their actions and the learner's.
+        open_mask: The mask if all their actions are legal. None: nothing can be masked.
+    """
+
+    kind: np.int64
+    encode: Encode | None
+    code: ActionCode
+    open_mask: Mask | None
+
+
+class Turn:
+    """The agents of a plan, as one learner that decides for each of them in turn.
+
+    Attributes:
+        observation_space, action_space: The spaces of the learner.
+        translates: Whether the learner's actions differ from those of the agents.
+        has_masks: Whether infos have masks of its actions.
+        informs: Whether infos have actions of the rule.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Unite the spaces of the active points, or raise ``ViewError`` if that is not possible."""
+        options = plan.options
+        definitions = [point.definition for point in plan.active]
+        common, encoders = common_observations([each.observation_space for each in definitions])
+        actions = [each.action_space for each in definitions]
+        self.action_space, codes = common_actions(actions, clips=options.clip_actions)
+        self.translates = any(space != self.action_space for space in actions)
+        hooks = [point.hook for point in plan.active]
+        kinds = map(np.int64, range(len(hooks)))
+        masks = [code.widen(None) for code in codes]
+        self._seats = dict(zip(hooks, map(Seat, kinds, encoders, codes, masks), strict=True))
+        self.has_masks = any(mask is not None for mask in masks)
+        self.informs = any(each.rule_action_mapping is not None for each in definitions)
+        parts: dict[str, Space] = {"kind": spaces.Discrete(len(hooks)), "observation": common}
+        self._indices: dict[str, np.int64] = {}
+        if options.possible_agents is not None:
+            parts["agent"] = spaces.Discrete(len(plan.roster))
+            self._indices = {name: np.int64(index) for index, name in enumerate(plan.roster)}
+        self._whole = spaces.Dict(parts)
+        self._common = common
+        self.observation_space: Space = self._whole
+        self._flatten = options.flatten
+        self._beginnings: dict[tuple[np.int64, str], Observation] = {}
+        if options.flatten:
+            self.observation_space = spaces.flatten_space(self._whole)
+            if not isinstance(self.observation_space, spaces.Box):
+                raise ViewError(
+                    "flatten=True needs observation spaces that can be flattened, not"
+                    f" {short_repr(common)}"
+                )
+
+    def seat(self, agent: Agent) -> Seat:
+        """Return the seat of an agent."""
+        return self._seats[agent.point.hook]
+
+    def observe(self, agent: Agent) -> Observation:
+        """Return an agent's latest observation as one of the learner."""
+        seat = self._seats[agent.point.hook]
+        encode = seat.encode
+        shared = agent.observation
+        if encode is None and type(shared) is ndarray:
+            shared = shared.copy()
+        else:
+            if shared is None:
+                shared = agent.point.blank()
+            shared = duplicate(shared) if encode is None else encode(shared)
+        if self._flatten:
+            is_box = isinstance(self._common, spaces.Box)
+            flat = shared.ravel() if is_box else spaces.flatten(self._common, shared)
+            return np.concatenate((self._beginning(agent, seat), flat))
+        if self._indices:
+            index = self._indices[agent.name]
+            return {"agent": index, "kind": seat.kind, "observation": shared}
+        return {"kind": seat.kind, "observation": shared}
+
+    def add_mask(self, agent: Agent, info: Info) -> None:
+        """Add the mask of the learner's actions to an agent's info."""
+        if agent.mask is None:
+            mask = self._seats[agent.point.hook].open_mask
+            if mask is not None:
+                info[MASK] = mask.copy()
+        elif self.translates:  # else the info has it
+            info[MASK] = self._seats[agent.point.hook].code.widen(agent.mask)
+
+    def _beginning(self, agent: Agent, seat: Seat) -> Observation:
+        """Return the flattened agent and kind, which come before the observation."""
+        key = seat.kind, agent.name if self._indices else ""
+        if key not in self._beginnings:
+            numbers = {"kind": seat.kind}
+            if self._indices:
+                numbers["agent"] = self._indices[agent.name]
+            parts = [spaces.flatten(self._whole[name], numbers[name]) for name in sorted(numbers)]
+            self._beginnings[key] = np.concatenate(parts).astype(self.observation_space.dtype)
+        return self._beginnings[key]
+
+
+class SimulationTurnEnv(OneAgentView):
+    """A simulation as a Gymnasium environment of one learner that takes each decision in turn.
+
+    ``turn_env`` makes it. A step answers the pending decision, and runs to the next one of any
+    agent, in the order of the AEC view.
+
+    Attributes:
+        observation_space: A ``Dict`` of the deciding agent's ``observation``, its ``kind`` (the
+            decision point, in the order of ``points``), and its ``agent`` (the index in
+            ``possible_agents``, if that option was given). With ``flatten=True``, the same as one
+            ``Box``. If the agents' observation spaces differ, each is flattened, and padded with
+            zeros.
+        action_space: The action space of all agents, if they have the same. Otherwise: the largest
+            ``Discrete``; for ``Box`` spaces, one in [-1, 1], which is scaled to each agent's own
+            bounds; for both, one whose first n parts are preferences for the actions of a
+            ``Discrete`` (the largest legal one is taken).
+        turn: The agents, united into one learner.
+        own_agent: The agent whose decision is pending, or was the last one.
+    """
+
+    own_agent: Agent
+    _option = "flatten"
+    _agent_name = "turn"
+    _last_time: float | None = None  # the time of the previous reset or step
+
+    def set_up(self) -> None:
+        """Unite the agents."""
+        self.turn: Turn = self.session.plan.derive(Turn)
+        episode = self.session.episode
+        if episode is not None and episode.pending is not None:
+            self.own_agent = episode.pending
+
+    @classmethod
+    def spaces_of(cls, plan: Plan) -> tuple[Space, Space]:
+        """Return the spaces of the learner."""
+        turn: Turn = plan.derive(Turn)
+        return turn.observation_space, turn.action_space
+
+    def _original_spaces(self, agent: str) -> tuple[Space, Space]:
+        return self.spaces_of(self.session.plan)
+
+    def begin(self, episode: EpisodeState) -> tuple[Observation, Info]:
+        """Return the observation and the info of a reset."""
+        self._last_time = None
+        agent = episode.pending
+        if agent is None:  # all moves were forced
+            agents = (*episode.agents.values(), *episode.ended.values())
+            agent = next(agent for agent in agents if agent.decided)
+        self.own_agent = agent
+        return self.turn.observe(agent), self._info(episode, agent)
+
+    def _clear(self) -> None:
+        if hasattr(self, "own_agent"):
+            del self.own_agent  # because it holds arguments of the model
+
+    def step(self, action: Action) -> StepResult:
+        """Answer the pending decision with an action, or ``RULE``, and run to the next one.
+
+        Returns:
+            Observation; reward: the sum of the rewards of all agents since the last step (a Python
+            float); terminated; truncated; info. The last observation is that of the agent that
+            decided last. ``info["agent"]`` is the name of the deciding agent.
+            ``info["action_mask"]`` exists if an agent has a ``Discrete`` action space.
+            ``info["elapsed"]`` and ``info["discount"]`` count from the last step.
+
+        Raises:
+            InvalidActionError: The action is not legal. The environment does not change.
+            BaseException: Any other error of ``SimulationAECEnv.step``.
+        """
+        episode = self.session.episode
+        if episode is None or (self._lock and not self._lock.held):
+            return self._step_in_lock(SimulationTurnEnv.step, action)
+        if self.turn.translates:
+            action = self._translate(episode, action)
+        episode.step(action)
+        if self._shows:
+            self.show_step()
+        observation, reward, info = self.read(episode)
+        if episode.pending is None:
+            return observation, reward, episode.terminated, episode.truncated, info
+        return observation, reward, False, False, info
+
+    def _translate(self, episode: EpisodeState, action: Action) -> Action:
+        """Return the deciding agent's own action for one of the learner."""
+        agent = episode.pending
+        if agent is None or action is RULE:
+            return action
+        return self.turn.seat(agent).code.decode(action, agent.mask)
+
+    def read(self, episode: EpisodeState) -> tuple[Observation, float, Info]:
+        """Return the observation, the reward and the info of a step."""
+        turn = self.turn
+        before = self.own_agent
+        agent = episode.pending
+        if agent is None:
+            agent = before
+            reward = sum([each.reward for each in episode.agents.values()], 0.0)
+        else:
+            reward = agent.reward
+            self.own_agent = agent
+        if episode.just_ended:
+            reward += sum([each.reward for each in episode.take_ended()])
+        info = self._info(episode, agent)
+        if turn.informs:
+            noted = info.pop(RULE_ACTION, None)
+            if agent is not before:  # else it is of an earlier step
+                noted = before.noted_action
+            if noted is not None:
+                info[RULE_ACTION] = turn.seat(before).code.encode(noted)
+        return turn.observe(agent), reward, info
+
+    def _info(self, episode: EpisodeState, agent: Agent) -> Info:
+        """Return the info of an agent, as one of the learner."""
+        info = agent.info.copy()
+        info["agent"] = agent.name
+        if self.turn.has_masks:
+            self.turn.add_mask(agent, info)
+        clock = episode.clock
+        if clock is not None:
+            if agent is not episode.pending:  # it may have ended earlier
+                info |= clock.read(None)
+            now = info["time"]
+            info["elapsed"] = elapsed = 0.0 if self._last_time is None else now - self._last_time
+            self._last_time = now
+            rate = episode.plan.options.discount_rate
+            if rate is not None:
+                info["discount"] = exp(-rate * elapsed)
+        return info
+
+    @classmethod
+    def read_all(cls, views: Sequence[Self]) -> tuple[list[Observation], list[float], list[Info]]:
+        """Return the observations, rewards and infos of the latest step of several views."""
+        results = [view.read(view.episode) for view in views]
+        return (
+            [observation for observation, _, _ in results],
+            [reward for _, reward, _ in results],
+            [info for _, _, info in results],
+        )
+
+    def read_end(self, episode: EpisodeState) -> tuple[bool, bool]:
+        """Return how an episode has ended: whether terminated, whether truncated."""
+        return episode.terminated, episode.truncated
+
+    def validate(self, action: Action) -> Action:
+        """Validate an action for the pending decision, before the simulation moves."""
+        episode = self.episode
+        action = self._translate(episode, action)
+        return action if episode.pending is None else episode.pending.validate(action)
+
+    def masks(self) -> list[Mask]:
+        """Return the mask of the deciding agent."""
+        agent = self.episode.pending or self.own_agent
+        mask = self.turn.seat(agent).code.widen(agent.mask)
+        return [agent.point.open_mask() if mask is None else mask]

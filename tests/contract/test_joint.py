@@ -299,7 +299,7 @@ def test_some_spaces_cannot_be_flattened(of_ant, of_bee, match):
     with pytest.raises(ViewError, match=match):
         joint_env(calling(ant, bee), [ant, bee], flatten=True)
     for make in (aec_env, parallel_env):
-        with pytest.raises(UnknownOptionError, match="an option of the joint view only"):
+        with pytest.raises(UnknownOptionError, match="an option of joint and turn views only"):
             make(calling(ant, bee), [ant, bee], flatten=True)
 
 

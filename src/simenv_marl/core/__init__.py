@@ -58,7 +58,13 @@ from .switching.generators import (
 )
 from .switching.resources import acquire, release, reuse_resources
 from .values.actions import ILLEGAL, MASK, Mask, action_check
-from .values.common import ActionCode, Encode, common_actions, common_observations
+from .values.common import (
+    ActionCode,
+    Encode,
+    common_actions,
+    common_observations,
+    preferences,
+)
 from .values.spaces import blank, duplicate, observation_cast, same
 from .values.stacking import Stacker, joined, split_batch, stack_masks, stacker, taken
 
@@ -80,7 +86,7 @@ __all__ = [  # noqa: RUF022 - by subject
     "unpack_outcome",
     # Values.
     "ILLEGAL", "MASK", "ActionCode", "Encode", "action_check", "as_json", "blank", "common_actions",
-    "common_observations", "duplicate", "explain_arguments", "joined", "observation_cast", "same", "source_name",
+    "common_observations", "duplicate", "explain_arguments", "joined", "observation_cast", "preferences", "same", "source_name",
     "split_batch", "stack_masks", "stacker", "taken",
     # Chance, and the user's side.
     "GlobalRandom", "LoopExit", "Streams", "environment_context", "generators_of", "global_states",

@@ -58,6 +58,13 @@ ResetOptions: TypeAlias = dict[str, Any] | None
 StepResult: TypeAlias = tuple[Observation, float, bool, bool, Info]
 """Observation, reward, terminated, truncated, info."""
 
+_OWN_OPTIONS = {
+    "agent": "the single view",
+    "flatten": "joint and turn views",
+    "state_in_info": "joint and turn views",
+}
+"""The options that not every view takes."""
+
 _NOT_COPIED = frozenset(("_finalizer", "_lock", "_roster", "joint", "own_agent", "session", "turn"))
 """The attributes that each view makes for itself."""
 
@@ -92,7 +99,8 @@ class View:
     """
 
     in_rounds = False
-    _option = ""  # the option that only this view takes
+    _has_warned_of_losses = False
+    _own_options: tuple[str, ...] = ()  # options that other views refuse
 
     def __init__(self, plan: Plan) -> None:
         """Make the view of a plan, with a new session."""
@@ -136,9 +144,9 @@ class View:
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Check that a plan allows this view, and return the plan of its sessions."""
-        for option, views in (("flatten", "joint and turn views"), ("agent", "single view")):
-            if getattr(plan.options, option) and option != cls._option:
-                raise UnknownOptionError(f"{option} is an option of the {views} only")
+        for option, views in _OWN_OPTIONS.items():
+            if getattr(plan.options, option) and option not in cls._own_options:
+                raise UnknownOptionError(f"{option} is an option of {views} only")
         return plan
 
     @classmethod
@@ -355,6 +363,19 @@ class View:
             raise session.refusal()
         with session.exclusive:
             return step(self, action)
+
+    def warn_of_losses(self, episode: EpisodeState) -> None:
+        """Warn once if an episode in rounds has used fewer than nine in ten actions."""
+        played = episode.round
+        if played is None or self._has_warned_of_losses or 10 * played.used >= 9 * played.given:
+            return
+        self._has_warned_of_losses = True
+        warn_user(
+            f"of {played.given} actions in this episode, {played.used} were used: the agents do not"
+            " decide in each round, and the other actions are lost;"
+            f" {played.early} decisions were answered by an action that was chosen before they"
+            " arose. aec_env loses none, nor does turn_env, for one learner"
+        )
 
     def _forget_ended(self) -> None:
         """Forget the records of an episode that has ended."""

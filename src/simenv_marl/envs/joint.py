@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from ..core import (
     Action,
+    ActionCode,
     EpisodeState,
     Info,
     Observation,
@@ -16,6 +17,7 @@ from ..core import (
     Space,
     checked_actions,
     duplicate,
+    preferences,
 )
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE, optional_method
@@ -44,7 +46,15 @@ class Joint:
         self._flatten = plan.options.flatten
         if not self._flatten:
             return
-        self.observation_space = _concatenate(observations.values())
+        flat = {name: _flat(space) for name, space in observations.items()}
+        self._flat_observations = {name for name in flat if flat[name] is not observations[name]}
+        self.observation_space = _concatenate(flat.values())
+        # Where agents with a Discrete stand beside agents with a Box.
+        self._codes: dict[str, ActionCode] = {}
+        if any(isinstance(space, spaces.Box) for space in actions.values()):
+            for name, space in actions.items():
+                if isinstance(space, spaces.Discrete):
+                    actions[name], self._codes[name] = preferences(space)
         self.action_space = _concatenate(actions.values(), discrete=True)
         # The index of each agent's action in the flattened one.
         self._places: dict[str, int | slice] = {}
@@ -73,7 +83,11 @@ class Joint:
                     f"the joint action {short_repr(action)} is not in"
                     f" {short_repr(self.action_space)}; with flatten=True, it is a NumPy array"
                 )
-            return {name: action[self._places[name]] for name in live}
+            parts = {name: action[self._places[name]] for name in live}
+            for name in self._codes.keys() & parts.keys():
+                mask = episode.agents[name].mask
+                parts[name] = self._codes[name].decode(parts[name], mask)
+            return parts
         if not isinstance(action, Mapping) or set(action) != set(self.roster):
             keys = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
@@ -107,11 +121,16 @@ class Joint:
             info["action_mask"] = masks
         if episode.clock is not None:
             info |= episode.clock.read(before)
-        reward = 0.0
-        for agent in (*episode.just_ended, *episode.agents.values()):
-            reward += agent.reward
+        reward = episode.earned
+        if reward is None:
+            reward = 0.0
+            for agent in (*episode.just_ended, *episode.agents.values()):
+                reward += agent.reward
         joined: Observation = observations
         if self._flatten:
+            for name in self._flat_observations:
+                space = self.roster[name].definition.observation_space
+                observations[name] = spaces.flatten(space, observations[name])
             parts = list(observations.values())
             joined = np.concatenate(parts).astype(self.observation_space.dtype)
         return joined, reward, episode.terminated, episode.truncated, info
@@ -129,12 +148,14 @@ class SimulationJointEnv(OneAgentView):
         observation_space, action_space: ``Dict`` spaces by agent. With ``flatten=True``:
             one-dimensional ``Box`` spaces, which concatenate the spaces of the agents (the paper's
             two-dimensional action space). ``Discrete`` and one-dimensional ``MultiDiscrete`` action
-            spaces become one ``MultiDiscrete``.
+            spaces become one ``MultiDiscrete``. Beside a ``Box``, a ``Discrete`` action becomes a
+            preference in [-1, 1] for each of its actions (the largest legal one is taken), and a
+            ``Discrete`` observation a vector of 0 and 1.
         joint: The agents, combined into one.
     """
 
     in_rounds = True
-    _option = "flatten"
+    _own_options = ("flatten", "state_in_info")
     _agent_name = "joint"
     _last_time: float | None = None  # the time of the previous reset or step
 
@@ -204,7 +225,12 @@ class SimulationJointEnv(OneAgentView):
     def read(self, episode: EpisodeState) -> StepResult:
         """Return the results of a step."""
         results = self.joint.read(episode, self._last_time)
-        self._last_time = results[-1].get("time")
+        info = results[-1]
+        self._last_time = info.get("time")
+        if self.session.plan.options.state_in_info:
+            info["state"] = self.state()
+        if episode.over:
+            self.warn_of_losses(episode)
         return results
 
     @classmethod
@@ -235,6 +261,11 @@ class SimulationJointEnv(OneAgentView):
         return actions
 
 
+def _flat(space: Space) -> Space:
+    """Return a ``Discrete`` as the vector that Gymnasium flattens it to. Others stay."""
+    return spaces.flatten_space(space) if isinstance(space, spaces.Discrete) else space
+
+
 def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
     """Return the space of concatenated vectors. ``discrete``: they may all be discrete, too."""
     kinds = (spaces.Discrete, spaces.MultiDiscrete)
@@ -247,7 +278,7 @@ def _concatenate(parts: Collection[Any], *, discrete: bool = False) -> Space:
     for space in parts:
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ViewError(
-                "flatten=True needs one-dimensional Box spaces, and actions that are all"
-                f" continuous or all discrete, not {space}"
+                "flatten=True needs Discrete and one-dimensional Box spaces, or actions that are all"
+                f" discrete, not {space}"
             )
     return spaces.flatten_space(spaces.Tuple(parts))

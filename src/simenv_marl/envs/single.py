@@ -64,7 +64,7 @@ class SimulationEnv(OneAgentView):
     """
 
     own_agent: Agent
-    _option = "agent"
+    _own_options = ("agent",)
 
     def set_up(self) -> None:
         """Find the agent."""

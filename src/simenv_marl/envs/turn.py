@@ -158,7 +158,7 @@ class SimulationTurnEnv(OneAgentView):
     """
 
     own_agent: Agent
-    _option = "flatten"
+    _own_options = ("flatten", "state_in_info")
     _agent_name = "turn"
     _last_time: float | None = None  # the time of the previous reset or step
 
@@ -239,6 +239,8 @@ class SimulationTurnEnv(OneAgentView):
             self.own_agent = agent
         if episode.just_ended:
             reward += sum([each.reward for each in episode.take_ended()])
+        if episode.earned is not None:
+            reward = episode.earned
         info = self._info(episode, agent)
         if turn.informs:
             noted = info.pop(RULE_ACTION, None)
@@ -264,6 +266,8 @@ class SimulationTurnEnv(OneAgentView):
             rate = episode.plan.options.discount_rate
             if rate is not None:
                 info["discount"] = exp(-rate * elapsed)
+        if episode.plan.options.state_in_info:
+            info["state"] = self.state()
         return info
 
     @classmethod

@@ -65,6 +65,7 @@ class Report(NamedTuple):
     time: float | None
     agents: list[tuple[str, int, tuple[Any, ...]]]
     pending: str | None
+    earned: float | None
     unreported_end: bool
 
 
@@ -89,6 +90,7 @@ class Mirror(EpisodeState):
         self.unreported_end = report.unreported_end
         self.outcome = report.outcome
         self.turns = report.turns
+        self.earned = report.earned
         self.round = report.round
         self._time[0] = report.time
         self.just_ended = []
@@ -190,6 +192,7 @@ class Host:
             None if episode.clock is None else float(episode.clock.time()),
             [(agent.name, hooks.index(agent.point.hook), _fields(agent)) for agent in agents],
             None if pending is None else pending.name,
+            episode.earned,
             episode.unreported_end,
         )
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import exp, isfinite
-from numbers import Real
+from math import exp
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from greenlet import getcurrent
 
-from ...errors import AgentError, MaskError, RewardError, short_repr
+from ...errors import AgentError, MaskError
 from ...hooks.hook import Hook
 from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
@@ -19,6 +18,7 @@ from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import Info, Where
 from ..switching.driver import AnyHandler
 from ..values.actions import MASK, Mask, only_choice
+from ..values.rewards import checked_reward
 from ..values.spaces import duplicate
 from .arguments import Arguments, freed, weaken
 from .decision import Decision
@@ -495,6 +495,10 @@ class Agent:
         self.reward = 0.0 if carry_on else total
         self._carried = total if carry_on else 0.0
 
+    def pay(self, reward: float) -> None:
+        """Set the reward to the team's."""
+        self.reward = reward
+
     # -- infos ------------------------------------------------------------------------------------
 
     def read_clock(self) -> None:
@@ -539,17 +543,3 @@ class Agent:
         """Return the observation, and forget it."""
         observation, self.observation = self.observation, None
         return observation
-
-
-def checked_reward(name: str, reward: Model) -> float:
-    """Return a reward as a float. Raise a ``RewardError`` if it is not one finite number."""
-    value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
-    if not isinstance(value, (Real, np.bool_)):
-        raise RewardError(f"the reward {short_repr(reward)} is not one number")
-    try:
-        number = float(value)
-    except OverflowError:
-        raise RewardError(f"the reward {short_repr(reward)} is too large for a float") from None
-    if not isfinite(number):
-        raise RewardError(f"the reward of {name!r} is {number}, which is not finite")
-    return number

@@ -34,7 +34,8 @@ functions run their rule.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from sys import maxsize
 from typing import Protocol
 from weakref import ref
@@ -66,6 +67,7 @@ from .events import Handlers
 from .round import Round
 from .split import SplitCall
 from .state import RUNNING, EpisodeState, Outcome, UnmatchedNames, checked_actions, missing_decision
+from .team import Team
 
 
 class EpisodeOwner(Protocol):
@@ -95,7 +97,7 @@ class Episode(EpisodeState):
 
     __slots__ = (
         "_context", "_entities", "_expected_calls", "_failed_in_model", "_handlers",
-        "_most_steps", "_plugins", "_split", "_tape_size", "called", "driver", "is_plain", "latest",
+        "_most_steps", "_plugins", "_split", "_tape_size", "_team", "called", "driver", "is_plain", "latest",
         "replay", "running", "session", "simulation", "tape",
     )  # fmt: skip
 
@@ -126,7 +128,10 @@ class Episode(EpisodeState):
         self._failed_in_model = False
         self._entities: dict[tuple[DecisionHandler, int], Agent] = {}  # by the id of the entity
         self._most_steps = plan.options.max_steps or maxsize
-        self.is_plain = not (in_rounds or self.skips)
+        self._team: Team | None = None
+        if plan.options.team_reward is not None:
+            self._team = Team(partial(plan.options.team_reward, simulation), self._plugins)
+        self.is_plain = not (in_rounds or self.skips or self._team)
         self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
         self._tape_size = LONGEST_TAPE + 1 if plan.has_planner or plan.has_user else 0
         self.replay = replay
@@ -240,7 +245,7 @@ class Episode(EpisodeState):
                 self.tape.append(recorded)
             self.turns += bool(checked)
             is_last = bool(checked) and self.turns == self._most_steps
-            played.begin(checked)
+            played.begin(checked, pending.name)
             if self.unreported_end:
                 self.unreported_end = False
             else:
@@ -314,8 +319,17 @@ class Episode(EpisodeState):
             forced = agent.only_action()
             agent.carry_reward(forced is not None or not agent.asked)
             if forced is not None:
+                if self._team is not None:
+                    self._team.join(agent)
                 return agent.reply_to(forced, forced=True)
+        if self._team is not None:
+            self._settle(self._team, [agent])
         return agent
+
+    def _settle(self, team: Team, agents: Collection[Agent]) -> None:
+        """Pay agents their share of the team's reward, before a reset or a step returns."""
+        team.settle(agents)
+        self.earned = team.earned
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
         """Answer a decision with the action of this round. Return the agent if it has none."""
@@ -327,6 +341,8 @@ class Episode(EpisodeState):
         if not agent.decided:  # it acts before it was ever updated
             args, kwargs = agent.arguments.recall()
             agent.update(args, kwargs, observe=False)
+            if self._team is not None:
+                self._team.join(agent)
         return agent.reply_to(action, forced is not None)
 
     def answer(self, agent: Agent, action: Action) -> Model:
@@ -511,6 +527,8 @@ class Episode(EpisodeState):
                 agent.carry_reward(not self.turns)
             if agent.choices is not None and agent is not pending:
                 agent.forget_choices()  # ``legal`` returns them again when it decides
+        if in_rounds and self._team is not None:
+            self._settle(self._team, self.agents.values())
         self.pending = pending
 
     def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
@@ -539,6 +557,8 @@ class Episode(EpisodeState):
         self.latest = latest  # the model continues after the decision of this agent
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
+        if self._team is not None:
+            self._team.note_end(agent)
 
     # -- branches that wait for one agent ---------------------------------------------------------
 
@@ -557,7 +577,7 @@ class Episode(EpisodeState):
         self.just_ended = []
         agent.take_over()
         self.round = None  # it is played in turns from now on
-        self.is_plain = not self.skips
+        self.is_plain = not (self.skips or self._team)
         if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
             args, kwargs = agent.arguments.recall()
             with self.context():
@@ -597,6 +617,8 @@ class Episode(EpisodeState):
         for agent in self.agents.values():
             self.latest = agent
             agent.conclude()
+        if self._team is not None:
+            self._settle(self._team, self.agents.values())
         self.outcome = Outcome.TRUNCATED if truncated else Outcome.TERMINATED
         session = self.session()
         if session is not None and (self.plan.named_agents or self.plan.removers):

@@ -24,26 +24,30 @@ class Round:
         acted: The names of the agents whose action was used in this round.
         used: The number of actions in the episode, other than ``RULE``, that decisions have used.
         unused: The number of actions that no decision has used.
+        early: The number of used actions that were chosen before their decision arose.
         stalled: The number of rounds in a row without an action for the pending agent.
     """
 
-    __slots__ = ("acted", "actions", "stalled", "unused", "used")
+    __slots__ = ("_pending", "acted", "actions", "early", "stalled", "unused", "used")
 
     def __init__(self) -> None:
         self.actions: dict[str, Action] = {}
         self.acted: set[str] = set()
         self.used = 0
         self.unused = 0
+        self.early = 0
         self.stalled = 0
+        self._pending = ""  # the agent whose decision waited when the round began
 
     @property
     def given(self) -> int:
         """The number of actions in the episode, other than ``RULE``."""
         return self.used + self.unused
 
-    def begin(self, actions: dict[str, Action]) -> None:
-        """Begin a round with checked actions."""
+    def begin(self, actions: dict[str, Action], pending: str) -> None:
+        """Begin a round with checked actions. ``pending``: the agent whose decision waits."""
         self.actions = actions
+        self._pending = pending
         self.acted = set()
 
     def take(self, agent: Agent) -> Action:
@@ -57,6 +61,7 @@ class Round:
                 if not mask_allows(space, agent.mask, action):
                     return WAIT
             self.used += 1
+            self.early += agent.name != self._pending
         self.acted.add(agent.name)
         return action
 

@@ -159,12 +159,13 @@ class EpisodeState:
         unreported_end: Whether agents ended during the reset, which the first step reports.
         turns: The number of actions that the environment's user has given.
         round: The present round. None if the episode is played in turns.
+        earned: The team's reward of the latest step. None if each agent has its own rewards.
         skips: Whether a decision with one legal action is answered with it.
         where: Where it is played, which determines the policies that are asked.
     """
 
     __slots__ = (
-        "_fault", "agents", "clock", "consulted", "ended", "just_ended", "others", "outcome",
+        "_fault", "agents", "clock", "consulted", "earned", "ended", "just_ended", "others", "outcome",
         "pending", "plan", "round", "seed", "skips", "turns", "unreported_end", "where",
     )  # fmt: skip
 
@@ -175,6 +176,7 @@ class EpisodeState:
         self.seed = seed
         self.clock = clock
         self.round = Round() if in_rounds else None
+        self.earned: float | None = None
         self.skips = plan.options.skip_forced
         self.where = where
         self.agents: dict[str, Agent] = {}

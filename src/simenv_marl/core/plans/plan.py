@@ -404,6 +404,11 @@ def make_plan(
     return _resolve(subject, checked)
 
 
+def _no_reward() -> float:
+    """Reward nothing, because the team's reward takes the place of the agent's."""
+    return 0.0
+
+
 # -- who decides where ----------------------------------------------------------------------------
 
 
@@ -431,6 +436,8 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         if policy is RULE and policies == [RULE]:
             continue
         clips = options.clip_actions
+        if options.team_reward is not None:
+            definition = replace(definition, reward_mapping=_no_reward)
         point = Point(hook, definition, agent, policy, records=collects, clips=clips)
         points.append(point)
         is_active = policies[0] is None

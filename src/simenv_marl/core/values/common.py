@@ -128,6 +128,12 @@ def common_actions(
     return common, codes
 
 
+def preferences(own: spaces.Discrete) -> tuple[spaces.Box, ActionCode]:
+    """Return a vector of preferences for the actions of a ``Discrete``, and its code."""
+    common = spaces.Box(-1.0, 1.0, (int(own.n),), np.float32)
+    return common, _Preferred(own, common, action_check(common), int(own.n))
+
+
 def _length(part: spaces.Box) -> int:
     if not part.is_bounded():
         raise ViewError(

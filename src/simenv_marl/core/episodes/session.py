@@ -7,13 +7,16 @@ freed at once, together with its session.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from ...errors import (
     BranchError,
+    NoDecisionError,
     OptionValueError,
     ReentrancyError,
     annotate,
@@ -23,7 +26,7 @@ from ...errors import (
 )
 from ...hooks.handlers import Installation
 from ...hooks.places import is_outdated
-from ...simulation import Model, make_simulation, optional_method, passing
+from ...simulation import Model, make_simulation, optional_method, passing, takes
 from ..plans.plan import DRIVERS, Plan
 from ..plans.policies import Where
 from ..switching.context import GlobalRandom, environment_context
@@ -35,6 +38,9 @@ from .base import LONGEST_TAPE, BaseSession, PendingDecision, Recording, Replay,
 from .episode import Episode
 from .events import Handlers, handlers_of
 from .state import EpisodeState, State, UnmatchedNames
+
+MOST_SEEDS: Final = 100
+"""How many seeds a reset tries until the one agent of a single view decides."""
 
 
 class Session(BaseSession):
@@ -154,9 +160,14 @@ class Session(BaseSession):
                     self._installed = Installation(self.plan.patches)
                 self._warn_of_outdated()
                 self.options = options
-                self.seed = self.seed_for(seed)
-                self._enter_ready_driver(driver)
-                return self._begin(self.seed, in_rounds, replay, beside)
+                for tried in self._seeds_to_try(self.seed_for(seed)):
+                    self.seed = tried
+                    self._enter_ready_driver(driver)
+                    try:
+                        return self._begin(tried, in_rounds, replay, beside)
+                    except NoDecisionError as error:
+                        missing = error
+                raise missing
             finally:
                 self._state = State.NEW if self.episode is None else State.OVER
 
@@ -170,6 +181,16 @@ class Session(BaseSession):
                 f" {listed(names)}. Calls of the new functions are no decisions here; name them in"
                 " points=, and make the environment anew"
             )
+
+    def _seeds_to_try(self, seed: int) -> Iterator[int]:
+        """Yield the seed of a reset, and more for an agent that is not born in each episode."""
+        yield seed
+        simulation = self._simulation
+        if self.plan.options.agent is None or not takes(simulation.reset, "seed"):
+            return
+        if not getattr(simulation, "deterministic", False):
+            more = np.random.SeedSequence(seed).generate_state(MOST_SEEDS - 1)
+            yield from map(int, more)
 
     def _enter_ready_driver(self, entered: Driver) -> None:
         """Replace the driver if it cannot run another job. ``entered``: the context's driver."""

@@ -103,11 +103,13 @@ class UnmatchedNames:
     def check(self, episode: EpisodeState, called: Collection[Hook] | None) -> None:
         """Warn once of names that options and ``removed_by=`` have in vain, at an episode's end.
 
+        Where an agent has joined or ended midway, a roster is an upper bound.
+
         ``called``: the functions that end agents and were called. None if the model has not ended.
         """
         if called is not None:
             self._check_removers(episode, called)
-        if not self._names:
+        if not self._names or episode.ended or episode.has_joined:
             return
         present = [
             name
@@ -156,6 +158,7 @@ class EpisodeState:
         consulted: The agent whose policy is being asked. In a replay, the one at whose decision
             the replay ends.
         outcome: How it has ended.
+        has_joined: Whether an agent has decided for the first time when others had decided twice.
         unreported_end: Whether agents ended during the reset, which the first step reports.
         turns: The number of actions that the environment's user has given.
         round: The present round. None if the episode is played in turns.
@@ -165,7 +168,7 @@ class EpisodeState:
     """
 
     __slots__ = (
-        "_fault", "agents", "clock", "consulted", "earned", "ended", "just_ended", "others", "outcome",
+        "_fault", "agents", "clock", "consulted", "earned", "ended", "has_joined", "just_ended", "others", "outcome",
         "pending", "plan", "round", "seed", "skips", "turns", "unreported_end", "where",
     )  # fmt: skip
 
@@ -186,6 +189,7 @@ class EpisodeState:
         self.pending: Agent | None = None
         self.consulted: Agent | None = None
         self.outcome = RUNNING
+        self.has_joined = False
         self.unreported_end = False
         self.turns = 0
         self._fault = ""

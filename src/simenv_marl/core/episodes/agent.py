@@ -336,10 +336,14 @@ class Agent:
         if point.expects_one and args:
             before = arguments.first()
             if before is not None and before is not args[0]:
-                self.fault = self.handler.warn_of_several(self.name)
+                self.note_several()
         arguments.store(args, kwargs)
         if point.agent is None and args:
             episode.note_entity(self, args[0])
+
+    def note_several(self) -> None:
+        """Note that it decides for several objects."""
+        self.fault = self.handler.warn_of_several(self.name)
 
     def is_entity(self, entity: Model) -> bool:
         """Return whether an object was the first argument of the latest decision."""

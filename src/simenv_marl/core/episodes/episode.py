@@ -430,7 +430,7 @@ class Episode(EpisodeState):
 
     def _next_item(self, call: SplitCall, reply: Model) -> Event:
         """Return the event of a call's next item. After the last one, resume the simulation."""
-        event = call.next_event(reply)
+        event = call.next_event(reply, self.latest)
         if event is not None:
             return event
         self._split = None
@@ -512,6 +512,7 @@ class Episode(EpisodeState):
             if agent.choices is not None and agent is not pending:
                 agent.forget_choices()  # ``legal`` returns them again when it decides
         self.pending = pending
+        self.latest = pending or self.latest
 
     def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
         """Return the agents that ``expected_calls`` announces, with the arguments of their call."""

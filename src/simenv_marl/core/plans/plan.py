@@ -373,8 +373,8 @@ def make_plan(
         )
     prototype: Prototype | None = None
     inspected = source
-    has_no_points = points is None and getattr(source, "points", None) is None
-    if has_no_points or not isinstance(source, type):
+    named = getattr(source, "points", None) if points is None else points
+    if named is None or not isinstance(source, type):
         prototype = Prototype(source, checked.driver)
         inspected = prototype.simulation
     if points is None:
@@ -425,9 +425,7 @@ def _resolve(subject: Subject, options: Options) -> Plan:
         policy = by_point.get(hook, subject.default_policy)
         if options.agent is not None and agent != only:
             policy = policy or RULE
-        policies = [policy, *by_agent.values()]
-        if agent is not None:
-            policies = [by_agent.get(agent, policy)]
+        policies = [policy, *by_agent.values()] if agent is None else [by_agent.get(agent, policy)]
         if policy is RULE and policies == [RULE]:
             continue
         clips = options.clip_actions

@@ -2,7 +2,8 @@
 
 import random
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from ctypes import addressof, c_char, c_uint64
 from functools import cache
 from gc import get_referents
 from numbers import Real
@@ -68,20 +69,22 @@ def draws_check(
         beside: Whether others run beside it. None: one check of its class is enough.
 
     Returns:
-        The function that ends the check, warns once for each class, and returns why the results
+        The function that looks for draws, warns once for each class, and returns why the results
         will be wrong, or "". None without a check.
     """
     kind = type(simulation)
     if beside is None and kind in _CHECKED:
         return None
-    states = global_states()
+    before = global_states()
+    count_draws = draw_counter()
+    count = count_draws()
     time_before = _time_of_other_threads()
+    is_seeded = False
 
     def warn_of_draws() -> str:
+        nonlocal is_seeded
         is_known = _CHECKED.setdefault(kind, False)
-        after = global_states()
-        names = [name for name, state in after.items() if state != states[name]]
-        if not names:
+        if is_seeded or count_draws() == count:
             return ""
         is_alone = all(
             thread is current_thread() or thread.name == SIMULATION
@@ -90,6 +93,8 @@ def draws_check(
         is_idle = not in_thread and _time_of_other_threads() - time_before < _SHORT
         if not (is_alone or is_idle or is_known):
             return ""
+        changes = {name: (before[name], after) for name, after in global_states().items()}
+        names = [name for name, (old, new) in changes.items() if old != new]
         problem = (
             f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which"
             " all code in the process shares: its environments influence each other, and a"
@@ -98,27 +103,33 @@ def draws_check(
         if not is_known:
             _CHECKED[kind] = True
             warn_user(problem)
-        is_wrong = beside or any(_has_drawn(states[name], after[name]) for name in names)
-        return problem if is_wrong else ""
+        is_seeded = not (beside or any(_has_drawn(*changes[name]) for name in names))
+        return "" if is_seeded else problem
 
     return warn_of_draws
 
 
-def _has_drawn(before: Model, after: Model) -> bool:
+_WORDS: Final = 624
+_KEY: Final = 4 * _WORDS
+"""The words and bytes of a state of the Mersenne Twister, besides the number of its next word."""
+
+_State: Final = c_char * (_KEY + 4)
+
+_STATE_OF_PYTHON: Final = _State.from_address(id(PYTHON) + object.__basicsize__)
+"""The state of Python's global generator in memory. The number of the next word comes first."""
+
+
+def _has_drawn(before: bytes, after: bytes) -> bool:
     """Return whether draws alone lead from one state to another: the generator was not seeded."""
-    if isinstance(after, str):  # of a generator of the user
+    if min(len(before), len(after)) < _KEY:  # another generator than the Mersenne Twister
         return True
-    if len(after) == 2:  # of NumPy
-        before, after = (
-            (3, (*np.frombuffer(key, np.uint32).tolist(), place), None)
-            for key, place in (before, after)
-        )
-    generator = random.Random()
-    generator.setstate(before)
+    twin: Any = MT19937()
+    key = np.frombuffer(before, np.uint32, _WORDS)
+    twin.state = {"bit_generator": "MT19937", "state": {"key": key, "pos": _WORDS}}
     for _ in range(_MOST_REFILLS):
-        if generator.getstate()[1][:-1] == after[1][:-1]:
+        if after.startswith(_State.from_address(twin.ctypes.state_address).raw[:_KEY]):
             return True
-        generator.getrandbits(32 * 624)
+        twin.random_raw(_WORDS, output=False)
     return False
 
 
@@ -127,12 +138,33 @@ def _time_of_other_threads() -> int:
     return process_time_ns() - thread_time_ns()
 
 
-def global_states() -> dict[str, object]:
-    """Return values that change when Python's or NumPy's global generator draws a number."""
-    state = LEGACY.get_bit_generator().state["state"]
-    is_mersenne = "key" in state  # as Python's
-    of_numpy = (state["key"].tobytes(), state["pos"]) if is_mersenne else repr(state)
-    return {"random": random.getstate(), "numpy.random": of_numpy}
+def global_states() -> dict[str, bytes]:
+    """Return values that change when Python's or NumPy's global generator draws a number.
+
+    They are copied from memory, because the generators take 40 microseconds to tell their states.
+    """
+    number_and_key = _STATE_OF_PYTHON.raw
+    bits = LEGACY.get_bit_generator()
+    if type(bits) is MT19937:
+        of_numpy = _State.from_address(bits.ctypes.state_address).raw
+    else:
+        of_numpy = repr(bits.state).encode()
+    other = repr(PYTHON.gauss_next).encode()
+    return {"random": number_and_key[4:] + number_and_key[:4] + other, "numpy.random": of_numpy}
+
+
+def draw_counter() -> Callable[[], tuple[object, ...]]:
+    """Make a function whose result changes when Python's or NumPy's global generator draws.
+
+    It is cheaper than ``global_states``.
+    """
+    bits = LEGACY.get_bit_generator()
+    if type(bits) is not MT19937:
+        return lambda: tuple(global_states().values())
+    # The number of the next word, and the word of the key beside it, which each refill changes.
+    of_python = c_uint64.from_address(addressof(_STATE_OF_PYTHON))
+    of_numpy = c_uint64.from_address(bits.ctypes.state_address + _KEY - 4)
+    return lambda: (of_python.value, of_numpy.value, LEGACY.get_bit_generator() is bits)
 
 
 # -- other futures --------------------------------------------------------------------------------
@@ -243,8 +275,7 @@ _SKIPPED: Final = (
     type,
     ModuleType,
     CodeType,
-    # They lead to no generator with a seed.
-    np.ndarray,
+    # They lead to nothing else.
     str,
     int,
     float,
@@ -325,28 +356,44 @@ def generators_of(simulation: Model) -> Iterator[Model]:
 
     ``Streams`` count as one.
     """
+    known = {id(PYTHON), id(NUMPY)}
+    for generator in find_objects([simulation], _GENERATORS, known):
+        yield generator
+        if isinstance(generator, Streams):
+            known.update(map(id, generator.values()))
+
+
+def find_objects(
+    roots: Iterable[Model], kinds: tuple[type, ...], known: set[int]
+) -> Iterator[Model]:
+    """Yield the objects of some classes that others hold, the nearest first, each of them once.
+
+    Args:
+        roots: The other objects.
+        kinds: The classes.
+        known: The identities of objects to leave out. Those of all objects are added.
+    """
 
     @cache
     def classify(kind: type) -> bool | None:
-        """Return whether objects of a class are generators. None: they are not searched."""
+        """Return whether objects of a class are yielded. None: they are not searched."""
         if hasattr(kind, "__globals__") or issubclass(kind, _SKIPPED):  # functions have globals
             return None
-        return issubclass(kind, _GENERATORS)
+        return issubclass(kind, kinds)
 
-    known = {id(PYTHON), id(NUMPY)}
-    queue = deque([simulation])
+    queue = deque(roots)
     while queue:
         thing = queue.popleft()
-        is_generator = classify(type(thing))  # type: ignore[arg-type] # mypy doubts its hash
-        if is_generator is None or id(thing) in known:
+        is_wanted = classify(type(thing))  # type: ignore[arg-type] # mypy doubts its hash
+        if is_wanted is None or id(thing) in known:
             continue
         known.add(id(thing))
-        if not is_generator:
-            queue.extend(get_referents(thing))
+        if is_wanted:
+            yield thing
             continue
-        yield thing
-        if isinstance(thing, Streams):
-            known.update(map(id, thing.values()))
+        queue.extend(get_referents(thing))
+        if isinstance(thing, np.ndarray):
+            queue.append(thing.base)
 
 
 def _seed_bits(bits: BitGenerator, stream: SeedSequence) -> None:

@@ -118,8 +118,8 @@ PATIENCE: Final = 2.0
 """After so many seconds without a response, look whether the process can still respond."""
 
 STUCK: Final = (
-    "it was ended, because all its threads waited for locks that nobody releases: a thread that is"
-    " not in the fork held one, or a library cannot be used in forks, such as OpenMP in"
+    "it was ended, because all its threads waited for locks that no thread releases: a thread that"
+    " is not in the fork held one, or a library cannot be used in forks, such as OpenMP in"
     ' scikit-learn, LightGBM and faiss; use method="replay", or have the library use one thread'
     " (OMP_NUM_THREADS=1)"
 )

@@ -223,10 +223,12 @@ class Player:
     # -- through wrappers -------------------------------------------------------------------------
 
     def _space_of(self, name: str) -> Space:
-        """Return the action space of an agent in the wrapped environment."""
+        """Return the action space of an agent, or of all together, in the wrapped environment."""
         space: Any = self.env.action_space
         if callable(space):
             space = space(name)
+        elif name != self.name:
+            space = space[name]
         return space  # type: ignore[no-any-return]
 
     def _step_env(
@@ -313,12 +315,6 @@ class JointPlayer(Player):
                 "a base by agent needs a joint view without flatten=True; pass one policy for all"
                 " agents"
             )
-
-    def _space_of(self, name: str) -> Space:
-        space: Any = self.env.action_space
-        if name != self.name:
-            space = space[name]
-        return space  # type: ignore[no-any-return]
 
     def _check(
         self,

@@ -3,7 +3,6 @@
 import random
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from ctypes import addressof, c_char, c_uint64
 from functools import cache
 from gc import get_referents
 from numbers import Real
@@ -69,22 +68,20 @@ def draws_check(
         beside: Whether others run beside it. None: one check of its class is enough.
 
     Returns:
-        The function that looks for draws, warns once for each class, and returns why the results
+        The function that ends the check, warns once for each class, and returns why the results
         will be wrong, or "". None without a check.
     """
     kind = type(simulation)
     if beside is None and kind in _CHECKED:
         return None
-    before = global_states()
-    count_draws = draw_counter()
-    count = count_draws()
+    states = global_states()
     time_before = _time_of_other_threads()
-    is_seeded = False
 
     def warn_of_draws() -> str:
-        nonlocal is_seeded
         is_known = _CHECKED.setdefault(kind, False)
-        if is_seeded or count_draws() == count:
+        after = global_states()
+        names = [name for name, state in after.items() if state != states[name]]
+        if not names:
             return ""
         is_alone = all(
             thread is current_thread() or thread.name == SIMULATION
@@ -93,8 +90,6 @@ def draws_check(
         is_idle = not in_thread and _time_of_other_threads() - time_before < _SHORT
         if not (is_alone or is_idle or is_known):
             return ""
-        changes = {name: (before[name], after) for name, after in global_states().items()}
-        names = [name for name, (old, new) in changes.items() if old != new]
         problem = (
             f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which"
             " all code in the process shares: its environments influence each other, and a"
@@ -103,33 +98,27 @@ def draws_check(
         if not is_known:
             _CHECKED[kind] = True
             warn_user(problem)
-        is_seeded = not (beside or any(_has_drawn(*changes[name]) for name in names))
-        return "" if is_seeded else problem
+        is_wrong = beside or any(_has_drawn(states[name], after[name]) for name in names)
+        return problem if is_wrong else ""
 
     return warn_of_draws
 
 
-_WORDS: Final = 624
-_KEY: Final = 4 * _WORDS
-"""The words and bytes of a state of the Mersenne Twister, besides the number of its next word."""
-
-_State: Final = c_char * (_KEY + 4)
-
-_STATE_OF_PYTHON: Final = _State.from_address(id(PYTHON) + object.__basicsize__)
-"""The state of Python's global generator in memory. The number of the next word comes first."""
-
-
-def _has_drawn(before: bytes, after: bytes) -> bool:
+def _has_drawn(before: Model, after: Model) -> bool:
     """Return whether draws alone lead from one state to another: the generator was not seeded."""
-    if min(len(before), len(after)) < _KEY:  # another generator than the Mersenne Twister
+    if isinstance(after, str):  # of a generator of the user
         return True
-    twin: Any = MT19937()
-    key = np.frombuffer(before, np.uint32, _WORDS)
-    twin.state = {"bit_generator": "MT19937", "state": {"key": key, "pos": _WORDS}}
+    if len(after) == 2:  # of NumPy
+        before, after = (
+            (3, (*np.frombuffer(key, np.uint32).tolist(), place), None)
+            for key, place in (before, after)
+        )
+    generator = random.Random()
+    generator.setstate(before)
     for _ in range(_MOST_REFILLS):
-        if after.startswith(_State.from_address(twin.ctypes.state_address).raw[:_KEY]):
+        if generator.getstate()[1][:-1] == after[1][:-1]:
             return True
-        twin.random_raw(_WORDS, output=False)
+        generator.getrandbits(32 * 624)
     return False
 
 
@@ -138,33 +127,12 @@ def _time_of_other_threads() -> int:
     return process_time_ns() - thread_time_ns()
 
 
-def global_states() -> dict[str, bytes]:
-    """Return values that change when Python's or NumPy's global generator draws a number.
-
-    They are copied from memory, because the generators take 40 microseconds to tell their states.
-    """
-    number_and_key = _STATE_OF_PYTHON.raw
-    bits = LEGACY.get_bit_generator()
-    if type(bits) is MT19937:
-        of_numpy = _State.from_address(bits.ctypes.state_address).raw
-    else:
-        of_numpy = repr(bits.state).encode()
-    other = repr(PYTHON.gauss_next).encode()
-    return {"random": number_and_key[4:] + number_and_key[:4] + other, "numpy.random": of_numpy}
-
-
-def draw_counter() -> Callable[[], tuple[object, ...]]:
-    """Make a function whose result changes when Python's or NumPy's global generator draws.
-
-    It is cheaper than ``global_states``.
-    """
-    bits = LEGACY.get_bit_generator()
-    if type(bits) is not MT19937:
-        return lambda: tuple(global_states().values())
-    # The number of the next word, and the word of the key beside it, which each refill changes.
-    of_python = c_uint64.from_address(addressof(_STATE_OF_PYTHON))
-    of_numpy = c_uint64.from_address(bits.ctypes.state_address + _KEY - 4)
-    return lambda: (of_python.value, of_numpy.value, LEGACY.get_bit_generator() is bits)
+def global_states() -> dict[str, object]:
+    """Return values that change when Python's or NumPy's global generator draws a number."""
+    state = LEGACY.get_bit_generator().state["state"]
+    is_mersenne = "key" in state  # as Python's
+    of_numpy = (state["key"].tobytes(), state["pos"]) if is_mersenne else repr(state)
+    return {"random": random.getstate(), "numpy.random": of_numpy}
 
 
 # -- other futures --------------------------------------------------------------------------------

@@ -31,6 +31,7 @@ from .report import (
     order_of,
 )
 from .runs import (
+    WARNINGS,
     Run,
     Runner,
     describe_with_place,
@@ -110,8 +111,10 @@ def check_simulation(
     )
     with silence() as warnings:
         check.run()
-    for warning in warnings:
-        check.add("warned", str(warning.message)[:300])
+    for text in (str(warning.message) for warning in warnings):
+        for part, name in WARNINGS.items():
+            if part in text:
+                check.add(name, text[:400], kind=part)
     return check.report(getattr(simulation, "__name__", type(simulation).__name__))
 
 

@@ -23,9 +23,9 @@ from collections.abc import (
     Iterator,
 )
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime
-from functools import cached_property, partial, wraps
+from functools import cached_property, partial
 from itertools import islice
 from textwrap import shorten
 from types import FrameType, coroutine
@@ -40,7 +40,6 @@ from ..core import (
     GlobalRandom,
     LoopExit,
     Plan,
-    Point,
     Where,
     environment_context,
     global_states,
@@ -63,9 +62,13 @@ from ..simulation import (
 )
 from .fingerprint import STEP, Fingerprint, fingerprint
 
-_WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appear in the episode")
-"""Texts of the warnings that are findings."""
-
+WARNINGS: Final = {
+    "their own rule decides": "silent_override",
+    "refuses to end": "warned",
+    "several objects decide at": "warned",
+    "did not appear in the episode": "warned",
+}
+"""Texts of the warnings that are findings, with their names."""
 
 Rule = Generator[Model, Model, Model]
 """The rule of a generator or coroutine function, while it runs."""
@@ -150,7 +153,7 @@ def silence() -> Iterator[list[warnings.WarningMessage]]:
         redirect_stderr(output),
     ):
         warnings.simplefilter("ignore")
-        for pattern in _WARNINGS:
+        for pattern in WARNINGS:
             warnings.filterwarnings("always", f".*{pattern}")
         yield records
 
@@ -175,7 +178,7 @@ class Run:
         is_stuck: Whether the last step began long before that exception.
         draws: The global generators that the run has used, by name.
         early: The places where a plain run called decision points before its main loop, by name.
-        times: The times of the simulation at the decisions of an episode, if it has a clock.
+        times: The times of the simulation at its steps, if it has a clock.
     """
 
     def __init__(self, state_of: Callable[[Model], Model] | None = None) -> None:
@@ -230,7 +233,7 @@ class Run:
         self.in_main_loop = True
         self.end = "truncated" if simulation.run() is TRUNCATED else "terminated"
         self.in_main_loop = False
-        self.take_fingerprint()
+        self.parts |= self.look()
 
     def play_rules(self, env: Any, seed: int) -> None:
         """Play an episode of an environment with ``RULE`` throughout."""
@@ -238,7 +241,7 @@ class Run:
         env.reset(seed=seed)
         while not env.episode.over:
             env.step(RULE)
-        self.take_fingerprint()
+        self.parts |= self.look()
 
     def play_randomly(
         self,
@@ -251,6 +254,7 @@ class Run:
         The last of ``drawn`` random actions is used at each step; without any, ``RULE``.
         """
         env.reset(seed=seed)  # which also seeds the spaces of the actions
+        self.simulation = env.simulation
         for name in env.agent_iter():
             result = env.last()
             _, _, terminated, truncated, info = result
@@ -264,8 +268,6 @@ class Run:
                 for _ in range(drawn):
                     action = env.action_space(name).sample(info.get(MASK))
                 self.actions.append(action)
-                if "time" in info:
-                    self.times.append(info["time"])
                 agent.describe(seed, Where.USER)  # which raises an error if labels do not fit
             yield
             env.step(action)
@@ -286,6 +288,9 @@ class Run:
         self._step_began = time.monotonic()
         step = f"{STEP} {len(self.calls)}, {name}"
         self.parts[step] = "without a result"
+        clock = optional_method(self.simulation, "time")
+        if clock is not None:
+            self.times.append(float(clock()))
         return step
 
     def end_step(self, step: str, value: Model) -> Model:
@@ -293,23 +298,22 @@ class Run:
         self.parts |= fingerprint(step, value, follow=False)
         return value
 
-    def take_fingerprint(self) -> None:
-        """Record the fingerprint of the simulation."""
+    def look(self) -> Fingerprint:
+        """Return the fingerprint of the simulation."""
         with outside_simulation():  # decision functions run their rule here
             simulation = self.simulation
             state = optional_method(simulation, "state")
             if self.state_of is not None:
-                self.parts |= fingerprint("fingerprint", self.state_of(simulation))
-            elif state is not None:
-                self.parts |= fingerprint("state()", state())
-            else:
-                self.parts |= fingerprint("simulation", simulation)
+                return fingerprint("fingerprint", self.state_of(simulation))
+            if state is not None:
+                return fingerprint("state()", state())
+            return fingerprint("simulation", simulation)
 
     def stop(self) -> NoReturn:
         """Stop the run at the limit of decisions, as often as the model swallows the exit."""
         if not self.is_cut:
             self.is_cut = True
-            self.take_fingerprint()
+            self.parts |= self.look()
         raise LimitReached
 
 
@@ -444,27 +448,6 @@ class Runner:
                 next(other, None)
 
         return run.play(start, self.seconds, seed)
-
-    def apply_waits(self, point: Point, seed: int) -> bool:
-        """Return whether actions at a point take time, because ``apply`` waits.
-
-        If it is not called in an episode of random actions, that is not known, and true.
-        """
-        apply = point.definition.apply
-        if apply is None:
-            return False
-        waits: set[bool] = set()
-
-        @wraps(apply)
-        def record(*args: Model, **kwargs: Model) -> Model:
-            result = apply(*args, **kwargs)
-            waits.add(hasattr(result, "send") or hasattr(result, "__await__"))
-            return result
-
-        plan = self.plan.redefined(point.hook, replace(point.definition, apply=record))
-        env = SimulationAECEnv(plan.amended({"max_steps": self.max_steps}))
-        self.run_randomly(env, seed)
-        return waits != {False}
 
     def sources_of_chance(self, seed: int) -> str:
         """Return where a plain run uses clocks, entropy and the global generators; or nothing."""

@@ -37,9 +37,11 @@ class PointRecord:
         self.seen: list[Observation] = []
         self.tallies: dict[str, NDArray[np.float64]] = {}
 
-    def add(self, agent: str, result: StepResult) -> None:
-        """Add a result of ``last()``, without its reward."""
-        observation, _, terminated, truncated, info = result
+    def add(self, agent: str, answered: int, result: StepResult) -> None:
+        """Add a result of ``last()`` to an agent that has ``answered`` so many decisions."""
+        observation, reward, terminated, truncated, info = result
+        if answered:
+            self.tally("reward", reward)
         self.tally("observation", observation)
         if not (self.seen and same(self.seen[0], observation)):
             self.seen[1:] = [observation]

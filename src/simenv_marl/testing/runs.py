@@ -25,8 +25,7 @@ from collections.abc import (
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from datetime import date, datetime
-from functools import cached_property, partial
-from itertools import islice
+from functools import cached_property
 from textwrap import shorten
 from types import FrameType, coroutine
 from typing import Any, Final, NoReturn
@@ -169,13 +168,14 @@ class Run:
         calls: The name of the decision point, or of the agent, of each step.
         parts: The fingerprint of the steps (the decisions of the rules, or the results of
             ``last()``), and of the simulation at the end or at the limit of decisions.
-        results: The agents and results of ``last()`` in an episode of random actions.
+        results: The agents in an episode of random actions, the numbers of their earlier decisions,
+            and the results of ``last()``.
         actions: Those actions.
         in_main_loop: Whether a plain run is in the main loop of the simulation.
         is_cut: Whether the run has reached the limit of decisions.
         end: "terminated" or "truncated".
         error: The exception that ended the run, unless the limit of decisions did.
-        is_stuck: Whether the last step began long before that exception.
+        step_began: The time at which the last step began.
         draws: The global generators that the run has used, by name.
         early: The places where a plain run called decision points before its main loop, by name.
         times: The times of the simulation at its steps, if it has a clock.
@@ -192,17 +192,16 @@ class Run:
         self.simulation: Model = None
         self.calls: list[str] = []
         self.parts: Fingerprint = {}
-        self.results: list[tuple[Agent, StepResult]] = []
+        self.results: list[tuple[Agent, int, StepResult]] = []
         self.actions: list[Action] = []
         self.in_main_loop = False
         self.is_cut = False
         self.end = "terminated"
         self.error: BaseException | None = None
-        self.is_stuck = False
         self.draws: set[str] = set()
         self.early: dict[str, str] = {}
         self.times: list[float] = []
-        self._step_began = time.monotonic()
+        self.step_began = time.monotonic()
 
     def play(
         self,
@@ -221,7 +220,6 @@ class Run:
         except (Exception, SystemExit, LimitReached) as error:
             if not self.is_cut:
                 self.error = error
-                self.is_stuck = time.monotonic() - self._step_began > seconds / 2
         for name, state in global_states().items():
             if state != states[name]:
                 self.draws.add(_GENERATORS[name])
@@ -259,7 +257,7 @@ class Run:
             result = env.last()
             _, _, terminated, truncated, info = result
             agent = env.episode.agents.get(name) or env.episode.ended[name]
-            self.results.append((agent, result))
+            self.results.append((agent, agent.answered, result))
             self.parts |= fingerprint(self.begin_step(name), result)
             self.end = "truncated" if truncated else "terminated"
             action = None
@@ -278,14 +276,15 @@ class Run:
         """Let the rule decide in a plain run."""
         return hook.function(*args, **kwargs)
 
-    def follow(self, hook: Hook, rule: Rule) -> Rule:
-        """Return the rule of a generator or coroutine function, as the run follows it."""
-        return rule
+    @coroutine
+    def follow(self, hook: Hook, step: str, rule: Rule) -> Rule:
+        """Follow the rule of a generator or coroutine function, and record its result."""
+        return self.end_step(step, (yield from rule))
 
     def begin_step(self, name: str) -> str:
         """Record the call of a decision point or agent; return the name of its step."""
         self.calls.append(name)
-        self._step_began = time.monotonic()
+        self.step_began = time.monotonic()
         step = f"{STEP} {len(self.calls)}, {name}"
         self.parts[step] = "without a result"
         clock = optional_method(self.simulation, "time")
@@ -356,18 +355,15 @@ class Runner:
                 refused[view] = error_text(error)
         return refused
 
-    def call(self, function: Callable[[], object]) -> Run:
-        """Call a function within the time limit."""
-        return Run().play(function, self.seconds)
-
     def run_plainly(self, seed: int, global_seed: int | None = None, run: Run | None = None) -> Run:
         """Run the simulation's own loop, with the plan's handlers and generators.
 
         Records the decisions of the rules, in a new ``run`` if none is given. The global generators
         get the same seed, or ``global_seed``.
         """
+        played = run or Run(self.state_of)
 
-        def start(run: Run) -> None:
+        def start() -> None:
             rng = GlobalRandom() if self.plan.options.global_rng else None
             installation = Installation(self.plan.patches)
             try:
@@ -376,23 +372,19 @@ class Runner:
                     if rng is not None:
                         rng.begin(seed)
                     passing(simulation.reset, "seed", "options")(seed=seed, options=None)
-                    run.run_main_loop(simulation)
+                    played.run_main_loop(simulation)
             finally:
                 installation.uninstall()
 
-        return self.record_rules(start, seed if global_seed is None else global_seed, run)
+        return self.record_rules(played, start, seed if global_seed is None else global_seed)
 
-    def record_rules(self, start: Callable[[Run], None], seed: int, run: Run | None = None) -> Run:
-        """Play a run, and record the decisions of the rules.
-
-        ``start`` plays it.
-        """
-        run = run or Run(self.state_of)
+    def record_rules(self, run: Run, start: Callable[[], object], seed: int) -> Run:
+        """Play a run by a function, and record the decisions of the rules."""
         hooks = {point.hook for point in self.plan.points}
         for hook in hooks:
             hook.replace_rule(self._recording_rule(hook, run))
         try:
-            return run.play(partial(start, run), self.seconds, seed)
+            return run.play(start, self.seconds, seed)
         finally:
             for hook in hooks:
                 hook.replace_rule()
@@ -414,11 +406,7 @@ class Runner:
             if hook.kind == "function":
                 return run.end_step(step, value)
             rule = value.__await__() if hook.kind == "coroutine" else value
-            return wait(step, run.follow(hook, rule))
-
-        @coroutine
-        def wait(step: str, rule: Rule) -> Rule:
-            return run.end_step(step, (yield from rule))
+            return run.follow(hook, step, rule)
 
         return decide
 
@@ -428,7 +416,6 @@ class Runner:
         seed: int,
         *,
         drawn: int = 1,
-        most: int | None = None,
         beside: SimulationAECEnv | None = None,
     ) -> Run:
         """Play an episode with random legal actions.
@@ -437,21 +424,20 @@ class Runner:
             env: The environment.
             seed: The seed of the episode and its actions.
             drawn: Another number gives other actions with the same seed; 0 gives ``RULE``.
-            most: The number of steps after which the episode is broken off.
             beside: Another environment, which is stepped in turns with this one.
         """
         run = Run()
 
         def start() -> None:
             other = iter(()) if beside is None else Run().play_randomly(beside, seed + 1)
-            for _ in islice(run.play_randomly(env, seed, drawn), most):
+            for _ in run.play_randomly(env, seed, drawn):
                 next(other, None)
 
         return run.play(start, self.seconds, seed)
 
     def sources_of_chance(self, seed: int) -> str:
         """Return where a plain run uses clocks, entropy and the global generators; or nothing."""
-        places: list[str] = []
+        places: dict[str, None] = {}
 
         def profile(frame: FrameType, event: str, function: object) -> None:
             source = _CHANCE.get(function) if event == "c_call" else None
@@ -460,7 +446,7 @@ class Runner:
             if source:
                 place = _innermost(traceback.extract_stack(frame), _LIBRARY)
                 if not place.startswith(_PACKAGE):
-                    places.append(f"{source} at {place}")
+                    places[f"{source} at {place}"] = None
 
         before = sys.getprofile()
         sys.setprofile(profile)
@@ -468,8 +454,7 @@ class Runner:
             self.run_plainly(seed)
         finally:
             sys.setprofile(before)
-        texts = list(dict.fromkeys(places))
-        return f"\nin the model, {'; '.join(texts[:3])}" if texts else ""
+        return f"\nin the model, {'; '.join([*places][:3])}" if places else ""
 
 
 # -- where errors and differences come from -------------------------------------------------------

@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
 from inspect import getclosurevars
+from types import coroutine
 
 from ..errors import short_repr
 from ..hooks.hook import Hook
@@ -58,7 +59,8 @@ class Watch(Run):
         self._looked += time.process_time() - begin
         return value
 
-    def follow(self, hook: Hook, rule: Rule) -> Rule:
+    @coroutine
+    def follow(self, hook: Hook, step: str, rule: Rule) -> Rule:
         """Note whether a rule yields, and whether it returns a value.
 
         An error that the model raises in the rule ends it, because the run's result is not used.

@@ -102,12 +102,12 @@ def check_simulation(
             f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
         )
     check = Check(
-        make_plan=partial(plan_of, simulation, points, options),
-        max_steps=max_steps,
-        seconds=time_limit / 4,
-        state_of=fingerprint,
-        seeds=list(map(int, unique_seeds)),
-        most_episodes=episodes,
+        partial(plan_of, simulation, points, options),
+        max_steps,
+        time_limit / 4,
+        fingerprint,
+        list(map(int, unique_seeds)),
+        episodes,
     )
     with silence() as warnings:
         check.run()
@@ -151,12 +151,12 @@ def inspect_simulation(
         run = runner.run_plainly(seed)
         refused = runner.refused_views()
     return Inspection(
-        simulation=runner.plan.name,
-        points=tuple(map(_describe, runner.plan.active)),
-        views=tuple(view for view in VIEWS if view not in refused),
-        calls=order_of(run.calls),
-        counts=dict(Counter(run.calls)),
-        ended=f"{len(run.calls)} decisions, then {_describe_end(run)}",
+        runner.plan.name,
+        tuple(map(_describe, runner.plan.active)),
+        tuple(view for view in VIEWS if view not in refused),
+        order_of(run.calls),
+        dict(Counter(run.calls)),
+        f"{len(run.calls)} decisions, then {_describe_end(run)}",
     )
 
 

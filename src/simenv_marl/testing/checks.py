@@ -99,7 +99,7 @@ processes also differ without it.
 """
 
 
-@dataclass(kw_only=True)
+@dataclass
 class Check(Runner):
     """A check: a simulation, the limits of its runs, and the results so far.
 
@@ -329,15 +329,13 @@ class Check(Runner):
         watch = Watch(self.state_of)
         self.run_plainly(self.seeds[0], run=watch)
         for point in self.plan.active:
-            found = watch.found[point.hook]
             apply = point.definition.apply
-            # It takes the place of the rule, with its effects, and may wait as well.
-            if apply is not None:
-                found.pop("changing_rule", None)
-                if isgeneratorfunction(apply) or iscoroutinefunction(apply):
-                    found = {name: found[name] for name in found if name == "settings"}
-            for name, evidence in found.items():
-                self.add(name, evidence, point=point.hook.name)
+            waits = isgeneratorfunction(apply) or iscoroutinefunction(apply)
+            for name, evidence in watch.found[point.hook].items():
+                # An apply takes the place of the rule, with its effects, and may wait as well.
+                is_replaced = waits or (point.applies and name == "changing_rule")
+                if name == "settings" or not is_replaced:
+                    self.add(name, evidence, point=point.hook.name)
 
     def check_clock(self, run: Run, *, drawn: int) -> None:
         """Check that the times of a run go on.
@@ -412,9 +410,7 @@ class Check(Runner):
                 for agent, answered, result in run.results:
                     records[agent.point.hook].add(agent.name, answered, result)
                 if self.fails(run):
-                    if isinstance(run.error, LimitReached):
-                        break
-                    continue
+                    break
                 if number == 1:
                     first = run
                     self.check_clock(run, drawn=1)

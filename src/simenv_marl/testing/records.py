@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import deepcopy
 from itertools import chain
 
 import numpy as np
@@ -105,11 +104,9 @@ class PointRecord:
             yield "not_finite", "; ".join(map(str, infinite[:3]))
         elif self.outside:
             yield "outside", self.outside
-        space = deepcopy(self.point.definition.observation_space)  # it keeps its generator
-        if self.decisions > 1 and len(self.seen) == 1:
-            (first,) = self.seen
-            if not all(same(first, space.sample()) for _ in range(9)):
-                yield "same_observations", f"always {short_repr(first)}"
+        has_others = self.point.definition.observation_space != Discrete(1)
+        if self.decisions > 1 and len(self.seen) == 1 and has_others:
+            yield "same_observations", f"always {short_repr(self.seen[0])}"
         if statistics.never_legal:
             yield "never_legal", f"actions {', '.join(map(str, statistics.never_legal[:10]))}"
         rewards = statistics.rewards

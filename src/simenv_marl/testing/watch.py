@@ -83,8 +83,7 @@ class Watch(Run):
         parts = self.look()
         if self.state_of is None:
             with suppress(TypeError):  # the function is not written in Python
-                nonlocals, variables, *_ = getclosurevars(hook.function)
-                parts |= fingerprint("variables", {**nonlocals, **variables})
+                parts |= fingerprint("variables", getclosurevars(hook.function))
             parts |= fingerprint("arguments", args)
         return parts
 

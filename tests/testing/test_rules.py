@@ -17,22 +17,20 @@ from gymnasium import spaces
 
 from simenv_marl import difference
 from simenv_marl.testing import check_simulation
-from tests.testing.test_testing import BOX, Walk, checked, clean, finding, variant
+from tests.testing.test_testing import (
+    BOX,
+    Walk,
+    checked,
+    clean,
+    finding,
+    report_with,
+    table_of,
+    variant,
+)
 from tests.worlds.models import define
 
 WALKS = []
-
-
-def fault(severity, words, *told, changes=None, **options):
-    """Add a model to the table with the one finding that it must have."""
-
-    def add(model):
-        WALKS.append(
-            pytest.param(model, changes, options, severity, words, told, id=model.__name__)
-        )
-        return model
-
-    return add
+fault = table_of(WALKS)
 
 
 def fault_of(name, severity, words, *told, **changes):
@@ -474,10 +472,7 @@ class Broken(Walk):
 
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), WALKS)
 def test_faults_are_found_with_their_place(model, changes, options, severity, words, told):
-    seen = finding(checked(model, changes, **options), words)
-    assert seen.severity == severity
-    text = " ".join(f"{seen.title} {seen.evidence} {seen.explanation}".split())
-    assert all(part in text for part in told), text
+    report_with(model, changes, options, severity, words, told)
 
 
 # -- tests that are left out ----------------------------------------------------------------------

@@ -203,19 +203,33 @@ def test_a_given_fingerprint_alone_is_compared():
 
 # -- what is wrong with models --------------------------------------------------------------------
 
+
+def table_of(rows):
+    """Return a decorator that adds models to rows, each with the one finding it must have."""
+
+    def found(severity, words, *told, changes=None, **options):
+        def add(model):
+            row = model, changes, options, severity, words, told
+            rows.append(pytest.param(*row, id=model.__name__))
+            return model
+
+        return add
+
+    return found
+
+
+def report_with(model, changes, options, severity, words, told):
+    """The report of a model, and its one finding with these words."""
+    report = checked(model, changes, **options)
+    seen = finding(report, words)
+    assert seen.severity == severity
+    text = " ".join(f"{seen.title} {seen.evidence} {seen.explanation}".split())
+    assert all(part in text for part in told), text
+    return report, seen
+
+
 FOUND = []
-
-
-def found(severity, words, *told, changes=None, **options):
-    """Add a model to the table with its expected finding; an error is its only finding."""
-
-    def add(model):
-        FOUND.append(
-            pytest.param(model, changes, options, severity, words, told, id=model.__name__)
-        )
-        return model
-
-    return add
+found = table_of(FOUND)
 
 
 def variant(name, **functions):
@@ -399,12 +413,8 @@ class Seeding(Global):
 
 @pytest.mark.parametrize(("model", "changes", "options", "severity", "words", "told"), FOUND)
 def test_faults_of_models_are_found(model, changes, options, severity, words, told):
-    report = checked(model, changes, **options)
-    seen = finding(report, words)
-    assert seen.severity == severity
+    report, seen = report_with(model, changes, options, severity, words, told)
     assert report.of("error") == ((seen,) if severity == "error" else ()), str(report)
-    text = " ".join(f"{seen.evidence} {seen.explanation}".split())
-    assert all(part in text for part in told), text
 
 
 def test_statistics_are_those_of_the_episodes():

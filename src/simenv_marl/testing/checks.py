@@ -163,10 +163,9 @@ class Check(Runner):
         """
         self.make_environment("aec")
         self.check_plain_runs()
-        if not any(run.error for run in self.plain_runs.values()):
+        if self.views:
             self.check_repetition()
             self.check_rules()
-        if self.views:
             self.check_views()
             self.check_episodes()
 
@@ -239,12 +238,11 @@ class Check(Runner):
                         return f"The {name} of {point.hook.name}"
         return ""
 
-    def fails(self, run: Run, where: str = "") -> bool:
+    def fails(self, run: Run) -> bool:
         """Return whether a run has failed, and add its error."""
         error = run.error
-        where = where or self.stage
         if isinstance(error, LimitReached):
-            evidence = f"{where}, after {len(run.calls)} steps"
+            evidence = f"{self.stage}, after {len(run.calls)} steps"
             with suppress(Exception):  # the simulation may have no clock
                 evidence += f", at the simulated time {run.simulation.time():g}"
             if time.monotonic() - run.step_began > self.seconds / 2:
@@ -252,7 +250,7 @@ class Check(Runner):
             else:
                 self.add("out_of_time", evidence)
         elif error is not None:
-            self.add_error(error, where)
+            self.add_error(error, self.stage)
         return error is not None
 
     @contextmanager
@@ -262,8 +260,7 @@ class Check(Runner):
         try:
             yield env
         finally:
-            where = "when an environment was closed in mid-episode"
-            self.fails(Run().play(env.close, self.seconds), where=where)
+            self.fails(Run().play(env.close, self.seconds))
 
     def repeats(self, first: Fingerprint, again: Fingerprint, name: str) -> bool:
         """Return whether a run repeats another one; else add the finding with a name."""
@@ -300,7 +297,7 @@ class Check(Runner):
         if any(run.is_cut for run in runs):
             self.add("cut_runs")
         if len(runs) > 1 and not any(differences(run.parts, other.parts) for other in runs):
-            self.add("same_seeds", f"seeds {', '.join(map(str, self.seeds))}")
+            self.add("same_seeds", f"seeds {self.seeds}")
 
     def check_repetition(self) -> None:
         """Repeat a plain run: if it differs, differences of environments mean nothing."""
@@ -355,8 +352,7 @@ class Check(Runner):
             is_one_time = len(run.times) >= most and len(set(run.times[late])) == 1
             if not is_one_time or 20 * len(set(run.calls[late])) > most:
                 return
-        evidence = f"{most} decisions, the last at {run.times[-1]:g}"
-        self.add("standing_clock", f"{self.stage}: {evidence}")
+        self.add("standing_clock", f"{self.stage}: {most} decisions, the last at {run.times[-1]:g}")
 
     # -- environments with RULE throughout --------------------------------------------------------
 
@@ -392,7 +388,7 @@ class Check(Runner):
                 return
         self.checked.append(
             f"plain runs against RULE throughout ({', '.join(self.views)}; drivers"
-            f" {', '.join(drivers)}; seeds {', '.join(map(str, self.seeds))})"
+            f" {', '.join(drivers)}; seeds {self.seeds})"
         )
 
     # -- episodes of random legal actions ---------------------------------------------------------
@@ -437,8 +433,10 @@ class Check(Runner):
         generators = generators_of(run.simulation)
         number = sum(len(each) if isinstance(each, Streams) else 1 for each in generators)
         if 0 < number < len(names):
-            evidence = f"{number} for {len(names)} agents, {names[0]} and {names[1]} among them"
-            self.add("few_generators", evidence)
+            self.add(
+                "few_generators",
+                f"{number} for {len(names)} agents, {names[0]} and {names[1]} among them",
+            )
 
     def compare_episodes(self, used: SimulationAECEnv, first: Run) -> None:
         """Repeat an episode in a new environment, in a used one, and beside another one."""

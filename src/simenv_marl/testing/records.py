@@ -104,8 +104,8 @@ class PointRecord:
             yield "not_finite", "; ".join(map(str, infinite[:3]))
         elif self.outside:
             yield "outside", self.outside
-        has_others = self.point.definition.observation_space != Discrete(1)
-        if self.decisions > 1 and len(self.seen) == 1 and has_others:
+        is_same = self.decisions > 1 and len(self.seen) == 1
+        if is_same and self.point.definition.observation_space != Discrete(1):
             yield "same_observations", f"always {short_repr(self.seen[0])}"
         if statistics.never_legal:
             yield "never_legal", f"actions {', '.join(map(str, statistics.never_legal[:10]))}"

@@ -40,8 +40,9 @@ class Watch(Run):
     def decide(self, hook: Hook, args: Args, kwargs: Kwargs) -> Model:
         """Let the rule decide, and compare the model before and after."""
         found = self.found[hook]
-        before = self._settings
-        changed = [name for name, value in _settings().items() if value != before.get(name, value)]
+        changed = [
+            name for name, value in _settings().items() if value != self._settings.get(name, value)
+        ]
         if changed:
             found["settings"] = ", ".join(changed)
         if self._looked > 2.0:  # looks are slow

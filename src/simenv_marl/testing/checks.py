@@ -25,6 +25,7 @@ from pettingzoo.test import (
 from ..core import Streams, generators_of, pack
 from ..envs import VIEWS, SimulationAECEnv
 from ..errors import (
+    AgentError,
     DefinitionError,
     InvalidActionError,
     MaskError,
@@ -238,7 +239,7 @@ class Check(Runner):
                         return f"The {name} of {point.hook.name}"
         return ""
 
-    def fails(self, run: Run) -> bool:
+    def fails(self, run: Run, view: str = "aec") -> bool:
         """Return whether a run has failed, and add its error."""
         error = run.error
         if isinstance(error, LimitReached):
@@ -249,7 +250,8 @@ class Check(Runner):
                 self.add("stuck", f"{evidence} ({place_of(error) or 'in another thread'})")
             else:
                 self.add("out_of_time", evidence)
-        elif error is not None:
+        # The joint view may be unable to know all agents.
+        elif error is not None and not (view == "joint" and isinstance(error, AgentError)):
             self.add_error(error, self.stage)
         return error is not None
 
@@ -372,11 +374,10 @@ class Check(Runner):
             if not plain.calls:
                 continue
             self.stage = f"in the {view} view, driver {driver}, seed {seed}, with RULE throughout"
-            # The joint view may be unable to know all agents.
-            with self.environment(view, driver=driver, undeclared="rule", **rules) as env:
+            with self.environment(view, driver=driver, **rules) as env:
                 run = Run(self.state_of)
                 self.record_rules(run, partial(run.play_rules, env, seed), seed)
-            if self.fails(run):
+            if self.fails(run, view):
                 continue
             if run.draws - self.sources:
                 self.sources |= run.draws
@@ -417,7 +418,8 @@ class Check(Runner):
                 self.statistics.append(record.statistics())
                 for name, evidence in record.findings():
                     self.add(name, evidence, point=hook.name)
-                if episodes and not record.decisions:
+                calls = [run.calls for run in self.plain_runs.values()]
+                if not (record.decisions or any(hook.name in names for names in calls)):
                     self.add("never_called", point=hook.name)
             if episodes:
                 self.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
@@ -474,9 +476,7 @@ class Check(Runner):
             reason = self.obstacle(name, view)
             if not reason:
                 self.stage = f"in {name}"
-                # The joint view may be unable to know all agents.
-                options = {"max_steps": self.max_steps, "undeclared": "rule"}
-                make = partial(self.make_environment, view, **options)
+                make = partial(self.make_environment, view, max_steps=self.max_steps)
                 run = Run().play(partial(test, make), self.left)
                 if self.is_late:
                     reason = "the time is up"
@@ -489,7 +489,7 @@ class Check(Runner):
                 elif isinstance(run.error, AssertionError):
                     self.add("failed_test", describe_with_place(run.error), test=name)
                 else:
-                    self.fails(run)
+                    self.fails(run, view)
             # The rest is a remedy, for those who want that view.
             self.tests.setdefault(reason.partition(";")[0], []).append(name)
 

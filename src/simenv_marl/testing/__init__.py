@@ -31,6 +31,7 @@ from .report import (
     order_of,
 )
 from .runs import (
+    WARNINGS,
     Run,
     Runner,
     describe_with_place,
@@ -101,17 +102,19 @@ def check_simulation(
             f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}"
         )
     check = Check(
-        make_plan=partial(plan_of, simulation, points, options),
-        max_steps=max_steps,
-        seconds=time_limit / 4,
-        state_of=fingerprint,
-        seeds=list(map(int, unique_seeds)),
-        most_episodes=episodes,
+        partial(plan_of, simulation, points, options),
+        max_steps,
+        time_limit / 4,
+        fingerprint,
+        list(map(int, unique_seeds)),
+        episodes,
     )
     with silence() as warnings:
         check.run()
-    for warning in warnings:
-        check.add("warned", str(warning.message)[:300])
+    for text in (str(warning.message) for warning in warnings):
+        for part, name in WARNINGS.items():
+            if part in text:
+                check.add(name, text[:400], kind=part)
     return check.report(getattr(simulation, "__name__", type(simulation).__name__))
 
 
@@ -148,12 +151,12 @@ def inspect_simulation(
         run = runner.run_plainly(seed)
         refused = runner.refused_views()
     return Inspection(
-        simulation=runner.plan.name,
-        points=tuple(map(_describe, runner.plan.active)),
-        views=tuple(view for view in VIEWS if view not in refused),
-        calls=order_of(run.calls),
-        counts=dict(Counter(run.calls)),
-        ended=f"{len(run.calls)} decisions, then {_describe_end(run)}",
+        runner.plan.name,
+        tuple(map(_describe, runner.plan.active)),
+        tuple(view for view in VIEWS if view not in refused),
+        order_of(run.calls),
+        dict(Counter(run.calls)),
+        f"{len(run.calls)} decisions, then {_describe_end(run)}",
     )
 
 

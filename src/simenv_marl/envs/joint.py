@@ -93,11 +93,7 @@ class Joint:
         used = () if episode.round is None else episode.round.acted
         for name in self.roster:
             agent = episode.agents.get(name) or episode.ended[name]
-            observation = agent.observation
-            if observation is None:
-                observations[name] = agent.point.blank()
-            else:
-                observations[name] = duplicate(observation)
+            observations[name] = agent.hand_out()
             acted[name] = name in used
             if agent.mask is not None:
                 masks[name] = duplicate(agent.mask)

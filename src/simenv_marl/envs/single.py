@@ -12,7 +12,6 @@ from typing import Any, NoReturn, Self
 
 import numpy as np
 from gymnasium import spaces
-from numpy import ndarray
 from numpy.typing import NDArray
 
 from ..core import (
@@ -25,7 +24,6 @@ from ..core import (
     Plan,
     Points,
     Space,
-    duplicate,
     make_plan,
 )
 from ..errors import CopyError, ReentrancyError, ViewError
@@ -120,7 +118,7 @@ class SimulationEnv(OneAgentView):
         name = self._agent_name
         agent = episode.agents.get(name) or episode.ended[name]
         self.own_agent = agent
-        return duplicate(agent.observation), agent.info
+        return agent.hand_out(), agent.info
 
     def _clear(self) -> None:
         if hasattr(self, "own_agent"):
@@ -145,9 +143,8 @@ class SimulationEnv(OneAgentView):
         terminated = truncated = False
         if episode.pending is None:
             terminated, truncated = self.read_end(episode)
-        seen = agent.observation  # a copy is returned, because users may change it
         return (
-            seen.copy() if type(seen) is ndarray else duplicate(seen),
+            agent.hand_out(),
             agent.reward,
             terminated,
             truncated,
@@ -159,7 +156,7 @@ class SimulationEnv(OneAgentView):
         """Return the observations, rewards and infos of the latest step of several views."""
         agents = [view.own_agent for view in views]
         return (
-            [agent.observation for agent in agents],
+            [agent.raw_observation for agent in agents],
             [agent.reward for agent in agents],
             [agent.info for agent in agents],
         )

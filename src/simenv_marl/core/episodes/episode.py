@@ -387,7 +387,7 @@ class Episode(EpisodeState):
                 return WAIT
         else:
             self.consulted = agent
-            observation = duplicate(agent.observation)  # which the policy may change
+            observation = duplicate(agent.raw_observation)  # which the policy may change
             try:
                 if isinstance(policy, EpisodePolicy):
                     action = policy.answer(self, agent, observation, agent.info)

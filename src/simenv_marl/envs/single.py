@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ..core import (
     Action,
-    Agent,
     EpisodeState,
     Info,
     Model,
@@ -61,7 +60,6 @@ class SimulationEnv(OneAgentView):
         own_agent: The agent, during an episode.
     """
 
-    own_agent: Agent
     _option = "agent"
 
     def set_up(self) -> None:
@@ -120,10 +118,6 @@ class SimulationEnv(OneAgentView):
         self.own_agent = agent
         return agent.hand_out(), agent.info
 
-    def _clear(self) -> None:
-        if hasattr(self, "own_agent"):
-            del self.own_agent  # because it holds arguments of the model
-
     def step(self, action: Action) -> StepResult:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
 
@@ -165,7 +159,7 @@ class SimulationEnv(OneAgentView):
         """Return how an episode has ended for the agent: whether terminated, whether truncated."""
         if self.own_agent.ended:
             return True, False
-        return episode.terminated, episode.truncated
+        return super().read_end(episode)
 
     def validate(self, action: Action) -> Action:
         """Validate an action for the pending decision, before the simulation moves."""

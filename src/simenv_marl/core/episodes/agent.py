@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import exp, isfinite
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from greenlet import getcurrent
@@ -15,16 +15,13 @@ from ...hooks.hook import Hook
 from ...hooks.stacks import DIFFERENCES, EVALUATING
 from ...plugins import Plugins
 from ...simulation import RULE, Action, Model, Observation
-from ..plans.point import Args, Kwargs, Policy
+from ..plans.point import Args, Kwargs, Point, Policy
 from ..plans.policies import Info, Where
 from ..switching.driver import AnyHandler
 from ..values.actions import MASK, Mask, only_choice
 from ..values.spaces import duplicate
 from .arguments import Arguments, freed, weaken
 from .decision import Decision
-
-if TYPE_CHECKING:
-    from ..plans.point import Point
 
 
 class Clock:
@@ -83,12 +80,6 @@ class RunningEpisode(Protocol):
 
     def agent_for(self, handler: DecisionHandler, name: Model) -> Agent:
         """Return the agent with a name that decides at a point."""
-
-    def note_entity(self, agent: Agent, entity: Model) -> None:
-        """Note the object as which an agent decides."""
-
-    def named_before(self, handler: DecisionHandler, entity: Model) -> str | None:
-        """Return the name of the agent as which an entity last decided."""
 
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent."""
@@ -206,7 +197,7 @@ class Agent:
         arguments = self.arguments
         first = arguments.first  # a variable, because calling an attribute is slower
         if not (arguments.is_single and args and first() is args[0]):
-            self.keep(episode, args, kwargs)
+            self.keep(args, kwargs)
         if not episode.is_plain:
             return episode.decide(self, args, kwargs)
         try:
@@ -268,6 +259,15 @@ class Agent:
         elif self.answered_at is None:
             self.answered_at = self.now
         return (self, reply) if point.applies and reply is not RULE else reply
+
+    def reply_if_forced(self) -> Model:
+        """Return the reply to a decision with one legal action, and carry its reward on.
+
+        Return this agent if there are several.
+        """
+        forced = self.only_action()
+        self.carry_reward(forced is not None or not self.asked)
+        return self if forced is None else self.reply_to(forced, forced=True)
 
     def _take_choice(self, action: Action, choices: list[Model]) -> Model:
         """Return the choice of an action in a list, and forget the others."""
@@ -332,23 +332,16 @@ class Agent:
 
     # -- arguments --------------------------------------------------------------------------------
 
-    def keep(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> None:
+    def keep(self, args: Args, kwargs: Kwargs) -> None:
         """Hold the arguments of a decision."""
         arguments = self.arguments
-        point = self.point
         if args:
             before = arguments.first()
             if arguments.is_single and before is args[0]:
                 return
-            if point.expects_one and before is not None and before is not args[0]:
+            if self.point.expects_one and before is not None and before is not args[0]:
                 self.fault = self.handler.warn_of_several(self.name)
         arguments.store(args, kwargs)
-        if point.agent is None and args:
-            episode.note_entity(self, args[0])
-
-    def is_entity(self, entity: Model) -> bool:
-        """Return whether an object was the first argument of the latest decision."""
-        return self.arguments.first() is entity
 
     # -- rewards and observations -----------------------------------------------------------------
 

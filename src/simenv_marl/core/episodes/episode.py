@@ -94,7 +94,7 @@ class Episode(EpisodeState):
     """
 
     __slots__ = (
-        "_context", "_entities", "_expected_calls", "_failed_in_model", "_handlers",
+        "_context", "_expected_calls", "_failed_in_model", "_handlers",
         "_most_steps", "_plugins", "_split", "_tape_size", "called", "driver", "is_plain", "latest",
         "replay", "running", "session", "simulation", "tape",
     )  # fmt: skip
@@ -124,7 +124,6 @@ class Episode(EpisodeState):
         self.called: set[Hook] = set()
         self.running = True
         self._failed_in_model = False
-        self._entities: dict[tuple[DecisionHandler, int], Agent] = {}  # by the id of the entity
         self._most_steps = plan.options.max_steps or maxsize
         self.is_plain = not (in_rounds or self.skips)
         self.tape: list[Action] = []  # not a deque, because that takes 600 bytes
@@ -310,12 +309,7 @@ class Episode(EpisodeState):
             self.finish(truncated=True)
             return WAIT
         agent.update(args, kwargs)
-        if self.skips:
-            forced = agent.only_action()
-            agent.carry_reward(forced is not None or not agent.asked)
-            if forced is not None:
-                return agent.reply_to(forced, forced=True)
-        return agent
+        return agent.reply_if_forced() if self.skips else agent
 
     def _use_action(self, played: Round, agent: Agent) -> Model:
         """Answer a decision with the action of this round. Return the agent if it has none."""
@@ -364,13 +358,11 @@ class Episode(EpisodeState):
         is_rewarded = isinstance(policy, AskingPolicy) and policy.asks
         agent.update(args, kwargs, reward=is_rewarded)
         if self.skips:
-            forced = agent.only_action()
-            if is_rewarded:
-                agent.carry_reward(forced is not None or not agent.asked)
-            if forced is not None:
-                return agent.reply_to(forced, forced=True)
+            reply = agent.reply_if_forced()
+            if reply is not agent:
+                return reply
         if isinstance(policy, AskingPolicy):
-            agent.keep(self, args, kwargs)
+            agent.keep(args, kwargs)
         if isinstance(policy, DeferredPolicy) and not self.is_branch:
             return agent
         action = self._consult(agent, policy)
@@ -467,17 +459,6 @@ class Episode(EpisodeState):
             )
         return agent
 
-    def note_entity(self, agent: Agent, entity: Model) -> None:
-        """Note the object as which an agent decides."""
-        self._entities[agent.handler, id(entity)] = agent
-
-    def named_before(self, handler: DecisionHandler, entity: Model) -> str | None:
-        """Return the name of the agent as which an entity last decided. None if it was none."""
-        agent = self._entities.get((handler, id(entity)))
-        if agent is None or not agent.is_entity(entity):  # a freed object may have had the same id
-            return None
-        return agent.name
-
     def blame(self, agent: Agent) -> None:
         """Note the agent that notes of errors name."""
         self.latest = agent
@@ -497,7 +478,7 @@ class Episode(EpisodeState):
         in_rounds = self.round is not None
         for agent, (args, kwargs) in self._announced().items():
             if agent is not pending and (in_rounds or not agent.decided):
-                agent.keep(self, args, kwargs)
+                agent.keep(args, kwargs)
         if truncated:
             self.finish(truncated=True)
             return

@@ -164,7 +164,12 @@ def _name_of_entity(
     if point.agent is not None:
         return point.agent
     name = point.name_agent(args[0])
-    return episode.named_before(handler, args[0]) if name is None else name
+    if name is not None:
+        return name
+    for agent in reversed(episode.agents.values()):  # an entity may have been another agent before
+        if agent.handler is handler and agent.arguments.first() is args[0]:
+            return agent.name
+    return None
 
 
 class RuleHandler(Observer):

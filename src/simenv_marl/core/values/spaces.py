@@ -227,8 +227,7 @@ def _convert_items(
             case Sequence(feature_space=part, stack=True):
                 return make(batch_space(part, _size(part, value)))(value)
             case Sequence(feature_space=part) if not isinstance(value, (str, Mapping)):
-                items = tuple(value)
-                return make(Tuple([part] * len(items)))(items)
+                return make(Tuple([part] * len(value)))(list(value))
             case Graph(node_space=part):
                 nodes, edges, links = value
                 number = _size(part, nodes)

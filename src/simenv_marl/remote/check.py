@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import zip_longest
 from math import inf
@@ -120,18 +120,18 @@ def check_wire(
     return _Check(command, start, decisions, timeout).run()
 
 
+@dataclass
 class _Check:
     """A check of one simulator. Its tests raise a ``ProcessError`` if they fail."""
 
-    def __init__(self, command: Sequence[str], start: bytes, longest: int, timeout: float) -> None:
-        self._command = command
-        self._start = start
-        self._longest = longest
-        self._timeout = timeout
-        self._first: Frames = []  # an episode by the rule, in a new process
-        self._calls: Frames = []  # its "decide" frames
-        self._can: frozenset[str] = frozenset()
-        self._draws = False  # whether other random numbers are known to change an episode
+    _command: Sequence[str]
+    _start: bytes
+    _longest: int
+    _timeout: float
+    _first: Frames = field(default_factory=list)  # an episode by the rule, in a new process
+    _calls: Frames = field(default_factory=list)  # its "decide" frames
+    _can: frozenset[str] = frozenset()
+    _draws: bool = False  # whether other random numbers are known to change an episode
 
     def run(self) -> WireReport:
         """Run all tests; if a simulator fails one of the first two, only these."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from math import exp, isfinite
 from numbers import Real
 from typing import Any, Protocol
@@ -24,19 +25,17 @@ from .arguments import Arguments, freed, weaken
 from .decision import Decision
 
 
+@dataclass(eq=False, slots=True)
 class Clock:
     """Reads the simulation's time.
 
     Attributes:
         time: Returns the simulation's time.
+        rate: The discount rate per unit of time. None: infos have no discount.
     """
 
-    __slots__ = ("_rate", "time")
-
-    def __init__(self, time: Callable[[], float], rate: float | None) -> None:
-        """Read times by a function, and discount by a rate per unit of time if there is one."""
-        self.time = time
-        self._rate = rate
+    time: Callable[[], float]
+    rate: float | None
 
     def read(self, before: float | None) -> dict[str, Any]:
         """Return the time, and the time elapsed since an earlier one, as an info."""
@@ -44,8 +43,8 @@ class Clock:
         time = read()
         now = time if type(time) is float else float(time)
         info: dict[str, Any] = {"time": now, "elapsed": 0.0 if before is None else now - before}
-        if self._rate is not None:
-            info["discount"] = exp(-self._rate * info["elapsed"])
+        if self.rate is not None:
+            info["discount"] = exp(-self.rate * info["elapsed"])
         return info
 
 
@@ -91,6 +90,7 @@ class RunningEpisode(Protocol):
         """Note the agent that notes of errors name."""
 
 
+@dataclass(eq=False, repr=False, slots=True)
 class Agent:
     """One agent of an episode.
 
@@ -126,53 +126,41 @@ class Agent:
         fault: Why its rewards are wrong. Empty as far as is known.
     """
 
-    __slots__ = (
-        "_applying", "_carried", "_has_rule_action", "_is_quick", "_numbers", "answered",
-        "answered_at", "arguments", "asked", "choices", "clock", "decided", "delegated", "ended",
-        "fallbacks", "fault", "handler", "info", "mask", "memory", "name", "now", "offered",
-        "plugins", "point", "policy", "present", "raw_observation", "reward", "rule_action",
-    )  # fmt: skip
+    name: str
+    handler: DecisionHandler
+    policy: Policy
+    delegated: bool
+    clock: Clock | None
+    plugins: Plugins | None
+    point: Point = field(init=False)
+    arguments: Arguments = field(init=False)
+    memory: dict[Any, Any] = field(default_factory=dict)
+    reward: float = 0.0
+    _carried: float = 0.0  # the sum of the rewards of forced moves
+    raw_observation: Observation = None
+    # The numbers of an array that the user has. Empty once the library has read it.
+    _numbers: bytes | None = None
+    info: Info = field(default_factory=dict)
+    mask: Mask | None = None
+    choices: list[Model] | None = None
+    offered: list[Model] | None = None
+    rule_action: Action = None
+    _has_rule_action: bool = False  # which the next info contains
+    decided: bool = False
+    _is_quick: bool = False  # an update needs no more than an observation and a reward
+    ended: bool = False
+    present: bool = False
+    asked: bool = False
+    answered: int = 0
+    answered_at: float | None = None
+    now: float | None = None
+    fallbacks: int = 0
+    fault: str = ""
+    _applying: int = 0
 
-    def __init__(
-        self,
-        name: str,
-        handler: DecisionHandler,
-        policy: Policy,
-        delegated: bool,
-        clock: Clock | None,
-        plugins: Plugins | None,
-    ) -> None:
-        self.name = name
-        self.handler = handler
-        self.point = point = handler.point
-        self.policy = policy
-        self.delegated = delegated
-        self.arguments = Arguments(point)
-        self.clock = clock
-        self.plugins = plugins
-        self.memory: dict[Any, Any] = {}
-        self.reward = 0.0
-        self._carried = 0.0  # the sum of the rewards of forced moves
-        self.raw_observation: Observation = None
-        # The numbers of an array that the user has. Empty once the library has read it.
-        self._numbers: bytes | None = None
-        self.info: Info = {}
-        self.mask: Mask | None = None
-        self.choices: list[Model] | None = None
-        self.offered: list[Model] | None = None
-        self.rule_action: Action = None
-        self._has_rule_action = False  # which the next info contains
-        self.decided = False
-        self._is_quick = False  # an update needs no more than an observation and a reward
-        self.ended = False
-        self.present = False
-        self.asked = False
-        self.answered = 0
-        self.answered_at: float | None = None
-        self.now: float | None = None
-        self.fallbacks = 0
-        self.fault = ""
-        self._applying = 0
+    def __post_init__(self) -> None:
+        self.point = self.handler.point
+        self.arguments = Arguments(self.point)
 
     # -- decisions --------------------------------------------------------------------------------
 
@@ -363,31 +351,33 @@ class Agent:
             observe: Whether to observe it.
             last: Whether its episode ends here.
         """
-        if not DIFFERENCES:
-            self._update(args, kwargs, reward, observe, last)
-            return
-        here = getcurrent()
-        before = EVALUATING.get(here)
-        EVALUATING[here] = self
+        here = getcurrent() if DIFFERENCES else None  # differences must know the agent
+        before = None
+        if here is not None:
+            before = EVALUATING.get(here)
+            EVALUATING[here] = self
         try:
-            self._update(args, kwargs, reward, observe, last)
+            point = self.point
+            if reward and self.decided:
+                self.reward = checked_reward(self.name, point.reward_mapping(*args, **kwargs))
+            elif reward and not last:  # it has not acted yet, so this value rewards nothing
+                point.reward_mapping(*args, **kwargs)
+                self.decided = True
+                informs = point.definition.rule_action_mapping is not None
+                self._is_quick = point.legal is None and not informs
+            if observe:
+                self._observe(args, kwargs, last)
         finally:
-            if before is None:  # without a function call, which fails at the recursion limit
-                del EVALUATING[here]
-            else:
-                EVALUATING[here] = before
+            if here is not None:
+                # Without a function call, which fails at the recursion limit.
+                if before is None:
+                    del EVALUATING[here]
+                else:
+                    EVALUATING[here] = before
 
-    def _update(self, args: Args, kwargs: Kwargs, reward: bool, observe: bool, last: bool) -> None:
-        """Do as ``update`` says. Differences must know the agent."""
+    def _observe(self, args: Args, kwargs: Kwargs, last: bool) -> None:
+        """Set the mask, the info and the observation for the arguments of a call."""
         point = self.point
-        if reward and self.decided:
-            self.reward = checked_reward(self.name, point.reward_mapping(*args, **kwargs))
-        elif reward and not last:  # the agent has not acted yet, so this value rewards nothing
-            point.reward_mapping(*args, **kwargs)
-            self.decided = True
-            self._is_quick = point.legal is None and point.definition.rule_action_mapping is None
-        if not observe:
-            return
         self.present = True
         if point.legal is not None:
             self._restrict(args, kwargs, last)

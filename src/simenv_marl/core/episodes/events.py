@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ...decision import inverse
 from ...errors import InvalidActionError, listed, short_repr, warn_user
@@ -90,22 +90,29 @@ class PointHandler:
         return problem
 
 
+@dataclass(eq=False)
 class RemovalHandler(Observer):
-    """Handles calls that end agents. It changes nothing in the simulation: the function runs."""
+    """Handles calls that end agents. It changes nothing in the simulation: the function runs.
 
-    def __init__(self, hook: Hook, roster: Collection[str], last: AnyHandler | None) -> None:
-        """Handle calls of a hook. ``last`` handles their ends."""
-        self._hook = hook
-        self._last = last
-        # The handlers of points, the classes of agents, and the callables that name agents.
-        self._removals: list[tuple[PointHandler | None, type | None, NameAgent | None]] = []
-        self._roster = roster
-        self._has_warned = False
+    Attributes:
+        hook: The hook of the function.
+        roster: The names of the agents that are known beforehand.
+        last: Handles the ends of the calls. None: nothing does.
+    """
+
+    hook: Hook
+    roster: Collection[str]
+    last: AnyHandler | None
+    # The handlers of points, the classes of agents, and the callables that name agents.
+    _removals: list[tuple[PointHandler | None, type | None, NameAgent | None]] = field(
+        default_factory=list
+    )
+    _has_warned: bool = False
 
     @property
     def report(self) -> AnyHandler | None:
         """Handles the ends of calls."""
-        return self._last
+        return self.last
 
     def add(self, handler: PointHandler | None, remover: Remover) -> None:
         """Let calls end agents of a point. None: any agents."""
@@ -116,7 +123,7 @@ class RemovalHandler(Observer):
 
     def handle(self, episode: RunningEpisode, args: Args, kwargs: Kwargs) -> Model:
         """Give the agents their last rewards and observations; then let the function run."""
-        episode.called.add(self._hook)
+        episode.called.add(self.hook)
         # All names come first, because the end of an agent may change them.
         named = []
         for handler, owner, name_agent in self._removals:
@@ -133,7 +140,7 @@ class RemovalHandler(Observer):
                 episode.end_agent(agent)
             elif handler is None and name is not None and not self._has_warned:
                 known = [*episode.agents, *episode.others, *episode.ended]
-                if name in known or name in self._roster:
+                if name in known or name in self.roster:
                     continue
                 self._has_warned = True
                 warn_user(

@@ -16,7 +16,7 @@ from .core import Points, ViewOptions
 from .envs import SimulationVectorEnv, vector_env, view_class
 from .envs.single import plan_of
 from .errors import OptionValueError, UnknownPointError, short_repr
-from .simulation import Model, is_integer
+from .simulation import Model, check_count
 
 _RECIPES: Final[dict[str, tuple[Model, Points, ViewOptions]]] = {}
 """The registered simulations with their points and options, by name and version."""
@@ -59,8 +59,7 @@ def register_simulation(
         raise OptionValueError(
             f"name= must consist of letters, digits, _ and -, not {short_repr(name)}"
         )
-    if not is_integer(version) or version < 0:
-        raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
+    check_count(version, "version")
     plan = plan_of(simulation, points, options)
     recipe = f"{name}-v{version}"
     _RECIPES[recipe] = simulation, points, options

@@ -6,7 +6,6 @@ from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import zip_longest
-from math import inf
 from subprocess import DEVNULL, TimeoutExpired, run
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -20,6 +19,7 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
+from ..simulation import check_count, check_seconds
 from .child import MOST_FRAMES, Child
 from .wire import KEYS, Frame, Json, decode, encode
 
@@ -112,10 +112,8 @@ def check_wire(
         raise OptionValueError(
             f"seed must be an integer from 0 to 2**31 - 1, not {short_repr(seed)}"
         )
-    if decisions < 1 or not 0 < timeout < inf:
-        raise OptionValueError(
-            f"decisions and timeout must be positive, not {decisions} and {timeout}"
-        )
+    check_count(decisions, "decisions", 1)
+    check_seconds(timeout, "timeout")
     start = encode({"start": {"seed": seed, "options": options or {}}})
     return _Check(command, start, decisions, timeout).run()
 

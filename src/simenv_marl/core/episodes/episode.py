@@ -44,7 +44,15 @@ from greenlet import getcurrent
 from ...errors import AgentError, annotate, clear_frames, short_repr, warn_user
 from ...hooks.hook import Hook
 from ...hooks.stacks import EVALUATING
-from ...simulation import RULE, TRUNCATED, Action, Model, Sentinel, optional_method
+from ...simulation import (
+    RULE,
+    TRUNCATED,
+    Action,
+    Function,
+    Model,
+    Sentinel,
+    optional_method,
+)
 from ..plans.plan import Plan
 from ..plans.point import Args, Kwargs, Policy
 from ..plans.policies import (
@@ -476,9 +484,11 @@ class Episode(EpisodeState):
         """
         pending, self.pending = self.pending, None  # so that an action from a mapping is refused
         in_rounds = self.round is not None
-        for agent, (args, kwargs) in self._announced().items():
-            if agent is not pending and (in_rounds or not agent.decided):
-                agent.keep(args, kwargs)
+        expected_calls = self._expected_calls
+        if expected_calls is not None:
+            for agent, (args, kwargs) in self._announced(expected_calls).items():
+                if agent is not pending and (in_rounds or not agent.decided):
+                    agent.keep(args, kwargs)
         if truncated:
             self.finish(truncated=True)
             return
@@ -494,12 +504,9 @@ class Episode(EpisodeState):
                 agent.forget_choices()  # ``legal`` returns them again when it decides
         self.pending = pending
 
-    def _announced(self) -> dict[Agent, tuple[Args, Kwargs]]:
+    def _announced(self, expected_calls: Function) -> dict[Agent, tuple[Args, Kwargs]]:
         """Return the agents that ``expected_calls`` announces, with the arguments of their call."""
         announced: dict[Agent, tuple[Args, Kwargs]] = {}
-        expected_calls = self._expected_calls
-        if expected_calls is None:
-            return announced
         for plan_point in self.plan.active:
             handler = self._handlers.by_point[plan_point]
             point = handler.point
